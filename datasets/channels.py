@@ -1,0 +1,49 @@
+"""The channel table: what a clip holds, in which shape, precision and unit."""
+
+from typing import NamedTuple
+
+
+class Channel(NamedTuple):
+    """One row of the table. Axes: F frames, S noise realisations, 2 reference halves, H rows, W columns, M meshes."""
+
+    axes: tuple[str | int, ...]
+    dtype: str  # as stored; radiance falls back to float32 where float16 would lose by it
+    unit: str
+    radiance: bool = False
+
+    @property
+    def components(self) -> int:
+        """Numbers a pixel, for channels with pixels."""
+        return int(self.axes[-1])
+
+    @property
+    def is_image(self) -> bool:
+        return "H" in self.axes
+
+    def shape(self, **sizes: int) -> list[int]:
+        """The stored shape for F=, S=, H=, W=, M=."""
+        return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
+
+
+RADIANCE = "W sr^-1 m^-2"
+
+CHANNELS: dict[str, Channel] = {
+    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "albedo": Channel(("F", "H", "W", 3), "<f2", "1"),
+    "normal": Channel(("F", "H", "W", 3), "<f2", "1"),
+    "depth": Channel(("F", "H", "W", 1), "<f4", "world units"),
+    "roughness": Channel(("F", "H", "W", 1), "<f2", "GGX alpha"),
+    "mesh_id": Channel(("F", "H", "W", 1), "<u2", "index"),
+    "motion": Channel(("F", "H", "W", 2), "<f4", "px"),
+    "dual_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
+    "K": Channel(("F", 3, 3), "<f8", "px"),
+    "camera_to_world": Channel(("F", 4, 4), "<f8", "world units"),
+    "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
+}
+
+CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
+REFERENCES = ("direct_reference", "indirect_reference")

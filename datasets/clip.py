@@ -1,0 +1,144 @@
+"""Reading clips and data sets straight from memory maps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.channels import CHANNELS
+from datasets.files import read_json
+from errors import BadInput
+from scenes.camera import View, motion_vectors, pixel_centres
+
+SCHEMA = 1
+SPLITS = ("train", "val", "test")
+WHOLE = (slice(None), slice(None))
+
+Window = tuple[slice, slice]  # rows, columns
+
+
+class Clip:
+    """One clip on disk. Nothing is read until it is asked for, and then only the window asked for.
+
+    Raises BadInput, naming the file, where the clip is missing, incomplete or damaged.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.facts: dict[str, Any] = read_json(path / "clip.json")
+        if not self.facts.get("complete"):
+            raise BadInput(f"{path} is not a complete clip: delete it and rerun `onespp dataset`")
+        self.frames: int = self.facts["frames"]
+        self.height: int = self.facts["height"]
+        self.width: int = self.facts["width"]
+        self.channels: dict[str, dict[str, Any]] = self.facts["channels"]
+        self._maps: dict[str, NDArray[Any]] = {}
+
+    @property
+    def scene(self) -> str:
+        return self.path.parent.name
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def exposure(self) -> float:
+        return self.facts["exposure"]
+
+    @property
+    def realisations(self) -> int:
+        entry = self.entry("direct")
+        return entry["shape"][1] if "shape" in entry else 1
+
+    def entry(self, channel: str) -> dict[str, Any]:
+        """How a channel is stored. Raises BadInput where it was not rendered."""
+        if channel not in self.channels:
+            raise BadInput(f"{self.path} holds no '{channel}': it was not rendered; render the data set with it")
+        return self.channels[channel]
+
+    def map(self, channel: str) -> NDArray[Any]:
+        """The memory-mapped array of a channel that has a file, checked against the shape that clip.json states."""
+        if channel not in self._maps:
+            entry, path = self.entry(channel), self.path / self.entry(channel)["file"]
+            try:
+                array = np.load(path, mmap_mode="r")
+            except FileNotFoundError:
+                raise BadInput(f"{path} is missing: delete {self.path} and rerun `onespp dataset`") from None
+            except (ValueError, EOFError) as error:
+                raise BadInput(f"{path} is damaged ({error}): delete {self.path} and rerun `onespp dataset`") from None
+            if list(array.shape) != entry["shape"] or array.dtype != np.dtype(entry["dtype"]):
+                raise BadInput(f"{path} is not what clip.json says: delete {self.path} and rerun `onespp dataset`")
+            self._maps[channel] = array
+        return self._maps[channel]
+
+    def read(self, channel: str, frame: int, window: Window = WHOLE, realisation: int = 0) -> NDArray[Any]:
+        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for the reference halves.
+
+        The same array whether the channel is stored in full, as one value or to be derived.
+        """
+        rows, columns = window
+        entry = self.entry(channel)
+        spec = CHANNELS[channel]
+        if "value" in entry:
+            area = np.empty((self.height, self.width), bool)[rows, columns].shape
+            leading = (2,) if spec.axes[1] == 2 else ()
+            return np.broadcast_to(np.array(entry["value"], spec.dtype), (*leading, *area, spec.components))
+        if "derived" in entry:
+            return self.motion_to(frame, max(frame - 1, 0), window)
+        array = self.map(channel)
+        if "S" in spec.axes:
+            return array[frame, realisation, rows, columns]
+        return array[frame, ..., rows, columns, :]
+
+    def view(self, frame: int) -> View:
+        return View(*(np.array(self.map(name)[frame]) for name in ("K", "camera_to_world", "object_to_world")))
+
+    def motion_to(self, frame: int, other: int, window: Window = WHOLE) -> NDArray[np.float32]:
+        """Motion vectors (h, w, 2) from `frame` to any `other` frame of the clip, from depth, cameras and meshes."""
+        pixels = pixel_centres(self.height, self.width)[window]
+        depth = self.read("depth", frame, window)[..., 0].astype(np.float64)
+        mesh_id = self.read("mesh_id", frame, window)[..., 0]
+        return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
+
+    def reference(self, frame: int) -> NDArray[np.float32]:
+        """Both halves (2, H, W, 3) of the reference radiance: emission + direct + indirect."""
+        halves = np.float32(self.read("direct_reference", frame)) + np.float32(self.read("indirect_reference", frame))
+        return halves + np.float32(self.read("emission", frame))
+
+
+class Dataset:
+    """A data set on disk: dataset.json and the clips it plans, by split.
+
+    Raises BadInput where there is none, or one of another schema version.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        if not path.is_dir():
+            raise BadInput(f"there is no data set at {path}: make one with `onespp dataset --data {path}`")
+        self.facts: dict[str, Any] = read_json(path / "dataset.json")
+        if self.facts.get("schema") != SCHEMA:
+            raise BadInput(
+                f"{path} has schema version {self.facts.get('schema')}, this onespp reads version {SCHEMA}: "
+                "render it again with `onespp dataset` into a new folder"
+            )
+
+    def planned(self, splits: Sequence[str] = SPLITS) -> list[Path]:
+        """Folders of all clips of `splits`, rendered or not, in a fixed order."""
+        return [self.path / split / clip for split in splits for clip in self.facts["splits"][split]]
+
+    def clips(self, split: str) -> list[Clip]:
+        """The clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
+        paths = self.planned([split])
+        missing = [path for path in paths if not (path / "clip.json").exists()]
+        if missing:
+            raise BadInput(
+                f"{self.path}: {len(missing)} of {len(paths)} clips of '{split}' are missing, first {missing[0]}; "
+                "finish them with `onespp dataset`"
+            )
+        if not paths:
+            raise BadInput(f"{self.path} has no clips to {split} with")
+        return [Clip(path) for path in paths]

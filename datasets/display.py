@@ -1,0 +1,31 @@
+"""Exposure and the display transform, for metrics and pictures only: networks never see them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
+
+
+def luminance(radiance: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Rec. 709 luminance (...,) of linear RGB (..., 3)."""
+    return radiance @ LUMINANCE
+
+
+def clip_exposure(y: NDArray[np.floating]) -> float:
+    """Exposure of a clip from the luminance of its reference's direct + indirect, all frames, any shape.
+
+    min(0.18 / exp(mean ln max(Y, 1e-4 mean Y)), 1 / P95(Y)): middle grey for the geometric mean, but at most 5 % of the
+    pixels clipped. 1 where everything is black.
+    """
+    y = y.astype(np.float64)
+    mean = y.mean()
+    if mean <= 0:
+        return 1.0
+    exposure = 0.18 / np.exp(np.log(np.maximum(y, 1e-4 * mean)).mean())
+    percentile = np.percentile(y, 95)
+    return float(min(exposure, 1 / percentile) if percentile > 0 else exposure)
+
+
+def display(radiance: NDArray[np.floating], exposure: float) -> NDArray[np.float64]:
+    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1]."""
+    return np.clip(exposure * radiance.astype(np.float64), 0, 1) ** (1 / 2.2)

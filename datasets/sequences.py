@@ -1,0 +1,101 @@
+"""Training sequences: random crops of consecutive frames, augmented, straight from memory maps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset as TorchDataset
+
+from datasets.channels import REFERENCES
+from datasets.clip import Clip
+from datasets.frame import Frame, read_frame
+from errors import BadInput
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Which of RAE §4.3's augmentations are on. Each transforms every channel and camera consistently."""
+
+    reverse: bool = False  # half of the sequences are played backward
+    stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
+    rotate: bool = False  # by a random multiple of 90 degrees
+    gain: bool = False  # a factor in [0, 2] of its own for each colour channel
+
+
+class TrainingSequences(TorchDataset[list[Frame]]):
+    """Sequences of `length` frames and `crop` x `crop` pixels; item i of epoch e depends on (seed, e, i) only.
+
+    An epoch holds as many sequences as it takes to see as many pixels as the clips have.
+    Raises BadInput where a clip is shorter than a sequence or smaller than a crop.
+    """
+
+    def __init__(
+        self, clips: Sequence[Clip], reads: Sequence[str], length: int, crop: int, augmentation: Augmentation, seed: int
+    ):
+        for clip in clips:
+            if clip.frames < length or min(clip.height, clip.width) < crop:
+                raise BadInput(
+                    f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small for "
+                    f"training sequences of {length} frames of {crop}x{crop}; train with a smaller profile"
+                )
+        self.clips, self.length, self.crop = clips, length, crop
+        self.channels = tuple(dict.fromkeys([*reads, *REFERENCES]))
+        self.augmentation, self.seed, self.epoch = augmentation, seed, 0
+        pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
+        self.share = pixels / pixels.sum()
+        self.count = max(1, round(pixels.sum() / (length * crop * crop)))
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch whose sequences come next."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> list[Frame]:
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        clip = self.clips[rng.choice(len(self.clips), p=self.share)]
+        playback = self._playback(clip, rng)
+        top, left = (int(rng.integers(size - self.crop + 1)) for size in (clip.height, clip.width))
+        window = (slice(top, top + self.crop), slice(left, left + self.crop))
+        # A stopped camera must not see the same noise again, so realisations are dealt out rather than drawn.
+        deal = rng.permutation(clip.realisations)
+        turns = int(rng.integers(4)) if self.augmentation.rotate else 0
+        gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.augmentation.gain else None
+
+        frames = []
+        for t, position in enumerate(playback):
+            realisation, previous = int(deal[t % len(deal)]), playback[max(t - 1, 0)]
+            frame = read_frame(clip, position, self.channels, realisation, previous, window)
+            for _ in range(turns):
+                frame = frame.rot90()
+            frames.append(frame if gain is None else replace(frame, gain=gain))
+        return frames
+
+    def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:
+        """Frame numbers in the order in which they are played."""
+        start = int(rng.integers(clip.frames - self.length + 1))
+        positions = np.arange(start, start + self.length)
+        if self.augmentation.reverse and rng.random() < 0.5:
+            positions = positions[::-1]
+        if self.augmentation.stop and rng.random() < 0.25:
+            positions = positions[np.minimum(np.arange(self.length), rng.integers(self.length))]
+        return [int(position) for position in positions]
+
+
+class Batch:
+    """What a training step sees: for each time step one Frame of all sequences.
+
+    Not a list: Fabric converts the tensors of collections, and the cameras' float64 must stay.
+    """
+
+    def __init__(self, frames: list[Frame]):
+        self.frames = frames
+
+    def to(self, device: torch.device | str) -> "Batch":
+        return Batch([frame.to(device) for frame in self.frames])
+
+
+def collate(sequences: list[list[Frame]]) -> Batch:
+    return Batch([Frame.stack(step) for step in zip(*sequences, strict=True)])

@@ -1,0 +1,186 @@
+"""Writing one clip: frames in, one finished folder out, or nothing."""
+
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.channels import CHANNELS, REFERENCES, Channel
+from datasets.display import clip_exposure, display, luminance
+from datasets.files import write_json
+
+HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in its normal range
+
+
+def working_dtype(channel: Channel) -> str:
+    """Precision in which frames wait for the decision what to store: float16 only after the whole clip is known."""
+    return "<f4" if channel.dtype == "<f2" else channel.dtype
+
+
+class RawChannel:
+    """One channel's frames on their way to disk, with what the decision on their storage needs to know."""
+
+    def __init__(self, folder: Path, name: str):
+        self.name, self.channel = name, CHANNELS[name]
+        self.path = folder / f"{name}.raw"
+        self.file = self.path.open("wb")
+        self.frame_shape: tuple[int, ...] = ()
+        self.frames = self.nonfinite = 0
+        self.first: NDArray[Any] | None = None
+        self.constant = self.channel.is_image
+        self.magnitude = self.half_error = 0.0
+
+    def add(self, array: NDArray[Any]) -> None:
+        """Append one frame (axes without F). What is not finite is counted and becomes 0."""
+        array = np.ascontiguousarray(array, dtype=working_dtype(self.channel))
+        if array.dtype.kind == "f":
+            finite = np.isfinite(array)
+            self.nonfinite += int(array.size - finite.sum())
+            array = np.where(finite, array, 0)
+        if self.first is None:
+            self.first, self.frame_shape = array.reshape(-1, array.shape[-1])[0], array.shape
+        self.constant = self.constant and bool((array == self.first).all())
+        if self.channel.radiance:
+            with np.errstate(over="ignore"):
+                self.half_error += float(np.abs(array.astype("<f2").astype("<f8") - array).sum())
+            self.magnitude += float(np.abs(array).sum(dtype=np.float64))
+        self.file.write(array.tobytes())
+        self.frames += 1
+
+    def read(self, frame: int) -> NDArray[Any]:
+        """One frame back, in working precision."""
+        dtype = np.dtype(working_dtype(self.channel))
+        count = int(np.prod(self.frame_shape))
+        return np.fromfile(self.path, dtype, count, offset=frame * count * dtype.itemsize).reshape(self.frame_shape)
+
+    def storage_dtype(self) -> str:
+        """float32 for radiance that float16 would round worse than it rounds normal numbers (overflow, flush to 0)."""
+        loses = self.channel.radiance and not self.half_error <= HALF_PRECISION * self.magnitude
+        return "<f4" if loses else self.channel.dtype
+
+    def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:
+        """Write the final file where one is needed. Returns the entry of clip.json and how many numbers were clamped."""
+        dtype = self.storage_dtype()
+        if derived:
+            entry: dict[str, Any] = {"derived": derived}
+            clamped = 0
+        elif self.constant:
+            assert self.first is not None
+            stored, clamped = to_storage(self.first, dtype)
+            entry = {"value": stored.tolist()}
+        else:
+            entry, clamped = self._write_array(dtype)
+        self.path.unlink()
+        return entry, clamped
+
+    def _write_array(self, dtype: str) -> tuple[dict[str, Any], int]:
+        shape = [self.frames, *self.frame_shape]
+        clamped = 0
+        path = self.path.with_suffix(".npy")
+        with path.open("wb") as file:
+            output = ChecksummedFile(file)
+            header = {"descr": dtype, "fortran_order": False, "shape": tuple(shape)}
+            np.lib.format.write_array_header_1_0(output, header)  # type: ignore[arg-type]
+            for frame in range(self.frames):
+                stored, lost = to_storage(self.read(frame), dtype)
+                clamped += lost
+                output.write(stored.tobytes())
+        crc32 = f"{output.crc32:08x}"
+        return {"file": path.name, "dtype": dtype, "shape": shape, "unit": self.channel.unit, "crc32": crc32}, clamped
+
+
+class ChecksummedFile:
+    """A binary file that sums up what passes through it."""
+
+    def __init__(self, file: BinaryIO):
+        self.file, self.crc32 = file, 0
+
+    def write(self, data: bytes) -> int:
+        self.crc32 = zlib.crc32(data, self.crc32)
+        return self.file.write(data)
+
+
+def to_storage(array: NDArray[Any], dtype: str) -> tuple[NDArray[Any], int]:
+    """The array as `dtype`, saturated instead of infinite, and how many numbers that changed."""
+    if dtype != "<f2":
+        return array.astype(dtype), 0
+    limit = float(np.finfo(np.float16).max)
+    return np.clip(array, -limit, limit).astype(dtype), int((np.abs(array) > limit).sum())
+
+
+class ClipWriter:
+    """Collects a clip's frames beside its destination and moves the whole there at the end.
+
+    Use as a context manager: `add` every frame, then `finish`. Leaving without `finish` removes everything written.
+    Frames pass through to disk, so memory does not grow with the clip's length.
+    """
+
+    def __init__(self, destination: Path):
+        self.destination = destination
+        self.folder = destination.with_name(f".{destination.name}.tmp")
+        self.channels: dict[str, RawChannel] = {}
+        self.luminances: list[NDArray[np.float32]] = []
+        self.timing: dict[str, float] = {}
+
+    def __enter__(self) -> "ClipWriter":
+        shutil.rmtree(self.folder, ignore_errors=True)  # left by a killed job
+        self.folder.mkdir(parents=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for raw in self.channels.values():
+            try:
+                raw.file.close()
+            except OSError:
+                pass  # a full disk fails again on closing; the first error is the one to report
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def add(self, channels: dict[str, NDArray[Any]], seconds: dict[str, float]) -> None:
+        """Append one frame: arrays as in the channel table without F, and seconds by step."""
+        for name, array in channels.items():
+            if name not in self.channels:
+                self.channels[name] = RawChannel(self.folder, name)
+            self.channels[name].add(array)
+        reference = sum(np.nan_to_num(channels[name].mean(axis=0), posinf=0, neginf=0) for name in REFERENCES)
+        self.luminances.append(luminance(np.asarray(reference)).astype(np.float32))
+        for step, spent in seconds.items():
+            self.timing[step] = self.timing.get(step, 0.0) + spent
+
+    def noise_floor(self, exposure: float) -> float:
+        """Mean over frames of mean((display A - display B)^2) / 4: the squared error of the mean of the two halves."""
+        floors = []
+        for frame in range(len(self.luminances)):
+            emission = self.channels["emission"].read(frame)
+            halves = sum(self.channels[name].read(frame) for name in REFERENCES) + emission
+            a, b = display(halves, exposure)
+            floors.append(((a - b) ** 2).mean() / 4)
+        return float(np.mean(floors))
+
+    def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
+        """Complete the clip. `facts` join clip.json; `derived` names channels the reader computes, and from what."""
+        for raw in self.channels.values():
+            raw.file.close()
+        exposure = clip_exposure(np.stack(self.luminances))
+        floor_mse = self.noise_floor(exposure)
+        height, width = self.luminances[0].shape
+        entries, clamped = {}, {}
+        for name, raw in self.channels.items():
+            entries[name], clamped[name] = raw.finish(derived.get(name))
+        content = {
+            "frames": len(self.luminances),
+            "height": height,
+            "width": width,
+            **facts,
+            "exposure": exposure,
+            "channels": entries,
+            "nonfinite": {name: raw.nonfinite for name, raw in self.channels.items()},
+            "clamped": clamped,
+            "floor_mse": floor_mse,
+            "complete": True,
+        }
+        write_json(self.folder / "timing.json", self.timing)
+        write_json(self.folder / "clip.json", content)
+        self.folder.rename(self.destination)

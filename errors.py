@@ -1,0 +1,8 @@
+"""The one error type that means: the user can fix this."""
+
+
+class BadInput(Exception):
+    """What the user gave cannot be used. The message is one line: what is wrong and what to do.
+
+    The command line prints it and exits with code 2; every other exception is a bug and keeps its traceback.
+    """

@@ -1,0 +1,91 @@
+"""Metrics of one frame (design §7): display space, linear radiance, and change over time."""
+
+import math
+
+import torch
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from models.operators import finite, luminance
+
+EPSILON = 0.01
+SSIM_WINDOW = 11
+
+
+def display(radiance: Tensor, exposure: float) -> Tensor:
+    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1]."""
+    return (exposure * radiance).clamp(0, 1) ** (1 / 2.2)
+
+
+def psnr(mse: float) -> float:
+    """min(100, -10 log10 mse) in dB, for signals in [0, 1]."""
+    return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0
+
+
+def ssim(x: Tensor, reference: Tensor) -> float | None:
+    """Mean over valid 11 x 11 Gaussian windows and RGB (Wang et al. 2004); None for images smaller than a window."""
+    if min(x.shape[-2:]) < SSIM_WINDOW:
+        return None
+    return float(structural_similarity_index_measure(x, reference, sigma=1.5, data_range=1.0))
+
+
+def image_metrics(output: Tensor, halves: Tensor, exposure: float) -> dict[str, float | None]:
+    """Metrics of one frame.
+
+    Args:
+        output: radiance (1, 3, H, W). A pixel that is not finite counts as 0.
+        halves: the two independent halves (2, 3, H, W) of the reference radiance.
+        exposure: the clip's.
+    """
+    output, halves = finite(output).double(), halves.double()
+    reference = halves.mean(dim=0, keepdim=True)
+    shown, truth = display(output, exposure), display(reference, exposure)
+    mse = (shown - truth).square().mean().item()
+    x, r, (a, b) = exposure * output, exposure * reference, exposure * halves
+    return {
+        "mse": mse,
+        "rmse": math.sqrt(mse),
+        "l1": (shown - truth).abs().mean().item(),
+        "psnr": psnr(mse),
+        "ssim": ssim(shown, truth),
+        "mse_unbiased": ((x - a) * (x - b)).mean().item(),
+        "smape": ((x - r).abs() / (x.abs() + r.abs() + EPSILON)).mean().item(),
+        "rel_mse": ((x - r).square() / (r.square() + EPSILON)).mean().item(),
+    }
+
+
+class TemporalMetrics:
+    """Change from frame to frame of one denoiser's display luminance. Feed every frame in order."""
+
+    def __init__(self) -> None:
+        self.before: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def update(self, output: Tensor, halves: Tensor, exposure: float, still: bool) -> dict[str, float | None]:
+        """`temporal_error`, its floor, and `flicker` where nothing moves in the clip; None on the first frame.
+
+        The floor is half the temporal error between the two reference halves: what the reference's own noise adds.
+        """
+        halves = halves.double()
+        images = (finite(output).double(), halves.mean(dim=0, keepdim=True), halves)
+        y, reference, ab = (luminance(display(image, exposure)) for image in images)
+        before, self.before = self.before, (y, reference, ab)
+        if before is None:
+            return {"temporal_error": None, "temporal_error_floor": None, "flicker": None}
+        change, reference_change, ab_change = y - before[0], reference - before[1], ab - before[2]
+        return {
+            "temporal_error": (change - reference_change).abs().mean().item(),
+            "temporal_error_floor": (ab_change[0] - ab_change[1]).abs().mean().item() / 2,
+            "flicker": change.abs().mean().item() if still else None,
+        }
+
+
+def disocclusion_l1(
+    output: Tensor, halves: Tensor, exposure: float, motion: Tensor, dual_motion: Tensor
+) -> float | None:
+    """Display L1 on disoccluded pixels: where the dual motion vector differs by more than 1/64 px; None without any."""
+    disoccluded = (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
+    if not disoccluded.any():
+        return None
+    reference = halves.double().mean(dim=0, keepdim=True)
+    error = (display(finite(output).double(), exposure) - display(reference, exposure)).abs()
+    return error.mean(dim=1, keepdim=True)[disoccluded].mean().item()

@@ -1,0 +1,36 @@
+"""Pictures for people."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+from torch import Tensor
+
+from eval.metrics import display
+from models.operators import finite
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt  # noqa: E402 - after the choice of backend
+
+DPI = 100
+CAPTION = 0.45  # inches
+SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor
+
+
+def save_strip(path: Path, images: Mapping[str, Tensor], errors: Mapping[str, Mapping[str, float | None]], exposure: float) -> None:
+    """A PNG of radiance images (1, 3, H, W) side by side as displayed, each captioned with its RMSE and SSIM."""
+    height, width = next(iter(images.values())).shape[-2:]
+    zoom = max(1, -(-SMALLEST_PANEL // max(height, width))) / DPI
+    size = (len(images) * width * zoom, height * zoom + CAPTION)
+    figure, axes = plt.subplots(1, len(images), figsize=size, dpi=DPI, squeeze=False)
+    for axis, (name, image) in zip(axes[0], images.items(), strict=True):
+        axis.imshow(display(finite(image), exposure)[0].permute(1, 2, 0).numpy(), interpolation="nearest")
+        axis.set_axis_off()
+        caption = [f"{key.upper()} {value:.3f}" for key in ("rmse", "ssim") if (value := errors.get(name, {}).get(key))]
+        axis.set_title("\n".join([name, "  ".join(caption)]), fontsize=8, pad=2)
+    figure.subplots_adjust(left=0, right=1, bottom=0, top=1 - CAPTION / size[1], wspace=0.01)
+    temporary = path.with_name(f".{path.name}")
+    figure.savefig(temporary, format="png")
+    plt.close(figure)
+    os.replace(temporary, path)

@@ -1,0 +1,32 @@
+"""From a noisy frame and a state to a denoised image."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from errors import BadInput
+from models.baselines import Accumulated, Noisy
+from models.denoiser import Denoiser
+from models.rae import RAE
+from models.weights import load_weights
+
+DENOISERS: dict[str, Callable[[], Denoiser]] = {"noisy": Noisy, "accumulated": Accumulated, "rae": RAE}
+
+
+def create(name: str) -> Denoiser:
+    """A denoiser by its name, with fresh weights where it has any. Raises BadInput for an unknown name."""
+    if name not in DENOISERS:
+        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}")
+    return DENOISERS[name]()
+
+
+def load(name: str, weights: Path | None) -> Denoiser:
+    """A denoiser ready to use: in evaluation mode, with the weights of the file if it has any.
+
+    Raises BadInput where the file is missing, damaged or of another network.
+    """
+    denoiser = create(name)
+    if denoiser.parameter_count():
+        if weights is None:
+            raise BadInput(f"'{name}' needs trained weights")
+        load_weights(denoiser, name, weights)
+    return denoiser.eval()

@@ -1,0 +1,122 @@
+"""RAE: the recurrent denoising autoencoder of Chaitanya et al. 2017."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame
+from models.denoiser import Denoiser, State
+from models.operators import RunningScale, finite, running_scale
+
+POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
+SLOPE = 0.1  # §5.3: leaky ReLU
+ENCODER = (32, 32, 43, 57, 76, 101, 101)
+DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
+
+
+def conv(inputs: int, outputs: int) -> nn.Conv2d:
+    """A 3 x 3 convolution with He initialisation for leaky ReLU (§5.3)."""
+    layer = nn.Conv2d(inputs, outputs, 3, padding=1)
+    nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def activate(x: Tensor) -> Tensor:
+    return F.leaky_relu(x, SLOPE)
+
+
+class RecurrentBlock(nn.Module):
+    """h_i = O_i = C(C(C(I_i) ∪ h_{i-1})) (§4.2)."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.input, self.merge, self.output = conv(width, width), conv(2 * width, width), conv(width, width)
+
+    def forward(self, x: Tensor, hidden: Tensor | None) -> Tensor:
+        x = activate(self.input(x))
+        hidden = torch.zeros_like(x) if hidden is None else hidden.to(x.dtype)
+        return activate(self.output(activate(self.merge(torch.cat([x, hidden], dim=1)))))
+
+
+class RecurrentAutoencoder(nn.Module):
+    """The network of Fig. 2: images whose sides are multiples of 32 in, images of the same size out.
+
+    36 convolutions: 7 in the encoder, 3 in each of 6 recurrent blocks, 10 in the decoder, one linear output layer.
+    The paper's drawn widths are lost; `encoder` and `decoder` name ours.
+    """
+
+    def __init__(self, inputs: int = 7, encoder: Sequence[int] = ENCODER, decoder: Sequence[tuple[int, int]] = DECODER):
+        super().__init__()
+        widths = encoder[1:]  # after the second convolution of full resolution, one width a resolution
+        self.first = conv(inputs, encoder[0])
+        self.encoder = nn.ModuleList(conv(a, b) for a, b in zip(encoder, widths, strict=False))
+        self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
+        below, stages = widths[-1], []
+        for skip, (middle, out) in zip(widths[-2::-1], decoder, strict=True):
+            stages.append(nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE), conv(middle, out)))
+            below = out
+        self.decoder = nn.ModuleList(stages)
+        self.output = conv(below, 3)
+
+    def forward(self, x: Tensor, hidden: Sequence[Tensor] | None) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Output (B, 3, H, W) and the new hidden features, finest first."""
+        features: list[Tensor] = []
+        x = activate(self.first(x))
+        for level, (encode, recur) in enumerate(zip(self.encoder, self.recurrent, strict=True)):
+            if level:
+                x = F.max_pool2d(x, 2)
+            x = recur(activate(encode(x)), hidden[level] if hidden else None)
+            features.append(x)
+        for skip, decode in zip(features[-2::-1], self.decoder, strict=True):
+            x = activate(decode(torch.cat([F.interpolate(x, scale_factor=2.0), skip], dim=1)))
+        return self.output(x), tuple(features)
+
+
+@dataclass(frozen=True)
+class RAEState(State):
+    """Hidden features, finest first, (B, w, H / 2^k, W / 2^k), and the running exposure and depth scale."""
+
+    hidden: tuple[Tensor, ...]
+    scale: RunningScale
+
+
+def pad(x: Tensor, multiple: int = 32) -> Tensor:
+    """Replicate the right and bottom borders until both sides are multiples of `multiple`."""
+    height, width = x.shape[-2:]
+    return F.pad(x, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+
+
+class RAE(Denoiser):
+    """Denoises demodulated irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
+
+    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.network = RecurrentAutoencoder().to(memory_format=torch.channels_last)
+
+    def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
+        """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
+        height, width = frame.size
+        before = state if isinstance(state, RAEState) else None
+        irradiance = finite(frame.irradiance(self.signal)).clamp(min=0)
+        scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
+        colour = self.compress(irradiance, scale, frame)
+        depth = scale.normalised_depth(frame.depth)
+        x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1))
+        hidden = before.hidden if before and before.hidden[0].shape[-2:] == x.shape[-2:] else None
+        p, hidden = self.network(x.contiguous(memory_format=torch.channels_last), hidden)
+        return p[..., :height, :width].float(), RAEState(hidden, scale)
+
+    def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
+        """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""
+        return (irradiance * scale.exposure() * frame.gain) ** POWER
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        p, state = self.predict(frame, state)
+        irradiance = p.clamp(min=0) ** (1 / POWER) / (state.scale.exposure() * frame.gain)
+        return frame.remodulate(irradiance, self.signal), state

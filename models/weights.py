@@ -1,0 +1,38 @@
+"""Weights on disk: safetensors, with the network's name and training recipe in the metadata."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from errors import BadInput
+from models.denoiser import Denoiser
+
+
+def save_weights(denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path) -> None:
+    """Write atomically: a reader sees the old file or the whole new one."""
+    tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
+    temporary = path.with_name(f".{path.name}.tmp")
+    save_file(tensors, temporary, {"denoiser": name, "recipe": json.dumps(recipe)})
+    os.replace(temporary, path)
+
+
+def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
+    """Fill `denoiser` from a file. Raises BadInput where it is missing, damaged or of another network."""
+    if not path.exists():
+        raise BadInput(f"there are no weights at {path}: train them with `onespp train {name}`")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    except (SafetensorError, OSError) as error:
+        raise BadInput(f"{path} is damaged or not a safetensors file ({error})") from None
+    if metadata.get("denoiser") != name:
+        raise BadInput(f"{path} holds weights of '{metadata.get('denoiser')}', not of '{name}'")
+    wanted = {key: tensor.shape for key, tensor in denoiser.state_dict().items()}
+    if {key: tensor.shape for key, tensor in tensors.items()} != wanted:
+        raise BadInput(f"{path} holds a '{name}' of another shape: train it again with `onespp train {name}`")
+    denoiser.load_state_dict(tensors)

@@ -1,0 +1,90 @@
+"""The command line: one subcommand a step, each thin."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from errors import BadInput
+
+Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
+Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
+Profile = Annotated[str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds) or quick (minutes)")]
+Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
+Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+
+
+def data_folder(data: Path | None, profile: str) -> Path:
+    return Path("data") / profile if data is None else data
+
+
+def dataset(data: Data = None, profile: Profile = "quick", seed: int = 0) -> None:
+    """Render the clips of a profile that are not there yet."""
+    from datasets.job import generate
+
+    folder = data_folder(data, profile)
+    print(f"{folder}: {generate(folder, profile, seed)} clips rendered")
+
+
+def verify(folder: Folder) -> None:
+    """Check every file of a data set against its checksum and shape; names what is damaged."""
+    from datasets.inspect import verify as find_problems
+
+    problems = find_problems(folder)
+    for problem in problems:
+        print(problem)
+    if problems:
+        raise BadInput(f"{folder}: {len(problems)} problems; delete the clips named above and rerun `onespp dataset`")
+    print(f"{folder}: everything is as it was written")
+
+
+def info(folder: Folder) -> None:
+    """Print what is in a data set: clips, channels, sizes, noise floors, times."""
+    from datasets.inspect import info as describe
+
+    print(describe(folder))
+
+
+def train(
+    names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick", seed: int = 0
+) -> None:
+    """Train denoisers (all that can be, unless some are named), or go on where a training was interrupted."""
+    from train.loop import train as train_one
+    from train.recipes import TRAINABLE
+
+    for name in names or TRAINABLE:
+        print(f"{name}: trained, {train_one(name, data_folder(data, profile), runs, profile, seed)}")
+
+
+def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
+    """Judge denoisers (all that can run, unless some are named) on the test clips: table, pictures, results.json."""
+    from eval.harness import evaluate as run
+
+    run(data_folder(data, profile), runs, profile, list(names) or None)
+
+
+COMMANDS = {"dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one subcommand. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="onespp", args=arguments, description=__doc__)
+    except BadInput as error:
+        sys.exit(_complain(str(error)))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        sys.exit(_complain(f"{where}{error.strerror or error}; make room or choose another folder, then run it again"))
+    except KeyboardInterrupt:
+        print("\ninterrupted; run the same command again to go on", file=sys.stderr)
+        sys.exit(130)
+
+
+def _complain(message: str) -> int:
+    print(f"onespp: {message}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    main()

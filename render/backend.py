@@ -1,0 +1,72 @@
+"""Mitsuba and Dr.Jit, set up: import `mi` and `dr` from here and nowhere else.
+
+The CUDA variant is used where a GPU works. Otherwise Dr.Jit compiles through LLVM and would load whatever libLLVM it
+finds first; versions before 17 abort the whole process on AVX-512 machines, so one is chosen before Mitsuba loads.
+"""
+
+import ctypes
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from errors import BadInput
+
+OLDEST_LLVM, TESTED_LLVM = 17, 19
+
+
+def installed_llvms() -> list[tuple[int, str]]:
+    """(major version, path) of every libLLVM that the loader or the usual folders know."""
+    listing = ""
+    if sys.platform.startswith("linux"):
+        try:
+            listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True).stdout
+        except OSError:
+            pass  # no ldconfig (musl): the folders below remain
+    paths = [line.rsplit("=> ", 1)[-1] for line in listing.splitlines() if "libLLVM" in line]
+    for pattern in ("usr/lib/llvm-*/lib/libLLVM*.so*", "usr/lib*/libLLVM*.so*", "opt/homebrew/opt/llvm*/lib/libLLVM.dylib"):
+        paths += [str(path) for path in Path("/").glob(pattern)]
+    found = []
+    for path in paths:
+        # The version stands in the resolved name (libLLVM.so.19.1) or in its folder (llvm-19).
+        match = re.search(r"libLLVM[-.](?:so\.|dylib\.)?(\d+)|llvm[-@/]?(\d+)", str(Path(path).resolve()))
+        if match:
+            found.append((int(match[1] or match[2]), path))
+    return found
+
+
+def choose_llvm() -> None:
+    """Point DRJIT_LIBLLVM_PATH at the usable libLLVM nearest to the tested version, unless the user has set it."""
+    if "DRJIT_LIBLLVM_PATH" in os.environ:
+        return
+    usable = [(abs(version - TESTED_LLVM), path) for version, path in installed_llvms() if version >= OLDEST_LLVM]
+    if not usable:
+        raise BadInput(
+            f"rendering on the CPU needs libLLVM {OLDEST_LLVM} or newer and none was found: install it "
+            f"(Debian, Ubuntu: apt install libllvm{TESTED_LLVM}; macOS: brew install llvm) or set DRJIT_LIBLLVM_PATH"
+        )
+    os.environ["DRJIT_LIBLLVM_PATH"] = min(usable)[1]
+
+
+def has_cuda() -> bool:
+    """Whether the CUDA driver is there and has a device."""
+    try:
+        cuda = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int()
+    return cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+
+
+VARIANT = "cuda_ad_rgb" if has_cuda() else "llvm_ad_rgb"
+if VARIANT == "llvm_ad_rgb":
+    choose_llvm()
+
+import drjit as dr  # noqa: E402 - must come after the choice
+import mitsuba as mi  # noqa: E402
+
+mi.set_variant(VARIANT)
+mi.set_log_level(mi.LogLevel.Error)
+
+__all__ = ["VARIANT", "dr", "mi"]

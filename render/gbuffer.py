@@ -1,0 +1,50 @@
+"""What the primary rays see, free of noise: geometry, material and light seen directly."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from render.backend import dr, mi
+from render.stage import Stage
+from scenes.camera import Array, View
+
+
+def depth_along_axis(si: Any, ray: Any, view: View) -> NDArray[np.float32]:
+    """Distance (N,) along the viewing axis; 0 where nothing is hit. float32, as stored."""
+    distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64)
+    cosine = np.array(ray.d, dtype=np.float64).T @ view.camera_to_world[:3, 2]
+    return np.float32(distance * cosine)
+
+
+def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArray[np.uint32], Array]:
+    """Depth (N,), mesh id (N,) and geometric normal (N, 3) of what is seen through `pixels` (N, 2) as now posed."""
+    ray = stage.rays(view, pixels)
+    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
+    mesh_id = stage.mesh_id(si)
+    dr.eval(si.t, si.n, mesh_id)
+    return np.float64(depth_along_axis(si, ray, view)), np.array(mesh_id), np.array(si.n, dtype=np.float64).T
+
+
+def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
+    """The noise-free channels (H, W, C) of the design's table, as the stage is now posed.
+
+    albedo: in [0, 1], diffuse reflectance of the surface seen, 1 for background. normal: world space, unit, toward
+    the viewer, 0 for background. roughness: GGX alpha, 1 for diffuse surfaces. emission: radiance seen directly.
+    """
+    ray = stage.rays(view)
+    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    hit = si.is_valid()
+    normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+    channels = {
+        "normal": dr.select(hit, normal, 0),
+        "albedo": dr.select(hit, dr.clip(si.bsdf().eval_diffuse_reflectance(si, hit), 0, 1), 1),
+        "emission": si.emitter(stage.mitsuba_scene).eval(si),
+        "mesh_id": stage.mesh_id(si),
+    }
+    dr.eval(channels, si.t)
+    shape = (stage.height, stage.width, -1)
+    arrays: dict[str, NDArray[Any]] = {name: np.array(value).T.reshape(shape) for name, value in channels.items()}
+    arrays["depth"] = depth_along_axis(si, ray, view).reshape(shape)
+    arrays["roughness"] = np.ones_like(arrays["depth"])
+    return arrays

@@ -1,0 +1,41 @@
+"""Dual motion vectors (NTD §3.2): where a surface that was hidden finds similar surroundings in the previous frame."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from render.gbuffer import trace_visible
+from render.stage import Stage
+from scenes.camera import Array, View, motion_vectors, move, pixel_centres, unproject
+
+SAME_SURFACE = 0.002  # of the depth: farther from the plane of what is seen there, a point was hidden
+
+
+def dual_motion(
+    stage: Stage, depth: Array, mesh_id: NDArray[np.integer], motion: Array, now: View, previous: View
+) -> Array:
+    """Dual motion vectors (H, W, 2) in pixels. The stage must be posed at the previous frame.
+
+    depth, mesh_id (H, W) and motion (H, W, 2) are of the current frame. With y = x + motion the traditional position
+    and z the place, now, of the surface seen at y then, the vector is y + (x - z) - x (NTD Eq. 2). It equals `motion`
+    exactly where the surface itself was visible, and where y or x_prev leaves the image or lies behind a camera.
+    """
+    height, width = depth.shape
+    x = pixel_centres(height, width)
+    y = x + motion
+    then_depth, then_mesh, then_normal = (a.reshape(height, width, -1) for a in trace_visible(stage, previous, y.reshape(-1, 2)))
+    then_depth, then_mesh = then_depth[..., 0], then_mesh[..., 0]
+
+    seen = unproject(y, then_depth, previous)
+    moved = move(unproject(x, depth, now), mesh_id, now, previous)
+    off_plane = np.abs(np.sum(then_normal * (moved - seen), axis=-1))
+    visible = (then_mesh == mesh_id) & ((mesh_id == 0) | (off_plane < SAME_SURFACE * then_depth))
+
+    z = y + motion_vectors(y, then_depth, then_mesh, previous, now)
+    x_previous = y + (x - z)
+
+    def inside(p: Array) -> NDArray[np.bool_]:
+        return ((p >= 0) & (p < (width, height))).all(axis=-1)
+
+    # z behind the camera is FAR_OUTSIDE, which takes x_previous out of the image too.
+    use_dual = ~visible & inside(y) & inside(x_previous)
+    return np.where(use_dual[..., None], x_previous - x, motion)

@@ -1,0 +1,111 @@
+"""Animated scenes as data: shapes with rigid motions, lights that change, a camera path, all evaluated at any frame."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from scenes.camera import View, intrinsics, look_at
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A value over time: a Catmull-Rom spline through `keys` (N, D) or (N,), spread evenly over frames 0 to `last`.
+
+    One key is a constant. Between keys the first derivative is continuous; outside 0..last the ends are held.
+    """
+
+    keys: Array
+    last: float = 1.0
+
+    @staticmethod
+    def constant(value: ArrayLike) -> "Track":
+        return Track(np.asarray(value, dtype=np.float64)[None])
+
+    def at(self, frame: float) -> Array:
+        keys = self.keys
+        if len(keys) == 1:
+            return keys[0]
+        position = np.clip(frame / max(self.last, 1e-9), 0, 1) * (len(keys) - 1)
+        k = min(int(position), len(keys) - 2)
+        u = position - k
+        # Ends are extended linearly, so that the path leaves and arrives at constant speed.
+        before = keys[k - 1] if k > 0 else 2 * keys[0] - keys[1]
+        after = keys[k + 2] if k + 2 < len(keys) else 2 * keys[-1] - keys[-2]
+        a, b = keys[k], keys[k + 1]
+        return 0.5 * (
+            2 * a
+            + (b - before) * u
+            + (2 * before - 5 * a + 4 * b - after) * u**2
+            + (3 * a - 3 * b + after - before) * u**3
+        )
+
+    def varies(self) -> bool:
+        return bool((self.keys != self.keys[0]).any())
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """A turn by `angle` radians about the vertical axis through the shape's rest origin, then a shift."""
+
+    position: Track  # (3,) world units
+    angle: Track  # scalar, radians
+
+    def matrix(self, frame: float) -> Array:
+        """object_to_world (4, 4), rigid."""
+        c, s = np.cos(self.angle.at(frame)), np.sin(self.angle.at(frame))
+        matrix = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+        matrix[:3, 3] = self.position.at(frame)
+        return matrix
+
+    def varies(self) -> bool:
+        return self.position.varies() or self.angle.varies()
+
+
+STILL = RigidMotion(Track.constant([0.0, 0.0, 0.0]), Track.constant(0.0))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh in its rest pose, with one material, perhaps emitting light, perhaps moving."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    bsdf: dict[str, Any]  # a Mitsuba BSDF dictionary
+    radiance: Track | None = None  # emitted radiance (3,), linear RGB; None does not emit
+    motion: RigidMotion = STILL
+    smooth: bool = False  # shade with the mesh's vertex normals instead of its faces'
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where the camera is, what it looks at and how wide, over time."""
+
+    eye: Track  # (3,) world units
+    target: Track  # (3,) world units
+    x_fov: Track = field(default_factory=lambda: Track.constant(60.0))  # horizontal field of view, degrees
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a renderer needs at any frame. A mesh's id is its index in `shapes` plus one; 0 is the background."""
+
+    shapes: tuple[Shape, ...]
+    camera: Camera
+    max_depth: int = 3  # path edges from the camera to a light: 3 is one indirect bounce
+
+    def view(self, frame: float, height: int, width: int) -> View:
+        """Projection and object poses of `frame` for an image of `height` x `width` pixels."""
+        return View(
+            K=intrinsics(float(self.camera.x_fov.at(frame)), height, width),
+            camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame)),
+            object_to_world=np.stack([shape.motion.matrix(frame) for shape in self.shapes]),
+        )
+
+    def moves(self) -> bool:
+        """Whether any object moves (the camera may move in any scene)."""
+        return any(shape.motion.varies() for shape in self.shapes)

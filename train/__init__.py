@@ -1,0 +1,1 @@
+"""Losses, recipes, and one training loop for all networks."""

@@ -1,0 +1,158 @@
+"""The training loop, one for all networks."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor
+from torch.utils.data import DataLoader
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from datasets.clip import Clip, Dataset
+from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
+from errors import BadInput
+from models import create
+from models.weights import save_weights
+from train.losses import SequenceLoss, loss_for
+from train.precision import fastest_precision
+from train.recipes import Recipe, recipe_for
+
+CHECKPOINT, BEST, WEIGHTS = "checkpoint.pt", "best.safetensors", "weights.safetensors"
+VALIDATIONS = 10  # in a training, besides the last epoch
+MOST_SKIPPED_IN_A_ROW = 20
+
+
+def run_folder(runs: Path, name: str, profile: str) -> Path:
+    """Where the training of a denoiser in a profile keeps its checkpoint, curves and weights."""
+    return runs / "train" / f"{name}-{profile}"
+
+
+def loader(clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int) -> DataLoader[Batch]:
+    augmentation = recipe.augmentation if augment else Augmentation()
+    sequences = TrainingSequences(clips, reads, recipe.length, recipe.crop, augmentation, seed)
+    return DataLoader(sequences, batch_size=recipe.batch, collate_fn=collate)
+
+
+class Training:
+    """One run: network, optimiser, data, and where it stands. Everything random follows from (seed, epoch, item)."""
+
+    def __init__(self, name: str, data: Path, runs: Path, profile: str, seed: int, precision: str | None):
+        self.name, self.recipe = name, recipe_for(name, profile)
+        self.folder = run_folder(runs, name, profile)
+        dataset = Dataset(data)
+        torch.manual_seed(seed)
+        denoiser = create(name)
+        self.train_data = loader(dataset.clips("train"), self.recipe, denoiser.reads, True, seed)
+        self.val_data = loader(dataset.clips("val"), self.recipe, denoiser.reads, False, seed)
+
+        checkpoint = self.folder / CHECKPOINT
+        saved: dict[str, Any] = torch.load(checkpoint, weights_only=True) if checkpoint.exists() else {}
+        device = Fabric(devices=1).device
+        # A resumed run keeps its precision, however the measurement would turn out this time.
+        self.precision = saved.get("precision") or precision or fastest_precision(device)
+        self.fabric = Fabric(devices=1, precision=self.precision)  # type: ignore[arg-type]
+        loss = loss_for(denoiser, name)
+        optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
+        self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
+
+        made_with = {key: dataset.facts[key] for key in ("profile", "seed", "generator", "scenes")}
+        self.facts = {"profile": profile, "seed": seed, "data": made_with, **asdict(self.recipe)}
+        self.epoch, self.best, self.skipped = 0, float("inf"), 0
+        if saved:
+            self.resume(saved)
+
+    def resume(self, saved: dict[str, Any]) -> None:
+        if saved["facts"] != self.facts:
+            raise BadInput(
+                f"{self.folder} holds a training with another recipe, seed or data set: delete it or use another --runs"
+            )
+        self.loss.load_state_dict(saved["loss"])
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.epoch, self.best, self.skipped = saved["epoch"], saved["best"], saved["skipped"]
+
+    def save(self) -> None:
+        """Write the checkpoint atomically: a full disk or a kill leaves the previous one."""
+        content = {
+            "facts": self.facts,
+            "precision": self.precision,
+            "loss": self.loss.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            **{key: getattr(self, key) for key in ("epoch", "best", "skipped")},
+        }
+        temporary = self.folder / f".{CHECKPOINT}.tmp"
+        torch.save(content, temporary)
+        os.replace(temporary, self.folder / CHECKPOINT)
+
+    def steps(self) -> Iterator[tuple[float, dict[str, Tensor]]]:
+        """One epoch: update the weights batch by batch; yields learning rate and losses of each step."""
+        count = len(self.train_data)
+        in_a_row = 0
+        self.train_data.dataset.set_epoch(self.epoch)  # type: ignore[attr-defined]
+        for index, batch in enumerate(self.train_data):
+            rate = self.recipe.learning_rate(self.epoch + index / count)
+            for group in self.optimiser.param_groups:
+                group["lr"] = rate
+            loss, parts = self.loss(batch.to(self.fabric.device))
+            if torch.isfinite(loss):
+                in_a_row = 0
+                self.fabric.backward(loss)
+                self.optimiser.step()
+            else:
+                self.skipped += 1
+                in_a_row += 1
+                if in_a_row >= MOST_SKIPPED_IN_A_ROW:
+                    raise BadInput(f"the loss was not finite in {in_a_row} steps in a row: check the data with `onespp info`")
+            self.optimiser.zero_grad()
+            yield rate, {"loss": loss.detach(), **parts}
+
+    @torch.no_grad()
+    def validate(self) -> float:
+        """Mean loss over the validation clips, always the same crops."""
+        losses = [self.loss(batch.to(self.fabric.device))[0].item() for batch in self.val_data]
+        return sum(losses) / len(losses)
+
+    def keep_best(self, validation: float) -> None:
+        if validation < self.best or not (self.folder / BEST).exists():
+            self.best = validation
+            denoiser = self.loss.module.denoiser
+            save_weights(denoiser, self.name, {**self.facts, "epoch": self.epoch, "validation": validation}, self.folder / BEST)
+
+
+def train(name: str, data: Path, runs: Path, profile: str, seed: int = 0, precision: str | None = None) -> Path:
+    """Train a denoiser, or go on where an interrupted training stopped. Returns the path of its weights.
+
+    Args:
+        name: the denoiser. data: the data set's folder. runs: where `train/NAME-PROFILE/` is written.
+        precision: Fabric's name of one, by default the fastest here.
+    Raises BadInput for an unknown name or profile, unusable data, or a run of another recipe in the folder.
+    """
+    training = Training(name, data, runs, profile, seed, precision)
+    training.folder.mkdir(parents=True, exist_ok=True)
+    weights = training.folder / WEIGHTS
+    epochs, steps = training.recipe.epochs, len(training.train_data)
+    every = max(1, epochs // VALIDATIONS)
+    label = f"{name} ({training.precision})"
+    with SummaryWriter(str(training.folder)) as board, tqdm(
+        total=epochs * steps, initial=training.epoch * steps, desc=label, unit="step"
+    ) as bar:
+        while training.epoch < epochs:
+            for rate, parts in training.steps():
+                board.add_scalar("learning_rate", rate, bar.n)
+                for part, value in parts.items():
+                    board.add_scalar(f"train/{part}", value, bar.n)
+                bar.set_postfix(loss=f"{parts['loss']:.3f}", val=f"{training.best:.3f}", skipped=training.skipped)
+                bar.update()
+            training.epoch += 1
+            if training.epoch % every == 0 or training.epoch == epochs:
+                validation = training.validate()
+                board.add_scalar("val/loss", validation, bar.n)
+                training.keep_best(validation)
+            training.save()
+    if (training.folder / BEST).exists():  # only a finished training has WEIGHTS
+        os.replace(training.folder / BEST, weights)
+    return weights
