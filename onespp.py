@@ -10,7 +10,9 @@ from errors import BadInput
 
 Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
 Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
-Profile = Annotated[str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds) or quick (minutes)")]
+Profile = Annotated[
+    str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds) or quick (minutes)")
+]
 Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 

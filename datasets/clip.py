@@ -46,7 +46,7 @@ class Clip:
 
     @property
     def exposure(self) -> float:
-        return self.facts["exposure"]
+        return float(self.facts["exposure"])
 
     @property
     def realisations(self) -> int:
@@ -105,8 +105,9 @@ class Clip:
 
     def reference(self, frame: int) -> NDArray[np.float32]:
         """Both halves (2, H, W, 3) of the reference radiance: emission + direct + indirect."""
-        halves = np.float32(self.read("direct_reference", frame)) + np.float32(self.read("indirect_reference", frame))
-        return halves + np.float32(self.read("emission", frame))
+        names = ("direct_reference", "indirect_reference", "emission")
+        direct, indirect, emission = (self.read(name, frame).astype(np.float32) for name in names)
+        return direct + indirect + emission
 
 
 class Dataset:

@@ -1,7 +1,12 @@
 """Exposure and the display transform, for metrics and pictures only: networks never see them."""
 
+import math
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
+
+Image = TypeVar("Image", bound=Any)
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
@@ -26,6 +31,11 @@ def clip_exposure(y: NDArray[np.floating]) -> float:
     return float(min(exposure, 1 / percentile) if percentile > 0 else exposure)
 
 
-def display(radiance: NDArray[np.floating], exposure: float) -> NDArray[np.float64]:
-    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1]."""
-    return np.clip(exposure * radiance.astype(np.float64), 0, 1) ** (1 / 2.2)
+def display(radiance: Image, exposure: float) -> Image:
+    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1], of a numpy array or a tensor."""
+    return (exposure * radiance).clip(0, 1) ** (1 / 2.2)
+
+
+def psnr(mse: float) -> float:
+    """min(100, -10 log10 mse) in dB, for signals in [0, 1]."""
+    return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0

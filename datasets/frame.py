@@ -20,7 +20,10 @@ ALBEDO_FLOOR = 0.01
 
 @dataclass(frozen=True)
 class Cameras:
-    """What projects a frame's surfaces: K (B, 3, 3), camera_to_world (B, 4, 4), object_to_world (B, M, 4, 4); float64."""
+    """What projects a frame's surfaces; float64.
+
+    K (B, 3, 3), camera_to_world (B, 4, 4), object_to_world (B, M, 4, 4).
+    """
 
     K: Tensor
     camera_to_world: Tensor
@@ -47,9 +50,9 @@ class Cameras:
 class Frame:
     """One frame of one noise realisation: tensors (B, C, H, W), float32, as attributes named like the channels.
 
-    `direct_reference` and `indirect_reference` are (B, 2, 3, H, W), where they were asked for. Reading a channel that was
-    not asked for, or that was not rendered, raises BadInput. `gain` (B, 3, 1, 1) is the per-channel gain of training
-    augmentation (RAE §4.3): a network multiplies its exposure by it; radiance stays as rendered.
+    `direct_reference` and `indirect_reference` are (B, 2, 3, H, W), where they were asked for. Reading a channel that
+    was not asked for raises BadInput. `gain` (B, 3, 1, 1) is the per-channel gain of training augmentation (RAE §4.3):
+    a network multiplies its exposure by it; radiance stays as rendered.
     """
 
     channels: dict[str, Tensor]
@@ -145,8 +148,8 @@ def read_frame(
 ) -> Frame:
     """Frame `index` (B = 1) of a clip with the named channels, cut to `window` (slices with start and stop).
 
-    `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is another
-    one (reversed playback, a stopped camera), motion vectors are made for it.
+    `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
+    another one (reversed playback, a stopped camera), motion vectors are made for it.
     """
     before = max(index - 1, 0)
     previous = before if previous is None else previous

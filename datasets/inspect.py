@@ -1,6 +1,5 @@
 """What is in a data set, and whether it is undamaged."""
 
-import math
 import zlib
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
+from datasets.display import psnr
 from datasets.files import read_json
 from errors import BadInput
 
@@ -55,11 +55,6 @@ def size_of(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-def psnr(mse: float) -> float:
-    """min(100, -10 log10 mse) in dB."""
-    return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0
-
-
 def stored_as(entry: dict[str, object]) -> str:
     if "file" in entry:
         return str(entry["dtype"])
@@ -69,7 +64,8 @@ def stored_as(entry: dict[str, object]) -> str:
 def info(root: Path) -> str:
     """Tables of clips (size, noise floor, render time) and of channels (storage, size)."""
     dataset = Dataset(root)
-    rows, sizes, storage = [], dict.fromkeys(CHANNELS, 0), {name: set[str]() for name in CHANNELS}
+    rows: list[list[object]] = []
+    sizes, storage = dict.fromkeys(CHANNELS, 0), {name: set[str]() for name in CHANNELS}
     for path in dataset.planned():
         label = str(path.relative_to(root))
         if not (path / "clip.json").exists():
@@ -82,9 +78,11 @@ def info(root: Path) -> str:
         seconds = sum(read_json(path / "timing.json").values())
         lost = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
         rows.append(
-            [label, clip.frames, f"{clip.height}x{clip.width}", clip.realisations, clip.facts["reference_spp"]]
-            + [f"{psnr(clip.facts['floor_mse']):.1f}", f"{clip.exposure:.3g}", lost]
-            + [f"{size_of(path) / 1e6:.1f}", f"{seconds:.1f}"]
+            [
+                *(label, clip.frames, f"{clip.height}x{clip.width}", clip.realisations, clip.facts["reference_spp"]),
+                *(f"{psnr(clip.facts['floor_mse']):.1f}", f"{clip.exposure:.3g}", lost),
+                *(f"{size_of(path) / 1e6:.1f}", f"{seconds:.1f}"),
+            ]
         )
     head = ["clip", "frames", "size", "noisy", "reference spp", "floor dB", "exposure", "bad values", "MB", "seconds"]
     channels = [[n, ", ".join(sorted(storage[n])), f"{sizes[n] / 1e6:.1f}"] for n in CHANNELS if storage[n]]

@@ -73,7 +73,9 @@ def only_job(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BadInput(f"another `onespp dataset` is writing to {root}: wait for it or use another folder") from None
+            raise BadInput(
+                f"another `onespp dataset` is writing to {root}: wait for it or use another folder"
+            ) from None
         yield
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -62,7 +63,7 @@ class RawChannel:
         return "<f4" if loses else self.channel.dtype
 
     def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:
-        """Write the final file where one is needed. Returns the entry of clip.json and how many numbers were clamped."""
+        """Write the final file where one is needed. Returns the entry of clip.json and the count of clamped numbers."""
         dtype = self.storage_dtype()
         if derived:
             entry: dict[str, Any] = {"derived": derived}
@@ -83,7 +84,7 @@ class RawChannel:
         with path.open("wb") as file:
             output = ChecksummedFile(file)
             header = {"descr": dtype, "fortran_order": False, "shape": tuple(shape)}
-            np.lib.format.write_array_header_1_0(output, header)  # type: ignore[arg-type]
+            np.lib.format.write_array_header_1_0(output, header)
             for frame in range(self.frames):
                 stored, lost = to_storage(self.read(frame), dtype)
                 clamped += lost
@@ -132,10 +133,8 @@ class ClipWriter:
 
     def __exit__(self, *_: object) -> None:
         for raw in self.channels.values():
-            try:
+            with suppress(OSError):  # a full disk fails again on closing; the first error is the one to report
                 raw.file.close()
-            except OSError:
-                pass  # a full disk fails again on closing; the first error is the one to report
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def add(self, channels: dict[str, NDArray[Any]], seconds: dict[str, float]) -> None:
@@ -155,7 +154,7 @@ class ClipWriter:
         for frame in range(len(self.luminances)):
             emission = self.channels["emission"].read(frame)
             halves = sum(self.channels[name].read(frame) for name in REFERENCES) + emission
-            a, b = display(halves, exposure)
+            a, b = display(halves.astype(np.float64), exposure)
             floors.append(((a - b) ** 2).mean() / 4)
         return float(np.mean(floors))
 

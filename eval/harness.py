@@ -13,10 +13,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
+from datasets.display import psnr
 from datasets.files import write_json
 from datasets.frame import Frame, read_frame, to_tensor
-from errors import BadInput
-from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics, psnr
+from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics
 from eval.pictures import save_strip
 from models import DENOISERS, create, load
 from models.denoiser import Denoiser, State
@@ -60,7 +60,7 @@ def is_still(clip: Clip) -> bool:
 
 @torch.no_grad()
 def evaluate_clip(clip: Clip, tracks: Mapping[str, Track], picture: Path) -> None:
-    """Run all denoisers over a clip, frame by frame; memory does not grow with its length. Saves a strip of pictures."""
+    """Run all denoisers over a clip frame by frame, in memory that does not grow with its length; save a picture."""
     channels = sorted({name for track in tracks.values() for name in track.denoiser.reads} | set(METRICS_CHANNELS))
     still, shown = is_still(clip), clip.frames * 3 // 4
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
@@ -141,7 +141,10 @@ def table(results: dict[str, Any], clips: list[Clip]) -> str:
         rows = [row for row in results["rows"] if (row["scene"], row["clip"]) == (clip.scene, clip.name)]
         label = f"{clip.scene}/{clip.name}"
         for row in rows:
-            cells = [form.format(row["metrics"][key]) if row["metrics"][key] is not None else "-" for key, (_, form) in COLUMNS.items()]
+            cells = [
+                form.format(row["metrics"][key]) if row["metrics"][key] is not None else "-"
+                for key, (_, form) in COLUMNS.items()
+            ]
             lines.append([label, row["denoiser"], *cells, row["nonfinite"]])
         floor = clip.facts["floor_mse"]
         floors = {"rmse": floor**0.5, "psnr": psnr(floor), "temporal_error": rows[0]["metrics"]["temporal_error_floor"]}

@@ -2,31 +2,23 @@
 
 import math
 
-import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from datasets.display import display, psnr
 from models.operators import finite, luminance
 
 EPSILON = 0.01
 SSIM_WINDOW = 11
 
 
-def display(radiance: Tensor, exposure: float) -> Tensor:
-    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1]."""
-    return (exposure * radiance).clamp(0, 1) ** (1 / 2.2)
-
-
-def psnr(mse: float) -> float:
-    """min(100, -10 log10 mse) in dB, for signals in [0, 1]."""
-    return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0
-
-
 def ssim(x: Tensor, reference: Tensor) -> float | None:
     """Mean over valid 11 x 11 Gaussian windows and RGB (Wang et al. 2004); None for images smaller than a window."""
     if min(x.shape[-2:]) < SSIM_WINDOW:
         return None
-    return float(structural_similarity_index_measure(x, reference, sigma=1.5, data_range=1.0))
+    _, full = structural_similarity_index_measure(x, reference, sigma=1.5, data_range=1.0, return_full_image=True)
+    margin = SSIM_WINDOW // 2  # torchmetrics averages over windows that reach into its padding too
+    return float(full[..., margin:-margin, margin:-margin].mean())
 
 
 def image_metrics(output: Tensor, halves: Tensor, exposure: float) -> dict[str, float | None]:

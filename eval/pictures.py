@@ -7,18 +7,20 @@ from pathlib import Path
 import matplotlib
 from torch import Tensor
 
-from eval.metrics import display
+from datasets.display import display
 from models.operators import finite
 
 matplotlib.use("Agg")
-from matplotlib import pyplot as plt  # noqa: E402 - after the choice of backend
+from matplotlib import pyplot as plt
 
 DPI = 100
 CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor
 
 
-def save_strip(path: Path, images: Mapping[str, Tensor], errors: Mapping[str, Mapping[str, float | None]], exposure: float) -> None:
+def save_strip(
+    path: Path, images: Mapping[str, Tensor], errors: Mapping[str, Mapping[str, float | None]], exposure: float
+) -> None:
     """A PNG of radiance images (1, 3, H, W) side by side as displayed, each captioned with its RMSE and SSIM."""
     height, width = next(iter(images.values())).shape[-2:]
     zoom = max(1, -(-SMALLEST_PANEL // max(height, width))) / DPI

@@ -39,7 +39,7 @@ class Surfaces:
 
 
 def rays(K: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Directions (..., 3) in the camera frame, of unit length along the viewing axis, through pixel positions x, y (...)."""
+    """Directions (..., 3) in the camera frame, of unit length along the viewing axis, through pixels at x, y (...)."""
     K = K.to(x)
     return torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], dim=-1)
 
@@ -151,7 +151,7 @@ class Reprojection:
 
 
 def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
-    """The previous frame's `history` (B, C, H, W) where this frame's surfaces find it, and a mask (B, 1, H, W) of where.
+    """The previous frame's `history` (B, C, H, W) where this frame's surfaces find it, and where (B, 1, H, W).
 
     `surfaces` is the previous frame's G-buffer. The frame must have depth, normal, mesh_id and motion.
     """
@@ -164,7 +164,7 @@ SMALLEST_ALPHA = 0.2
 
 @dataclass(frozen=True)
 class Accumulation:
-    """History of temporal accumulation: irradiance (B, 3, H, W), its length in frames (B, 1, H, W), and the G-buffer."""
+    """History of accumulation: irradiance (B, 3, H, W), its length in frames (B, 1, H, W), and the G-buffer."""
 
     irradiance: Tensor
     length: Tensor

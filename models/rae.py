@@ -21,6 +21,7 @@ def conv(inputs: int, outputs: int) -> nn.Conv2d:
     """A 3 x 3 convolution with He initialisation for leaky ReLU (§5.3)."""
     layer = nn.Conv2d(inputs, outputs, 3, padding=1)
     nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+    assert layer.bias is not None
     nn.init.zeros_(layer.bias)
     return layer
 
@@ -30,7 +31,7 @@ def activate(x: Tensor) -> Tensor:
 
 
 class RecurrentBlock(nn.Module):
-    """h_i = O_i = C(C(C(I_i) ∪ h_{i-1})) (§4.2)."""
+    """h_i = O_i = C(C(C(I_i) ++ h_{i-1})) (§4.2), ++ concatenation."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -91,13 +92,13 @@ def pad(x: Tensor, multiple: int = 32) -> Tensor:
 
 
 class RAE(Denoiser):
-    """Denoises demodulated irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
+    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
 
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
 
     def __init__(self) -> None:
         super().__init__()
-        self.network = RecurrentAutoencoder().to(memory_format=torch.channels_last)
+        self.network = RecurrentAutoencoder().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""

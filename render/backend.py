@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from errors import BadInput
@@ -20,12 +21,14 @@ def installed_llvms() -> list[tuple[int, str]]:
     """(major version, path) of every libLLVM that the loader or the usual folders know."""
     listing = ""
     if sys.platform.startswith("linux"):
-        try:
+        with suppress(OSError):  # no ldconfig (musl): the folders below remain
             listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True).stdout
-        except OSError:
-            pass  # no ldconfig (musl): the folders below remain
     paths = [line.rsplit("=> ", 1)[-1] for line in listing.splitlines() if "libLLVM" in line]
-    for pattern in ("usr/lib/llvm-*/lib/libLLVM*.so*", "usr/lib*/libLLVM*.so*", "opt/homebrew/opt/llvm*/lib/libLLVM.dylib"):
+    for pattern in (
+        "usr/lib/llvm-*/lib/libLLVM*.so*",
+        "usr/lib*/libLLVM*.so*",
+        "opt/homebrew/opt/llvm*/lib/libLLVM.dylib",
+    ):
         paths += [str(path) for path in Path("/").glob(pattern)]
     found = []
     for path in paths:

@@ -14,7 +14,7 @@ def depth_along_axis(si: Any, ray: Any, view: View) -> NDArray[np.float32]:
     """Distance (N,) along the viewing axis; 0 where nothing is hit. float32, as stored."""
     distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64)
     cosine = np.array(ray.d, dtype=np.float64).T @ view.camera_to_world[:3, 2]
-    return np.float32(distance * cosine)
+    return (distance * cosine).astype(np.float32)
 
 
 def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArray[np.uint32], Array]:
@@ -23,7 +23,8 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArr
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
     mesh_id = stage.mesh_id(si)
     dr.eval(si.t, si.n, mesh_id)
-    return np.float64(depth_along_axis(si, ray, view)), np.array(mesh_id), np.array(si.n, dtype=np.float64).T
+    depth = depth_along_axis(si, ray, view).astype(np.float64)
+    return depth, np.array(mesh_id), np.array(si.n, dtype=np.float64).T
 
 
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:

@@ -22,8 +22,9 @@ def dual_motion(
     height, width = depth.shape
     x = pixel_centres(height, width)
     y = x + motion
-    then_depth, then_mesh, then_normal = (a.reshape(height, width, -1) for a in trace_visible(stage, previous, y.reshape(-1, 2)))
-    then_depth, then_mesh = then_depth[..., 0], then_mesh[..., 0]
+    traced_depth, traced_mesh, traced_normal = trace_visible(stage, previous, y.reshape(-1, 2))
+    then_depth, then_mesh = traced_depth.reshape(height, width), traced_mesh.reshape(height, width)
+    then_normal = traced_normal.reshape(height, width, 3)
 
     seen = unproject(y, then_depth, previous)
     moved = move(unproject(x, depth, now), mesh_id, now, previous)
@@ -34,7 +35,7 @@ def dual_motion(
     x_previous = y + (x - z)
 
     def inside(p: Array) -> NDArray[np.bool_]:
-        return ((p >= 0) & (p < (width, height))).all(axis=-1)
+        return np.asarray(((p >= 0) & (p < (width, height))).all(axis=-1))
 
     # z behind the camera is FAR_OUTSIDE, which takes x_previous out of the image too.
     use_dual = ~visible & inside(y) & inside(x_previous)

@@ -1,7 +1,7 @@
 """The path tracer: direct and indirect radiance in one pass from shared, noise-free primary hits.
 
-Unidirectional with next-event estimation and multiple importance sampling, as Mitsuba's `path` without Russian roulette,
-but the primary ray is traced once however many samples a pixel gets, and what one bounce brings is kept apart from the rest.
+Unidirectional with next-event estimation and multiple importance sampling, as Mitsuba's `path` without Russian
+roulette; but the primary ray is traced once however many samples a pixel gets, and the first bounce is kept apart.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ def mis_weight(pdf: Any, other: Any) -> Any:
 
 
 def bounce(scene: Any, si: Any, throughput: Any, active: Any, sampler: Sampler) -> tuple[Any, Any, Any, Any]:
-    """Radiance that reaches `si` straight from emitters, and the next vertex: (radiance, next si, throughput, active)."""
+    """Radiance that comes to `si` straight from emitters, and the next vertex: (radiance, si, throughput, active)."""
     bsdf = si.bsdf()
     u_emitter, u_lobe, u_direction = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
 
@@ -35,7 +35,9 @@ def bounce(scene: Any, si: Any, throughput: Any, active: Any, sampler: Sampler) 
 
     throughput = throughput * bsdf_weight
     active = active & dr.any(throughput != 0)
-    following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), mi.RayFlags.All, coherent=False, active=active)
+    following = scene.ray_intersect(
+        si.spawn_ray(si.to_world(sample.wo)), mi.RayFlags.All, coherent=False, active=active
+    )
     emitter = following.emitter(scene, active)
     towards = mi.DirectionSample3f(scene, following, si)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
@@ -58,7 +60,7 @@ def trace_paths(scene: Any, si: Any, sampler: Sampler, max_depth: int) -> tuple[
 
 @dr.syntax
 def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: int) -> tuple[Any, Any]:
-    """Mean of `spp` (mi.UInt32) samples a ray of direct and of indirect radiance, summed lane by lane in a fixed order."""
+    """Mean direct and indirect radiance of `spp` (mi.UInt32) samples a ray, summed lane by lane in a fixed order."""
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     lane = dr.arange(mi.UInt32, dr.width(ray))
     # Hash the lane before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
@@ -70,7 +72,8 @@ def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: int) -> tu
         direct += sample_direct
         indirect += sample_indirect
         index += 1
-    return direct / mi.Float(spp), indirect / mi.Float(spp)
+    count = mi.Color3f(spp)
+    return direct / count, indirect / count
 
 
 def render_radiance(stage: Stage, ray: Any, seed: int, spp: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -78,7 +81,7 @@ def render_radiance(stage: Stage, ray: Any, seed: int, spp: int) -> tuple[NDArra
 
     `seed` in [0, 2^32); different seeds are independent, equal seeds give equal bytes. Emission is not included.
     """
-    opaque_seed, opaque_spp = mi.UInt32(np.uint32([seed])), mi.UInt32(np.uint32([spp]))
+    opaque_seed, opaque_spp = (mi.UInt32(np.array([number], np.uint32)) for number in (seed, spp))
     images = sample_mean(stage.mitsuba_scene, ray, opaque_seed, opaque_spp, stage.scene.max_depth)
     dr.eval(images)
     direct, indirect = (np.array(image).T.reshape(stage.height, stage.width, 3) for image in images)

@@ -1,8 +1,8 @@
 """Random numbers as a pure function of (pixel, seed, sample index, dimension): no state, no layout to get wrong.
 
 Every pair of dimensions is a (0, 2)-sequence of its own: the first two Sobol dimensions, Owen-scrambled by hashing and
-visited in an Owen-shuffled order (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4), §3). One sample alone is
-uniform and independent of every other seed's; many samples of one seed stratify.
+visited in an Owen-shuffled order (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4), §3). One sample alone
+is uniform and independent of every other seed's; many samples of one seed stratify.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def scramble_reversed(x: Any, seed: Any) -> Any:
 
 
 def sobol_second_reversed(index: Any) -> Any:
-    """The second Sobol dimension with its bits reversed: index times the Pascal triangle mod 2, one Kronecker factor a line."""
+    """The second Sobol dimension, bits reversed: index times the Pascal triangle mod 2, one Kronecker factor a line."""
     index = index ^ ((index & 0xAAAAAAAA) >> 1)
     index = index ^ ((index & 0xCCCCCCCC) >> 2)
     index = index ^ ((index & 0xF0F0F0F0) >> 4)

@@ -84,7 +84,7 @@ class Stage:
     def mesh_id(self, si: Any) -> Any:
         """mi.UInt32: which of the scene's shapes (index + 1) a surface interaction lies on, 0 for none."""
         index = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self.mesh_id_of_shape, index, si.is_valid())
+        return dr.gather(mi.UInt32, self.mesh_id_of_shape, index, si.is_valid())  # type: ignore[arg-type]
 
     def pose(self, frame: float) -> None:
         """Move meshes and set lights to where they are in `frame`. All changes enter the kernels as data."""
@@ -98,7 +98,7 @@ class Stage:
                     normals = shape.mesh.vertex_normals @ matrix[:3, :3].T
                     changes[f"{shape.name}.vertex_normals"] = np.float32(normals).ravel()
             if shape.radiance is not None:
-                changes[f"{shape.name}.emitter.radiance.value"] = np.float32(shape.radiance.at(frame))
+                changes[f"{shape.name}.emitter.radiance.value"] = shape.radiance.at(frame).astype(np.float32)
         changes = {
             name: value
             for name, value in changes.items()

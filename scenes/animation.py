@@ -14,12 +14,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Track:
-    """A value over time: a Catmull-Rom spline through `keys` (N, D) or (N,), spread evenly over frames 0 to `last`.
+    """A value over time: a Catmull-Rom spline through `keys` (N, D) or (N,), spread evenly over frames `first`..`last`.
 
-    One key is a constant. Between keys the first derivative is continuous; outside 0..last the ends are held.
+    One key is a constant. Between keys the first derivative is continuous; outside first..last the ends are held.
     """
 
     keys: Array
+    first: float = 0.0
     last: float = 1.0
 
     @staticmethod
@@ -30,7 +31,7 @@ class Track:
         keys = self.keys
         if len(keys) == 1:
             return keys[0]
-        position = np.clip(frame / max(self.last, 1e-9), 0, 1) * (len(keys) - 1)
+        position = np.clip((frame - self.first) / (self.last - self.first), 0, 1) * (len(keys) - 1)
         k = min(int(position), len(keys) - 2)
         u = position - k
         # Ends are extended linearly, so that the path leaves and arrives at constant speed.

@@ -3,6 +3,7 @@
 The reflectances and the light's colour are the RGB values that renderers commonly ship for the measured originals.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
 
 def box(width: float, height: float) -> trimesh.Trimesh:
     """A square block standing on the origin, so that its rest pose turns about its own vertical axis."""
-    mesh = trimesh.creation.box((width, height, width))
+    mesh: trimesh.Trimesh = trimesh.creation.box((width, height, width))
     mesh.apply_translation((0, height / 2, 0))
     return mesh
 
@@ -47,53 +48,65 @@ def light(position: Track, radiance: Track) -> Shape:
     return Shape("light", quad(*corners), diffuse(WHITE), radiance=radiance, motion=motion)
 
 
-def block(name: str, width: float, height: float, position: Array, angle: Array, last: float) -> Shape:
-    """A white block that passes through the floor positions (N, 2) = (x, z) and turns through the angles (N,)."""
-    floor = np.full(len(position), FLOOR)
-    path = np.stack([position[:, 0], floor, position[:, 1]], axis=1)
-    return Shape(name, box(width, height), diffuse(WHITE), motion=RigidMotion(Track(path, last), Track(angle, last)))
+def block(name: str, width: float, height: float, position: Track, angle: Track) -> Shape:
+    """A white block that passes through floor positions (x, y, z) and turns through angles."""
+    return Shape(name, box(width, height), diffuse(WHITE), motion=RigidMotion(position, angle))
 
 
-def fly(rng: np.random.Generator, low: Array, high: Array, keys: int, last: float, x_fov: float) -> Camera:
+FRAMES_BETWEEN_KEYS = 48
+
+
+class Keys:
+    """Draws tracks: speeds are alike in clips of any length, and a clip sees the middle of what happens."""
+
+    def __init__(self, rng: np.random.Generator, frames: int):
+        self.rng = rng
+        spans = max(1, -(-(frames - 1) // FRAMES_BETWEEN_KEYS))
+        self.count = spans + 1
+        self.first = -(spans * FRAMES_BETWEEN_KEYS - (frames - 1)) / 2
+        self.last = self.first + spans * FRAMES_BETWEEN_KEYS
+
+    def track(self, keys: Array) -> Track:
+        """Through keys (count, ...)."""
+        return Track(keys, self.first, self.last)
+
+    def between(self, low: Sequence[float], high: Sequence[float]) -> Track:
+        """Through random points of a box."""
+        return self.track(self.rng.uniform(low, high, (self.count, len(low))))
+
+
+def fly(keys: Keys, low: Sequence[float], high: Sequence[float]) -> Camera:
     """A smooth flight through random points of the box low..high that looks around the middle of the room."""
-    eye = rng.uniform(low, high, (keys, 3))
-    target = rng.uniform([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4], (keys, 3))
-    return Camera(Track(eye, last), Track(target, last), Track.constant(x_fov))
-
-
-def keys_for(frames: int) -> tuple[int, float]:
-    """Number of spline keys and the last frame: about 12 frames between keys keep speeds alike in clips of any length."""
-    return max(2, round(frames / 12) + 1), float(max(frames - 1, 1))
+    target = keys.between([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4])
+    return Camera(keys.between(low, high), target, Track.constant(75.0))
 
 
 def cornell_box(rng: np.random.Generator, frames: int) -> Scene:
     """The classic box: two white blocks, a ceiling light, nothing moves but the camera, which flies around in it."""
-    keys, last = keys_for(frames)
-    short = block("short-block", 0.6, 0.6, np.array([[0.33, 0.35]]), np.array([-0.29]), last)
-    tall = block("tall-block", 0.6, 1.2, np.array([[-0.33, -0.28]]), np.array([0.30]), last)
+    short = block("short-block", 0.6, 0.6, Track.constant([0.33, FLOOR, 0.35]), Track.constant(-0.29))
+    tall = block("tall-block", 0.6, 1.2, Track.constant([-0.33, FLOOR, -0.28]), Track.constant(0.30))
     lamp = light(Track.constant([0.0, 0.99, 0.0]), Track.constant(LIGHT))
-    camera = fly(rng, np.array([-0.8, -0.4, 0.75]), np.array([0.8, 0.7, 0.98]), keys, last, x_fov=75.0)
-    return Scene((*room(), short, tall, lamp), camera)
+    return Scene((*room(), short, tall, lamp), fly(Keys(rng, frames), [-0.8, -0.4, 0.75], [0.8, 0.7, 0.98]))
 
 
 def cornell_box_moving(rng: np.random.Generator, frames: int) -> Scene:
     """The blocks slide past each other and past the back wall and turn, each in its own lane; the light moves slowly.
 
-    The lanes are farther apart than the blocks' diagonals reach, so nothing ever touches.
+    The lanes are farther apart than the blocks' diagonals reach, so nothing ever touches. Speeds are bounded so that a
+    dual motion vector, which looks one step of the occluder beside it, mostly finds the surface that came into view.
     """
-    keys, last = keys_for(frames)
-    sides = np.where(np.arange(keys) % 2 == 0, -1.0, 1.0) * rng.choice([-1.0, 1.0])
+    keys = Keys(rng, frames)
+    sides = np.where(np.arange(keys.count) % 2 == 0, -1.0, 1.0) * rng.choice([-1.0, 1.0])
 
-    def lane(z: float, side: Array) -> Array:
-        x = side * rng.uniform(0.25, 0.55, keys)
-        return np.stack([x, np.full(keys, z)], axis=1)
+    def lane(z: float, side: Array) -> Track:
+        x = side * rng.uniform(0.25, 0.55, keys.count)
+        return keys.track(np.stack([x, np.full(keys.count, FLOOR), np.full(keys.count, z)], axis=1))
 
-    def turns() -> Array:
-        return rng.uniform(-np.pi, np.pi) + np.cumsum(rng.uniform(-0.8, 0.8, keys))
+    def turn() -> Track:
+        return keys.track(rng.uniform(-np.pi, np.pi) + np.cumsum(rng.uniform(-0.3, 0.3, keys.count)))
 
-    short = block("short-block", 0.5, 0.6, lane(0.3, sides), turns(), last)
-    tall = block("tall-block", 0.5, 1.2, lane(-0.5, -sides), turns(), last)
-    slide = np.stack([rng.uniform(-0.6, 0.6, 2), np.full(2, 0.99), rng.uniform(-0.5, 0.5, 2)], axis=1)
-    lamp = light(Track(slide, last), Track(LIGHT * rng.uniform(0.7, 1.3, (2, 1)), last))
-    camera = fly(rng, np.array([-0.6, -0.3, 0.8]), np.array([0.6, 0.6, 0.98]), keys, last, x_fov=75.0)
-    return Scene((*room(), short, tall, lamp), camera)
+    short = block("short-block", 0.5, 0.6, lane(0.3, sides), turn())
+    tall = block("tall-block", 0.5, 1.2, lane(-0.5, -sides), turn())
+    brightness = keys.track(LIGHT * rng.uniform(0.7, 1.3, (keys.count, 1)))
+    lamp = light(keys.between([-0.6, 0.99, -0.5], [0.6, 0.99, 0.5]), brightness)
+    return Scene((*room(), short, tall, lamp), fly(keys, [-0.3, 0.0, 0.85], [0.3, 0.5, 0.98]))

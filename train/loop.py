@@ -18,7 +18,7 @@ from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
 from errors import BadInput
 from models import create
 from models.weights import save_weights
-from train.losses import SequenceLoss, loss_for
+from train.losses import loss_for
 from train.precision import fastest_precision
 from train.recipes import Recipe, recipe_for
 
@@ -35,7 +35,7 @@ def run_folder(runs: Path, name: str, profile: str) -> Path:
 def loader(clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int) -> DataLoader[Batch]:
     augmentation = recipe.augmentation if augment else Augmentation()
     sequences = TrainingSequences(clips, reads, recipe.length, recipe.crop, augmentation, seed)
-    return DataLoader(sequences, batch_size=recipe.batch, collate_fn=collate)
+    return DataLoader(sequences, batch_size=recipe.batch, collate_fn=collate)  # type: ignore[arg-type]
 
 
 class Training:
@@ -106,7 +106,9 @@ class Training:
                 self.skipped += 1
                 in_a_row += 1
                 if in_a_row >= MOST_SKIPPED_IN_A_ROW:
-                    raise BadInput(f"the loss was not finite in {in_a_row} steps in a row: check the data with `onespp info`")
+                    raise BadInput(
+                        f"the loss was not finite in {in_a_row} steps in a row: check the data with `onespp info`"
+                    )
             self.optimiser.zero_grad()
             yield rate, {"loss": loss.detach(), **parts}
 
@@ -120,7 +122,9 @@ class Training:
         if validation < self.best or not (self.folder / BEST).exists():
             self.best = validation
             denoiser = self.loss.module.denoiser
-            save_weights(denoiser, self.name, {**self.facts, "epoch": self.epoch, "validation": validation}, self.folder / BEST)
+            save_weights(
+                denoiser, self.name, {**self.facts, "epoch": self.epoch, "validation": validation}, self.folder / BEST
+            )
 
 
 def train(name: str, data: Path, runs: Path, profile: str, seed: int = 0, precision: str | None = None) -> Path:
@@ -137,9 +141,10 @@ def train(name: str, data: Path, runs: Path, profile: str, seed: int = 0, precis
     epochs, steps = training.recipe.epochs, len(training.train_data)
     every = max(1, epochs // VALIDATIONS)
     label = f"{name} ({training.precision})"
-    with SummaryWriter(str(training.folder)) as board, tqdm(
-        total=epochs * steps, initial=training.epoch * steps, desc=label, unit="step"
-    ) as bar:
+    with (
+        SummaryWriter(str(training.folder)) as board,
+        tqdm(total=epochs * steps, initial=training.epoch * steps, desc=label, unit="step") as bar,
+    ):
         while training.epoch < epochs:
             for rate, parts in training.steps():
                 board.add_scalar("learning_rate", rate, bar.n)

@@ -10,7 +10,7 @@ WORTHWHILE = 1.2  # bfloat16 must be this much faster to be used
 
 def step_seconds(device: torch.device, bfloat16: bool) -> float:
     """Best of three times of a small convolutional forward and backward pass."""
-    layer = nn.Conv2d(64, 64, 3, padding=1).to(device, memory_format=torch.channels_last)
+    layer = nn.Conv2d(64, 64, 3, padding=1).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     x = torch.rand(4, 64, 64, 64, device=device).contiguous(memory_format=torch.channels_last)
     best = float("inf")
     for _ in range(4):  # the first also warms up
@@ -24,5 +24,5 @@ def step_seconds(device: torch.device, bfloat16: bool) -> float:
 
 
 def fastest_precision(device: torch.device) -> str:
-    """"bf16-mixed" where the processor is fast at it, else "32-true" (Fabric's names)."""
+    """ "bf16-mixed" where the processor is fast at it, else "32-true" (Fabric's names)."""
     return "bf16-mixed" if step_seconds(device, False) > WORTHWHILE * step_seconds(device, True) else "32-true"

@@ -1,0 +1,53 @@
+# One call of `onespp` a target. Everything below `setup` runs in the virtual environment it makes.
+PROFILE ?= quick
+DATA ?= data/$(PROFILE)
+RUNS ?= runs
+PYTHON ?= python3
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+SOURCES := onespp.py errors.py scenes render datasets models train eval tests
+LLVM := libllvm19
+
+.NOTPARALLEL:
+.PHONY: all setup dataset train eval test test-all lint clean
+
+all: dataset train eval
+
+setup: $(READY)
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "onespp needs Python 3.11 or newer: set PYTHON=/path/to/python3"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@# Rendering on the CPU needs libLLVM; get it where that takes no password, else the message says what to install.
+	@$(BIN)/python -c 'import render.backend' >/dev/null 2>&1 || { \
+		if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq $(LLVM); \
+		elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq $(LLVM); fi; } || true
+	@$(BIN)/python -c 'import render.backend' || { echo "see 'Set-up' in README.md"; exit 1; }
+	@touch $(READY)
+
+dataset: $(READY)
+	$(BIN)/onespp dataset --profile $(PROFILE) --data $(DATA)
+
+train: $(READY)
+	$(BIN)/onespp train --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
+
+eval: $(READY)
+	$(BIN)/onespp eval --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
+
+test: $(READY)
+	$(BIN)/python -m pytest -q
+
+test-all: $(READY)
+	$(BIN)/python -m pytest -q -m ''
+
+lint: $(READY)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) data runs build *.egg-info

@@ -1,0 +1,42 @@
+"""What the tests share: a tiny data set rendered once, and a loaded moving scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.job import generate
+from render.stage import Stage
+from scenes import build_scene
+from scenes.animation import Camera, Scene, Shape, Track
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set of the tiny profile, seed 0. Read only: tests that damage it copy it first."""
+    root = tmp_path_factory.mktemp("data") / "tiny"
+    generate(root, "tiny", seed=0)
+    return root
+
+
+@pytest.fixture(scope="session", params=["cornell_box", "cornell_box_moving"])
+def stage(request: pytest.FixtureRequest) -> Stage:
+    """A built-in scene at 64 x 64, posed by whoever uses it."""
+    return Stage(build_scene(request.param, seed=3, frames=24), 64, 64)
+
+
+@pytest.fixture(scope="session")
+def moving() -> Stage:
+    return Stage(build_scene("cornell_box_moving", seed=3, frames=24), 96, 96)
+
+
+@pytest.fixture(scope="session")
+def square() -> Scene:
+    """A grey unit square, 3 units before a camera that looks along -z, half its width in view; black sky around it."""
+    mesh = trimesh.Trimesh(np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) / 2, [[0, 1, 2], [0, 2, 3]])
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
+    shape = Shape("square", mesh, grey, radiance=Track.constant([1.0, 2.0, 3.0]))
+    fov = np.degrees(2 * np.arctan(1 / 3))  # two units wide at the square's distance
+    camera = Camera(Track.constant([0.0, 0, 3]), Track.constant([0.0, 0, 0]), Track.constant(fov))
+    return Scene((shape,), camera)

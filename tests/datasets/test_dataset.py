@@ -1,0 +1,218 @@
+"""The data set on disk: derived channels, damage, resumption, and the promise of equal bytes."""
+
+import hashlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets.clip import Clip, Dataset
+from datasets.inspect import info, verify
+from datasets.job import DATA_PROFILES, clip_seed, generate, only_job, plan
+from errors import BadInput
+from render.clip import render_clip
+from scenes import build_scene
+
+ONESPP = [sys.executable, "-m", "onespp"]
+
+
+def digest(root: Path) -> dict[str, str]:
+    """Hashes of all files except timings."""
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.name not in ("timing.json", ".lock")
+    }
+
+
+@pytest.fixture
+def copy(tiny, tmp_path) -> Path:
+    return Path(shutil.copytree(tiny, tmp_path / "copy"))
+
+
+def test_plan_and_layout(tiny):
+    facts = json.loads((tiny / "dataset.json").read_text())
+    assert facts["schema"] == 1 and facts["profile"] == "tiny" and facts["seed"] == 0
+    assert set(facts) == {"schema", "profile", "generator", "versions", "seed", "scenes", "splits"}
+    for path in Dataset(tiny).planned():
+        names = {file.name for file in path.iterdir()}
+        assert {"clip.json", "timing.json", "direct.npy", "dual_motion.npy"} <= names
+        assert not any(name.endswith(".raw") for name in names)
+    assert verify(tiny) == []
+
+
+def test_stored_arrays_are_what_was_rendered(tiny):
+    """Render one clip again, in this process, and compare with the disk."""
+    clip = Dataset(tiny).clips("test")[1]
+    profile = DATA_PROFILES["tiny"]
+    seed = clip_seed(0, clip.scene, "test", 0)
+    scene = build_scene(clip.scene, seed, profile.frames)
+    for index, (channels, _) in enumerate(
+        render_clip(scene, profile.frames, profile.height, profile.width, profile.test, seed)
+    ):
+        for name in ("direct", "depth", "motion", "dual_motion", "normal", "mesh_id"):
+            rendered = channels[name][0] if name == "direct" else channels[name]
+            stored = clip.read(name, index)
+            np.testing.assert_array_equal(stored, rendered.astype(stored.dtype))
+        np.testing.assert_array_equal(clip.view(index).camera_to_world, channels["camera_to_world"])
+
+
+def test_derived_motion_equals_rendered_motion(tiny):
+    clip = Dataset(tiny).clips("test")[0]
+    assert clip.scene == "cornell_box" and clip.channels["motion"] == {"derived": "camera"}
+    assert clip.channels["roughness"] == {"value": [1.0]}
+    visible = np.zeros(2)
+    for index in range(1, clip.frames):
+        # Both are the renderer's, and equal where nothing was disoccluded.
+        motion, dual = clip.read("motion", index), clip.read("dual_motion", index)
+        visible += [(motion == dual).all(axis=-1).mean(), np.abs(motion).max() > 0.5]
+        window = (slice(10, 20), slice(5, 60))
+        np.testing.assert_array_equal(clip.read("motion", index, window), motion[window])
+    assert visible[0] / (clip.frames - 1) > 0.9 and visible[1] > 0
+    assert (clip.read("motion", 0) == 0).all() and (clip.read("dual_motion", 0) == 0).all()
+
+
+def test_absent_channel_is_a_clear_error(copy):
+    path = Dataset(copy).planned(["test"])[0]
+    facts = json.loads((path / "clip.json").read_text())
+    del facts["channels"]["dual_motion"]
+    (path / "clip.json").write_text(json.dumps(facts))
+    with pytest.raises(BadInput, match=r"'dual_motion'.*not rendered"):
+        Clip(path).read("dual_motion", 0)
+
+
+def flip_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_verify_names_every_kind_of_damage(copy):
+    clip = copy / "train" / "cornell_box" / "000"
+    flip_byte(clip / "depth.npy")
+    (clip / "normal.npy").write_bytes((clip / "normal.npy").read_bytes()[:-100])
+    (clip / "albedo.npy").unlink()
+    np.save(clip / "mesh_id.npy", np.zeros((2, 2), np.uint16))
+    (copy / "val" / "cornell_box" / "000" / "clip.json").write_text("{")
+    shutil.rmtree(copy / "test" / "cornell_box" / "000")
+    problems = "\n".join(verify(copy))
+    for damaged in ("depth.npy", "normal.npy", "albedo.npy", "mesh_id.npy", "clip.json", "test/cornell_box/000"):
+        assert damaged in problems
+    assert len(problems.splitlines()) == 6
+
+
+def test_info_tells_sizes_floors_and_what_is_missing(copy):
+    shutil.rmtree(copy / "val" / "cornell_box" / "000")
+    text = info(copy)
+    for word in ("floor dB", "dual_motion", "derived", "value", "missing", "test/cornell_box_moving/000"):
+        assert word in text
+
+
+def test_missing_clip_and_other_schema(copy):
+    shutil.rmtree(copy / "train" / "cornell_box" / "000")
+    with pytest.raises(BadInput, match=r"train/cornell_box/000.*onespp dataset"):
+        Dataset(copy).clips("train")
+    facts = json.loads((copy / "dataset.json").read_text())
+    (copy / "dataset.json").write_text(json.dumps(facts | {"schema": 99}))
+    with pytest.raises(BadInput, match="schema version 99"):
+        Dataset(copy)
+    with pytest.raises(BadInput, match="there is no data set"):
+        Dataset(copy / "nowhere")
+
+
+def test_rerun_renders_only_what_is_missing_and_ends_with_equal_bytes(tiny, copy):
+    """Also across processes: the fixture was rendered in one, clip after clip, and this clip alone in another."""
+    expected = digest(tiny)
+    victim = copy / "train" / "cornell_box_moving" / "000"
+    shutil.rmtree(victim)
+    (victim.parent / ".000.tmp").mkdir()
+    (victim.parent / ".000.tmp" / "direct.raw").write_bytes(b"left by a killed job")
+    untouched = (copy / "test" / "cornell_box" / "000" / "direct.npy").stat().st_mtime_ns
+    run = subprocess.run([*ONESPP, "dataset", "--data", str(copy), "--profile", "tiny"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "1 clips rendered" in run.stdout
+    assert digest(copy) == expected
+    assert (copy / "test" / "cornell_box" / "000" / "direct.npy").stat().st_mtime_ns == untouched
+    assert generate(copy, "tiny", 0) == 0
+
+
+def kill_and_resume(root: Path, rng: np.random.Generator, kills: int) -> int:
+    """Kill the job at random moments, then let it finish. Returns how many kills hit a running job."""
+    hit = 0
+    for _ in range(kills):
+        job = subprocess.Popen(
+            [*ONESPP, "dataset", "--data", str(root), "--profile", "tiny"], stderr=subprocess.DEVNULL
+        )
+        time.sleep(rng.uniform(1.0, 5.0))
+        hit += job.poll() is None
+        job.send_signal(signal.SIGKILL)
+        job.wait()
+        for clip in root.glob("*/*/[0-9]*"):
+            assert json.loads((clip / "clip.json").read_text())["complete"]  # whole or absent
+    subprocess.run(
+        [*ONESPP, "dataset", "--data", str(root), "--profile", "tiny"], check=True, stderr=subprocess.DEVNULL
+    )
+    return hit
+
+
+def test_killed_job_resumes_to_equal_bytes(tiny, tmp_path):
+    assert kill_and_resume(tmp_path / "data", np.random.default_rng(0), kills=3) > 0
+    assert digest(tmp_path / "data") == digest(tiny)
+
+
+@pytest.mark.slow
+def test_killed_fifty_times(tiny, tmp_path):
+    rng, hit = np.random.default_rng(1), 0
+    for attempt in range(10):
+        hit += kill_and_resume(tmp_path / str(attempt), rng, kills=5)
+        assert digest(tmp_path / str(attempt)) == digest(tiny)
+    assert hit > 10
+
+
+def test_full_disk_is_one_clear_line_and_leaves_whole_clips_only(tmp_path):
+    """A limit on file size stands in for a full disk: writing fails with an error of the operating system."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+
+    root = tmp_path / "data"
+    command = [*ONESPP, "dataset", "--data", str(root), "--profile", "tiny"]
+    environment = os.environ | {"DRJIT_CACHE_DIR": str(tmp_path / "kernels")}
+    (tmp_path / "kernels").mkdir()
+    run = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit, env=environment)
+    assert run.returncode == 2, run.stderr
+    assert "run it again" in run.stderr.splitlines()[-1] and "Traceback" not in run.stderr
+    assert [path for path in root.rglob("*") if path.is_file() and path.name not in ("dataset.json", ".lock")] == []
+
+
+def test_two_jobs_on_one_folder(tiny):
+    with only_job(tiny), pytest.raises(BadInput, match="another `onespp dataset`"), only_job(tiny):
+        pass
+
+
+def test_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(BadInput, match="something else"):
+        generate(tmp_path, "tiny", 0)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="is a file"):
+        generate(tmp_path / "file", "tiny", 0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "thesis.tex"]
+
+
+def test_other_seed_or_profile_needs_another_folder(tiny):
+    with pytest.raises(BadInput, match="another seed"):
+        generate(tiny, "tiny", 1)
+    with pytest.raises(BadInput, match="another profile"):
+        generate(tiny, "quick", 0)
+    with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
+        plan("huge", 0)

@@ -1,0 +1,188 @@
+"""Training sequences: deterministic, and consistent under every augmentation."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.channels import CHANNELS
+from datasets.clip import Dataset
+from datasets.frame import Cameras, Frame, read_frame
+from datasets.sequences import Augmentation, TrainingSequences, collate
+from errors import BadInput
+
+ALL = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name != "dual_motion")
+AUGMENTATIONS = {
+    "none": Augmentation(),
+    "reverse": Augmentation(reverse=True),
+    "stop": Augmentation(stop=True),
+    "rotate": Augmentation(rotate=True),
+    "all": Augmentation(True, True, True, True),
+}
+
+
+@pytest.fixture(scope="module")
+def clips(tiny):
+    return Dataset(tiny).clips("train")
+
+
+def sequences(clips, augmentation=AUGMENTATIONS["none"], crop=32, length=5, seed=0) -> TrainingSequences:
+    return TrainingSequences(clips, ALL, length, crop, augmentation, seed)
+
+
+def positions(frame: Frame) -> torch.Tensor:
+    """Pixel centres (2, H, W)."""
+    height, width = frame.size
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    return torch.stack([x, y]).double()
+
+
+def surface(frame: Frame, cameras: Cameras) -> torch.Tensor:
+    """World points (3, N) of all pixels by the inverse of K, in homogeneous coordinates."""
+    pixels = positions(frame).flatten(1)
+    depth = frame.depth[0, 0].flatten().double()
+    local = torch.linalg.inv(cameras.K[0]) @ torch.cat([pixels, torch.ones_like(pixels[:1])]) * depth
+    return (cameras.camera_to_world[0] @ torch.cat([local, torch.ones_like(local[:1])]))[:3]
+
+
+def project(points: torch.Tensor, cameras: Cameras) -> torch.Tensor:
+    local = torch.linalg.inv(cameras.camera_to_world[0]) @ torch.cat([points, torch.ones_like(points[:1])])
+    homogeneous = cameras.K[0] @ local[:3]
+    return homogeneous[:2] / homogeneous[2:]
+
+
+@pytest.mark.parametrize("kind", AUGMENTATIONS)
+def test_augmented_motion_and_cameras_agree(clips, kind):
+    """Reproject after augmentation: every surface point lands where the augmented motion vector says."""
+    checked = moved = 0
+    for index in range(12):
+        for frame in sequences(clips, AUGMENTATIONS[kind])[index]:
+            points = surface(frame, frame.now)
+            mesh = frame.mesh_id[0, 0].long().flatten()
+            relative = frame.previous.object_to_world[0] @ torch.linalg.inv(frame.now.object_to_world[0])
+            relative = torch.cat([torch.eye(4, dtype=torch.float64)[None], relative])[mesh]
+            carried = torch.einsum("nij,jn->in", relative[:, :3, :3], points) + relative[:, :3, 3].T
+            expected = project(carried, frame.previous)
+            target = (positions(frame) + frame.motion[0]).flatten(1)
+            hit = (mesh > 0) & (target.abs().amax(dim=0) < 1e4)
+            assert (target - expected)[:, hit].abs().max() < 0.01
+            checked += 1
+            moved += bool(frame.motion.abs().max() > 0.1)
+    assert checked == 60 and moved > 20
+
+
+def test_rotation_turns_images_normals_and_cameras_alike(clips):
+    frame = read_frame(clips[1], 4, ALL, window=(slice(8, 40), slice(20, 52)))
+    turned = frame.rot90()
+    np.testing.assert_array_equal(turned.albedo[0, 0], np.rot90(frame.albedo[0, 0]))
+    # The same world points, only at other pixels.
+    points, same = (surface(f, f.now).reshape(3, 32, 32) for f in (frame, turned))
+    torch.testing.assert_close(same, torch.rot90(points, dims=(1, 2)))
+    # A view-space normal that pointed right points up after a counter-clockwise turn.
+    before, after = frame.view_normal()[0], turned.view_normal()[0]
+    before = torch.rot90(before, dims=(1, 2))
+    torch.testing.assert_close(after, torch.stack([-before[1], before[0], before[2]]), atol=2e-3, rtol=0)
+    assert (before[2][frame.rot90().mesh_id[0, 0] > 0] > -0.01).all()  # toward the viewer
+    four = frame
+    for _ in range(4):
+        four = four.rot90()
+    for name in ALL:
+        torch.testing.assert_close(four.channels[name], frame.channels[name], rtol=0, atol=0)
+    torch.testing.assert_close(four.now.K, frame.now.K)
+    torch.testing.assert_close(four.now.camera_to_world, frame.now.camera_to_world)
+
+
+def test_an_item_depends_on_seed_epoch_and_index_only(clips):
+    a, b = sequences(clips, AUGMENTATIONS["all"]), sequences(clips, AUGMENTATIONS["all"])
+    for epoch in (3, 0):
+        a.set_epoch(epoch)
+        b.set_epoch(epoch)
+        a[5]  # reading another item in between changes nothing
+        for x, y in zip(a[2], b[2], strict=True):
+            assert all(torch.equal(x.channels[name], y.channels[name]) for name in ALL)
+            assert torch.equal(x.gain, y.gain) and torch.equal(x.now.K, y.now.K)
+    first = a[0][0].direct
+    a.set_epoch(1)
+    assert not torch.equal(first, a[0][0].direct)
+    assert not torch.equal(first, sequences(clips, AUGMENTATIONS["all"], seed=1)[0][0].direct)
+
+
+def test_a_stopped_camera_repeats_everything_but_the_noise(clips):
+    stopped = 0
+    for index in range(40):
+        frames = sequences(clips, AUGMENTATIONS["stop"])[index]
+        for before, frame in pairwise(frames):
+            if torch.equal(before.depth, frame.depth):
+                stopped += 1
+                assert (frame.motion == 0).all()
+                torch.testing.assert_close(frame.now.camera_to_world, frame.previous.camera_to_world)
+                assert torch.equal(before.direct_reference, frame.direct_reference)
+                assert not torch.equal(before.direct, frame.direct)
+    assert stopped > 5
+
+
+def test_reversed_playback_uses_forward_vectors(clips):
+    """Played backward, the vector of frame i points to where the surface stands in frame i + 1."""
+    reversed_found = 0
+    for index in range(20):
+        frames = sequences(clips, AUGMENTATIONS["reverse"])[index]
+        for before, frame in pairwise(frames):
+            torch.testing.assert_close(frame.previous.camera_to_world, before.now.camera_to_world)
+        reversed_found += any((f.previous.camera_to_world - f.now.camera_to_world).abs().max() > 0 for f in frames)
+    assert reversed_found > 0
+    clip = clips[1]
+    forward = read_frame(clip, 3, ("motion",), previous=4).motion
+    backward = read_frame(clip, 3, ("motion",)).motion
+    assert (forward + backward).abs().max() > 0.005  # computed, not negated
+
+
+def test_dual_motion_refuses_reversed_playback(clips):
+    with pytest.raises(BadInput, match="forward playback only"):
+        read_frame(clips[0], 3, ("dual_motion",), previous=4)
+    assert (read_frame(clips[0], 3, ("dual_motion",), previous=3).dual_motion == 0).all()
+
+
+def test_gain_is_one_factor_a_channel_and_sequence(clips):
+    gains = []
+    for index in range(30):
+        frames = sequences(clips, AUGMENTATIONS["all"])[index]
+        assert all(torch.equal(frame.gain, frames[0].gain) for frame in frames)
+        gains.append(frames[0].gain.flatten())
+    gains = torch.stack(gains)
+    assert (gains >= 0).all() and (gains <= 2).all() and 0.8 < gains.mean() < 1.2
+    assert (sequences(clips)[0][0].gain == 1).all()
+
+
+def test_batches_stack_sequences_and_pad_meshes(clips):
+    data = sequences(clips)
+    batch = collate([data[0], data[1]])
+    assert len(batch.frames) == 5 and batch.frames[0].direct.shape == (2, 3, 32, 32)
+    assert batch.frames[0].direct_reference.shape == (2, 2, 3, 32, 32)
+    torch.testing.assert_close(batch.frames[2].albedo[1:], data[1][2].albedo)
+    small, large = data[0][0], data[1][0]
+    fewer = replace(small.now, object_to_world=small.now.object_to_world[:, :3])
+    mixed = Frame.stack([replace(small, now=fewer, previous=fewer), large])
+    meshes = large.now.object_to_world.shape[1]
+    assert mixed.now.object_to_world.shape == (2, meshes, 4, 4)
+    assert torch.equal(mixed.now.object_to_world[0, 3:], torch.eye(4).double().expand(meshes - 3, 4, 4))
+
+
+def test_too_short_or_small_clips_are_refused(clips):
+    with pytest.raises(BadInput, match="smaller profile"):
+        sequences(clips, length=9)
+    with pytest.raises(BadInput, match="smaller profile"):
+        sequences(clips, crop=65)
+
+
+def test_demodulation_round_trip_and_unread_channels(clips):
+    frame = read_frame(clips[0], 2, ("direct", "indirect", "emission", "albedo"))
+    total = frame.remodulate(frame.irradiance("total"), "total")
+    torch.testing.assert_close(total, frame.radiance("total"), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        frame.remodulate(frame.irradiance("indirect"), "indirect"), frame.indirect, rtol=1e-6, atol=0
+    )
+    with pytest.raises(BadInput, match="'normal' was not loaded"):
+        frame.view_normal()
+    assert not hasattr(frame, "__array__")

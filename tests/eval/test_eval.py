@@ -1,0 +1,188 @@
+"""Metrics against independent implementations, and the harness end to end."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torchmetrics.functional.image import peak_signal_noise_ratio as torch_psnr
+
+from datasets.clip import Dataset
+from datasets.display import display
+from errors import BadInput
+from eval.harness import evaluate
+from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics, luminance
+from models import create
+from models.weights import save_weights
+from train.loop import run_folder
+
+
+def pair(seed: int = 0, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0, 0.6, (1, 3, *size))
+    output = torch.from_numpy(truth + rng.normal(0, 0.05, truth.shape)).float()
+    return output, torch.from_numpy(np.concatenate([truth, truth])).float()
+
+
+def shown(x: torch.Tensor, exposure: float) -> np.ndarray:
+    return (np.clip(exposure * x.double().numpy(), 0, 1) ** (1 / 2.2))[0].transpose(1, 2, 0)
+
+
+def test_metrics_equal_independent_implementations():
+    output, halves = pair()
+    exposure = 1.3
+    metrics = image_metrics(output, halves, exposure)
+    a, b = shown(output, exposure), shown(halves[:1], exposure)
+    assert metrics["mse"] == pytest.approx(((a - b) ** 2).mean())
+    assert metrics["rmse"] == pytest.approx(math.sqrt(metrics["mse"]))
+    assert metrics["l1"] == pytest.approx(np.abs(a - b).mean())
+    assert metrics["psnr"] == pytest.approx(peak_signal_noise_ratio(b, a, data_range=1))
+    assert metrics["psnr"] == pytest.approx(torch_psnr(torch.from_numpy(a), torch.from_numpy(b), data_range=1.0).item())
+    # scikit-image truncates its Gaussian at 3.5 sigma, which is 11 pixels, and crops to valid windows.
+    options = {
+        "gaussian_weights": True,
+        "sigma": 1.5,
+        "use_sample_covariance": False,
+        "data_range": 1,
+        "channel_axis": 2,
+    }
+    _, full = structural_similarity(b, a, full=True, **options)
+    assert metrics["ssim"] == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
+    x, r = exposure * output.double().numpy(), exposure * halves[:1].double().numpy()
+    assert metrics["smape"] == pytest.approx((np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)).mean())
+    assert metrics["rel_mse"] == pytest.approx(((x - r) ** 2 / (r**2 + 0.01)).mean())
+
+
+def test_identical_constant_and_one_pixel_images():
+    _, halves = pair()
+    same = image_metrics(halves[:1], halves, 1.0)
+    assert (same["mse"], same["psnr"], same["mse_unbiased"]) == (0, 100, 0) and same["ssim"] == pytest.approx(1)
+    black, white = torch.zeros(1, 3, 16, 16), torch.ones(2, 3, 16, 16)
+    opposite = image_metrics(black, white, 1.0)
+    assert opposite["psnr"] == 0 and opposite["rmse"] == 1 and 0 <= opposite["ssim"] < 0.01
+    assert image_metrics(black, torch.zeros(2, 3, 16, 16), 1.0)["psnr"] == 100
+    one = image_metrics(torch.full((1, 3, 1, 1), 0.5), torch.full((2, 3, 1, 1), 0.25), 1.0)
+    assert one["ssim"] is None and one["mse_unbiased"] == pytest.approx(0.0625)
+
+
+def test_non_finite_output_counts_as_zero():
+    output, halves = pair()
+    zeroed = output.clone()
+    output[0, :, 3, 4] = torch.tensor([math.nan, math.inf, -math.inf])
+    zeroed[0, :, 3, 4] = 0
+    assert image_metrics(output, halves, 1.0) == image_metrics(zeroed, halves, 1.0)
+
+
+def test_unbiased_mse_estimates_the_error_to_the_truth():
+    """Closed form: truth t, output t + d, halves t + noise of variance v. E = d^2; the plain MSE is biased by v / 2."""
+    truth, offset, deviation = 0.4, 0.05, 0.2
+    rng = np.random.default_rng(0)
+    unbiased, plain = [], []
+    for _ in range(200):
+        halves = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
+        output = torch.full((1, 3, 32, 32), truth + offset)
+        unbiased.append(image_metrics(output, halves, 1.0)["mse_unbiased"])
+        plain.append(float((output - halves.mean(0)).square().mean()))
+    error = np.std(unbiased) / np.sqrt(len(unbiased))
+    assert abs(np.mean(unbiased) - offset**2) < 4 * error < 0.1 * offset**2
+    assert np.mean(plain) == pytest.approx(offset**2 + deviation**2 / 2, rel=0.02)
+
+
+def test_temporal_metrics_by_hand():
+    temporal = TemporalMetrics()
+    flat = lambda *levels: torch.stack([torch.full((3, 4, 4), level) for level in levels])  # noqa: E731
+    to = lambda y: y**2.2  # noqa: E731 - radiance that is displayed as y
+    first = temporal.update(flat(to(0.2)), flat(to(0.3), to(0.3)), 1.0, still=True)
+    assert set(first.values()) == {None}
+    second = temporal.update(flat(to(0.5)), flat(to(0.4), to(0.4)), 1.0, still=True)
+    assert second["temporal_error"] == pytest.approx(0.2, abs=1e-6)  # 0.3 of change against 0.1
+    assert second["flicker"] == pytest.approx(0.3, abs=1e-6) and second["temporal_error_floor"] == pytest.approx(
+        0, abs=1e-7
+    )
+    third = temporal.update(flat(to(0.5)), flat(to(0.5), to(0.3)), 1.0, still=False)
+    assert third["temporal_error_floor"] == pytest.approx(0.1, abs=1e-6) and third["flicker"] is None
+
+
+def test_disocclusion_counts_only_where_vectors_differ():
+    output, halves = torch.full((1, 3, 2, 2), 1.0), torch.zeros(2, 3, 2, 2)
+    halves[:, :, 0, 0] = 1
+    motion, dual = torch.zeros(1, 2, 2, 2), torch.zeros(1, 2, 2, 2)
+    assert disocclusion_l1(output, halves, 1.0, motion, dual) is None
+    dual[0, 0, 0] = 0.5
+    dual[0, 1, 1, 1] = 0.015  # less than 1/64
+    assert disocclusion_l1(output, halves, 1.0, motion, dual) == pytest.approx(0.5)
+
+
+def test_display_and_luminance():
+    x = torch.tensor([0.0, 0.25, 2.0])[None, :, None, None]
+    torch.testing.assert_close(display(x, 2.0).flatten(), torch.tensor([0.0, 0.5 ** (1 / 2.2), 1.0]))
+    assert luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)
+
+
+METRICS = {
+    *("mse", "rmse", "l1", "psnr", "ssim", "mse_unbiased", "smape", "rel_mse"),
+    *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1"),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tiny, tmp_path_factory):
+    """Results of all denoisers on the tiny data, RAE with fresh weights."""
+    runs = tmp_path_factory.mktemp("runs")
+    folder = run_folder(runs, "rae", "tiny")
+    folder.mkdir(parents=True)
+    torch.manual_seed(0)
+    save_weights(create("rae"), "rae", {}, folder / "weights.safetensors")
+    evaluate(tiny, runs, "tiny")
+    return runs
+
+
+def test_results_file_has_the_agreed_form(runs, tiny):
+    results = json.loads((runs / "eval" / "results.json").read_text())
+    assert results.keys() == {"schema", "dataset", "device", "versions", "rows"} and results["schema"] == 1
+    assert len(results["rows"]) == 3 * 2
+    for row in results["rows"]:
+        assert row.keys() == {"denoiser", "signal", "weights", "scene", "clip", "frames", "metrics", "nonfinite"}
+        assert row["metrics"].keys() == METRICS
+        assert (row["weights"] is None) == (row["denoiser"] != "rae")
+        assert row["frames"] == 8 and row["nonfinite"] == 0
+        assert row["metrics"]["flicker"] is None  # the camera moves
+
+
+def test_results_are_the_means_of_frames(runs, tiny):
+    """The row of `noisy`, recomputed with numpy from the files."""
+    results = json.loads((runs / "eval" / "results.json").read_text())
+    clip = Dataset(tiny).clips("test")[0]
+    row = next(r for r in results["rows"] if (r["denoiser"], r["scene"]) == ("noisy", clip.scene))
+    mse, rmse = [], []
+    for i in range(clip.frames):
+        noisy = sum(np.float32(clip.read(name, i)) for name in ("direct", "indirect", "emission"))
+        halves = (
+            np.float64(clip.read("direct_reference", i)) + clip.read("indirect_reference", i) + clip.read("emission", i)
+        )
+        x, r = (np.clip(clip.exposure * v, 0, 1) ** (1 / 2.2) for v in (noisy, halves.mean(0)))
+        mse.append(((x - r) ** 2).mean())
+        rmse.append(np.sqrt(mse[-1]))
+    assert row["metrics"]["mse"] == pytest.approx(np.mean(mse), rel=1e-4)
+    assert row["metrics"]["rmse"] == pytest.approx(np.mean(rmse), rel=1e-4)
+
+
+def test_pictures_show_every_denoiser_and_the_reference(runs):
+    from matplotlib import image
+
+    for scene in ("cornell_box", "cornell_box_moving"):
+        picture = image.imread(runs / "eval" / f"{scene}-000.png")
+        assert picture.shape[1] == pytest.approx(4 * 256, abs=4) and picture.shape[0] >= 256
+        panels = np.array_split(picture[60:, :, :3], 4, axis=1)
+        assert all(panel.std() > 0.02 for panel in panels)
+        assert panels[0][:, :250].tobytes() != panels[3][:, :250].tobytes()
+
+
+def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys):
+    with pytest.raises(BadInput, match="onespp train rae"):
+        evaluate(tiny, tmp_path, "tiny", ["rae"])
+    results = evaluate(tiny, tmp_path, "tiny")
+    assert {row["denoiser"] for row in results["rows"]} == {"noisy", "accumulated"}
+    assert "rae: skipped" in capsys.readouterr().out

@@ -1,0 +1,229 @@
+"""What every denoiser must keep to. A new one is included by being registered."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_operators import flat_frame
+
+import models
+from datasets.clip import Dataset
+from datasets.frame import read_frame
+from errors import BadInput
+from models.rae import RAE, RAEState
+from models.weights import load_weights, save_weights
+
+NAMES = list(models.DENOISERS)
+
+
+@pytest.fixture(scope="module")
+def denoisers():
+    torch.manual_seed(0)
+    return {name: models.create(name).eval() for name in NAMES}
+
+
+def run(denoiser, frames):
+    state, outputs = None, []
+    with torch.no_grad():
+        for frame in frames:
+            output, state = denoiser(frame, state)
+            outputs.append(output)
+    return outputs
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reads_what_it_says_and_nothing_else(tiny, denoisers, name):
+    clip = Dataset(tiny).clips("test")[1]
+    frames = [read_frame(clip, index, denoisers[name].reads) for index in range(3)]
+    for output in run(denoisers[name], frames):
+        assert output.shape == (1, 3, 64, 64) and output.dtype == torch.float32
+        assert torch.isfinite(output).all() and (output >= 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [(1, 1), (1, 37), (33, 1), (2, 3), (31, 33), (67, 41)])
+def test_any_size(denoisers, name, size):
+    frames = [flat_frame(*size), flat_frame(*size, motion=(0.3, -0.7))]
+    assert all(output.shape == (1, 3, *size) for output in run(denoisers[name], frames))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_change_of_size_starts_anew(denoisers, name):
+    a, b = flat_frame(20, 24), flat_frame(33, 16)
+    torch.testing.assert_close(run(denoisers[name], [a, a, b])[2], run(denoisers[name], [b])[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_batch_items_do_not_mix(tiny, denoisers, name):
+    from datasets.frame import Frame
+
+    clips = Dataset(tiny).clips("train")
+    single = [[read_frame(clip, i, denoisers[name].reads) for i in range(2)] for clip in clips]
+    together = run(denoisers[name], [Frame.stack(step) for step in zip(*single, strict=True)])[1]
+    for item, frames in enumerate(single):
+        torch.testing.assert_close(together[item : item + 1], run(denoisers[name], frames)[1], rtol=1e-4, atol=1e-5)
+
+
+EXTREMES = st.sampled_from([0.0, 1e-7, 1e-3, 1.0, 6e4, 65504.0])
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    level=EXTREMES,
+    firefly=EXTREMES,
+    depth=st.sampled_from([0.0, 1e-4, 1.0, 1e6]),
+    albedo=st.sampled_from([0.0, 0.5, 1.0]),
+)
+@pytest.mark.parametrize("name", NAMES)
+def test_finite_in_finite_out(denoisers, name, level, firefly, depth, albedo):
+    frames = []
+    for motion in ((0.0, 0.0), (1e5, -1e5), (0.5, 0.0)):
+        frame = flat_frame(9, 11, motion, depth=depth, irradiance=torch.full((1, 3, 9, 11), level))
+        frame.direct[0, :, 4, 5] = firefly
+        frame.channels["albedo"] = torch.full((1, 3, 9, 11), albedo)
+        if depth == 0:
+            frame.channels["mesh_id"] = torch.zeros(1, 1, 9, 11)
+        frames.append(frame)
+    for output in run(denoisers[name], frames):
+        assert torch.isfinite(output).all() and (output >= 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "noisy"])
+@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])
+def test_a_poisoned_pixel_is_gone_from_the_next_frame(denoisers, name, poison):
+    clean = [flat_frame(12, 12) for _ in range(3)]
+    frames = [flat_frame(12, 12) for _ in range(3)]
+    frames[0].direct[0, :, 5, 6] = poison
+    assert all(torch.isfinite(output).all() for output in run(denoisers[name], frames))
+    if name == "accumulated":
+        outputs, expected = run(denoisers[name], frames), run(denoisers[name], clean)
+        others = torch.ones(12, 12, dtype=torch.bool)
+        others[5, 6] = False
+        assert all(torch.equal(a[..., others], b[..., others]) for a, b in zip(outputs, expected, strict=True))
+
+
+def test_accumulation_beats_the_noise(tiny, denoisers):
+    clip = Dataset(tiny).clips("test")[0]
+    names = (*denoisers["accumulated"].reads, "direct_reference", "indirect_reference")
+    frames = [read_frame(clip, index, names) for index in range(clip.frames)]
+    truth = frames[-1].remodulate(frames[-1].reference_irradiance("total"), "total")
+    noisy, accumulated = (run(denoisers[name], frames)[-1] for name in ("noisy", "accumulated"))
+    assert (accumulated - truth).square().mean() < 0.5 * (noisy - truth).square().mean()
+
+
+def test_noisy_is_the_sum_of_its_parts(tiny, denoisers):
+    clip = Dataset(tiny).clips("test")[0]
+    frame = read_frame(clip, 3, denoisers["noisy"].reads)
+    parts = [np.float32(clip.read(name, 3)) for name in ("emission", "direct", "indirect")]
+    np.testing.assert_allclose(run(denoisers["noisy"], [frame])[0][0].permute(1, 2, 0), sum(parts), rtol=1e-6)
+
+
+# --- RAE --------------------------------------------------------------------------------------------------------------
+
+
+def test_rae_has_the_paper_s_36_convolutions(denoisers):
+    convolutions = [m for m in denoisers["rae"].modules() if isinstance(m, torch.nn.Conv2d)]
+    assert len(convolutions) == 36 and all(m.kernel_size == (3, 3) for m in convolutions)
+    assert denoisers["rae"].parameter_count() == 1_951_935
+    assert convolutions[0].in_channels == 7
+
+
+def test_rae_recurrence_is_the_paper_s_equation():
+    """h = C(C(C(I) ++ h_prev)), by numpy's slow way through scipy."""
+    from scipy.ndimage import correlate
+
+    from models.rae import RecurrentBlock
+
+    torch.manual_seed(1)
+    block = RecurrentBlock(2).double()
+    x, hidden = torch.rand(1, 2, 5, 6).double(), torch.rand(1, 2, 5, 6).double()
+
+    def layer(conv, image):
+        weight, bias = conv.weight.detach().numpy(), conv.bias.detach().numpy()
+        sums = [sum(correlate(c, k, mode="constant") for c, k in zip(image, w, strict=True)) for w in weight]
+        value = np.stack(sums) + bias[:, None, None]
+        return np.where(value > 0, value, 0.1 * value)
+
+    merged = np.concatenate([layer(block.input, x[0].numpy()), hidden[0].numpy()])
+    expected = layer(block.output, layer(block.merge, merged))
+    np.testing.assert_allclose(block(x, hidden)[0].detach().numpy(), expected, atol=1e-12)
+
+
+def test_rae_state_carries_over(tiny, denoisers):
+    """Two calls with the state equal one run over two frames; without it the second frame comes out differently."""
+    rae = denoisers["rae"]
+    clip = Dataset(tiny).clips("test")[0]
+    frames = [read_frame(clip, index, rae.reads) for index in (4, 5)]
+    with torch.no_grad():
+        _, state = rae(frames[0], None)
+        with_state, next_state = rae(frames[1], state)
+        without, _ = rae(frames[1], None)
+    assert isinstance(next_state, RAEState) and len(next_state.hidden) == 6
+    assert torch.equal(with_state, run(rae, frames)[1])
+    assert not torch.allclose(with_state, without)
+
+
+def test_rae_is_blind_to_the_scene_s_brightness(tiny, denoisers):
+    """Causal exposure: a sequence a thousand times brighter comes out a thousand times brighter."""
+    rae = denoisers["rae"]
+    clip = Dataset(tiny).clips("test")[0]
+    frames = [read_frame(clip, index, rae.reads) for index in range(3)]
+    bright = [read_frame(clip, index, rae.reads) for index in range(3)]
+    for frame in bright:
+        for name in ("direct", "indirect", "emission"):
+            frame.channels[name] = frame.channels[name] * 1000
+    for a, b in zip(run(rae, frames), run(rae, bright), strict=True):
+        torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_rae_inputs_are_the_seven_of_the_paper(tiny, denoisers, monkeypatch):
+    rae = denoisers["rae"]
+    clip = Dataset(tiny).clips("test")[1]
+    frame = read_frame(clip, 2, rae.reads)
+    seen = []
+    monkeypatch.setattr(rae.network, "forward", lambda x, h: (seen.append(x), (x[:, :3], (x,) * 6))[1])
+    _, state = rae(frame, None)
+    (x,) = seen
+    irradiance = (frame.direct + frame.indirect) / frame.albedo.clamp(min=0.01)
+    torch.testing.assert_close(x[:, :3], (irradiance * state.scale.exposure()) ** 0.2)
+    # View-space normals from Mitsuba's frame: x to the right is minus its x.
+    local = torch.einsum("ij,jhw->ihw", torch.linalg.inv(frame.now.camera_to_world[0, :3, :3]).float(), frame.normal[0])
+    torch.testing.assert_close(x[0, 3], -local[0])
+    torch.testing.assert_close(x[0, 4], local[1])
+    median = frame.depth[frame.depth > 0].median()
+    torch.testing.assert_close(x[:, 5:6], frame.depth / (frame.depth + median), rtol=1e-4, atol=1e-5)
+    assert (x[:, 6] == 1).all() and x.shape[1] == 7
+
+
+# --- Weights ----------------------------------------------------------------------------------------------------------
+
+
+def test_weights_round_trip(tmp_path, denoisers):
+    path = tmp_path / "w.safetensors"
+    save_weights(denoisers["rae"], "rae", {"epochs": 3}, path)
+    loaded = models.load("rae", path)
+    for a, b in zip(loaded.parameters(), denoisers["rae"].parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert not loaded.training and list(tmp_path.iterdir()) == [path]
+
+
+def test_unusable_weights_are_named(tmp_path, denoisers):
+    path = tmp_path / "w.safetensors"
+    with pytest.raises(BadInput, match="onespp train rae"):
+        models.load("rae", path)
+    with pytest.raises(BadInput, match="needs trained weights"):
+        models.load("rae", None)
+    path.write_bytes(b"not weights")
+    with pytest.raises(BadInput, match="damaged"):
+        models.load("rae", path)
+    save_weights(denoisers["rae"], "wskp6", {}, path)
+    with pytest.raises(BadInput, match="'wskp6', not of 'rae'"):
+        models.load("rae", path)
+    small = RAE()
+    small.network = torch.nn.Conv2d(7, 3, 1)
+    save_weights(small, "rae", {}, path)
+    with pytest.raises(BadInput, match="another shape"):
+        load_weights(RAE(), "rae", path)
+    with pytest.raises(BadInput, match=r"unknown denoiser 'oidnn'.*accumulated"):
+        models.create("oidnn")

@@ -1,0 +1,113 @@
+"""The G-buffer on scenes whose answer is known, and that nothing is recompiled from frame to frame."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from errors import BadInput
+from render.gbuffer import render_gbuffer
+from render.stage import Stage
+from scenes import build_scene
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.camera import pixel_centres, unproject
+
+
+def test_square_before_a_black_sky(square):
+    stage = Stage(square, 32, 32)
+    buffer = render_gbuffer(stage, stage.view(0))
+    hit = np.zeros((32, 32), bool)
+    hit[8:24, 8:24] = True  # half the width, a quarter of the area, in the middle
+    assert np.array_equal(buffer["mesh_id"][..., 0], hit)
+    np.testing.assert_allclose(buffer["depth"][..., 0], 3 * hit, rtol=1e-6)
+    np.testing.assert_allclose(buffer["normal"], hit[..., None] * [0, 0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(buffer["albedo"], np.where(hit[..., None], [0.2, 0.4, 0.6], 1), rtol=1e-6)
+    np.testing.assert_allclose(buffer["emission"], hit[..., None] * [1.0, 2, 3], rtol=1e-6)
+    assert (buffer["roughness"] == 1).all()
+
+
+def test_normals_face_the_viewer_from_behind(square):
+    camera = replace(square.camera, eye=Track.constant([0.0, 0, -3]))
+    stage = Stage(replace(square, camera=camera), 16, 16)
+    buffer = render_gbuffer(stage, stage.view(0))
+    np.testing.assert_allclose(buffer["normal"][8, 8], [0, 0, -1], atol=1e-6)
+    assert buffer["emission"].max() == 0  # lamps shine to one side
+
+
+def test_smooth_mesh_keeps_and_turns_its_vertex_normals():
+    """A sphere of unit normals moved and turned: normal = (p - centre) / radius, facets notwithstanding."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    motion = RigidMotion(Track(np.array([[0.0, 0, 0], [0.5, 0.25, 0]])), Track(np.array([0.0, 2.0])))
+    camera = Camera(Track.constant([0.0, 0, 5]), Track.constant([0.0, 0, 0]), Track.constant(40.0))
+    stage = Stage(Scene((Shape("ball", ball, white, motion=motion, smooth=True),), camera), 48, 48)
+    for frame, centre in ((0, [0, 0, 0]), (1, [0.5, 0.25, 0])):
+        stage.pose(frame)
+        view = stage.view(frame)
+        buffer = render_gbuffer(stage, view)
+        hit = buffer["mesh_id"][..., 0] > 0
+        points = unproject(pixel_centres(48, 48), buffer["depth"][..., 0].astype(float), view)
+        expected = points - centre
+        expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+        assert hit.sum() > 300
+        assert np.abs(buffer["normal"] - expected)[hit].max() < 5e-3  # facets are off by up to 0.03
+
+
+def test_colours_lie_on_their_walls(stage):
+    stage.pose(0)
+    buffer = render_gbuffer(stage, stage.view(0))
+    for index, shape in enumerate(stage.scene.shapes):
+        seen = buffer["albedo"][buffer["mesh_id"][..., 0] == index + 1]
+        np.testing.assert_allclose(seen, np.broadcast_to(shape.bsdf["reflectance"]["value"], seen.shape), rtol=1e-5)
+
+
+def test_unsupported_material_is_named(square):
+    shape = replace(square.shapes[0], bsdf={"type": "hair"})
+    with pytest.raises(BadInput, match=r"'square'.*'hair'.*diffuse"):
+        Stage(replace(square, shapes=(shape,)), 8, 8)
+
+
+def test_posing_is_reversible(moving):
+    """Going to another frame and back gives the same bytes: no state is left behind."""
+    moving.pose(4)
+    first = render_gbuffer(moving, moving.view(4))
+    moving.pose(20)
+    moving.pose(4)
+    again = render_gbuffer(moving, moving.view(4))
+    assert all(first[name].tobytes() == again[name].tobytes() for name in first)
+
+
+COUNT_COMPILATIONS = """
+from render.backend import dr
+from render.clip import Sampling, render_clip
+from scenes import build_scene
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+scene = build_scene("cornell_box_moving", 5, 10)
+for channels, _ in render_clip(scene, 10, 40, 40, Sampling(2, 1, 4), 0):
+    kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    print(len(kernels), sum(not k["cache_hit"] for k in kernels))
+"""
+
+
+def test_no_kernel_is_recompiled_from_frame_to_frame(tmp_path):
+    """In a new process with an empty kernel cache: all compilation happens before the first frame is out."""
+    environment = os.environ | {"DRJIT_CACHE_DIR": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", COUNT_COMPILATIONS], capture_output=True, text=True, env=environment)
+    assert run.returncode == 0, run.stderr
+    frames = [tuple(map(int, line.split())) for line in run.stdout.split("\n") if line]
+    assert len(frames) == 10
+    assert frames[0][1] > 0  # the count can see a compilation
+    for launched, compiled in frames[1:]:
+        assert launched >= 4 and compiled == 0
+
+
+def test_mesh_ids_are_scene_order():
+    scene = build_scene("cornell_box", 0, 2)
+    reordered = replace(scene, shapes=scene.shapes[::-1])
+    a, b = (Stage(s, 32, 32) for s in (scene, reordered))
+    ids = [render_gbuffer(s, s.view(0))["mesh_id"] for s in (a, b)]
+    assert np.array_equal(ids[0], len(scene.shapes) + 1 - ids[1])

@@ -1,0 +1,63 @@
+"""The sampler: stratified within a seed, uniform and independent between seeds."""
+
+import numpy as np
+import pytest
+
+from render.backend import dr, mi
+from render.sampler import Sampler, hash32
+
+
+def points(key: int, count: int, skip: int = 0) -> np.ndarray:
+    sampler = Sampler(mi.UInt32(key), dr.arange(mi.UInt32, count))
+    for _ in range(skip):
+        sampler.next_2d()
+    return np.array(sampler.next_2d()).T
+
+
+@pytest.mark.parametrize("key", [0, 1, 0xFFFFFFFF, 123456789])
+@pytest.mark.parametrize("bits", [0, 1, 4, 7])
+def test_every_elementary_interval_holds_one_point(key, bits):
+    p = points(key, 2**bits, skip=key % 3)
+    for k in range(bits + 1):
+        cells = (p * [2**k, 2 ** (bits - k)]).astype(int)
+        assert len({tuple(cell) for cell in cells}) == 2**bits
+
+
+def test_second_dimension_is_sobol():
+    """Unscrambled, the construction gives Sobol's second dimension, whose direction numbers follow a recurrence."""
+    from render.sampler import sobol_second_reversed
+
+    count = 256
+    ours = np.array(dr.brev(sobol_second_reversed(dr.arange(mi.UInt32, count))), dtype=np.uint64)
+    directions = [1 << 31]
+    for _ in range(7):
+        directions.append(directions[-1] ^ (directions[-1] >> 1))
+    theirs = [np.bitwise_xor.reduce([0] + [d for k, d in enumerate(directions) if i >> k & 1]) for i in range(count)]
+    assert ours.tolist() == [int(x) for x in theirs]
+
+
+def test_single_samples_are_uniform_and_independent():
+    """Chi-square of first samples over many seeds, and correlations between dimensions and neighbouring seeds."""
+    count = 1 << 16
+    sampler = Sampler(hash32(dr.arange(mi.UInt32, count)), mi.UInt32(0))
+    dimensions = np.stack([*np.array(sampler.next_2d()), np.array(sampler.next_1d()), *np.array(sampler.next_2d())])
+    assert (dimensions >= 0).all() and (dimensions < 1).all()
+    for u in dimensions:
+        histogram = np.bincount((u * 64).astype(int), minlength=64)
+        chi2 = ((histogram - count / 64) ** 2 / (count / 64)).sum()
+        assert abs(chi2 - 63) < 5 * np.sqrt(2 * 63)
+        assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 5 / np.sqrt(count)
+    correlations = np.corrcoef(dimensions) - np.eye(len(dimensions))
+    assert np.abs(correlations).max() < 5 / np.sqrt(count)
+
+
+def test_integrates_better_than_random():
+    """A smooth integrand: the error of 256 samples over many seeds is far below that of independent samples."""
+    estimates = []
+    for key in range(200):
+        p = points(key * 7919, 256)
+        estimates.append((np.sin(np.pi * p[:, 0]) * p[:, 1] ** 2).mean())
+    errors = np.array(estimates) - 2 / np.pi / 3
+    variance = 0.5 * 0.2 - (2 / np.pi / 3) ** 2
+    assert abs(errors.mean()) < 5 * errors.std() / np.sqrt(200)
+    assert errors.var() < 0.01 * variance / 256
