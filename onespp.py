@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -12,6 +12,9 @@ Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's 
 Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
 Profile = Annotated[
     str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds) or quick (minutes)")
+]
+Precision = Annotated[
+    Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
 ]
 Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
@@ -49,14 +52,19 @@ def info(folder: Folder) -> None:
 
 
 def train(
-    names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick", seed: int = 0
+    names: Names = (),
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    seed: int = 0,
+    precision: Precision = None,
 ) -> None:
     """Train denoisers (all that can be, unless some are named), or go on where a training was interrupted."""
     from train.loop import train as train_one
     from train.recipes import TRAINABLE
 
     for name in names or TRAINABLE:
-        print(f"{name}: trained, {train_one(name, data_folder(data, profile), runs, profile, seed)}")
+        print(f"{name}: trained, {train_one(name, data_folder(data, profile), runs, profile, seed, precision)}")
 
 
 def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick") -> None:

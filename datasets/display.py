@@ -33,7 +33,8 @@ def clip_exposure(y: NDArray[np.floating]) -> float:
 
 def display(radiance: Image, exposure: float) -> Image:
     """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1], of a numpy array or a tensor."""
-    return (exposure * radiance).clip(0, 1) ** (1 / 2.2)
+    exposed: Any = exposure * radiance
+    return exposed.clip(0, 1) ** (1 / 2.2)
 
 
 def psnr(mse: float) -> float:

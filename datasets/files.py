@@ -8,12 +8,19 @@ from typing import Any
 from errors import BadInput
 
 
+def write_file(path: Path, content: bytes) -> None:
+    """Write atomically: whatever fails, what stood at `path` before still does. Raises OSError, on a full disk too."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write atomically. Raises ValueError for NaN, which JSON cannot hold."""
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+    write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:

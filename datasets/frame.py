@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.channels import CAMERA_CHANNELS, REFERENCES
+from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES
 from datasets.clip import WHOLE, Clip, Window
 from errors import BadInput
 from scenes.camera import View
@@ -62,12 +62,11 @@ class Frame:
     source: str = ""
 
     def __getattr__(self, name: str) -> Tensor:
-        try:
-            return self.__dict__["channels"][name]
-        except KeyError:
-            if name.startswith("_") or "channels" not in self.__dict__:
-                raise AttributeError(name) from None
-            raise BadInput(f"{self.source}: the channel '{name}' was not loaded for this frame") from None
+        if name not in CHANNELS:
+            raise AttributeError(name)
+        if name not in self.channels:
+            raise BadInput(f"{self.source}: the channel '{name}' was not loaded for this frame")
+        return self.channels[name]
 
     @property
     def size(self) -> tuple[int, int]:

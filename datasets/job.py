@@ -39,7 +39,7 @@ DATA_PROFILES = {
         64, 64, 8, {"train": 1, "val": 1, "test": 1}, train=Sampling(2, 1, 64), test=Sampling(1, 1, 128)
     ),
     "quick": DataProfile(
-        128, 128, 24, {"train": 4, "val": 1, "test": 1}, train=Sampling(7, 1, 256), test=Sampling(1, 1, 1024)
+        128, 128, 24, {"train": 4, "val": 1, "test": 1}, train=Sampling(7, 1, 256), test=Sampling(1, 1, 256)
     ),
 }
 

@@ -1,6 +1,6 @@
 """Pictures for people."""
 
-import os
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import matplotlib
 from torch import Tensor
 
 from datasets.display import display
+from datasets.files import write_file
 from models.operators import finite
 
 matplotlib.use("Agg")
@@ -32,7 +33,7 @@ def save_strip(
         caption = [f"{key.upper()} {value:.3f}" for key in ("rmse", "ssim") if (value := errors.get(name, {}).get(key))]
         axis.set_title("\n".join([name, "  ".join(caption)]), fontsize=8, pad=2)
     figure.subplots_adjust(left=0, right=1, bottom=0, top=1 - CAPTION / size[1], wspace=0.01)
-    temporary = path.with_name(f".{path.name}")
-    figure.savefig(temporary, format="png")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
     plt.close(figure)
-    os.replace(temporary, path)
+    write_file(path, buffer.getvalue())

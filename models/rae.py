@@ -27,7 +27,7 @@ def conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def activate(x: Tensor) -> Tensor:
-    return F.leaky_relu(x, SLOPE)
+    return F.leaky_relu(x, SLOPE, inplace=True)
 
 
 class RecurrentBlock(nn.Module):
@@ -58,7 +58,9 @@ class RecurrentAutoencoder(nn.Module):
         self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
         below, stages = widths[-1], []
         for skip, (middle, out) in zip(widths[-2::-1], decoder, strict=True):
-            stages.append(nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE), conv(middle, out)))
+            stages.append(
+                nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE, inplace=True), conv(middle, out))
+            )
             below = out
         self.decoder = nn.ModuleList(stages)
         self.output = conv(below, 3)

@@ -1,13 +1,13 @@
 """Weights on disk: safetensors, with the network's name and training recipe in the metadata."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
+from datasets.files import write_file
 from errors import BadInput
 from models.denoiser import Denoiser
 
@@ -15,9 +15,7 @@ from models.denoiser import Denoiser
 def save_weights(denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path) -> None:
     """Write atomically: a reader sees the old file or the whole new one."""
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
-    temporary = path.with_name(f".{path.name}.tmp")
-    save_file(tensors, temporary, {"denoiser": name, "recipe": json.dumps(recipe)})
-    os.replace(temporary, path)
+    write_file(path, save(tensors, {"denoiser": name, "recipe": json.dumps(recipe)}))
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:

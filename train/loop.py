@@ -1,5 +1,6 @@
 """The training loop, one for all networks."""
 
+import io
 import os
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -14,6 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
+from datasets.files import write_file
 from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
 from errors import BadInput
 from models import create
@@ -35,7 +37,9 @@ def run_folder(runs: Path, name: str, profile: str) -> Path:
 def loader(clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int) -> DataLoader[Batch]:
     augmentation = recipe.augmentation if augment else Augmentation()
     sequences = TrainingSequences(clips, reads, recipe.length, recipe.crop, augmentation, seed)
-    return DataLoader(sequences, batch_size=recipe.batch, collate_fn=collate)  # type: ignore[arg-type]
+    # A smaller last batch would weigh its sequences more (and single ones are not reproducible bit for bit on CPUs).
+    whole = len(sequences) >= recipe.batch
+    return DataLoader(sequences, recipe.batch, collate_fn=collate, drop_last=whole)  # type: ignore[arg-type]
 
 
 class Training:
@@ -52,17 +56,17 @@ class Training:
 
         checkpoint = self.folder / CHECKPOINT
         saved: dict[str, Any] = torch.load(checkpoint, weights_only=True) if checkpoint.exists() else {}
-        device = Fabric(devices=1).device
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
         # A resumed run keeps its precision, however the measurement would turn out this time.
-        self.precision = saved.get("precision") or precision or fastest_precision(device)
-        self.fabric = Fabric(devices=1, precision=self.precision)  # type: ignore[arg-type]
+        self.precision = saved.get("precision") or precision or fastest_precision(torch.device(accelerator))
+        self.fabric = Fabric(accelerator=accelerator, devices=1, precision=self.precision)  # type: ignore[arg-type]
         loss = loss_for(denoiser, name)
         optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
 
         made_with = {key: dataset.facts[key] for key in ("profile", "seed", "generator", "scenes")}
         self.facts = {"profile": profile, "seed": seed, "data": made_with, **asdict(self.recipe)}
-        self.epoch, self.best, self.skipped = 0, float("inf"), 0
+        self.epoch, self.best, self.skipped, self.skipped_in_a_row = 0, float("inf"), 0, 0
         if saved:
             self.resume(saved)
 
@@ -84,14 +88,13 @@ class Training:
             "optimiser": self.optimiser.state_dict(),
             **{key: getattr(self, key) for key in ("epoch", "best", "skipped")},
         }
-        temporary = self.folder / f".{CHECKPOINT}.tmp"
-        torch.save(content, temporary)
-        os.replace(temporary, self.folder / CHECKPOINT)
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_file(self.folder / CHECKPOINT, buffer.getvalue())
 
     def steps(self) -> Iterator[tuple[float, dict[str, Tensor]]]:
         """One epoch: update the weights batch by batch; yields learning rate and losses of each step."""
         count = len(self.train_data)
-        in_a_row = 0
         self.train_data.dataset.set_epoch(self.epoch)  # type: ignore[attr-defined]
         for index, batch in enumerate(self.train_data):
             rate = self.recipe.learning_rate(self.epoch + index / count)
@@ -99,15 +102,16 @@ class Training:
                 group["lr"] = rate
             loss, parts = self.loss(batch.to(self.fabric.device))
             if torch.isfinite(loss):
-                in_a_row = 0
+                self.skipped_in_a_row = 0
                 self.fabric.backward(loss)
                 self.optimiser.step()
             else:
                 self.skipped += 1
-                in_a_row += 1
-                if in_a_row >= MOST_SKIPPED_IN_A_ROW:
+                self.skipped_in_a_row += 1
+                if self.skipped_in_a_row >= MOST_SKIPPED_IN_A_ROW:
                     raise BadInput(
-                        f"the loss was not finite in {in_a_row} steps in a row: check the data with `onespp info`"
+                        f"the loss was not finite in {self.skipped_in_a_row} steps in a row: check the data with "
+                        "`onespp info` and `onespp verify`, or train with --precision 32-true"
                     )
             self.optimiser.zero_grad()
             yield rate, {"loss": loss.detach(), **parts}

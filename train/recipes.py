@@ -41,8 +41,8 @@ RAE_PAPER = Recipe(
 
 RECIPES: dict[tuple[str, str], Recipe] = {
     ("rae", "paper"): RAE_PAPER,
-    ("rae", "tiny"): replace(RAE_PAPER, epochs=12, batch=2, crop=32),
-    ("rae", "quick"): replace(RAE_PAPER, epochs=50, crop=64),
+    ("rae", "tiny"): replace(RAE_PAPER, epochs=15, crop=32, ramp_epochs=1),
+    ("rae", "quick"): replace(RAE_PAPER, epochs=60, crop=64, ramp_epochs=2),
 }
 
 TRAINABLE = tuple(dict.fromkeys(name for name, _ in RECIPES))

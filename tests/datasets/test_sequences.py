@@ -185,4 +185,4 @@ def test_demodulation_round_trip_and_unread_channels(clips):
     )
     with pytest.raises(BadInput, match="'normal' was not loaded"):
         frame.view_normal()
-    assert not hasattr(frame, "__array__")
+    assert not hasattr(frame, "no_channel")

@@ -125,7 +125,6 @@ def test_reprojection_follows_a_mesh_that_moves(tiny):
     """On the moving box: visible surfaces find their history, and nothing is ever fetched from another mesh."""
     clip = Dataset(tiny).clips("test")[1]
     names = ("normal", "depth", "mesh_id", "motion", "dual_motion")
-    lost = 0
     for index in range(1, clip.frames):
         frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
         position = frame.motion + torch.stack(torch.meshgrid(torch.arange(64), torch.arange(64), indexing="xy"))[None]
@@ -134,8 +133,11 @@ def test_reprojection_follows_a_mesh_that_moves(tiny):
         history, found = reproject(frame, before.mesh_id, Surfaces.of(before))
         assert found[inside & ~hidden].float().mean() > 0.99
         torch.testing.assert_close(history[found], frame.mesh_id[found])
-        lost += (~found).sum()
-    assert lost > 0
+    # Seven frames at once: strips too wide for any tap to bridge come into view.
+    last, first = read_frame(clip, 7, names[:-1], previous=0), read_frame(clip, 0, names[:-1])
+    history, found = reproject(last, first.mesh_id, Surfaces.of(first))
+    torch.testing.assert_close(history[found], last.mesh_id[found])
+    assert 0.005 < (~found).float().mean() < 0.3
 
 
 def test_accumulation_averages_five_frames_then_moves_on():

@@ -1,7 +1,9 @@
 """Losses by hand, the schedule, and that training learns, resumes and refuses as it should."""
 
 import math
+import resource
 import shutil
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -184,11 +186,12 @@ def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, short, mo
 
 
 def test_training_writes_recipe_and_curves(tiny, tmp_path, short):
-    weights = train("rae", tiny, tmp_path, "tiny", precision="32-true")
+    weights = train("rae", tiny, tmp_path, "tiny", precision="bf16-mixed")
     with safe_open(weights, "pt") as file:
         metadata = file.metadata()
     assert metadata["denoiser"] == "rae" and '"epochs": 4' in metadata["recipe"] and '"crop": 32' in metadata["recipe"]
     assert list(weights.parent.glob("events.out.tfevents.*"))
+    assert all(t.dtype == torch.float32 and torch.isfinite(t).all() for t in tensors(weights).values())
 
 
 def test_rae_learns_one_batch(tiny):
@@ -240,3 +243,25 @@ def test_unusable_input_is_named(tiny, tmp_path):
     with pytest.raises(BadInput, match="'val' are missing"):
         train("rae", copy, tmp_path, "tiny")
     assert not (tmp_path / "train").exists()
+
+
+def test_full_disk_is_one_clear_line_and_keeps_the_earlier_checkpoint(tiny, tmp_path, short):
+    """A limit on file size stands in for a full disk."""
+    training = Training("rae", tiny, tmp_path, "tiny", 0, "32-true")
+    training.folder.mkdir(parents=True)
+    training.save()
+    checkpoint = training.folder / "checkpoint.pt"
+    before = checkpoint.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
+        with pytest.raises(OSError, match="File too large"):
+            training.save()
+        with pytest.raises(OSError, match="File too large"):
+            training.keep_best(0.5)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert checkpoint.read_bytes() == before
+    assert not [path for path in training.folder.iterdir() if path.name.startswith(".") or "safetensors" in path.name]
