@@ -1,5 +1,6 @@
 """The command line: one subcommand a step, each thin."""
 
+import errno
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -85,7 +86,9 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(_complain(str(error)))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        sys.exit(_complain(f"{where}{error.strerror or error}; make room or choose another folder, then run it again"))
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room" if full else "mend that or choose another folder"
+        sys.exit(_complain(f"{where}{error.strerror or error}; {remedy} and run it again"))
     except KeyboardInterrupt:
         print("\ninterrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(130)

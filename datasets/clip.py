@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from scenes.camera import View, motion_vectors, pixel_centres
 
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
+CLIP_FACTS = ("frames", "height", "width", "exposure", "channels", "floor_mse", "nonfinite", "clamped", "complete")
 WHOLE = (slice(None), slice(None))
 
 Window = tuple[slice, slice]  # rows, columns
@@ -27,8 +29,8 @@ class Clip:
 
     def __init__(self, path: Path):
         self.path = path
-        self.facts: dict[str, Any] = read_json(path / "clip.json")
-        if not self.facts.get("complete"):
+        self.facts = read_json(path / "clip.json", CLIP_FACTS)
+        if not self.facts["complete"]:
             raise BadInput(f"{path} is not a complete clip: delete it and rerun `onespp dataset`")
         self.frames: int = self.facts["frames"]
         self.height: int = self.facts["height"]
@@ -67,7 +69,7 @@ class Clip:
                 array = np.load(path, mmap_mode="r")
             except FileNotFoundError:
                 raise BadInput(f"{path} is missing: delete {self.path} and rerun `onespp dataset`") from None
-            except (ValueError, EOFError) as error:
+            except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load parses the header as Python
                 raise BadInput(f"{path} is damaged ({error}): delete {self.path} and rerun `onespp dataset`") from None
             if list(array.shape) != entry["shape"] or array.dtype != np.dtype(entry["dtype"]):
                 raise BadInput(f"{path} is not what clip.json says: delete {self.path} and rerun `onespp dataset`")
@@ -85,7 +87,8 @@ class Clip:
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
             leading = (2,) if spec.axes[1] == 2 else ()
-            return np.broadcast_to(np.array(entry["value"], spec.dtype), (*leading, *area, spec.components))
+            value = np.array(entry["value"], "<f4" if spec.radiance else spec.dtype)
+            return np.broadcast_to(value, (*leading, *area, spec.components))
         if "derived" in entry:
             return self.motion_to(frame, max(frame - 1, 0), window)
         array = self.map(channel)
@@ -120,10 +123,10 @@ class Dataset:
         self.path = path
         if not path.is_dir():
             raise BadInput(f"there is no data set at {path}: make one with `onespp dataset --data {path}`")
-        self.facts: dict[str, Any] = read_json(path / "dataset.json")
-        if self.facts.get("schema") != SCHEMA:
+        self.facts = read_json(path / "dataset.json", ("schema",))
+        if self.facts["schema"] != SCHEMA:
             raise BadInput(
-                f"{path} has schema version {self.facts.get('schema')}, this onespp reads version {SCHEMA}: "
+                f"{path} has schema version {self.facts['schema']}, this onespp reads version {SCHEMA}: "
                 "render it again with `onespp dataset` into a new folder"
             )
 

@@ -75,6 +75,11 @@ class Frame:
         return height, width
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, H, W)."""
+        return (len(self.gain), *self.size)
+
+    @property
     def divisor(self) -> Tensor:
         """What demodulation divides by: max(albedo, 0.01), (B, 3, H, W)."""
         return self.albedo.clamp(min=ALBEDO_FLOOR)

@@ -1,9 +1,6 @@
 """The generation job: render the clips of a profile that are not there yet."""
 
-import fcntl
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from datasets.clip import SCHEMA, SPLITS, Dataset
-from datasets.files import read_json, write_json
+from datasets.files import locked, read_json, write_json
 from datasets.writer import ClipWriter
 from errors import BadInput
 from render.clip import Sampling, render_clip
@@ -51,7 +48,9 @@ def clip_seed(seed: int, scene: str, split: str, index: int) -> int:
 
 
 def plan(profile: str, seed: int) -> dict[str, Any]:
-    """The content of dataset.json. Raises BadInput for an unknown profile."""
+    """The content of dataset.json. Raises BadInput for an unknown profile or an unusable seed."""
+    if seed < 0:
+        raise BadInput(f"the seed {seed} is negative: use 0 or more")
     if profile not in DATA_PROFILES:
         raise BadInput(f"unknown profile '{profile}'; the profiles are {', '.join(DATA_PROFILES)}")
     clips = DATA_PROFILES[profile].clips
@@ -66,34 +65,33 @@ def plan(profile: str, seed: int) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def only_job(root: Path) -> Iterator[None]:
-    """Hold the data set's lock. Raises BadInput where another job is writing there."""
-    with (root / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BadInput(
-                f"another `onespp dataset` is writing to {root}: wait for it or use another folder"
-            ) from None
-        yield
-
-
-def begin(root: Path, profile: str, seed: int) -> None:
-    """Create the data set's folder and plan, or check that the plan there is the same."""
-    wanted = plan(profile, seed)
-    if root.exists() and not root.is_dir():
-        raise BadInput(f"{root} is a file, not a folder: choose another --data")
+def begin(root: Path, wanted: dict[str, Any]) -> None:
+    """Write the plan into a new data set's folder, or check that the plan there is the same."""
     if not (root / "dataset.json").exists():
-        if root.exists() and any(path.name != ".lock" for path in root.iterdir()):
-            raise BadInput(f"{root} holds something else than a data set: choose an empty or new folder")
-        root.mkdir(parents=True, exist_ok=True)
         write_json(root / "dataset.json", wanted)
         return
     present = read_json(root / "dataset.json")
     for key in ("schema", "profile", "seed", "generator", "splits"):
         if present.get(key) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
+
+
+def check_folder(root: Path) -> None:
+    """Raise BadInput for a place that is not a new folder, an empty one or a data set's."""
+    if root.exists() and not root.is_dir():
+        raise BadInput(f"{root} is a file, not a folder: choose another --data")
+    visible = [path.name for path in root.glob("[!.]*")]
+    if visible and "dataset.json" not in visible:
+        raise BadInput(f"{root} holds something else than a data set: choose an empty or new folder")
+
+
+def check_versions(dataset: Dataset, here: dict[str, str]) -> None:
+    """Raise BadInput where the data set was begun with other packages: the same seed may render other bytes."""
+    changed = [
+        f"{name} {old}, here {here[name]}" for name, old in dataset.facts["versions"].items() if here[name] != old
+    ]
+    if changed:
+        raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
 def render_to(destination: Path, scene_name: str, profile: DataProfile, split: str, seed: int) -> None:
@@ -115,9 +113,15 @@ def render_to(destination: Path, scene_name: str, profile: DataProfile, split: s
 
 def generate(root: Path, profile: str, seed: int) -> int:
     """Render what is missing of `profile`'s data set at `root`. Returns how many clips were rendered."""
-    begin(root, profile, seed)
-    with only_job(root):
-        missing = [path for path in Dataset(root).planned() if not (path / "clip.json").exists()]
+    wanted = plan(profile, seed)
+    check_folder(root)
+    root.mkdir(parents=True, exist_ok=True)
+    with locked(root, "writing to"):
+        begin(root, wanted)
+        dataset = Dataset(root)
+        missing = [path for path in dataset.planned() if not (path / "clip.json").exists()]
+        if missing:
+            check_versions(dataset, wanted["versions"])
         for path in tqdm(missing, "clips", unit="clip"):
             split, scene, index = path.parts[-3:]
             render_to(path, scene, DATA_PROFILES[profile], split, clip_seed(seed, scene, split, int(index)))

@@ -59,7 +59,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         playback = self._playback(clip, rng)
         top, left = (int(rng.integers(size - self.crop + 1)) for size in (clip.height, clip.width))
         window = (slice(top, top + self.crop), slice(left, left + self.crop))
-        # A stopped camera must not see the same noise again, so realisations are dealt out rather than drawn.
+        # Dealt out rather than drawn, so that a stopped camera sees new noise as long as there are realisations.
         deal = rng.permutation(clip.realisations)
         turns = int(rng.integers(4)) if self.augmentation.rotate else 0
         gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.augmentation.gain else None

@@ -32,10 +32,10 @@ class RawChannel:
         self.frames = self.nonfinite = 0
         self.first: NDArray[Any] | None = None
         self.constant = self.channel.is_image
-        self.magnitude = self.half_error = 0.0
+        self.half_loses = False
 
-    def add(self, array: NDArray[Any]) -> None:
-        """Append one frame (axes without F). What is not finite is counted and becomes 0."""
+    def add(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Append one frame (axes without F). What is not finite is counted and becomes 0. Returns what was added."""
         array = np.ascontiguousarray(array, dtype=working_dtype(self.channel))
         if array.dtype.kind == "f":
             finite = np.isfinite(array)
@@ -46,10 +46,11 @@ class RawChannel:
         self.constant = self.constant and bool((array == self.first).all())
         if self.channel.radiance:
             with np.errstate(over="ignore"):
-                self.half_error += float(np.abs(array.astype("<f2").astype("<f8") - array).sum())
-            self.magnitude += float(np.abs(array).sum(dtype=np.float64))
+                error = np.abs(array.astype("<f2").astype("<f8") - array).sum()
+            self.half_loses |= not error <= HALF_PRECISION * np.abs(array).sum(dtype=np.float64)
         self.file.write(array.tobytes())
         self.frames += 1
+        return array
 
     def read(self, frame: int) -> NDArray[Any]:
         """One frame back, in working precision."""
@@ -58,9 +59,8 @@ class RawChannel:
         return np.fromfile(self.path, dtype, count, offset=frame * count * dtype.itemsize).reshape(self.frame_shape)
 
     def storage_dtype(self) -> str:
-        """float32 for radiance that float16 would round worse than it rounds normal numbers (overflow, flush to 0)."""
-        loses = self.channel.radiance and not self.half_error <= HALF_PRECISION * self.magnitude
-        return "<f4" if loses else self.channel.dtype
+        """float32 for radiance of which float16 would round a frame worse than it rounds normal numbers."""
+        return "<f4" if self.half_loses else self.channel.dtype
 
     def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:
         """Write the final file where one is needed. Returns the entry of clip.json and the count of clamped numbers."""
@@ -116,7 +116,7 @@ class ClipWriter:
     """Collects a clip's frames beside its destination and moves the whole there at the end.
 
     Use as a context manager: `add` every frame, then `finish`. Leaving without `finish` removes everything written.
-    Frames pass through to disk, so memory does not grow with the clip's length.
+    Frames pass through to disk; only the luminance of the reference is kept for the exposure.
     """
 
     def __init__(self, destination: Path):
@@ -139,11 +139,10 @@ class ClipWriter:
 
     def add(self, channels: dict[str, NDArray[Any]], seconds: dict[str, float]) -> None:
         """Append one frame: arrays as in the channel table without F, and seconds by step."""
-        for name, array in channels.items():
-            if name not in self.channels:
-                self.channels[name] = RawChannel(self.folder, name)
-            self.channels[name].add(array)
-        reference = sum(np.nan_to_num(channels[name].mean(axis=0), posinf=0, neginf=0) for name in REFERENCES)
+        if not self.channels:
+            self.channels = {name: RawChannel(self.folder, name) for name in channels}
+        added = {name: raw.add(channels[name]) for name, raw in self.channels.items()}
+        reference = sum(added[name].mean(axis=0) for name in REFERENCES)
         self.luminances.append(luminance(np.asarray(reference)).astype(np.float32))
         for step, spent in seconds.items():
             self.timing[step] = self.timing.get(step, 0.0) + spent
@@ -182,4 +181,5 @@ class ClipWriter:
         }
         write_json(self.folder / "timing.json", self.timing)
         write_json(self.folder / "clip.json", content)
+        shutil.rmtree(self.destination, ignore_errors=True)  # what stands there has no clip.json, so it is no clip
         self.folder.rename(self.destination)

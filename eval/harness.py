@@ -128,6 +128,7 @@ COLUMNS = {
     "rmse": ("RMSE", "{:.4f}"),
     "psnr": ("PSNR dB", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
+    "flip": ("FLIP", "{:.4f}"),
     "mse_unbiased": ("unbiased MSE", "{:.2e}"),
     "temporal_error": ("temporal error", "{:.4f}"),
     "disocclusion_l1": ("disocclusion L1", "{:.4f}"),

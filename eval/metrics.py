@@ -2,6 +2,7 @@
 
 import math
 
+import flip_evaluator
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -19,6 +20,13 @@ def ssim(x: Tensor, reference: Tensor) -> float | None:
     _, full = structural_similarity_index_measure(x, reference, sigma=1.5, data_range=1.0, return_full_image=True)
     margin = SSIM_WINDOW // 2  # torchmetrics averages over windows that reach into its padding too
     return float(full[..., margin:-margin, margin:-margin].mean())
+
+
+def flip(x: Tensor, reference: Tensor) -> float:
+    """Mean LDR-FLIP (Andersson et al. 2020) of displayed images (1, 3, H, W), at its default viewing distance."""
+    images = (image[0].permute(1, 2, 0).float().contiguous().numpy() for image in (reference, x))
+    _, mean, _ = flip_evaluator.evaluate(*images, "LDR")
+    return float(mean)
 
 
 def image_metrics(output: Tensor, halves: Tensor, exposure: float) -> dict[str, float | None]:
@@ -40,6 +48,7 @@ def image_metrics(output: Tensor, halves: Tensor, exposure: float) -> dict[str, 
         "l1": (shown - truth).abs().mean().item(),
         "psnr": psnr(mse),
         "ssim": ssim(shown, truth),
+        "flip": flip(shown, truth),
         "mse_unbiased": ((x - a) * (x - b)).mean().item(),
         "smape": ((x - r).abs() / (x.abs() + r.abs() + EPSILON)).mean().item(),
         "rel_mse": ((x - r).square() / (r.square() + EPSILON)).mean().item(),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from datasets.frame import Frame
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser, State, carried
 from models.operators import Accumulation, accumulate
 
 
@@ -15,7 +15,7 @@ class Noisy(Denoiser):
     reads = ("direct", "indirect", "emission")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        return frame.radiance(self.signal), State()
+        return frame.radiance(self.signal), State(frame.shape)
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,6 @@ class Accumulated(Denoiser):
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        history = state.history if isinstance(state, AccumulatedState) else None
-        history = accumulate(frame, frame.irradiance(self.signal), history)
-        return frame.remodulate(history.irradiance, self.signal), AccumulatedState(history)
+        before = carried(state, AccumulatedState, frame)
+        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
+        return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.shape, history)

@@ -1,7 +1,7 @@
 """The one interface of everything that denoises."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,7 +11,17 @@ from datasets.frame import Frame, Signal
 
 @dataclass(frozen=True)
 class State:
-    """What a denoiser carries from frame to frame: tensors only. Each denoiser has a subclass of its own."""
+    """What a denoiser carries from frame to frame: tensors. Each denoiser has a subclass of its own."""
+
+    shape: tuple[int, int, int]  # (B, H, W) of the frames it was made from
+
+
+S = TypeVar("S", bound=State)
+
+
+def carried(state: State | None, kind: type[S], frame: Frame) -> S | None:
+    """The state as one's own kind, or None where a frame of another image or batch size starts a new sequence."""
+    return state if isinstance(state, kind) and state.shape == frame.shape else None
 
 
 class Denoiser(torch.nn.Module):

@@ -1,5 +1,6 @@
 """Operators that denoisers share. Tensors are (B, C, H, W), float32."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -175,11 +176,11 @@ def accumulate(frame: Frame, irradiance: Tensor, history: Accumulation | None) -
     """Blend noisy `irradiance` (B, 3, H, W) into its history with weight alpha = max(0.2, 1 / (n + 1)).
 
     n is the history's length, so the first five frames are averaged evenly; then it is an exponential moving average.
-    Disoccluded pixels, and a history of another image size, start anew.
+    Disoccluded pixels start anew.
     """
     irradiance = finite(irradiance)
     length = torch.ones_like(irradiance[:, :1])
-    if history is not None and history.irradiance.shape == irradiance.shape:
+    if history is not None:
         past, found = reproject(frame, torch.cat([history.irradiance, history.length], dim=1), history.surfaces)
         n = past[:, 3:]
         alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
@@ -193,51 +194,55 @@ LUMINANCE_BLOCK = 16  # px; the logarithm of a mean over a block is far less bia
 
 
 @dataclass(frozen=True)
+class RunningMean:
+    """A causal mean over frames, (B,): even at first, then with weight 0.1 for the newest."""
+
+    value: Tensor
+    count: Tensor  # frames that contributed
+
+    def update(self, new: Tensor, valid: Tensor) -> "RunningMean":
+        """With one more frame's `new` (B,), where `valid` (B,)."""
+        count = self.count + valid
+        rate = (1 / count.clamp(min=1)).clamp(min=SLOWEST_RATE)
+        return RunningMean(torch.where(valid, torch.lerp(self.value, new, rate), self.value), count)
+
+
+@dataclass(frozen=True)
 class RunningScale:
-    """Causal estimates of a sequence's brightness and depth: what networks use instead of the clip's exposure.
+    """Causal estimates of a sequence's brightness and depth: what networks use instead of the clip's exposure."""
 
-    log_luminance, log_depth and frames are (B,).
-    """
+    log_luminance: RunningMean
+    log_depth: RunningMean
 
-    log_luminance: Tensor
-    log_depth: Tensor
-    frames: Tensor
+    @staticmethod
+    def neutral(like: Tensor) -> "RunningScale":
+        """Exposure 1 and depth scale 1 for a batch of `like` (B, ...), until a frame tells better."""
+        zero = like.new_zeros(len(like))
+        return RunningScale(RunningMean(zero + math.log(0.18), zero), RunningMean(zero, zero))
 
     def exposure(self) -> Tensor:
         """0.18 / geometric mean luminance, (B, 1, 1, 1)."""
-        return (0.18 * torch.exp(-self.log_luminance))[:, None, None, None]
+        return (0.18 * torch.exp(-self.log_luminance.value))[:, None, None, None]
 
     def normalised_depth(self, depth: Tensor) -> Tensor:
         """d / (d + s) in [0, 1) with s the running median depth; 1 for background (depth 0)."""
-        scale = torch.exp(self.log_depth)[:, None, None, None]
+        scale = torch.exp(self.log_depth.value)[:, None, None, None]
         return torch.where(depth > 0, depth / (depth + scale), 1)
 
 
 def running_scale(radiance: Tensor, depth: Tensor, before: RunningScale | None) -> RunningScale:
     """Update the estimates with one frame's noisy direct + indirect `radiance` (B, 3, H, W) and its `depth`.
 
-    The logarithms of each frame's estimates are averaged, evenly at first and then with weight 0.1 for the newest.
-    A frame that is all black or has no surface leaves its estimate as it was (at first: exposure 1, scale 1).
+    The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
     """
+    before = before or RunningScale.neutral(radiance)
     luminances = luminance(finite(radiance)).clamp(min=0)
     blocks = F.avg_pool2d(luminances, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False)
     y = blocks.flatten(1).double()
     mean = y.mean(dim=1)
-    black = mean <= 0
-    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)).mean(dim=1)
+    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)).mean(dim=1).to(radiance.dtype)
     depths = depth.flatten(1)
-    hits = torch.where(depths > 0, depths, torch.nan)
-    median = hits.nanmedian(dim=1).values
-    empty = median.isnan()
-    log_d = torch.log(torch.where(empty, 1, median))
-
-    if before is None or before.frames.shape != mean.shape:
-        neutral = torch.full_like(log_y, 0.18).log()
-        first = torch.where(black, neutral, log_y)
-        return RunningScale(first.float(), log_d, torch.ones_like(log_d))
-    rate = (1 / (before.frames + 1)).clamp(min=SLOWEST_RATE)
-    return RunningScale(
-        torch.where(black, before.log_luminance, torch.lerp(before.log_luminance, log_y.float(), rate)),
-        torch.where(empty, before.log_depth, torch.lerp(before.log_depth, log_d, rate)),
-        before.frames + 1,
-    )
+    median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
+    hit = ~median.isnan()
+    log_depth = torch.log(torch.where(hit, median, 1))
+    return RunningScale(before.log_luminance.update(log_y, mean > 0), before.log_depth.update(log_depth, hit))

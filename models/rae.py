@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser, State, carried
 from models.operators import RunningScale, finite, running_scale
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
@@ -105,15 +105,15 @@ class RAE(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
         height, width = frame.size
-        before = state if isinstance(state, RAEState) else None
+        before = carried(state, RAEState, frame)
         irradiance = finite(frame.irradiance(self.signal)).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
         colour = self.compress(irradiance, scale, frame)
         depth = scale.normalised_depth(frame.depth)
         x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1))
-        hidden = before.hidden if before and before.hidden[0].shape[-2:] == x.shape[-2:] else None
-        p, hidden = self.network(x.contiguous(memory_format=torch.channels_last), hidden)
-        return p[..., :height, :width].float(), RAEState(hidden, scale)
+        x = x.contiguous(memory_format=torch.channels_last)
+        p, hidden = self.network(x, before.hidden if before else None)
+        return p[..., :height, :width].to(x.dtype), RAEState(frame.shape, hidden, scale)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""

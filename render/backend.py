@@ -26,16 +26,19 @@ def installed_llvms() -> list[tuple[int, str]]:
     paths = [line.rsplit("=> ", 1)[-1] for line in listing.splitlines() if "libLLVM" in line]
     for pattern in (
         "usr/lib/llvm-*/lib/libLLVM*.so*",
-        "usr/lib*/libLLVM*.so*",
+        "usr/lib64/libLLVM*.so*",
         "opt/homebrew/opt/llvm*/lib/libLLVM.dylib",
     ):
         paths += [str(path) for path in Path("/").glob(pattern)]
     found = []
     for path in paths:
-        # The version stands in the resolved name (libLLVM.so.19.1) or in its folder (llvm-19).
-        match = re.search(r"libLLVM[-.](?:so\.|dylib\.)?(\d+)|llvm[-@/]?(\d+)", str(Path(path).resolve()))
-        if match:
-            found.append((int(match[1] or match[2]), path))
+        # The version stands in the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or in its folder (llvm-19).
+        resolved = Path(path).resolve()
+        name = re.fullmatch(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so|dylib)(?:\.(\d+)[\d.]*)?", resolved.name)
+        folder = re.search(r"llvm[-@/]?(\d+)", str(resolved.parent))
+        version = name and (name[1] or name[2] or (folder and folder[1]))
+        if version:
+            found.append((int(version), path))
     return found
 
 

@@ -36,26 +36,26 @@ def render_clip(
     Deterministic in its arguments on one variant and processor.
     """
     stage = Stage(scene, height, width)
-    gbuffers, seconds = [], []
+    centres = pixel_centres(height, width)
+    ahead, clock = render_gbuffer(stage, stage.view(0)), Clock()
+    ahead["motion"] = ahead["dual_motion"] = np.zeros((height, width, 2))
+    clock.lap("gbuffer")
     for frame in range(frames):
-        start = time.perf_counter()
-        stage.pose(frame)
-        gbuffers.append(render_gbuffer(stage, stage.view(frame)))
-        seconds.append({"gbuffer": time.perf_counter() - start})
+        clock.start()
+        channels, view, more = ahead, stage.view(frame), frame + 1 < frames
+        if more:
+            stage.pose(frame + 1)
+            now = stage.view(frame + 1)
+            ahead = render_gbuffer(stage, now)
+            clock.lap("gbuffer")
+            depth, mesh_id = ahead["depth"][..., 0].astype(np.float64), ahead["mesh_id"][..., 0]
+            ahead["motion"] = motion_vectors(centres, depth, mesh_id, now, view)
+            clock.lap("motion")
+            stage.pose(frame)
+            # The dual vectors of the next frame look into the scene as it is posed in this one.
+            ahead["dual_motion"] = dual_motion(stage, depth, mesh_id, ahead["motion"], now, view)
+            clock.lap("dual_motion")
 
-    # The dual vectors of frame i look into the scene as it was posed in frame i - 1.
-    dual = np.zeros((height, width, 2))
-    for frame in range(frames):
-        clock = Clock(seconds[frame])
-        channels, view = gbuffers[frame], stage.view(frame)
-        previous = stage.view(max(frame - 1, 0))
-        depth, mesh_id = channels["depth"][..., 0].astype(np.float64), channels["mesh_id"][..., 0]
-        channels["motion"] = motion_vectors(pixel_centres(height, width), depth, mesh_id, view, previous)
-        channels["dual_motion"] = dual
-        channels.update(K=view.K, camera_to_world=view.camera_to_world, object_to_world=view.object_to_world)
-        clock.lap("motion")
-
-        stage.pose(frame)
         ray = stage.rays(view)
         for name, kind, count, spp in (
             ("", 0, sampling.realisations, sampling.noisy_spp),
@@ -65,24 +65,28 @@ def render_clip(
             channels["direct" + name] = np.stack([direct for direct, _ in images])
             channels["indirect" + name] = np.stack([indirect for _, indirect in images])
             clock.lap("reference" if name else "noisy")
-
-        if frame + 1 < frames:
-            following = gbuffers[frame + 1]
-            depth, mesh_id = following["depth"][..., 0].astype(np.float64), following["mesh_id"][..., 0]
-            now = stage.view(frame + 1)
-            vectors = motion_vectors(pixel_centres(height, width), depth, mesh_id, now, view)
-            dual = dual_motion(stage, depth, mesh_id, vectors, now, view)
-            clock.lap("dual_motion")
-        yield channels, seconds[frame]
+        channels.update(K=view.K, camera_to_world=view.camera_to_world, object_to_world=view.object_to_world)
+        yield channels, clock.read()
 
 
 class Clock:
-    """Adds the time between laps to a table of seconds."""
+    """Seconds by step since it was last read."""
 
-    def __init__(self, seconds: dict[str, float]):
-        self.seconds, self.last = seconds, time.perf_counter()
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.start()
+
+    def start(self) -> None:
+        """Leave out the time until now."""
+        self.last = time.perf_counter()
 
     def lap(self, name: str) -> None:
+        """Count the time since the last lap as `name`."""
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
         self.last = now
+
+    def read(self) -> dict[str, float]:
+        """The table, which starts anew."""
+        seconds, self.seconds = self.seconds, {}
+        return seconds

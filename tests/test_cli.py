@@ -12,8 +12,9 @@ def fails(capsys, *arguments: str) -> str:
     with pytest.raises(SystemExit) as exit_:
         main(list(arguments))
     assert exit_.value.code == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("onespp: ")]
-    assert len(lines) == 1
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("onespp: ")]
+    assert len(lines) == 1 and err.endswith(lines[0] + "\n") and "Traceback" not in err
     return lines[0]
 
 

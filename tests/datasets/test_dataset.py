@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from datasets.clip import Clip, Dataset
-from datasets.inspect import info, verify
-from datasets.job import DATA_PROFILES, clip_seed, generate, only_job, plan
+from datasets.files import locked
+from datasets.inspect import check_clip, info, verify
+from datasets.job import DATA_PROFILES, clip_seed, generate, plan
 from errors import BadInput
 from render.clip import render_clip
 from scenes import build_scene
@@ -109,6 +110,25 @@ def test_verify_names_every_kind_of_damage(copy):
     assert len(problems.splitlines()) == 6
 
 
+def test_damaged_headers_and_json_of_another_form_are_bad_input(copy):
+    """Bits flipped in an .npy header, which numpy reads as Python, and JSON that is valid but something else."""
+    path = copy / "test" / "cornell_box" / "000"
+    header = (path / "depth.npy").read_bytes()
+    rng = np.random.default_rng(0)
+    for bit in rng.integers(0, 128 * 8, 60):
+        data = bytearray(header)
+        data[bit // 8] ^= 1 << (bit % 8)
+        (path / "depth.npy").write_bytes(data)
+        assert any("depth.npy" in problem for problem in check_clip(path))
+    for content in ("[]", "3", '{"complete": true}'):
+        (path / "clip.json").write_text(content)
+        with pytest.raises(BadInput, match=r"clip.json is damaged"):
+            Clip(path)
+    (copy / "dataset.json").write_text("[]")
+    with pytest.raises(BadInput, match=r"dataset.json is damaged"):
+        Dataset(copy)
+
+
 def test_info_tells_sizes_floors_and_what_is_missing(copy):
     shutil.rmtree(copy / "val" / "cornell_box" / "000")
     text = info(copy)
@@ -195,8 +215,28 @@ def test_full_disk_is_one_clear_line_and_leaves_whole_clips_only(tmp_path):
 
 
 def test_two_jobs_on_one_folder(tiny):
-    with only_job(tiny), pytest.raises(BadInput, match="another `onespp dataset`"), only_job(tiny):
-        pass
+    with locked(tiny, "writing to"), pytest.raises(BadInput, match="another process is writing"):
+        generate(tiny, "tiny", 0)
+
+
+def test_what_a_kill_or_a_careless_hand_left_is_repaired(tiny, copy):
+    (copy / "dataset.json").rename(copy / ".dataset.json.tmp")  # killed before the first file was in place
+    for path in (copy / "train", copy / "val", copy / "test"):
+        shutil.rmtree(path)
+    assert generate(copy, "tiny", 0) == 6
+    (copy / "test" / "cornell_box" / "000" / "clip.json").unlink()
+    assert generate(copy, "tiny", 0) == 1
+    assert digest(copy) == digest(tiny)
+
+
+def test_a_data_set_is_not_continued_with_other_versions(copy):
+    facts = json.loads((copy / "dataset.json").read_text())
+    facts["versions"]["mitsuba"] = "3.0.0"
+    (copy / "dataset.json").write_text(json.dumps(facts))
+    assert generate(copy, "tiny", 0) == 0  # nothing to render
+    shutil.rmtree(copy / "val" / "cornell_box" / "000")
+    with pytest.raises(BadInput, match=r"begun with mitsuba 3.0.0"):
+        generate(copy, "tiny", 0)
 
 
 def test_folder_of_something_else_is_left_alone(tmp_path):
@@ -216,3 +256,5 @@ def test_other_seed_or_profile_needs_another_folder(tiny):
         generate(tiny, "quick", 0)
     with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
         plan("huge", 0)
+    with pytest.raises(BadInput, match="negative"):
+        plan("tiny", -1)

@@ -94,6 +94,22 @@ def test_radiance_is_float32_where_float16_would_lose(tmp_path, value, dtype):
     assert clip.facts["clamped"]["indirect"] == 0
 
 
+@pytest.mark.parametrize("value", [1e-8, 0.25, 65504.0, 1e5])
+def test_constant_radiance_keeps_its_value(tmp_path, value):
+    frames = random_frames()
+    for frame in frames:
+        frame["emission"][:] = value
+    clip = write(tmp_path / "clip", frames)
+    assert "value" in clip.channels["emission"]
+    np.testing.assert_allclose(clip.read("emission", 1), value, rtol=1e-6)
+
+
+def test_one_dark_frame_among_bright_ones_keeps_its_precision(tmp_path):
+    frames = random_frames()
+    frames[2]["direct"] *= 1e-7
+    assert write(tmp_path / "clip", frames).channels["direct"]["dtype"] == "<f4"
+
+
 def test_a_few_tiny_values_among_normal_ones_do_not_cost_precision_twice(tmp_path):
     frames = random_frames()
     frames[0]["direct"][0, 0] = 1e-9

@@ -63,6 +63,7 @@ def test_identical_constant_and_one_pixel_images():
     opposite = image_metrics(black, white, 1.0)
     assert opposite["psnr"] == 0 and opposite["rmse"] == 1 and 0 <= opposite["ssim"] < 0.01
     assert image_metrics(black, torch.zeros(2, 3, 16, 16), 1.0)["psnr"] == 100
+    assert same["flip"] == 0 and opposite["flip"] > 0.9
     one = image_metrics(torch.full((1, 3, 1, 1), 0.5), torch.full((2, 3, 1, 1), 0.25), 1.0)
     assert one["ssim"] is None and one["mse_unbiased"] == pytest.approx(0.0625)
 
@@ -122,7 +123,7 @@ def test_display_and_luminance():
 
 
 METRICS = {
-    *("mse", "rmse", "l1", "psnr", "ssim", "mse_unbiased", "smape", "rel_mse"),
+    *("mse", "rmse", "l1", "psnr", "ssim", "flip", "mse_unbiased", "smape", "rel_mse"),
     *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1"),
 }
 

@@ -9,7 +9,7 @@ from test_operators import flat_frame
 
 import models
 from datasets.clip import Dataset
-from datasets.frame import read_frame
+from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models.rae import RAE, RAEState
 from models.weights import load_weights, save_weights
@@ -50,14 +50,15 @@ def test_any_size(denoisers, name, size):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_change_of_size_starts_anew(denoisers, name):
-    a, b = flat_frame(20, 24), flat_frame(33, 16)
+    """Also where both sizes are padded alike, and for another batch size."""
+    a, b = flat_frame(20, 20), flat_frame(30, 30, depth=50.0, irradiance=torch.full((1, 3, 30, 30), 1000.0))
     torch.testing.assert_close(run(denoisers[name], [a, a, b])[2], run(denoisers[name], [b])[0])
+    two = Frame.stack([b, b])
+    torch.testing.assert_close(run(denoisers[name], [b, two])[1], run(denoisers[name], [two])[0])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_batch_items_do_not_mix(tiny, denoisers, name):
-    from datasets.frame import Frame
-
     clips = Dataset(tiny).clips("train")
     single = [[read_frame(clip, i, denoisers[name].reads) for i in range(2)] for clip in clips]
     together = run(denoisers[name], [Frame.stack(step) for step in zip(*single, strict=True)])[1]

@@ -84,12 +84,13 @@ def test_gains_scale_input_and_target_alike(tiny):
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
-def test_loss_and_gradients_are_finite_at_the_extremes(tiny, level):
+@pytest.mark.parametrize("gain", [0.0, 1.0, 2.0])
+def test_loss_and_gradients_are_finite_at_the_extremes(tiny, level, gain):
     batch = batch_of(tiny, 1)
     for frame in batch.frames:
         for name in ("direct", "indirect", "direct_reference", "indirect_reference"):
             frame.channels[name] = torch.full_like(frame.channels[name], level)
-        frame.gain.zero_()
+        frame.gain.fill_(gain)
     loss = RAELoss(RAE())
     value, _ = loss(batch)
     value.backward()
@@ -98,41 +99,30 @@ def test_loss_and_gradients_are_finite_at_the_extremes(tiny, level):
 
 
 def test_gradients_through_time_equal_finite_differences(tiny):
-    """In float64, along a random direction of all weights."""
+    """The loss of the last frame alone, in float64, along a random change of the first frame's light."""
     batch = batch_of(tiny, 1)
     torch.manual_seed(2)
     loss = RAELoss(RAE()).double()
+    loss.frame_weights = (0.0,) * 6 + (1.0,)
+    loss.temporal = 0.0  # it would reach one frame back without any recurrence
     for frame in batch.frames:
         frame.channels.update({name: tensor.double() for name, tensor in frame.channels.items()})
-    # predict() returns float32 for autocast's sake; differentiate its float64 network output instead.
-    rae = loss.denoiser
-    network = rae.network
+        frame.gain.data = frame.gain.double()
+        frame.channels["direct"] = frame.direct + 0.1  # away from zero, where the power's slope is infinite
+    first = batch.frames[0]
+    light = first.direct
+    direction = torch.randn_like(light) * light
 
-    def value() -> torch.Tensor:
-        hidden, total = None, torch.zeros((), dtype=torch.float64)
-        for t, frame in enumerate(batch.frames[:3]):
-            x = torch.cat(
-                [frame.irradiance("total") ** 0.2, frame.view_normal()[:, :2], frame.depth, frame.roughness], 1
-            )
-            p, hidden = network(x, hidden)
-            total = total + (t == 2) * (p - frame.reference_irradiance("total") ** 0.2).square().mean()
-        return total
+    def value(step: float) -> torch.Tensor:
+        first.channels["direct"] = light + step * direction
+        return loss(batch)[0]
 
-    parameters = list(network.parameters())
-    gradient = torch.autograd.grad(value(), parameters)
-    direction = [torch.randn_like(p) * p.abs().mean() for p in parameters]
-    slope = sum((g * d).sum() for g, d in zip(gradient, direction, strict=True)).item()
-    step, sides = 1e-6, []
-    for sign in (1, -1):
-        with torch.no_grad():
-            for p, d in zip(parameters, direction, strict=True):
-                p.add_(sign * step * d)
-            sides.append(value().item())
-            for p, d in zip(parameters, direction, strict=True):
-                p.sub_(sign * step * d)
-    assert (sides[0] - sides[1]) / (2 * step) == pytest.approx(slope, rel=1e-3)
-    first_layer = torch.autograd.grad(value(), network.recurrent[0].merge.weight)[0]
-    assert first_layer.abs().sum() > 0
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(value(step), step)
+    with torch.no_grad():
+        difference = (value(1e-5) - value(-1e-5)) / 2e-5
+    assert abs(slope) > 1e-7
+    assert slope.item() == pytest.approx(difference.item(), rel=1e-3)
 
 
 def test_learning_rate_is_the_paper_s():
@@ -183,6 +173,15 @@ def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, short, mo
     assert train("rae", tiny, tmp_path / "resumed", "tiny") == resumed and resumed.stat().st_mtime_ns == before
     with pytest.raises(BadInput, match="another recipe, seed or data set"):
         train("rae", tiny, tmp_path / "resumed", "tiny", seed=1)
+    with pytest.raises(BadInput, match="a training in 32-true"):
+        train("rae", tiny, tmp_path / "resumed", "tiny", precision="bf16-mixed")
+    resumed.unlink()
+    with pytest.raises(BadInput, match="no weights"):
+        train("rae", tiny, tmp_path / "resumed", "tiny")
+    checkpoint = folder / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(BadInput, match=r"checkpoint.pt is damaged"):
+        train("rae", tiny, tmp_path / "resumed", "tiny")
 
 
 def test_training_writes_recipe_and_curves(tiny, tmp_path, short):
@@ -224,10 +223,20 @@ def test_non_finite_losses_are_skipped_counted_and_finally_refused(tiny, tmp_pat
     monkeypatch.setattr(RAELoss, "forward", forward)
     monkeypatch.setattr("train.loop.MOST_SKIPPED_IN_A_ROW", 3)
     training = Training("rae", tiny, tmp_path / "one", "tiny", 0, "32-true")
+    training.folder.mkdir(parents=True)
     for _ in training.steps():
         pass
     assert training.skipped == 1
     assert all(torch.isfinite(p).all() for p in training.loss.parameters())
+    # A finite loss with a gradient that is not is skipped too.
+    before = [p.clone() for p in training.loss.parameters()]
+    hook = next(training.loss.parameters()).register_hook(lambda gradient: gradient * math.nan)
+    next(training.steps())
+    hook.remove()
+    assert training.skipped == 2
+    assert all(torch.equal(p, q) for p, q in zip(before, training.loss.parameters(), strict=True))
+    training.keep_best(math.nan)
+    assert not (training.folder / "best.safetensors").exists()
     broken.clear()
     with pytest.raises(BadInput, match="not finite in 3 steps in a row"):
         train("rae", tiny, tmp_path / "all", "tiny", precision="32-true")
