@@ -25,12 +25,19 @@ def data_folder(data: Path | None, profile: str) -> Path:
     return Path("data") / profile if data is None else data
 
 
-def dataset(data: Data = None, profile: Profile = "quick", seed: int = 0) -> None:
+PartArgument = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="K/N", help="render only the K-th of N disjoint shares, to spread the work over machines"),
+]
+
+
+def dataset(data: Data = None, profile: Profile = "quick", seed: int = 0, part: PartArgument = None) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.job import generate
+    from datasets.job import Part, generate
 
     folder = data_folder(data, profile)
-    print(f"{folder}: {generate(folder, profile, seed)} clips rendered")
+    rendered = generate(folder, profile, seed, Part.parse(part) if part else None)
+    print(f"{folder}: {rendered} clips rendered")
 
 
 def verify(folder: Folder) -> None:
@@ -75,7 +82,14 @@ def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), pr
     run(data_folder(data, profile), runs, profile, list(names) or None)
 
 
-COMMANDS = {"dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate}
+def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]) -> None:
+    """Write one multi-layer OpenEXR file a frame of a clip's folder (such as data/quick/test/cornell_box/000)."""
+    from datasets.exr import export_clip
+
+    print(f"{out}: {export_clip(clip, out)} files")
+
+
+COMMANDS = {"dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate, "exr": exr}
 
 
 def main(arguments: list[str] | None = None) -> None:

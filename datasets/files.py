@@ -13,7 +13,7 @@ from errors import BadInput
 
 def write_file(path: Path, content: bytes) -> None:
     """Write atomically: whatever fails, what stood at `path` before still does. Raises OSError, on a full disk too."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # of this process: others may write the same file
     try:
         temporary.write_bytes(content)
         os.replace(temporary, path)

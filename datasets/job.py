@@ -1,6 +1,10 @@
 """The generation job: render the clips of a profile that are not there yet."""
 
+import fcntl
+import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -10,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from datasets.clip import SCHEMA, SPLITS, Dataset
-from datasets.files import locked, read_json, write_json
+from datasets.files import read_json, write_json
 from datasets.writer import ClipWriter
 from errors import BadInput
 from render.clip import Sampling, render_clip
@@ -94,6 +98,28 @@ def check_versions(dataset: Dataset, here: dict[str, str]) -> None:
         raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
+def is_clip(path: Path) -> bool:
+    """Whether a whole clip stands at `path`: clips appear by renaming, with clip.json inside."""
+    return (path / "clip.json").exists()
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Claim a clip for this process while it renders. Yields False where another process has it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    claim = path.with_name(f".{path.name}.lock")
+    with claim.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            claim.unlink(missing_ok=True)
+
+
 def render_to(destination: Path, scene_name: str, profile: DataProfile, split: str, seed: int) -> None:
     """Render one clip, whole or not at all. Deterministic in its arguments."""
     scene = build_scene(scene_name, seed, profile.frames)
@@ -111,18 +137,55 @@ def render_to(destination: Path, scene_name: str, profile: DataProfile, split: s
         writer.finish(facts, {} if scene.moves() else {"motion": "camera"})
 
 
-def generate(root: Path, profile: str, seed: int) -> int:
-    """Render what is missing of `profile`'s data set at `root`. Returns how many clips were rendered."""
+@dataclass(frozen=True)
+class Part:
+    """Share `index` (from 1) of `count` disjoint ones of a data set's clips."""
+
+    index: int
+    count: int
+
+    @staticmethod
+    def parse(text: str) -> "Part":
+        """From "K/N". Raises BadInput unless 1 <= K <= N."""
+        match = re.fullmatch(r"(\d+)/(\d+)", text)
+        part = Part(int(match[1]), int(match[2])) if match else Part(0, 0)
+        if not 1 <= part.index <= part.count:
+            raise BadInput(f"'{text}' is not a part: write K/N with K from 1 to N, such as 2/8")
+        return part
+
+
+def generate(root: Path, profile: str, seed: int, part: Part | None = None) -> int:
+    """Render what is missing of `profile`'s data set at `root`, or of one part of it. Returns how many clips were.
+
+    Several jobs may work on one folder, on machines that share it or not: each clip is rendered by one of them, and
+    merged folders of disjoint parts are the whole. A clip that fails is left out and the rest goes on.
+    Raises BadInput at the end, naming the first clip that failed; OSError at once, for a full disk fills for all.
+    """
     wanted = plan(profile, seed)
     check_folder(root)
     root.mkdir(parents=True, exist_ok=True)
-    with locked(root, "writing to"):
-        begin(root, wanted)
-        dataset = Dataset(root)
-        missing = [path for path in dataset.planned() if not (path / "clip.json").exists()]
-        if missing:
-            check_versions(dataset, wanted["versions"])
-        for path in tqdm(missing, "clips", unit="clip"):
-            split, scene, index = path.parts[-3:]
-            render_to(path, scene, DATA_PROFILES[profile], split, clip_seed(seed, scene, split, int(index)))
-    return len(missing)
+    begin(root, wanted)
+    dataset = Dataset(root)
+    first, step = (part.index - 1, part.count) if part else (0, 1)
+    missing = [path for path in dataset.planned()[first::step] if not is_clip(path)]
+    if missing:
+        check_versions(dataset, wanted["versions"])
+    rendered, failed = 0, dict[Path, Exception]()
+    for path in tqdm(missing, "clips", unit="clip"):
+        split, scene, index = path.parts[-3:]
+        with claimed(path) as ours:
+            if not ours:
+                tqdm.write(f"{path}: left to another process, which is rendering it")
+            elif not is_clip(path):
+                try:
+                    render_to(path, scene, DATA_PROFILES[profile], split, clip_seed(seed, scene, split, int(index)))
+                    rendered += 1
+                except (RuntimeError, ValueError) as error:
+                    failed[path] = error
+                    tqdm.write(f"{path}: failed, the rest goes on: {error}")
+    if failed:
+        path, first_error = next(iter(failed.items()))
+        raise BadInput(
+            f"{len(failed)} of {len(missing)} clips failed and can be tried again, first {path}: {first_error}"
+        ) from first_error
+    return rendered

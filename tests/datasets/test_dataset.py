@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import datasets.job
 from datasets.clip import Clip, Dataset
-from datasets.files import locked
-from datasets.inspect import check_clip, info, verify
-from datasets.job import DATA_PROFILES, clip_seed, generate, plan
+from datasets.inspect import check_clip, difficulty, info, verify
+from datasets.job import DATA_PROFILES, Part, claimed, clip_seed, generate, plan
+from datasets.writer import ClipWriter
 from errors import BadInput
 from render.clip import render_clip
 from scenes import build_scene
@@ -30,7 +31,7 @@ def digest(root: Path) -> dict[str, str]:
     return {
         str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and path.name not in ("timing.json", ".lock")
+        if path.is_file() and path.name not in ("timing.json",) and not path.name.startswith(".")
     }
 
 
@@ -132,8 +133,34 @@ def test_damaged_headers_and_json_of_another_form_are_bad_input(copy):
 def test_info_tells_sizes_floors_and_what_is_missing(copy):
     shutil.rmtree(copy / "val" / "cornell_box" / "000")
     text = info(copy)
-    for word in ("floor dB", "dual_motion", "derived", "value", "missing", "test/cornell_box_moving/000"):
+    for word in ("floor dB", "P95/P5", "dual_motion", "derived", "value", "missing", "test/cornell_box_moving/000"):
         assert word in text
+
+
+def test_difficulty_by_hand(tmp_path):
+    """Half of the pixels black at 1 spp, the others twice the reference of 1; one firefly; a dark tenth."""
+    shape = (40, 50)
+    reference = np.ones((*shape, 3))
+    reference[:4] = 0.01  # a tenth of the rows
+    noisy = 2 * reference
+    noisy[:, ::2] = 0
+    frame = {
+        "direct": noisy[None] / 2,
+        "indirect": np.zeros((1, *shape, 3)),
+        "direct_reference": np.stack([reference, reference]) / 2,
+        "indirect_reference": np.zeros((2, *shape, 3)),
+        "emission": np.full((*shape, 3), 7.0),
+        "albedo": np.full((*shape, 3), 0.5),
+        "mesh_id": np.ones((*shape, 1)),
+    }
+    with ClipWriter(tmp_path / "clip") as writer:
+        writer.add(frame, {})
+        writer.finish({}, {})
+    zeros, relative_mse, peak, contrast = difficulty(Clip(tmp_path / "clip"))
+    assert zeros == pytest.approx(0.5)
+    assert relative_mse == pytest.approx((reference[..., 0] ** 2).mean() / reference[..., 0].mean() ** 2, rel=1e-3)
+    assert peak == pytest.approx(2 / noisy.mean(), rel=1e-3)
+    assert contrast == pytest.approx(100, rel=1e-2)
 
 
 def test_missing_clip_and_other_schema(copy):
@@ -211,12 +238,49 @@ def test_full_disk_is_one_clear_line_and_leaves_whole_clips_only(tmp_path):
     run = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit, env=environment)
     assert run.returncode == 2, run.stderr
     assert "run it again" in run.stderr.splitlines()[-1] and "Traceback" not in run.stderr
-    assert [path for path in root.rglob("*") if path.is_file() and path.name not in ("dataset.json", ".lock")] == []
+    assert [path for path in root.rglob("*") if path.is_file() and path.name != "dataset.json"] == []
 
 
-def test_two_jobs_on_one_folder(tiny):
-    with locked(tiny, "writing to"), pytest.raises(BadInput, match="another process is writing"):
-        generate(tiny, "tiny", 0)
+def test_two_jobs_on_one_folder_share_the_work(copy, tiny):
+    """A clip that another process renders is left to it; the rest goes on."""
+    theirs, ours = copy / "val" / "cornell_box" / "000", copy / "train" / "cornell_box" / "000"
+    for path in (theirs, ours):
+        shutil.rmtree(path)
+    with claimed(theirs) as claim:
+        assert claim
+        assert generate(copy, "tiny", 0) == 1
+        assert ours.exists() and not theirs.exists()
+    assert generate(copy, "tiny", 0) == 1
+    assert digest(copy) == digest(tiny)
+
+
+def test_parts_are_disjoint_and_their_union_is_the_whole(tiny, tmp_path):
+    shares = [tmp_path / str(k) for k in (1, 2, 3, 4)]
+    counts = [generate(share, "tiny", 0, Part.parse(f"{k}/4")) for k, share in enumerate(shares, 1)]
+    assert sum(counts) == 6 and max(counts) - min(counts) <= 1
+    for share in shares[1:]:
+        shutil.copytree(share, shares[0], dirs_exist_ok=True)
+    assert digest(shares[0]) == digest(tiny)
+    for text in ("0/4", "5/4", "1/0", "x", "1", "-1/2"):
+        with pytest.raises(BadInput, match="K/N"):
+            Part.parse(text)
+
+
+def test_a_clip_that_fails_does_not_stop_the_others(copy, monkeypatch):
+    for scene in ("cornell_box", "cornell_box_moving"):
+        shutil.rmtree(copy / "val" / scene / "000")
+    genuine = datasets.job.build_scene
+
+    def broken(name, seed, frames):
+        if name == "cornell_box":
+            raise RuntimeError("no such texture")
+        return genuine(name, seed, frames)
+
+    monkeypatch.setattr(datasets.job, "build_scene", broken)
+    with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
+        generate(copy, "tiny", 0)
+    assert (copy / "val" / "cornell_box_moving" / "000" / "clip.json").exists()
+    assert not list((copy / "val" / "cornell_box").glob("*"))
 
 
 def test_what_a_kill_or_a_careless_hand_left_is_repaired(tiny, copy):
