@@ -26,7 +26,7 @@ $(READY): pyproject.toml
 	@$(BIN)/python -c 'import render.backend' >/dev/null 2>&1 || { \
 		if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq $(LLVM); \
 		elif sudo -n true 2>/dev/null; then sudo apt-get update -qq && sudo apt-get install -y -qq $(LLVM); fi; } || true
-	@$(BIN)/python -c 'import render.backend' || { echo "see 'Set-up' in README.md"; exit 1; }
+	@$(BIN)/python -c 'import render.backend' || exit 1
 	@touch $(READY)
 
 dataset: $(READY)

@@ -18,17 +18,15 @@ Precision = Annotated[
     Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
 ]
 Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
+PartArgument = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="K/N", help="render only the K-th of N disjoint shares, to spread the work over machines"),
+]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 
 
 def data_folder(data: Path | None, profile: str) -> Path:
     return Path("data") / profile if data is None else data
-
-
-PartArgument = Annotated[
-    str | None,
-    tyro.conf.arg(metavar="K/N", help="render only the K-th of N disjoint shares, to spread the work over machines"),
-]
 
 
 def dataset(data: Data = None, profile: Profile = "quick", seed: int = 0, part: PartArgument = None) -> None:

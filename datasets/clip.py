@@ -21,6 +21,11 @@ WHOLE = (slice(None), slice(None))
 Window = tuple[slice, slice]  # rows, columns
 
 
+def is_clip(path: Path) -> bool:
+    """Whether a whole clip stands at `path`: clips appear by renaming, with clip.json inside."""
+    return (path / "clip.json").exists()
+
+
 class Clip:
     """One clip on disk. Nothing is read until it is asked for, and then only the window asked for.
 
@@ -137,7 +142,7 @@ class Dataset:
     def clips(self, split: str) -> list[Clip]:
         """The clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
         paths = self.planned([split])
-        missing = [path for path in paths if not (path / "clip.json").exists()]
+        missing = [path for path in paths if not is_clip(path)]
         if missing:
             raise BadInput(
                 f"{self.path}: {len(missing)} of {len(paths)} clips of '{split}' are missing, first {missing[0]}; "

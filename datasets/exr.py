@@ -1,7 +1,6 @@
 """OpenEXR exchange: one multi-layer file a frame, readable by other tools, and back without loss."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
+from datasets.files import replacing
 from errors import BadInput
 from scenes.camera import View, rigid_inverse
 
@@ -52,15 +52,11 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
         "worldToCamera": np.ascontiguousarray(rigid_inverse(view.camera_to_world).T, np.float32),
         ATTRIBUTE: json.dumps(facts),
     }
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with OpenEXR.File(header, planes) as file:
+        with replacing(path) as temporary, OpenEXR.File(header, planes) as file:
             file.write(str(temporary))
-        os.replace(temporary, path)
     except RuntimeError as error:  # OpenEXR's word for a full or unwritable disk
         raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]:

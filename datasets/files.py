@@ -11,14 +11,21 @@ from typing import Any
 from errors import BadInput
 
 
-def write_file(path: Path, content: bytes) -> None:
-    """Write atomically: whatever fails, what stood at `path` before still does. Raises OSError, on a full disk too."""
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path that takes the place of `path` at the end; whatever fails, what stood there still does."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # of this process: others may write the same file
     try:
-        temporary.write_bytes(content)
+        yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write atomically. Raises OSError, on a full disk too."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -40,11 +47,19 @@ def read_json(path: Path, keys: Sequence[str] = ()) -> dict[str, Any]:
 
 
 @contextmanager
-def locked(folder: Path, doing: str) -> Iterator[None]:
-    """Hold a folder's lock. Raises BadInput where another process is `doing` something there."""
-    with (folder / ".lock").open("w") as lock:
+def locked(lock: Path) -> Iterator[bool]:
+    """Hold the lock file `lock` until the end, then remove it. Yields False, without it, where another process does.
+
+    The system lets go of the lock of a process that dies, so a file left behind locks nobody out.
+    """
+    with lock.open("w") as file:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BadInput(f"another process is {doing} {folder}: wait for it or use another folder") from None
-        yield
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            ours = lock.stat().st_ino == os.fstat(file.fileno()).st_ino  # else its last holder has just removed it
+        except (BlockingIOError, FileNotFoundError):
+            ours = False
+        try:
+            yield ours
+        finally:
+            if ours:
+                lock.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS
-from datasets.clip import Clip, Dataset
+from datasets.clip import Clip, Dataset, is_clip
 from datasets.display import luminance, psnr
 from datasets.files import read_json
 from errors import BadInput
@@ -110,7 +110,7 @@ def info(root: Path) -> str:
     sizes, storage = dict.fromkeys(CHANNELS, 0), {name: set[str]() for name in CHANNELS}
     for path in dataset.planned():
         label = str(path.relative_to(root))
-        if not (path / "clip.json").exists():
+        if not is_clip(path):
             rows.append([label, "missing"])
             continue
         clip = Clip(path)

@@ -1,10 +1,7 @@
 """The generation job: render the clips of a profile that are not there yet."""
 
-import fcntl
 import re
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,8 +10,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from datasets.clip import SCHEMA, SPLITS, Dataset
-from datasets.files import read_json, write_json
+from datasets.clip import SCHEMA, SPLITS, Dataset, is_clip
+from datasets.files import locked, read_json, write_json
 from datasets.writer import ClipWriter
 from errors import BadInput
 from render.clip import Sampling, render_clip
@@ -98,28 +95,6 @@ def check_versions(dataset: Dataset, here: dict[str, str]) -> None:
         raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
-def is_clip(path: Path) -> bool:
-    """Whether a whole clip stands at `path`: clips appear by renaming, with clip.json inside."""
-    return (path / "clip.json").exists()
-
-
-@contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Claim a clip for this process while it renders. Yields False where another process has it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    claim = path.with_name(f".{path.name}.lock")
-    with claim.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-            return
-        try:
-            yield True
-        finally:
-            claim.unlink(missing_ok=True)
-
-
 def render_to(destination: Path, scene_name: str, profile: DataProfile, split: str, seed: int) -> None:
     """Render one clip, whole or not at all. Deterministic in its arguments."""
     scene = build_scene(scene_name, seed, profile.frames)
@@ -173,7 +148,8 @@ def generate(root: Path, profile: str, seed: int, part: Part | None = None) -> i
     rendered, failed = 0, dict[Path, Exception]()
     for path in tqdm(missing, "clips", unit="clip"):
         split, scene, index = path.parts[-3:]
-        with claimed(path) as ours:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path.with_name(f".{path.name}.lock")) as ours:
             if not ours:
                 tqdm.write(f"{path}: left to another process, which is rendering it")
             elif not is_clip(path):

@@ -30,7 +30,8 @@ def save_strip(
     for axis, (name, image) in zip(axes[0], images.items(), strict=True):
         axis.imshow(display(finite(image), exposure)[0].permute(1, 2, 0).numpy(), interpolation="nearest")
         axis.set_axis_off()
-        caption = [f"{key.upper()} {value:.3f}" for key in ("rmse", "ssim") if (value := errors.get(name, {}).get(key))]
+        measured = {key: errors.get(name, {}).get(key) for key in ("rmse", "ssim")}
+        caption = [f"{key.upper()} {value:.3f}" for key, value in measured.items() if value is not None]
         axis.set_title("\n".join([name, "  ".join(caption)]), fontsize=8, pad=2)
     figure.subplots_adjust(left=0, right=1, bottom=0, top=1 - CAPTION / size[1], wspace=0.01)
     buffer = io.BytesIO()

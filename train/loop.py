@@ -188,7 +188,9 @@ def train(name: str, data: Path, runs: Path, profile: str, seed: int = 0, precis
     training = Training(name, data, runs, profile, seed, precision)
     training.folder.mkdir(parents=True, exist_ok=True)
     best, weights = training.folder / BEST, training.folder / WEIGHTS
-    with locked(training.folder, "training in"):
+    with locked(training.folder / ".lock") as ours:
+        if not ours:
+            raise BadInput(f"another process is training in {training.folder}: wait for it or use another --runs")
         if training.epoch < training.recipe.epochs:
             run(training)
         if best.exists():  # only a finished training has WEIGHTS

@@ -24,5 +24,5 @@ def step_seconds(device: torch.device, bfloat16: bool) -> float:
 
 
 def fastest_precision(device: torch.device) -> str:
-    """ "bf16-mixed" where the processor is fast at it, else "32-true" (Fabric's names)."""
+    """Fabric's name of it: bf16-mixed where the processor is fast at it, else 32-true."""
     return "bf16-mixed" if step_seconds(device, False) > WORTHWHILE * step_seconds(device, True) else "32-true"

@@ -16,8 +16,9 @@ import pytest
 
 import datasets.job
 from datasets.clip import Clip, Dataset
+from datasets.files import locked
 from datasets.inspect import check_clip, difficulty, info, verify
-from datasets.job import DATA_PROFILES, Part, claimed, clip_seed, generate, plan
+from datasets.job import DATA_PROFILES, Part, clip_seed, generate, plan
 from datasets.writer import ClipWriter
 from errors import BadInput
 from render.clip import render_clip
@@ -246,7 +247,7 @@ def test_two_jobs_on_one_folder_share_the_work(copy, tiny):
     theirs, ours = copy / "val" / "cornell_box" / "000", copy / "train" / "cornell_box" / "000"
     for path in (theirs, ours):
         shutil.rmtree(path)
-    with claimed(theirs) as claim:
+    with locked(theirs.with_name(".000.lock")) as claim:
         assert claim
         assert generate(copy, "tiny", 0) == 1
         assert ours.exists() and not theirs.exists()
