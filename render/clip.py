@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from render.gbuffer import render_gbuffer
 from render.motion import dual_motion
-from render.path import render_radiance
+from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Scene
 from scenes.camera import motion_vectors, pixel_centres
@@ -36,6 +36,7 @@ def render_clip(
     Deterministic in its arguments on one variant and processor.
     """
     stage = Stage(scene, height, width)
+    tracer = PathTracer(stage)
     centres = pixel_centres(height, width)
     ahead, clock = render_gbuffer(stage, stage.view(0)), Clock()
     ahead["motion"] = ahead["dual_motion"] = np.zeros((height, width, 2))
@@ -61,7 +62,7 @@ def render_clip(
             ("", 0, sampling.realisations, sampling.noisy_spp),
             ("_reference", 1, 2, sampling.reference_spp // 2),
         ):
-            images = [render_radiance(stage, ray, stream_seed(seed, frame, kind, i), spp) for i in range(count)]
+            images = [tracer.radiance(ray, stream_seed(seed, frame, kind, i), spp) for i in range(count)]
             channels["direct" + name] = np.stack([direct for direct, _ in images])
             channels["indirect" + name] = np.stack([indirect for _, indirect in images])
             clock.lap("reference" if name else "noisy")

@@ -30,16 +30,19 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArr
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     """The noise-free channels (H, W, C) of the design's table, as the stage is now posed.
 
-    albedo: in [0, 1], diffuse reflectance of the surface seen, 1 for background. normal: world space, unit, toward
-    the viewer, 0 for background. roughness: GGX alpha, 1 for diffuse surfaces. emission: radiance seen directly.
+    albedo, in [0, 1]: diffuse reflectance and specular reflectance at normal incidence, 1 for background. normal: world
+    space, unit, toward the viewer, 0 for background. roughness: GGX alpha, 1 for diffuse surfaces and background.
+    emission: radiance seen directly.
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     hit = si.is_valid()
     normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+    albedo, roughness = stage.materials.evaluate(si, hit)
     channels = {
         "normal": dr.select(hit, normal, 0),
-        "albedo": dr.select(hit, dr.clip(si.bsdf().eval_diffuse_reflectance(si, hit), 0, 1), 1),
+        "albedo": albedo,
+        "roughness": roughness,
         "emission": si.emitter(stage.mitsuba_scene).eval(si),
         "mesh_id": stage.mesh_id(si),
     }
@@ -47,5 +50,4 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     shape = (stage.height, stage.width, -1)
     arrays: dict[str, NDArray[Any]] = {name: np.array(value).T.reshape(shape) for name, value in channels.items()}
     arrays["depth"] = depth_along_axis(si, ray, view).reshape(shape)
-    arrays["roughness"] = np.ones_like(arrays["depth"])
     return arrays

@@ -47,20 +47,27 @@ def bounce(scene: Any, si: Any, throughput: Any, active: Any, sampler: Sampler) 
     return radiance, following, throughput, active & following.is_valid()
 
 
-def trace_paths(scene: Any, si: Any, sampler: Sampler, max_depth: int) -> tuple[Any, Any]:
-    """One sample of (direct, indirect) radiance, both mi.Color3f, leaving the primary hits `si` toward the camera."""
-    throughput, active = mi.Color3f(1), si.is_valid()
-    direct, si, throughput, active = bounce(scene, si, throughput, active, sampler)
+@dr.syntax
+def trace_paths(scene: Any, primary: Any, key: Any, index: Any, max_depth: Any) -> tuple[Any, Any]:
+    """One sample of (direct, indirect) radiance, both mi.Color3f, leaving the hits `primary` toward the camera."""
+    throughput, active = mi.Color3f(1), primary.is_valid()
+    direct, si, throughput, active = bounce(scene, primary, throughput, active, Sampler(key, index))
     indirect = mi.Color3f(0)
-    for _ in range(max_depth - 2):
+    depth = mi.UInt32(2)
+    while active & (depth < max_depth):
+        sampler = Sampler(hash32(key ^ depth), index)
         radiance, si, throughput, active = bounce(scene, si, throughput, active, sampler)
         indirect += radiance
+        depth += 1
     return direct, indirect
 
 
 @dr.syntax
-def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: int) -> tuple[Any, Any]:
-    """Mean direct and indirect radiance of `spp` (mi.UInt32) samples a ray, summed lane by lane in a fixed order."""
+def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: Any) -> tuple[Any, Any]:
+    """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
+
+    `seed`, `spp` and `max_depth` are opaque mi.UInt32: one kernel serves all their values.
+    """
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     lane = dr.arange(mi.UInt32, dr.width(ray))
     # Hash the lane before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
@@ -68,7 +75,7 @@ def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: int) -> tu
     direct, indirect = mi.Color3f(0), mi.Color3f(0)
     index = mi.UInt32(0)
     while index < spp:
-        sample_direct, sample_indirect = trace_paths(scene, si, Sampler(key, index), max_depth)
+        sample_direct, sample_indirect = trace_paths(scene, si, key, index, max_depth)
         direct += sample_direct
         indirect += sample_indirect
         index += 1
@@ -76,13 +83,24 @@ def sample_mean(scene: Any, ray: Any, seed: Any, spp: Any, max_depth: int) -> tu
     return direct / count, indirect / count
 
 
-def render_radiance(stage: Stage, ray: Any, seed: int, spp: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(direct, indirect) radiance (H, W, 3) toward the camera along the primary `ray`s, as the stage is now posed.
+class PathTracer:
+    """Path-traces the scene on a stage, as that is posed at the time."""
 
-    `seed` in [0, 2^32); different seeds are independent, equal seeds give equal bytes. Emission is not included.
-    """
-    opaque_seed, opaque_spp = (mi.UInt32(np.array([number], np.uint32)) for number in (seed, spp))
-    images = sample_mean(stage.mitsuba_scene, ray, opaque_seed, opaque_spp, stage.scene.max_depth)
-    dr.eval(images)
-    direct, indirect = (np.array(image).T.reshape(stage.height, stage.width, 3) for image in images)
-    return direct, indirect
+    def __init__(self, stage: Stage):
+        self.stage, self.pose = stage, -1
+
+    def radiance(self, ray: Any, seed: int, spp: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary `ray`s of all pixels.
+
+        `seed` in [0, 2^32); different seeds are independent, equal seeds give equal bytes. Emission is not included.
+        """
+        stage = self.stage
+        if self.pose != stage.poses:
+            # Tracing the program in Python takes longer than running it at 1 spp: frozen, it is replayed. But a frozen
+            # function does not notice all changes of meshes (seen with Dr.Jit 1.5), so it lasts as long as a pose.
+            self.sample_mean, self.pose = dr.freeze(sample_mean), stage.poses
+        numbers = (dr.opaque(mi.UInt32, number) for number in (seed, spp, stage.scene.max_depth))
+        images = self.sample_mean(stage.mitsuba_scene, ray, *numbers)
+        dr.eval(images)
+        direct, indirect = (np.array(image).T.reshape(stage.height, stage.width, 3) for image in images)
+        return direct, indirect

@@ -1,41 +1,42 @@
 """An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from errors import BadInput
 from render.backend import dr, mi
+from render.materials import MaterialTable, registry_index
 from scenes.animation import Scene, Shape
 from scenes.camera import Array, View, directions, pixel_centres
 
-MATERIALS = ("diffuse", "twosided")
 
+def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
+    """A Mitsuba dictionary in which numpy arrays (the data of bitmaps) have become Dr.Jit's."""
 
-def check_material(shape: str, bsdf: dict[str, Any]) -> None:
-    """Raise BadInput for a BSDF whose albedo and roughness the G-buffer could not tell."""
-    if bsdf["type"] not in MATERIALS:
-        raise BadInput(f"shape '{shape}': the material '{bsdf['type']}' is not supported; use {' or '.join(MATERIALS)}")
-    for value in bsdf.values():
-        if isinstance(value, dict) and bsdf["type"] == "twosided":
-            check_material(shape, value)
+    def convert(value: Any) -> Any:
+        if isinstance(value, dict):
+            return to_mitsuba(value)
+        return mi.TensorXf(np.ascontiguousarray(value, np.float32)) if isinstance(value, np.ndarray) else value
+
+    return {key: convert(value) for key, value in description.items()}
 
 
 def load_mesh(shape: Shape) -> Any:
     """A mi.Mesh in the shape's rest pose."""
-    check_material(shape.name, shape.bsdf)
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(shape.bsdf)
+    properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
     if shape.radiance is not None:
         light = {"type": "area", "radiance": {"type": "rgb", "value": shape.radiance.at(0).tolist()}}
         properties["emitter"] = mi.load_dict(light)
+    uv = getattr(shape.mesh.visual, "uv", None)
     mesh = mi.Mesh(
         shape.name,
         vertex_count=len(shape.mesh.vertices),
         face_count=len(shape.mesh.faces),
         has_vertex_normals=shape.smooth,
-        has_vertex_texcoords=False,
+        has_vertex_texcoords=uv is not None,
         props=properties,
     )
     parameters = mi.traverse(mesh)
@@ -43,6 +44,8 @@ def load_mesh(shape: Shape) -> Any:
     parameters["vertex_positions"] = np.float32(shape.mesh.vertices).ravel()
     if shape.smooth:
         parameters["vertex_normals"] = np.float32(shape.mesh.vertex_normals).ravel()
+    if uv is not None:
+        parameters["vertex_texcoords"] = np.float32(uv).ravel()
     parameters.update()
     return mesh
 
@@ -59,32 +62,35 @@ def upload(values: Array) -> Any:
     return mi.Float(buffer[start : start + len(values)])
 
 
+def mesh_ids(shapes: Sequence[Any]) -> Any:
+    """mi.UInt32 table from Mitsuba's registry index of a shape to its place in `shapes` plus one; 0 for no shape."""
+    indices = [int(np.array(registry_index(mi.ShapePtr(shape)))[0]) for shape in shapes]
+    table = np.zeros(max(indices) + 1, np.uint32)
+    table[indices] = np.arange(len(indices)) + 1
+    return mi.UInt32(table)
+
+
 class Stage:
     """`scene` loaded for images of `height` x `width` pixels. `pose` before every use of `mitsuba_scene`."""
 
     def __init__(self, scene: Scene, height: int, width: int):
         self.scene, self.height, self.width = scene, height, width
         meshes = {shape.name: load_mesh(shape) for shape in scene.shapes}
+        sky = {} if scene.sky is None else {"sky": {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}}
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
-        self.mitsuba_scene = mi.load_dict({"type": "scene", **meshes}, optimize=False)
+        self.mitsuba_scene = mi.load_dict({"type": "scene", **meshes, **sky}, optimize=False)
         self.parameters = mi.traverse(self.mitsuba_scene)
-        self.mesh_id_of_shape = self._mesh_ids()
-        self.posed: dict[str, NDArray[Any]] = {}
-        self.pose(0)
-
-    def _mesh_ids(self) -> Any:
-        """mi.UInt32 table from Mitsuba's registry index of a shape to our mesh id; 0 for no shape."""
         loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
-        pointers = [mi.ShapePtr(loaded[shape.name]) for shape in self.scene.shapes]
-        indices = [int(np.array(dr.reinterpret_array(mi.UInt32, pointer))[0]) for pointer in pointers]
-        table = np.zeros(max(indices) + 1, np.uint32)
-        table[indices] = np.arange(len(indices)) + 1
-        return mi.UInt32(table)
+        shapes = [loaded[shape.name] for shape in scene.shapes]
+        self.materials = MaterialTable(shapes)
+        self.mesh_id_of_shape = mesh_ids(shapes)
+        self.posed: dict[str, NDArray[Any]] = {}
+        self.poses = 0  # how often something has changed
+        self.pose(0)
 
     def mesh_id(self, si: Any) -> Any:
         """mi.UInt32: which of the scene's shapes (index + 1) a surface interaction lies on, 0 for none."""
-        index = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self.mesh_id_of_shape, index, si.is_valid())  # type: ignore[arg-type]
+        return dr.gather(mi.UInt32, self.mesh_id_of_shape, registry_index(si.shape), si.is_valid())
 
     def pose(self, frame: float) -> None:
         """Move meshes and set lights to where they are in `frame`. All changes enter the kernels as data."""
@@ -109,6 +115,7 @@ class Stage:
         if changes:
             self.parameters.update()  # once a frame: every update rebuilds the top level of the ray-tracing structure
             self.posed.update(changes)
+            self.poses += 1
 
     def view(self, frame: float) -> View:
         return self.scene.view(frame, self.height, self.width)

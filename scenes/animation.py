@@ -75,8 +75,8 @@ class Shape:
     """A mesh in its rest pose, with one material, perhaps emitting light, perhaps moving."""
 
     name: str
-    mesh: trimesh.Trimesh
-    bsdf: dict[str, Any]  # a Mitsuba BSDF dictionary
+    mesh: trimesh.Trimesh  # with texture coordinates in visual.uv where a texture is to be used
+    bsdf: dict[str, Any]  # a Mitsuba BSDF dictionary; bitmaps have their values as a numpy array under "data"
     radiance: Track | None = None  # emitted radiance (3,), linear RGB; None does not emit
     motion: RigidMotion = STILL
     smooth: bool = False  # shade with the mesh's vertex normals instead of its faces'
@@ -98,6 +98,7 @@ class Scene:
     shapes: tuple[Shape, ...]
     camera: Camera
     max_depth: int = 3  # path edges from the camera to a light: 3 is one indirect bounce
+    sky: Array | None = None  # radiance (H, W, 3) from all directions, latitude-longitude, y up; None is black
 
     def view(self, frame: float, height: int, width: int) -> View:
         """Projection and object poses of `frame` for an image of `height` x `width` pixels."""

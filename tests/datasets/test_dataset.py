@@ -199,7 +199,7 @@ def kill_and_resume(root: Path, rng: np.random.Generator, kills: int) -> int:
         job = subprocess.Popen(
             [*ONESPP, "dataset", "--data", str(root), "--profile", "tiny"], stderr=subprocess.DEVNULL
         )
-        time.sleep(rng.uniform(1.0, 5.0))
+        time.sleep(rng.uniform(0.7, 2.7))
         hit += job.poll() is None
         job.send_signal(signal.SIGKILL)
         job.wait()

@@ -67,7 +67,7 @@ def test_colours_lie_on_their_walls(stage):
 
 def test_unsupported_material_is_named(square):
     shape = replace(square.shapes[0], bsdf={"type": "hair"})
-    with pytest.raises(BadInput, match=r"'square'.*'hair'.*diffuse"):
+    with pytest.raises(BadInput, match=r"'square'.*Hair.*SmoothDiffuse"):
         Stage(replace(square, shapes=(shape,)), 8, 8)
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
-from render.path import render_radiance
+from render.path import PathTracer
 from render.stage import Stage
 from scenes import build_scene
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
@@ -36,34 +36,34 @@ def block_means(images: np.ndarray) -> np.ndarray:
 
 
 def assert_same_mean(ours: np.ndarray, theirs: np.ndarray) -> None:
-    """Blocks of pixels of many independent images (N, H, W, 3) agree: 99 % within 3 standard errors, all within 5."""
+    """Blocks of pixels of many independent images (N, H, W, 3) agree: 98 % within 3 standard errors, all within 5."""
     a, b = block_means(ours), block_means(theirs)
     error = np.sqrt(a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b))
     z = np.abs(a.mean(axis=0) - b.mean(axis=0)) / np.maximum(error, 1e-9)
-    assert (z < 3).mean() >= 0.99
+    assert (z < 3).mean() >= 0.98  # the three colours of a block go together
     assert z.max() < 5
 
 
 def realisations(stage: Stage, count: int, first_seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    ray = stage.rays(stage.view(FRAME))
-    images = [render_radiance(stage, ray, first_seed + i, spp=1) for i in range(count)]
+    ray, radiance = stage.rays(stage.view(FRAME)), PathTracer(stage).radiance
+    images = [radiance(ray, first_seed + i, spp=1) for i in range(count)]
     return np.stack([direct for direct, _ in images]), np.stack([indirect for _, indirect in images])
 
 
 def test_one_spp_images_average_to_the_stock_integrator(stage):
     stage.pose(FRAME)
-    direct, indirect = realisations(stage, 400)
+    direct, indirect = realisations(stage, 1200)
     emission = render_gbuffer(stage, stage.view(FRAME))["emission"]
     np.testing.assert_allclose(emission, stock(stage, 1, 1, 0), atol=1e-6)
-    assert_same_mean(emission + direct, np.stack([stock(stage, 2, 16, s) for s in range(40)]))
-    assert_same_mean(emission + direct + indirect, np.stack([stock(stage, 3, 16, s) for s in range(40)]))
+    assert_same_mean(emission + direct, np.stack([stock(stage, 2, 16, s) for s in range(60)]))
+    assert_same_mean(emission + direct + indirect, np.stack([stock(stage, 3, 16, s) for s in range(60)]))
 
 
 def test_reference_averages_to_the_stock_integrator(stage):
     """Many samples of one seed are stratified, not biased."""
     stage.pose(FRAME)
-    ray = stage.rays(stage.view(FRAME))
-    images = [np.add(*render_radiance(stage, ray, seed, spp=32)) for seed in range(12)]
+    ray, radiance = stage.rays(stage.view(FRAME)), PathTracer(stage).radiance
+    images = [np.add(*radiance(ray, seed, spp=32)) for seed in range(12)]
     emission = render_gbuffer(stage, stage.view(FRAME))["emission"]
     assert_same_mean(emission + np.stack(images), np.stack([stock(stage, 3, 16, 100 + s) for s in range(40)]))
 
@@ -77,13 +77,27 @@ def test_a_scene_may_ask_for_more_bounces():
     assert_same_mean(emission + direct + indirect, np.stack([stock(stage, 5, 16, s) for s in range(30)]))
 
 
+def test_a_replayed_kernel_follows_the_scene(moving):
+    """After other frames were rendered, a frame has the bytes that it has when it is the first one."""
+    tracer, images = PathTracer(moving), {}
+    for frame in (4, 20, 4):
+        moving.pose(frame)
+        ray = moving.rays(moving.view(frame))
+        images[frame] = np.stack([tracer.radiance(ray, seed, 4) for seed in (1, 2)])
+    for frame in (20, 4):
+        moving.pose(frame)
+        ray = moving.rays(moving.view(frame))
+        fresh = np.stack([PathTracer(moving).radiance(ray, seed, 4) for seed in (1, 2)])
+        assert images[frame].tobytes() == fresh.tobytes()
+
+
 def test_equal_seeds_equal_bytes_and_different_seeds_uncorrelated_noise(stage):
     stage.pose(FRAME)
-    ray = stage.rays(stage.view(FRAME))
-    images = [np.add(*render_radiance(stage, ray, seed, spp=1)) for seed in range(8)]
-    again = np.add(*render_radiance(stage, ray, 7, spp=1))
+    ray, radiance = stage.rays(stage.view(FRAME)), PathTracer(stage).radiance
+    images = [np.add(*radiance(ray, seed, spp=1)) for seed in range(8)]
+    again = np.add(*radiance(ray, 7, spp=1))
     assert images[7].tobytes() == again.tobytes()
-    mean = np.add(*render_radiance(stage, ray, 1000, spp=1024))
+    mean = np.add(*radiance(ray, 1000, spp=1024))
     noise = np.stack([((image - mean) / (mean + 0.01)).mean(axis=-1) for image in images])
     pairs = 28
 
@@ -112,7 +126,7 @@ def test_direct_light_on_a_square_in_closed_form():
     lamp = Shape("lamp", quad(half, up=False), grey, Track.constant([radiance] * 3), above)
     camera = Camera(Track.constant([1e-3, 1.0, 0]), Track.constant([0.0, 0, 0]), Track.constant(1.0))
     stage = Stage(Scene((Shape("floor", quad(5, up=True), grey), lamp), camera), 8, 8)
-    direct, indirect = render_radiance(stage, stage.rays(stage.view(0)), 0, spp=256)
+    direct, indirect = PathTracer(stage).radiance(stage.rays(stage.view(0)), 0, spp=256)
     expected = albedo / np.pi * radiance * (2 * half) ** 2 / distance**2
     np.testing.assert_allclose(direct, expected, rtol=2e-3)
     assert indirect.max() < 1e-3 * expected
@@ -122,8 +136,8 @@ def test_direct_light_on_a_square_in_closed_form():
 def test_no_bias_over_many_seeds(stage):
     """The whole-image mean of 20 000 one-spp images is within 4 standard errors of 65 536 stock samples a pixel."""
     stage.pose(FRAME)
-    ray = stage.rays(stage.view(FRAME))
-    ours = np.array([np.add(*render_radiance(stage, ray, seed, spp=1)).mean() for seed in range(20000)])
+    ray, radiance = stage.rays(stage.view(FRAME)), PathTracer(stage).radiance
+    ours = np.array([np.add(*radiance(ray, seed, spp=1)).mean() for seed in range(20000)])
     emission = render_gbuffer(stage, stage.view(FRAME))["emission"].mean()
     theirs = np.array([stock(stage, 3, 64, seed).mean() for seed in range(1024)]) - emission
     error = np.sqrt(ours.var() / len(ours) + theirs.var() / len(theirs))
