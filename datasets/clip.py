@@ -1,5 +1,6 @@
 """Reading clips and data sets straight from memory maps."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from tokenize import TokenError
@@ -71,7 +72,7 @@ class Clip:
         if channel not in self._maps:
             entry, path = self.entry(channel), self.path / self.entry(channel)["file"]
             try:
-                array = np.load(path, mmap_mode="r")
+                array = np.load(path, mmap_mode="r" if math.prod(entry["shape"]) else None)  # nothing cannot be mapped
             except FileNotFoundError:
                 raise BadInput(f"{path} is missing: delete {self.path} and rerun `onespp dataset`") from None
             except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load parses the header as Python

@@ -42,7 +42,7 @@ class RawChannel:
             self.nonfinite += int(array.size - finite.sum())
             array = np.where(finite, array, 0)
         if self.first is None:
-            self.first, self.frame_shape = array.reshape(-1, array.shape[-1])[0], array.shape
+            self.first, self.frame_shape = array[(0,) * (array.ndim - 1)] if self.constant else array, array.shape
         self.constant = self.constant and bool((array == self.first).all())
         if self.channel.radiance:
             with np.errstate(over="ignore"):

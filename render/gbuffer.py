@@ -10,9 +10,9 @@ from render.stage import Stage
 from scenes.camera import Array, View
 
 
-def depth_along_axis(si: Any, ray: Any, view: View) -> NDArray[np.float32]:
+def depth_along_axis(stage: Stage, si: Any, ray: Any, view: View) -> NDArray[np.float32]:
     """Distance (N,) along the viewing axis; 0 where nothing is hit. float32, as stored."""
-    distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64)
+    distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64) * stage.unit
     cosine = np.array(ray.d, dtype=np.float64).T @ view.camera_to_world[:3, 2]
     return (distance * cosine).astype(np.float32)
 
@@ -23,7 +23,7 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArr
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
     mesh_id = stage.mesh_id(si)
     dr.eval(si.t, si.n, mesh_id)
-    depth = depth_along_axis(si, ray, view).astype(np.float64)
+    depth = depth_along_axis(stage, si, ray, view).astype(np.float64)
     return depth, np.array(mesh_id), np.array(si.n, dtype=np.float64).T
 
 
@@ -47,7 +47,6 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
         "mesh_id": stage.mesh_id(si),
     }
     dr.eval(channels, si.t)
-    shape = (stage.height, stage.width, -1)
-    arrays: dict[str, NDArray[Any]] = {name: np.array(value).T.reshape(shape) for name, value in channels.items()}
-    arrays["depth"] = depth_along_axis(si, ray, view).reshape(shape)
+    arrays = {name: stage.image(value) for name, value in channels.items()}
+    arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     return arrays

@@ -127,9 +127,10 @@ class MaterialTable:
 
     def __init__(self, shapes: Sequence[Any]):
         # Objects live as long as the table does: pointers do not keep them.
-        self.materials = [describe(shape.bsdf(), shape.id()) for shape in shapes]
+        nothing = Material(constant(1), constant(1), constant(0), WHITE)  # an empty scene needs a row, too
+        self.materials = [describe(shape.bsdf(), shape.id()) for shape in shapes] or [nothing]
         indices = [int(np.array(registry_index(mi.BSDFPtr(shape.bsdf())))[0]) for shape in shapes]
-        row = np.zeros(max(indices) + 1, np.uint32)
+        row = np.zeros(max(indices, default=0) + 1, np.uint32)
         row[indices] = np.arange(len(indices))
         self.row = mi.UInt32(row)
         self.base, self.roughness, self.metallic = (

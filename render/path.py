@@ -102,5 +102,4 @@ class PathTracer:
         numbers = (dr.opaque(mi.UInt32, number) for number in (seed, spp, stage.scene.max_depth))
         images = self.sample_mean(stage.mitsuba_scene, ray, *numbers)
         dr.eval(images)
-        direct, indirect = (np.array(image).T.reshape(stage.height, stage.width, 3) for image in images)
-        return direct, indirect
+        return stage.image(images[0]), stage.image(images[1])

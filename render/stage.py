@@ -13,14 +13,16 @@ from scenes.camera import Array, View, directions, pixel_centres
 
 
 def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba dictionary in which numpy arrays (the data of bitmaps) have become Dr.Jit's."""
+    """A Mitsuba dictionary whose numpy arrays (the values and placement of bitmaps) have become Mitsuba's types."""
 
-    def convert(value: Any) -> Any:
+    def convert(key: str, value: Any) -> Any:
         if isinstance(value, dict):
             return to_mitsuba(value)
+        if key == "to_uv":
+            return mi.ScalarTransform3f(value)
         return mi.TensorXf(np.ascontiguousarray(value, np.float32)) if isinstance(value, np.ndarray) else value
 
-    return {key: convert(value) for key, value in description.items()}
+    return {key: convert(key, value) for key, value in description.items()}
 
 
 def load_mesh(shape: Shape) -> Any:
@@ -65,9 +67,19 @@ def upload(values: Array) -> Any:
 def mesh_ids(shapes: Sequence[Any]) -> Any:
     """mi.UInt32 table from Mitsuba's registry index of a shape to its place in `shapes` plus one; 0 for no shape."""
     indices = [int(np.array(registry_index(mi.ShapePtr(shape)))[0]) for shape in shapes]
-    table = np.zeros(max(indices) + 1, np.uint32)
+    table = np.zeros(max(indices, default=0) + 1, np.uint32)
     table[indices] = np.arange(len(indices)) + 1
     return mi.UInt32(table)
+
+
+def unit_of(scene: Scene) -> float:
+    """World units that a unit of Mitsuba's stands for: 1, or a power of two for very small and very large scenes.
+
+    Mitsuba keeps rays from hitting what they leave by steps that suit scenes of human size.
+    """
+    sizes = [np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max() for shape in scene.shapes]
+    extent = float(max(sizes, default=1))
+    return 1.0 if 1 / 16 < extent < 1024 or extent == 0 else float(2.0 ** np.round(np.log2(extent)))
 
 
 class Stage:
@@ -75,6 +87,7 @@ class Stage:
 
     def __init__(self, scene: Scene, height: int, width: int):
         self.scene, self.height, self.width = scene, height, width
+        self.unit = unit_of(scene)
         meshes = {shape.name: load_mesh(shape) for shape in scene.shapes}
         sky = {} if scene.sky is None else {"sky": {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}}
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
@@ -98,7 +111,7 @@ class Stage:
         for shape in self.scene.shapes:
             if shape.motion.varies() or not self.posed:
                 matrix = shape.motion.matrix(frame)
-                vertices = shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+                vertices = (shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]) / self.unit
                 changes[f"{shape.name}.vertex_positions"] = np.float32(vertices).ravel()
                 if shape.smooth:  # in the same update: positions alone would recompute the authored normals
                     normals = shape.mesh.vertex_normals @ matrix[:3, :3].T
@@ -117,6 +130,12 @@ class Stage:
             self.posed.update(changes)
             self.poses += 1
 
+    def image(self, value: Any) -> NDArray[Any]:
+        """(H, W, C) of a Dr.Jit value with a lane a pixel, or one for all."""
+        array = np.array(value)
+        planes = np.atleast_2d(array).reshape(-1, array.shape[-1])
+        return np.broadcast_to(planes.T, (self.height * self.width, len(planes))).reshape(self.height, self.width, -1)
+
     def view(self, frame: float) -> View:
         return self.scene.view(frame, self.height, self.width)
 
@@ -126,7 +145,7 @@ class Stage:
             pixels = pixel_centres(self.height, self.width).reshape(-1, 2)
         towards = directions(pixels, view)
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-        origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:]))
+        origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:] / self.unit))
         ray = mi.Ray3f(origin, mi.Vector3f(*map(upload, towards.T)))
         dr.eval(ray)
         return ray

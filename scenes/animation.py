@@ -105,7 +105,7 @@ class Scene:
         return View(
             K=intrinsics(float(self.camera.x_fov.at(frame)), height, width),
             camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame)),
-            object_to_world=np.stack([shape.motion.matrix(frame) for shape in self.shapes]),
+            object_to_world=np.array([shape.motion.matrix(frame) for shape in self.shapes]).reshape(-1, 4, 4),
         )
 
     def moves(self) -> bool:

@@ -66,7 +66,7 @@ def test_albedo_of_plastics_is_diffuse_plus_specular(bsdf, eta):
     stage = Stage(square(bsdf), 4, 4)
     albedo = render_gbuffer(stage, stage.view(0))["albedo"][0, 0]
     coat = reflected({**bsdf, "diffuse_reflectance": rgb(0, 0, 0)})
-    np.testing.assert_allclose(albedo, [0.1, 0.4, 0.7] + coat, rtol=0.02)
+    np.testing.assert_allclose(albedo, np.array([0.1, 0.4, 0.7]) + coat, rtol=0.02)
 
 
 def test_principled_mixes_by_metallic():

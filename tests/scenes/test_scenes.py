@@ -28,7 +28,7 @@ def test_same_seed_same_scene(name):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**63), frames=st.integers(1, 60))
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ["cornell_box", "cornell_box_moving"])
 def test_nothing_touches(name, seed, frames):
     scene = build_scene(name, seed, frames)
     for frame in np.linspace(0, frames - 1, 9):

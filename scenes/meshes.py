@@ -1,0 +1,278 @@
+"""Surfaces to build objects from: boxes, pads, lathes, tubes, sheets and blobs, with normals and texture coordinates.
+
+Metres, y up. Texture coordinates are in metres too, unless a function says otherwise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from scenes.animation import Array, Track
+
+Faces = NDArray[np.int64]
+
+UP = np.array([0.0, 1.0, 0.0])
+CREASE = np.cos(np.radians(40))  # profiles that bend more than this keep a sharp edge
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles, counter-clockwise seen from outside, with a normal and texture coordinates at every vertex."""
+
+    points: Array  # (V, 3)
+    normals: Array  # (V, 3), unit length, outward
+    uv: Array  # (V, 2)
+    faces: Faces  # (F, 3)
+    smooth: bool  # shade with the interpolated normals
+
+    def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Surface":
+        """Shifted by (x, y, z)."""
+        return replace(self, points=self.points + np.array([x, y, z]))
+
+    def turned(self, angle: float, axis: int = 1) -> "Surface":
+        """Turned by `angle` radians about the line through the origin along x, y or z (`axis` 0, 1, 2)."""
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        matrix = np.eye(3)
+        matrix[i, i] = matrix[j, j] = np.cos(angle)
+        matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
+        return replace(self, points=self.points @ matrix.T, normals=self.normals @ matrix.T)
+
+    def mesh(self) -> trimesh.Trimesh:
+        visual = trimesh.visual.TextureVisuals(uv=self.uv)
+        return trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
+
+
+def join(surfaces: Sequence[Surface]) -> Surface:
+    """One surface of all triangles; smooth if any is (flat ones have their own vertices, so they stay flat)."""
+    starts = np.cumsum([0] + [len(surface.points) for surface in surfaces])
+    return Surface(
+        np.concatenate([surface.points for surface in surfaces]),
+        np.concatenate([surface.normals for surface in surfaces]),
+        np.concatenate([surface.uv for surface in surfaces]),
+        np.concatenate([surface.faces + start for surface, start in zip(surfaces, starts, strict=False)]),
+        any(surface.smooth for surface in surfaces),
+    )
+
+
+def unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def area_vectors(points: Array, faces: Faces) -> Array:
+    """Normals (F, 3) of the triangles, as long as twice their areas."""
+    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    return np.cross(b - a, c - a)
+
+
+def mean_normals(points: Array, faces: Faces) -> Array:
+    """Unit normals (V, 3): means of the adjacent triangles' normals by area."""
+    areas = np.repeat(area_vectors(points, faces), 3, axis=0)
+    return unit(np.stack([np.bincount(faces.ravel(), areas[:, k], len(points)) for k in range(3)], axis=1))
+
+
+def unwrapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Surface:
+    """With every triangle's texture coordinates projected along the axis it mostly faces.
+
+    Vertices that are seen along several axes are duplicated.
+    """
+    axis = np.abs(area_vectors(points, faces)).argmax(axis=1)
+    keys, corners = np.unique(3 * faces + axis[:, None], return_inverse=True)
+    vertex, along = keys // 3, keys % 3
+    across = np.array([[2, 1], [0, 2], [0, 1]])[along]
+    uv = np.take_along_axis(points[vertex], across, axis=1)
+    return Surface(points[vertex], normals[vertex], uv, corners.reshape(-1, 3), smooth)
+
+
+def flat(points: Array, faces: Faces) -> Surface:
+    """Facets: every triangle has its own vertices and normal."""
+    normals = np.repeat(unit(area_vectors(points, faces)), 3, axis=0)
+    return unwrapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
+
+
+def rounded(points: Array, faces: Faces) -> Surface:
+    """A smooth closed surface."""
+    return unwrapped(points, mean_normals(points, faces), faces, True)
+
+
+@cache
+def unit_box(subdivisions: int) -> tuple[Array, Faces]:
+    """Points (V, 3) and the 12 * 4^subdivisions triangles of the cube -1..1."""
+    box = trimesh.creation.box((2, 2, 2))
+    for _ in range(subdivisions):
+        box = box.subdivide()
+    return np.array(box.vertices), np.array(box.faces)
+
+
+@cache
+def unit_sphere(subdivisions: int) -> tuple[Array, Faces]:
+    """Points (V, 3) and the 20 * 4^subdivisions triangles of a subdivided icosahedron."""
+    sphere = trimesh.creation.icosphere(subdivisions)
+    return np.array(sphere.vertices), np.array(sphere.faces)
+
+
+def slab(width: float, height: float, depth: float) -> Surface:
+    """A box along x, y, z, standing on the origin."""
+    points, faces = unit_box(0)
+    return flat((points + UP) * (width / 2, height / 2, depth / 2), faces)
+
+
+def pad(width: float, height: float, depth: float, power: float, subdivisions: int = 2) -> Surface:
+    """A box with soft edges (the unit sphere of the `power` norm; 2 is an ellipsoid), standing on the origin."""
+    points, faces = unit_box(subdivisions)
+    points = np.sin(np.pi / 2 * points)  # more points near the edges
+    points = points / np.linalg.norm(points, ord=power, axis=1, keepdims=True)
+    return rounded((points + UP) * (width / 2, height / 2, depth / 2), faces)
+
+
+def blob(rng: np.random.Generator, radius: float, roughness: float, subdivisions: int) -> Surface:
+    """A ball of `radius` displaced by smooth noise of relative amplitude `roughness`, about the origin."""
+    points, faces = unit_sphere(subdivisions)
+    waves = rng.normal(0, 2.0, (3, 12))
+    noise = np.sin(points @ waves + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / np.sqrt(6)
+    return rounded(points * radius * np.exp(roughness * noise)[:, None], faces)
+
+
+def gem(rng: np.random.Generator, radius: float, subdivisions: int) -> Surface:
+    """Facets of a jittered icosahedron (20 triangles, or 80), about the origin."""
+    points, faces = unit_sphere(subdivisions)
+    return flat(points * radius * rng.uniform(0.75, 1.0, (len(points), 1)), faces)
+
+
+def sheet(points: Array, uv: Array, normals: Array | None = None) -> Surface:
+    """A grid of points (R, C, 3) with uv (R, C, 2), seen from where columns run right and rows run up.
+
+    Without `normals` (R, C, 3) it is smooth within itself. Triangles without area are left out.
+    """
+    rows, columns = points.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    points, uv = points.reshape(-1, 3), uv.reshape(-1, 2)
+    faces = faces[np.linalg.norm(area_vectors(points, faces), axis=1) > 1e-12]
+    smooth = mean_normals(points, faces) if normals is None else normals.reshape(-1, 3)
+    return Surface(points, smooth, uv, faces, True)
+
+
+def profile_normals(profile: Array) -> tuple[Array, Array]:
+    """Normals (N - 1, 2) at the begin and at the end of every piece of a lathe's profile (N, 2)."""
+    normals = unit(np.diff(profile, axis=0)[:, ::-1] * (1, -1))
+    before = np.roll(normals, 1, axis=0)
+    if not np.array_equal(profile[0], profile[-1]):
+        # On the axis the profile goes on as its mirror image, elsewhere it just ends.
+        mirror = np.array([-1, 1])
+        before[0] = normals[0] * mirror if profile[0, 0] == 0 else normals[0]
+        last = normals[-1] * mirror if profile[-1, 0] == 0 else normals[-1]
+    else:
+        last = normals[0]
+    after = np.concatenate([normals[1:], last[None]])
+
+    def blend(other: Array) -> Array:
+        soft = (normals * other).sum(axis=1, keepdims=True) > CREASE
+        return unit(np.where(soft, normals + other, normals))
+
+    return blend(before), blend(after)
+
+
+def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
+    """The surface that `profile` (N, 2), radii and heights, sweeps about the y axis; closed if it ends on the axis.
+
+    The outside is to the right of the way along the profile: it runs outward along the bottom, up, and inward along
+    the top. Texture: u runs around and repeats seamlessly, v along the profile at the same scale; about a metre each.
+    """
+    profile = np.asarray(profile, dtype=np.float64)
+    length = np.linalg.norm(np.diff(profile, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(length)])
+    begin, end = profile_normals(profile)
+    # Every piece has its own two rows of vertices, so that it can have its own normals; gaps between have no area.
+    rows = np.stack([profile[:-1], profile[1:]], axis=1).reshape(-1, 2)
+    normals = np.stack([begin, end], axis=1).reshape(-1, 2)
+    v = np.stack([along[:-1], along[1:]], axis=1).ravel()
+    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)
+    around = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
+
+    def sweep(pairs: Array) -> Array:
+        flat_part = pairs[:, None, :1] * around
+        height = np.broadcast_to(pairs[:, None, 1:], (*flat_part.shape[:2], 1))
+        return np.concatenate([flat_part[..., :1], height, flat_part[..., 1:]], axis=2)
+
+    circumference = 2 * np.pi * profile[:, 0].max()
+    repeats = max(1, round(circumference))
+    u = np.broadcast_to(np.linspace(0, repeats, segments + 1), (len(rows), segments + 1))
+    uv = np.stack([u, np.broadcast_to(v[:, None] * repeats / circumference, u.shape)], axis=2)
+    return sheet(sweep(rows), uv, sweep(normals))
+
+
+def silhouette(radii: ArrayLike, height: float, count: int = 20) -> Array:
+    """A profile (count, 2) that rises to `height` and passes smoothly through `radii` at even heights."""
+    spline = Track(np.asarray(radii, dtype=np.float64))
+    t = np.linspace(0, 1, count)
+    return np.stack([np.maximum([spline.at(x) for x in t], 0.002), t * height], axis=1)
+
+
+def solid(outer: ArrayLike) -> Array:
+    """The closed profile of a solid whose side is `outer` (N, 2)."""
+    outer = np.asarray(outer, dtype=np.float64)
+    return np.concatenate([[(0, outer[0, 1])], outer, [(0, outer[-1, 1])]])
+
+
+def hollow(outer: Array, wall: float, base: float) -> Array:
+    """The closed profile of a vessel with side `outer` (N, 2), a `wall` that thick and its inner floor at `base`."""
+    inner = outer[(outer[:, 1] > base) & (outer[:, 0] > 1.5 * wall)] - (wall, 0)
+    return np.concatenate([[(0, outer[0, 1])], outer, inner[::-1], [(0, base)]])
+
+
+def circle(radius: float, thickness: float, segments: int = 10) -> Array:
+    """The profile (segments + 1, 2) of a torus: a circle of radius `thickness` about (`radius`, 0)."""
+    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)
+    return np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1)
+
+
+def disc(radius: float, thickness: float, segments: int = 40) -> Surface:
+    """A round board with bevelled edges, standing on the origin."""
+    bevel = min(radius, thickness) * 0.15
+    side = [(radius - bevel, 0), (radius, bevel), (radius, thickness - bevel), (radius - bevel, thickness)]
+    turned = lathe(solid(side), segments)
+    return unwrapped(turned.points, turned.normals, turned.faces, True)
+
+
+def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
+    """A closed round tube along `path` (N, 3), of one radius or of radii (N,)."""
+    path = np.asarray(path, dtype=np.float64)
+    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), len(path))
+    step = unit(np.diff(path, axis=0))
+    tangent = unit(np.concatenate([step[:1], step]) + np.concatenate([step, step[-1:]]))
+    right = np.empty_like(path)
+    side = np.eye(3)[np.abs(tangent[0]).argmin()]
+    for k, forward in enumerate(tangent):
+        side = unit(side - forward * (side @ forward))  # turns no more than it must
+        right[k] = side
+    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)[:, None]
+    around = np.cos(angle) * right[:, None] + np.sin(angle) * np.cross(tangent, right)[:, None]
+    # Caps: a ring with the cap's normal, and the centre.
+    ends = [0, 0, *range(len(path)), -1, -1]
+    radii = np.concatenate([[0, radii[0]], radii, [radii[-1], 0]])
+    points = path[ends][:, None] + radii[:, None, None] * around[ends]
+    cap = np.broadcast_to(tangent[[0, 0, -1, -1], None], (4, segments + 1, 3)) * np.array([-1, -1, 1, 1])[:, None, None]
+    normals = np.concatenate([cap[:2], around, cap[2:]])
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points[:, 0], axis=0), axis=1))])
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi * radii.max(), segments + 1), along)
+    return sheet(points, np.stack([u, v], axis=2), normals)
+
+
+def leaf(path: Array, width: float, fold: float) -> Surface:
+    """A thin pointed leaf about `path` (N, 3), its middle `fold` * `width` lower than its edges; seen from above.
+
+    The path lies in a vertical plane and does not end straight above where it begins.
+    """
+    across = unit(np.cross(path[-1] - path[0], UP))
+    share = np.sin(np.pi * np.linspace(0.04, 0.98, len(path)) ** 0.8) * width / 2
+    side = share[:, None] * across
+    edge = path + UP * (fold * share)[:, None]
+    points = np.stack([edge - side, path, edge + side], axis=1)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    uv = np.stack([share[:, None] * (-1, 0, 1), np.broadcast_to(along[:, None], (len(path), 3))], axis=2)
+    return sheet(points, uv)

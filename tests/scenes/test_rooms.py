@@ -1,0 +1,154 @@
+"""Rooms: deterministic, full, free of collisions; flights through free space; light that is neither night nor glare."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets.display import clip_exposure, display, luminance
+from render.gbuffer import render_gbuffer
+from render.path import PathTracer
+from render.stage import Stage
+from scenes import build_scene
+from scenes.animation import Scene, Shape
+from scenes.camera import motion_vectors, pixel_centres
+
+FRAMES = 24
+FEW, MANY = range(8), range(1000, 1100)
+
+
+@cache
+def room(number: int) -> Scene:
+    return build_scene(f"room-{number}", 0, FRAMES)
+
+
+def owner(name: str) -> str:
+    """What a shape belongs to: its thing's number, or itself."""
+    head = name.split("-")[0]
+    return head if head.isdigit() else name
+
+
+def things(scene: Scene) -> dict[str, list[Shape]]:
+    owned: dict[str, list[Shape]] = {}
+    for shape in scene.shapes:
+        if owner(shape.name).isdigit():
+            owned.setdefault(owner(shape.name), []).append(shape)
+    return owned
+
+
+def lights(scene: Scene) -> list[Shape]:
+    return [shape for shape in scene.shapes if shape.radiance is not None]
+
+
+def world(scene: Scene, frame: int) -> trimesh.collision.CollisionManager:
+    """All meshes where they are in a frame."""
+    manager = trimesh.collision.CollisionManager()
+    for shape in scene.shapes:
+        manager.add_object(shape.name, shape.mesh, shape.motion.matrix(frame))
+    return manager
+
+
+def check(number: int) -> None:
+    scene = room(number)
+    assert 15 <= len(things(scene)) <= 60
+    assert 1 <= len(lights(scene)) + (scene.sky is not None) <= 7
+    assert len({shape.name for shape in scene.shapes}) == len(scene.shapes)
+    for shape in lights(scene):
+        radiance = np.stack([shape.radiance.at(frame) for frame in range(FRAMES)])
+        assert (radiance > 0).any(axis=1).all() and radiance.max() < 65504
+
+    for frame in (0, FRAMES // 2, FRAMES - 1) if scene.moves() else (0,):
+        manager = world(scene, frame)
+        _, pairs = manager.in_collision_internal(return_names=True)
+        # Building parts join each other, and lamps sit in their fixtures.
+        loose = {pair for pair in pairs if any(owner(name).isdigit() for name in pair)}
+        assert not {pair for pair in loose if owner(pair[0]) != owner(pair[1]) and "lamp" not in "".join(pair)}
+        eye = trimesh.creation.icosphere(1, 0.01)
+        matrix = np.eye(4)
+        matrix[:3, 3] = scene.camera.eye.at(frame)
+        assert manager.min_distance_single(eye, matrix) > 0.1
+
+    eyes = np.stack([scene.camera.eye.at(frame) for frame in np.linspace(0, FRAMES - 1, 8 * FRAMES)])
+    walls = np.stack([shape.mesh.bounds for shape in scene.shapes if shape.name.startswith(("wall", "floor"))])
+    assert (eyes > walls[:, 0].min(axis=0) + 0.1).all()
+    assert (eyes[:, [0, 2]] < walls[:, 1].max(axis=0)[[0, 2]] - 0.1).all()
+
+
+@pytest.mark.parametrize("number", FEW)
+def test_room(number):
+    check(number)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", MANY)
+def test_many_rooms(number):
+    check(number)
+
+
+def test_same_number_same_room_whatever_the_seed():
+    a, b = room(3), build_scene("room-3", 77, FRAMES)
+    for x, y in zip(a.shapes, b.shapes, strict=True):
+        assert x.name == y.name and np.array_equal(x.mesh.vertices, y.mesh.vertices)
+        assert np.array_equal(x.motion.matrix(5), y.motion.matrix(5))
+    assert np.array_equal(a.view(7, 9, 9).camera_to_world, b.view(7, 9, 9).camera_to_world)
+    assert build_scene("room--3", 0, FRAMES).shapes[0].mesh.bounds.tolist() != a.shapes[0].mesh.bounds.tolist()
+
+
+def test_rooms_differ():
+    sizes = {tuple(room(number).shapes[0].mesh.bounds.ravel()) for number in FEW}
+    assert len(sizes) == len(FEW)
+    kinds = {shape.bsdf["type"] for number in FEW for shape in room(number).shapes}
+    assert {"diffuse", "twosided", "roughplastic", "principled", "roughconductor"} <= kinds
+
+
+def share_of_kinds(numbers: range) -> dict[str, float]:
+    """Shares of rooms in which something moves, lights change, the camera stops, the sky is seen, glass stands."""
+    rooms = [room(number) for number in numbers]
+    facts = {
+        "two things move": [sum(parts[0].motion.varies() for parts in things(s).values()) >= 2 for s in rooms],
+        "lights change": [any(light.radiance.varies() or light.motion.varies() for light in lights(s)) for s in rooms],
+        "camera stops": [s.camera.eye.last < FRAMES - 1 for s in rooms],
+        "sky": [s.sky is not None for s in rooms],
+        "glass": [any("dielectric" in shape.bsdf["type"] for shape in s.shapes) for s in rooms],
+    }
+    return {name: float(np.mean(values)) for name, values in facts.items()}
+
+
+@pytest.mark.slow
+def test_half_of_the_rooms_move():
+    shares = share_of_kinds(MANY)
+    assert 0.4 <= shares["two things move"] <= 0.65
+    assert all(0.03 <= shares[name] for name in shares)
+    assert all(shares[name] <= 0.5 for name in ("lights change", "camera stops", "sky"))
+
+
+@pytest.mark.parametrize("number", [0, 3, 5])
+def test_frames_are_neither_night_nor_glare(number):
+    size = 48
+    stage = Stage(room(number), size, size)
+    tracer, images, emissions = PathTracer(stage), [], []
+    for frame in (0, FRAMES - 1):
+        stage.pose(frame)
+        view = stage.view(frame)
+        images.append(np.add(*tracer.radiance(stage.rays(view), frame, 64)))
+        emissions.append(render_gbuffer(stage, view)["emission"])
+    exposure = clip_exposure(luminance(np.stack(images)))
+    for image, emission in zip(images, emissions, strict=True):
+        shown = display((image + emission).astype(np.float64), exposure)
+        assert 0.08 < shown.mean() < 0.9
+        assert (shown.min(axis=-1) >= 1).mean() < 0.3 and (shown.max(axis=-1) < 0.02).mean() < 0.5
+
+
+@pytest.mark.parametrize("number", FEW[:4])
+def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
+    """Motion of what is seen, bar a margin for what comes nearer than the centres of things, which were aimed at."""
+    size, scene = 64, room(number)
+    stage = Stage(scene, size, size)
+    for frame in (1, FRAMES // 2, FRAMES - 1):
+        stage.pose(frame)
+        now, before = stage.view(frame), stage.view(frame - 1)
+        buffer = render_gbuffer(stage, now)
+        depth, mesh_id = buffer["depth"][..., 0].astype(float), buffer["mesh_id"][..., 0]
+        motion = motion_vectors(pixel_centres(size, size), depth, mesh_id, now, before)
+        assert np.percentile(np.abs(motion).max(axis=-1), 95) < 1.5 * 20 / 256 * size
