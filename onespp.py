@@ -12,7 +12,7 @@ from errors import BadInput
 Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
 Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
 Profile = Annotated[
-    str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds) or quick (minutes)")
+    str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds), quick (minutes) or release (days)")
 ]
 Precision = Annotated[
     Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
@@ -22,6 +22,18 @@ PartArgument = Annotated[
     str | None,
     tyro.conf.arg(metavar="K/N", help="render only the K-th of N disjoint shares, to spread the work over machines"),
 ]
+Reads = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(metavar="DENOISER...", help="render for training only what these denoisers read, or else all known"),
+]
+RayArgument = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(
+        help="render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach "
+        "the data set's folder under the same path"
+    ),
+]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 
 
@@ -29,12 +41,24 @@ def data_folder(data: Path | None, profile: str) -> Path:
     return Path("data") / profile if data is None else data
 
 
-def dataset(data: Data = None, profile: Profile = "quick", seed: int = 0, part: PartArgument = None) -> None:
+def dataset(
+    data: Data = None,
+    profile: Profile = "quick",
+    seed: int = 0,
+    reads: Reads = (),
+    part: PartArgument = None,
+    ray: RayArgument = False,
+) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.job import Part, generate
+    from datasets.job import Part, generate, render_here
+    from models import channels_read
 
+    if ray:
+        from datasets.cluster import render_on_cluster
     folder = data_folder(data, profile)
-    rendered = generate(folder, profile, seed, Part.parse(part) if part else None)
+    share = Part.parse(part) if part else None
+    channels = channels_read(reads)
+    rendered = generate(folder, profile, seed, share, channels, render_on_cluster if ray else render_here)
     print(f"{folder}: {rendered} clips rendered")
 
 

@@ -58,10 +58,21 @@ def size_of(path: Path) -> int:
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
-def stored_as(entry: dict[str, object]) -> str:
+def stored_as(clip: Clip, name: str) -> str:
+    entry = clip.channels.get(name, {})
     if "file" in entry:
         return str(entry["dtype"])
-    return "value" if "value" in entry else "derived"
+    return next((kind for kind in ("value", "derived") if kind in entry), "not rendered")
+
+
+def size_in_full(clip: Clip, name: str) -> int:
+    """Bytes that a channel would take with all its numbers written out."""
+    if "shape" in clip.channels.get(name, {}):
+        entry = clip.channels[name]
+        return math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize
+    meshes = len(clip.facts["meshes"])
+    shape = CHANNELS[name].shape(F=clip.frames, S=clip.realisations, H=clip.height, W=clip.width, M=meshes)
+    return math.prod(shape) * np.dtype(CHANNELS[name].dtype).itemsize
 
 
 class Difficulty(NamedTuple):
@@ -103,34 +114,69 @@ def measure_frame(clip: Clip, frame: int) -> Difficulty:
     )
 
 
+def clip_row(clip: Clip, label: str, seconds: float) -> list[object]:
+    lost = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
+    return [
+        *(label, clip.frames, f"{clip.height}x{clip.width}", clip.realisations, clip.facts["reference_spp"]),
+        *(f"{psnr(clip.facts['floor_mse']):.1f}", f"{clip.exposure:.3g}", lost),
+        *(f"{measure:.3g}" for measure in difficulty(clip)),
+        *(f"{size_of(clip.path) / 1e6:.1f}", f"{seconds:.1f}"),
+    ]
+
+
+CLIP_HEAD = [
+    *("clip", "frames", "size", "noisy", "reference spp", "floor dB", "exposure", "bad values"),
+    *("zeros", "rel. MSE", "P99.9/mean", "P95/P5", "MB", "seconds"),
+]
+
+
 def info(root: Path) -> str:
-    """Tables of clips (size, noise floor, difficulty, render time) and of channels (storage, size)."""
+    """Tables of clips (size, noise floor, difficulty, render time), of channels (storage, savings) and of steps."""
     dataset = Dataset(root)
     rows: list[list[object]] = []
-    sizes, storage = dict.fromkeys(CHANNELS, 0), {name: set[str]() for name in CHANNELS}
-    for path in dataset.planned():
+    clips: list[Clip] = []
+    seconds: dict[str, float] = {}
+    for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
         label = str(path.relative_to(root))
         if not is_clip(path):
             rows.append([label, "missing"])
             continue
-        clip = Clip(path)
-        for name, entry in clip.channels.items():
-            storage[name].add(stored_as(entry))
-            sizes[name] += (path / entry["file"]).stat().st_size if "file" in entry else 0
-        seconds = sum(read_json(path / "timing.json").values())
-        lost = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
-        rows.append(
-            [
-                *(label, clip.frames, f"{clip.height}x{clip.width}", clip.realisations, clip.facts["reference_spp"]),
-                *(f"{psnr(clip.facts['floor_mse']):.1f}", f"{clip.exposure:.3g}", lost),
-                *(f"{measure:.3g}" for measure in difficulty(clip)),
-                *(f"{size_of(path) / 1e6:.1f}", f"{seconds:.1f}"),
-            ]
-        )
-    head = ["clip", "frames", "size", "noisy", "reference spp", "floor dB", "exposure", "bad values"]
-    head += ["zeros", "rel. MSE", "P99.9/mean", "P95/P5", "MB", "seconds"]
-    channels = [[n, ", ".join(sorted(storage[n])), f"{sizes[n] / 1e6:.1f}"] for n in CHANNELS if storage[n]]
+        clips.append(Clip(path))
+        timing = read_json(path / "timing.json")
+        rows.append(clip_row(clips[-1], label, sum(timing.values())))
+        for step, spent in timing.items():
+            seconds[step] = seconds.get(step, 0.0) + spent
     facts = dataset.facts
     title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {size_of(root) / 1e6:.1f} MB"
-    tables = [tabulate(rows, head), tabulate(channels, ["channel", "stored as", "MB"], disable_numparse=True)]
-    return "\n\n".join([title, *tables])
+    if not clips:
+        return "\n\n".join([title, tabulate(rows, CLIP_HEAD)])
+    return "\n\n".join([title, tabulate(rows, CLIP_HEAD), channel_table(clips), step_table(clips, seconds)])
+
+
+def channel_table(clips: list[Clip]) -> str:
+    """How channels are stored, and what that saves."""
+    rows: list[list[object]] = []
+    totals = np.zeros((2, 2))
+    for name, channel in CHANNELS.items():
+        entries = [clip.channels.get(name, {}) for clip in clips]
+        files = [clip.path / e["file"] for clip, e in zip(clips, entries, strict=True) if "file" in e]
+        stored, full = sum(file.stat().st_size for file in files), sum(size_in_full(clip, name) for clip in clips)
+        kinds = sorted({stored_as(clip, name) for clip in clips})
+        rows.append([name, ", ".join(kinds), f"{stored / 1e6:.1f}", f"{full / 1e6:.1f}"])
+        totals[int((channel.is_image and not channel.radiance) or name == "emission")] += [stored / 1e6, full / 1e6]
+    both, auxiliary = totals.sum(axis=0), totals[1]
+    for label, (stored, full) in (("auxiliary channels", auxiliary), ("all", both)):
+        rows.append([label, f"{stored / full:.0%} of full", f"{stored:.1f}", f"{full:.1f}"])
+    return tabulate(rows, ["channel", "stored as", "MB", "in full"], disable_numparse=True)
+
+
+def step_table(clips: list[Clip], seconds: dict[str, float]) -> str:
+    """Seconds by step, and what skipping cost: by the step's mean time a pixel in the clips that have the channel."""
+    rows = [[step, f"{spent:.2f}", ""] for step, spent in seconds.items()]
+    pixels = {True: 0, False: 0}
+    for clip in clips:
+        pixels["dual_motion" in clip.channels] += clip.frames * clip.height * clip.width
+    if pixels[True] and "dual_motion" in seconds:
+        saved = seconds["dual_motion"] * pixels[False] / pixels[True]
+        rows = [[*row[:2], f"{saved:.2f}" if row[0] == "dual_motion" else ""] for row in rows]
+    return tabulate(rows, ["step", "seconds", "saved"], disable_numparse=True)

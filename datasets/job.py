@@ -1,69 +1,22 @@
 """The generation job: render the clips of a profile that are not there yet."""
 
 import re
-import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 from tqdm import tqdm
 
-from datasets.clip import SCHEMA, SPLITS, Dataset, is_clip
+from datasets.channels import CHANNELS
+from datasets.clip import Dataset, is_clip
 from datasets.files import locked, read_json, write_json
+from datasets.pilot import reference_spp
+from datasets.profiles import ClipKind, DataProfile, clip_seed, plan, profile_of, versions
 from datasets.writer import ClipWriter
 from errors import BadInput
-from render.clip import Sampling, render_clip
-from scenes import SCENES, build_scene
-
-GENERATOR = 2  # raise it when the same seed renders different bytes
-
-
-@dataclass(frozen=True)
-class DataProfile:
-    """How much to render of each scene: image size, clips by split, frames a clip, samples."""
-
-    height: int
-    width: int
-    frames: int
-    clips: dict[str, int]
-    train: Sampling
-    test: Sampling  # validation and test
-
-
-DATA_PROFILES = {
-    "tiny": DataProfile(
-        64, 64, 8, {"train": 1, "val": 1, "test": 1}, train=Sampling(2, 1, 64), test=Sampling(1, 1, 128)
-    ),
-    "quick": DataProfile(
-        128, 128, 24, {"train": 4, "val": 1, "test": 1}, train=Sampling(7, 1, 256), test=Sampling(1, 1, 256)
-    ),
-}
-
-
-def clip_seed(seed: int, scene: str, split: str, index: int) -> int:
-    """A seed of its own for every clip: independent of which other clips there are and of the order of rendering."""
-    words = [seed, zlib.crc32(scene.encode()), zlib.crc32(split.encode()), index]
-    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
-
-
-def plan(profile: str, seed: int) -> dict[str, Any]:
-    """The content of dataset.json. Raises BadInput for an unknown profile or an unusable seed."""
-    if seed < 0:
-        raise BadInput(f"the seed {seed} is negative: use 0 or more")
-    if profile not in DATA_PROFILES:
-        raise BadInput(f"unknown profile '{profile}'; the profiles are {', '.join(DATA_PROFILES)}")
-    clips = DATA_PROFILES[profile].clips
-    return {
-        "schema": SCHEMA,
-        "profile": profile,
-        "generator": GENERATOR,
-        "versions": {package: version(package) for package in ("onespp", "mitsuba", "drjit", "numpy")},
-        "seed": seed,
-        "scenes": list(SCENES),
-        "splits": {split: [f"{s}/{i:03d}" for s in SCENES for i in range(clips[split])] for split in SPLITS},
-    }
+from render.clip import PLAIN, Clock, Options, Sampling, render_clip
+from scenes import build_scene
 
 
 def begin(root: Path, wanted: dict[str, Any]) -> None:
@@ -72,7 +25,7 @@ def begin(root: Path, wanted: dict[str, Any]) -> None:
         write_json(root / "dataset.json", wanted)
         return
     present = read_json(root / "dataset.json")
-    for key in ("schema", "profile", "seed", "generator", "splits"):
+    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options"):
         if present.get(key) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
 
@@ -86,8 +39,9 @@ def check_folder(root: Path) -> None:
         raise BadInput(f"{root} holds something else than a data set: choose an empty or new folder")
 
 
-def check_versions(dataset: Dataset, here: dict[str, str]) -> None:
+def check_versions(dataset: Dataset) -> None:
     """Raise BadInput where the data set was begun with other packages: the same seed may render other bytes."""
+    here = versions()
     changed = [
         f"{name} {old}, here {here[name]}" for name, old in dataset.facts["versions"].items() if here[name] != old
     ]
@@ -95,21 +49,33 @@ def check_versions(dataset: Dataset, here: dict[str, str]) -> None:
         raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
-def render_to(destination: Path, scene_name: str, profile: DataProfile, split: str, seed: int) -> None:
-    """Render one clip, whole or not at all. Deterministic in its arguments."""
+def render_to(
+    destination: Path, profile: DataProfile, seed: int, channels: Sequence[str], options: Options = PLAIN
+) -> None:
+    """Render the clip DATA/SPLIT/SCENE/CLIP, whole or not at all, with the named channels. `seed` is the data set's.
+
+    Deterministic in its arguments.
+    """
+    split, scene_name, name = destination.parts[-3:]
+    kind, quality = ClipKind.of(name), profile.quality[split]
+    seed = clip_seed(seed, scene_name, split, kind.number)
     scene = build_scene(scene_name, seed, profile.frames)
-    sampling = profile.train if split == "train" else profile.test
-    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
-    label = f"{split}/{scene_name}/{destination.name}"
+    scene = scene.still() if kind.still else scene
+    size = profile.frames, profile.height, profile.width
+    clock = Clock()
+    spp = reference_spp(scene, *size, quality, seed)
+    clock.lap("pilot")
+    frames = render_clip(scene, *size, Sampling(quality.realisations, kind.noisy_spp, spp, options), seed, channels)
     with ClipWriter(destination) as writer:
-        for channels, seconds in tqdm(frames, label, profile.frames, leave=False, unit="frame"):
-            writer.add(channels, seconds)
+        writer.timing = clock.read()
+        for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{name}", profile.frames, leave=False, unit="frame"):
+            writer.add(arrays, seconds)
         facts = {
-            "noisy_spp": sampling.noisy_spp,
-            "reference_spp": sampling.reference_spp // 2 * 2,
+            "noisy_spp": kind.noisy_spp,
+            "reference_spp": spp // 2 * 2,
             "meshes": [shape.name for shape in scene.shapes],
         }
-        writer.finish(facts, {} if scene.moves() else {"motion": "camera"})
+        writer.finish(facts, {} if scene.moves() or "motion" not in channels else {"motion": "camera"})
 
 
 @dataclass(frozen=True)
@@ -129,39 +95,89 @@ class Part:
         return part
 
 
-def generate(root: Path, profile: str, seed: int, part: Part | None = None) -> int:
+class ClipJob(NamedTuple):
+    """One clip to render, and all that its bytes follow from."""
+
+    path: Path  # DATA/SPLIT/SCENE/CLIP
+    profile: str
+    seed: int  # of the data set
+    channels: tuple[str, ...]
+    options: Options
+
+
+class Outcome(NamedTuple):
+    """How a clip's job ended, and for what reason where it did not render the clip."""
+
+    path: Path
+    ending: Literal["rendered", "left", "failed"]
+    reason: str = ""
+
+
+def render_clip_job(job: ClipJob) -> Outcome:
+    """Render a clip, unless another process renders it or has done so.
+
+    A failure of the renderer is an outcome; OSError is raised, for a disk that is full is full for all clips.
+    """
+    job.path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(job.path.with_name(f".{job.path.name}.lock")) as ours:
+        if not ours:
+            return Outcome(job.path, "left", "left to another process, which is rendering it")
+        if is_clip(job.path):
+            return Outcome(job.path, "left", "another process has rendered it")
+        try:
+            render_to(job.path, profile_of(job.profile), job.seed, job.channels, job.options)
+        except (RuntimeError, ValueError) as error:
+            return Outcome(job.path, "failed", str(error))
+    return Outcome(job.path, "rendered")
+
+
+def render_here(jobs: Sequence[ClipJob]) -> Iterator[Outcome]:
+    """Render clips in this process, one after the other."""
+    return map(render_clip_job, jobs)
+
+
+def generate(
+    root: Path,
+    profile: str,
+    seed: int,
+    part: Part | None = None,
+    reads: Sequence[str] = tuple(CHANNELS),
+    options: Options = PLAIN,
+    render: Callable[[Sequence[ClipJob]], Iterator[Outcome]] = render_here,
+) -> int:
     """Render what is missing of `profile`'s data set at `root`, or of one part of it. Returns how many clips were.
+
+    Clips for training have the channels in `reads` and those that are always needed.
 
     Several jobs may work on one folder, on machines that share it or not: each clip is rendered by one of them, and
     merged folders of disjoint parts are the whole. A clip that fails is left out and the rest goes on.
     Raises BadInput at the end, naming the first clip that failed; OSError at once, for a full disk fills for all.
     """
-    wanted = plan(profile, seed)
+    wanted = plan(profile, seed, reads, options)
     check_folder(root)
     root.mkdir(parents=True, exist_ok=True)
     begin(root, wanted)
     dataset = Dataset(root)
     first, step = (part.index - 1, part.count) if part else (0, 1)
-    missing = [path for path in dataset.planned()[first::step] if not is_clip(path)]
-    if missing:
-        check_versions(dataset, wanted["versions"])
-    rendered, failed = 0, dict[Path, Exception]()
-    for path in tqdm(missing, "clips", unit="clip"):
-        split, scene, index = path.parts[-3:]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path.with_name(f".{path.name}.lock")) as ours:
-            if not ours:
-                tqdm.write(f"{path}: left to another process, which is rendering it")
-            elif not is_clip(path):
-                try:
-                    render_to(path, scene, DATA_PROFILES[profile], split, clip_seed(seed, scene, split, int(index)))
-                    rendered += 1
-                except (RuntimeError, ValueError) as error:
-                    failed[path] = error
-                    tqdm.write(f"{path}: failed, the rest goes on: {error}")
-    if failed:
-        path, first_error = next(iter(failed.items()))
+    jobs = [
+        ClipJob(path, profile, seed, tuple(wanted["channels"][path.parts[-3]]), options)
+        for path in dataset.planned()[first::step]
+        if not is_clip(path)
+    ]
+    if not jobs:
+        return 0
+    check_versions(dataset)
+    ended: dict[str, list[Outcome]] = {"rendered": [], "left": [], "failed": []}
+    for outcome in tqdm(render(jobs), "clips", len(jobs), unit="clip"):
+        ended[outcome.ending].append(outcome)
+        if outcome.ending == "left":
+            tqdm.write(f"{outcome.path}: {outcome.reason}")
+        elif outcome.ending == "failed":
+            tqdm.write(f"{outcome.path}: failed, the rest goes on: {outcome.reason}")
+    if ended["failed"]:
+        first_failed = ended["failed"][0]
         raise BadInput(
-            f"{len(failed)} of {len(missing)} clips failed and can be tried again, first {path}: {first_error}"
-        ) from first_error
-    return rendered
+            f"{len(ended['failed'])} of {len(jobs)} clips failed and can be tried again, "
+            f"first {first_failed.path}: {first_failed.reason}"
+        )
+    return len(ended["rendered"])

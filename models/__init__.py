@@ -1,6 +1,6 @@
 """From a noisy frame and a state to a denoised image."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from errors import BadInput
@@ -17,6 +17,11 @@ def create(name: str) -> Denoiser:
     if name not in DENOISERS:
         raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}")
     return DENOISERS[name]()
+
+
+def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
+    """The channels that the named denoisers read, or all denoisers. Raises BadInput for an unknown name."""
+    return tuple(sorted({channel for name in names or DENOISERS for channel in create(name).reads}))
 
 
 def load(name: str, weights: Path | None) -> Denoiser:

@@ -7,7 +7,11 @@ is uniform and independent of every other seed's; many samples of one seed strat
 
 from typing import Any
 
+import numpy as np
+
 from render.backend import dr, mi
+
+ONE_MINUS_EPSILON = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
 def hash32(x: Any) -> Any:
@@ -44,10 +48,10 @@ def to_unit(x: Any) -> Any:
 
 
 class Sampler:
-    """Sample `index` (mi.UInt32) of the sequences that `key` (mi.UInt32, a hash of pixel and seed) names."""
+    """Sample `index` (mi.UInt32) of the sequences that `key` (a hash of pixel and seed) and the path's `depth` name."""
 
-    def __init__(self, key: Any, index: Any):
-        self.key, self.reversed_index, self.dimension = key, dr.brev(index), 0
+    def __init__(self, key: Any, index: Any, depth: Any):
+        self.key, self.reversed_index, self.dimension = hash32(key ^ depth), dr.brev(index), 0
 
     def _next(self) -> tuple[Any, Any]:
         self.dimension += 1
@@ -65,3 +69,42 @@ class Sampler:
         x = dr.brev(scramble_reversed(index, hash32(seed + 1)))
         y = dr.brev(scramble_reversed(sobol_second_reversed(index), hash32(seed + 2)))
         return mi.Point2f(to_unit(x), to_unit(y))
+
+
+CYCLE = 16  # frames
+PRIMES = (  # six numbers a bounce, four bounces
+    *((2, 3, 5, 7, 11, 13), (17, 19, 23, 29, 31, 37)),
+    *((41, 43, 47, 53, 59, 61), (67, 71, 73, 79, 83, 89)),
+)
+
+
+class Halton:
+    """Point `index` mod 16 of the Halton sequence, shifted in every pixel by its own random vector (mod 1).
+
+    Real-time renderers draw one point of the cycle a frame (SVGF §3, RAE §3.1): each frame alone is unbiased, and the
+    mean of 16 consecutive ones is less noisy than that of independent ones. `key` fixes the shift, so the frames of a
+    realisation share it. Bounces beyond the fourth repeat the primes of the first with other shifts.
+    """
+
+    def __init__(self, key: Any, index: Any, depth: Any):
+        self.key, self.index, self.dimension = hash32(key ^ depth), index & (CYCLE - 1), 0
+        self.bounce = (depth - 1) & (len(PRIMES) - 1)
+
+    def next_1d(self) -> Any:
+        """mi.Float in [0, 1)."""
+        base = mi.UInt32(PRIMES[0][self.dimension])
+        for bounce in range(1, len(PRIMES)):
+            base = dr.select(self.bounce == bounce, PRIMES[bounce][self.dimension], base)
+        shift = to_unit(hash32(self.key ^ mi.UInt32(self.dimension * 0x9E3779B9 & 0xFFFFFFFF)))
+        self.dimension += 1
+        remaining, scale, inverse = self.index, dr.rcp(mi.Float(base)), mi.Float(0)
+        weight = scale
+        for _ in range(4):  # 16 has four digits in base 2, fewer in others
+            inverse += mi.Float(remaining % base) * weight
+            remaining, weight = remaining // base, weight * scale
+        shifted = inverse + shift
+        return dr.minimum(shifted - dr.floor(shifted), ONE_MINUS_EPSILON)
+
+    def next_2d(self) -> Any:
+        """mi.Point2f in [0, 1)^2."""
+        return mi.Point2f(self.next_1d(), self.next_1d())

@@ -89,7 +89,9 @@ class Stage:
         self.scene, self.height, self.width = scene, height, width
         self.unit = unit_of(scene)
         meshes = {shape.name: load_mesh(shape) for shape in scene.shapes}
-        sky = {} if scene.sky is None else {"sky": {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}}
+        sky = (
+            {} if scene.sky is None else {"sky": {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}}
+        )
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
         self.mitsuba_scene = mi.load_dict({"type": "scene", **meshes, **sky}, optimize=False)
         self.parameters = mi.traverse(self.mitsuba_scene)

@@ -1,6 +1,6 @@
 """Animated scenes as data: shapes with rigid motions, lights that change, a camera path, all evaluated at any frame."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,10 @@ class Track:
 
     def varies(self) -> bool:
         return bool((self.keys != self.keys[0]).any())
+
+    def held(self) -> "Track":
+        """For good what it is in frame 0."""
+        return Track.constant(self.at(0))
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,19 @@ class Scene:
             camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame)),
             object_to_world=np.array([shape.motion.matrix(frame) for shape in self.shapes]).reshape(-1, 4, 4),
         )
+
+    def still(self) -> "Scene":
+        """The scene of frame 0, in which nothing moves or changes any more, the camera included."""
+        shapes = [
+            replace(
+                shape,
+                radiance=shape.radiance and shape.radiance.held(),
+                motion=RigidMotion(shape.motion.position.held(), shape.motion.angle.held()),
+            )
+            for shape in self.shapes
+        ]
+        camera = Camera(self.camera.eye.held(), self.camera.target.held(), self.camera.x_fov.held())
+        return replace(self, shapes=tuple(shapes), camera=camera)
 
     def moves(self) -> bool:
         """Whether any object moves (the camera may move in any scene)."""

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from datasets.job import generate
+from models import channels_read
 from render.stage import Stage
 from scenes import build_scene
 from scenes.animation import Camera, Scene, Shape, Track
@@ -14,9 +15,9 @@ from scenes.animation import Camera, Scene, Shape, Track
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The data set of the tiny profile, seed 0. Read only: tests that damage it copy it first."""
+    """What `onespp dataset --profile tiny` makes. Read only: tests that damage it copy it first."""
     root = tmp_path_factory.mktemp("data") / "tiny"
-    generate(root, "tiny", seed=0)
+    generate(root, "tiny", seed=0, reads=channels_read())
     return root
 
 

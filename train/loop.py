@@ -36,12 +36,14 @@ def run_folder(runs: Path, name: str, profile: str) -> Path:
     return runs / "train" / f"{name}-{profile}"
 
 
-def loader(clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int) -> DataLoader[Batch]:
+def loader(
+    clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int, workers: int = 0
+) -> DataLoader[Batch]:
     augmentation = recipe.augmentation if augment else Augmentation()
     sequences = TrainingSequences(clips, reads, recipe.length, recipe.crop, augmentation, seed)
     # A smaller last batch would weigh its sequences more (and single ones are not reproducible bit for bit on CPUs).
     whole = len(sequences) >= recipe.batch
-    return DataLoader(sequences, recipe.batch, collate_fn=collate, drop_last=whole)  # type: ignore[arg-type]
+    return DataLoader(sequences, recipe.batch, collate_fn=collate, drop_last=whole, num_workers=workers)  # type: ignore[arg-type]
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -116,16 +118,20 @@ class Training:
             rate = self.recipe.learning_rate(self.epoch + index / count)
             for group in self.optimiser.param_groups:
                 group["lr"] = rate
-            loss, parts = self.loss(batch.to(self.fabric.device))
-            self.fabric.backward(loss)
-            gradients = [parameter.grad for parameter in self.loss.parameters() if parameter.grad is not None]
-            if torch.isfinite(loss) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
-                self.skipped_in_a_row = 0
-                self.optimiser.step()
-            else:
-                self.skip_step()
-            self.optimiser.zero_grad()
-            yield rate, {"loss": loss.detach(), **parts}
+            yield rate, self.step(batch)
+
+    def step(self, batch: Batch) -> dict[str, Tensor]:
+        """Update the weights once. Returns the loss and its parts."""
+        loss, parts = self.loss(batch.to(self.fabric.device))
+        self.fabric.backward(loss)
+        gradients = [parameter.grad for parameter in self.loss.parameters() if parameter.grad is not None]
+        if torch.isfinite(loss) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
+            self.skipped_in_a_row = 0
+            self.optimiser.step()
+        else:
+            self.skip_step()
+        self.optimiser.zero_grad()
+        return {"loss": loss.detach(), **parts}
 
     def skip_step(self) -> None:
         """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""

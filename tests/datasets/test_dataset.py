@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,16 @@ import datasets.job
 from datasets.clip import Clip, Dataset
 from datasets.files import locked
 from datasets.inspect import check_clip, difficulty, info, verify
-from datasets.job import DATA_PROFILES, Part, clip_seed, generate, plan
+from datasets.job import Part
+from datasets.profiles import DATA_PROFILES, clip_seed, plan
 from datasets.writer import ClipWriter
 from errors import BadInput
-from render.clip import render_clip
+from models import channels_read
+from render.clip import Sampling, render_clip
 from scenes import build_scene
 
 ONESPP = [sys.executable, "-m", "onespp"]
+generate = partial(datasets.job.generate, reads=channels_read())  # as the command line does
 
 
 def digest(root: Path) -> dict[str, str]:
@@ -44,10 +48,21 @@ def copy(tiny, tmp_path) -> Path:
 def test_plan_and_layout(tiny):
     facts = json.loads((tiny / "dataset.json").read_text())
     assert facts["schema"] == 1 and facts["profile"] == "tiny" and facts["seed"] == 0
-    assert set(facts) == {"schema", "profile", "generator", "versions", "seed", "scenes", "splits"}
+    assert set(facts) == {
+        "schema",
+        "profile",
+        "generator",
+        "versions",
+        "seed",
+        "scenes",
+        "options",
+        "channels",
+        "splits",
+    }
     for path in Dataset(tiny).planned():
         names = {file.name for file in path.iterdir()}
-        assert {"clip.json", "timing.json", "direct.npy", "dual_motion.npy"} <= names
+        assert {"clip.json", "timing.json", "direct.npy", "depth.npy"} <= names
+        assert ("dual_motion.npy" in names) == (path.parts[-3] == "test")  # nobody who trains reads it
         assert not any(name.endswith(".raw") for name in names)
     assert verify(tiny) == []
 
@@ -58,9 +73,9 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     profile = DATA_PROFILES["tiny"]
     seed = clip_seed(0, clip.scene, "test", 0)
     scene = build_scene(clip.scene, seed, profile.frames)
-    for index, (channels, _) in enumerate(
-        render_clip(scene, profile.frames, profile.height, profile.width, profile.test, seed)
-    ):
+    sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
+    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
+    for index, (channels, _) in enumerate(frames):
         for name in ("direct", "depth", "motion", "dual_motion", "normal", "mesh_id"):
             rendered = channels[name][0] if name == "direct" else channels[name]
             stored = clip.read(name, index)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from render.backend import dr, mi
-from render.sampler import Sampler, hash32
+from render.sampler import Halton, Sampler, hash32
 
 
 def points(key: int, count: int, skip: int = 0) -> np.ndarray:
-    sampler = Sampler(mi.UInt32(key), dr.arange(mi.UInt32, count))
+    sampler = Sampler(mi.UInt32(key), dr.arange(mi.UInt32, count), mi.UInt32(1))
     for _ in range(skip):
         sampler.next_2d()
     return np.array(sampler.next_2d()).T
@@ -39,7 +39,7 @@ def test_second_dimension_is_sobol():
 def test_single_samples_are_uniform_and_independent():
     """Chi-square of first samples over many seeds, and correlations between dimensions and neighbouring seeds."""
     count = 1 << 16
-    sampler = Sampler(hash32(dr.arange(mi.UInt32, count)), mi.UInt32(0))
+    sampler = Sampler(hash32(dr.arange(mi.UInt32, count)), mi.UInt32(0), mi.UInt32(1))
     dimensions = np.stack([*np.array(sampler.next_2d()), np.array(sampler.next_1d()), *np.array(sampler.next_2d())])
     assert (dimensions >= 0).all() and (dimensions < 1).all()
     for u in dimensions:
@@ -61,3 +61,25 @@ def test_integrates_better_than_random():
     variance = 0.5 * 0.2 - (2 / np.pi / 3) ** 2
     assert abs(errors.mean()) < 5 * errors.std() / np.sqrt(200)
     assert errors.var() < 0.01 * variance / 256
+
+
+def test_halton_is_the_halton_sequence_shifted():
+    """Against SciPy's, unscrambled; the shift is one number for a dimension and pixel."""
+    from scipy.stats import qmc
+
+    count = 16
+    sampler = Halton(mi.UInt32(77), dr.arange(mi.UInt32, count), mi.UInt32(1))
+    ours = np.stack([np.array(sampler.next_1d()) for _ in range(6)], axis=1).astype(float)
+    shift = np.mod(ours - qmc.Halton(6, scramble=False).random(count), 1)
+    np.testing.assert_allclose(np.mod(shift - shift[0] + 0.5, 1), 0.5, atol=1e-6)
+    assert len(np.unique(shift[0].round(6))) == 6
+    again = Halton(mi.UInt32(77), dr.arange(mi.UInt32, count) + 16, mi.UInt32(1))
+    assert np.array_equal(np.array(again.next_1d()), ours[:, 0].astype(np.float32))  # a cycle
+
+
+def test_halton_is_uniform_over_pixels():
+    sampler = Halton(hash32(dr.arange(mi.UInt32, 1 << 16)), mi.UInt32(3), mi.UInt32(2))
+    values = np.array([np.array(sampler.next_1d()) for _ in range(6)])
+    assert (values >= 0).all() and (values < 1).all()
+    np.testing.assert_allclose(values.mean(axis=1), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.corrcoef(values), np.eye(6), atol=0.02)

@@ -1,0 +1,131 @@
+"""Which clips a profile has, what their names mean, how many samples references get, what is left out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets.channels import CHANNELS
+from datasets.clip import Clip, Dataset
+from datasets.inspect import info, size_in_full
+from datasets.job import render_to
+from datasets.pilot import reference_spp
+from datasets.profiles import ClipKind, DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
+from errors import BadInput
+from models import channels_read
+from scenes import build_scene
+
+AUXILIARY = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+
+
+def test_release_has_rooms_enough_and_tests_on_others():
+    facts = plan("release", 0)
+    rooms = {split: {c for c in clips if c.startswith("room")} for split, clips in facts["splits"].items()}
+    assert len(rooms["train"]) >= 64 and len(rooms["val"]) >= 8 and rooms["test"]
+    assert not rooms["train"] & rooms["val"] and not (rooms["train"] | rooms["val"]) & rooms["test"]
+    boxes = {split: [c for c in clips if c.startswith("cornell")] for split, clips in facts["splits"].items()}
+    assert not boxes["train"] and {"cornell_box/000", "cornell_box_moving/still"} <= set(boxes["test"])
+    assert {f"cornell_box_moving/000-{spp}spp" for spp in (4, 64, 256)} <= set(boxes["test"])
+    quality = profile_of("release").quality
+    assert quality["train"].floor == 30 and quality["test"].floor == 40
+
+
+def test_other_seeds_have_other_rooms():
+    a, b = (set(clips_of(profile_of("release"), "train", seed)) for seed in (0, 1))
+    assert not a & b
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("000", (0, False, 1)), ("012", (12, False, 1)), ("still", (0, True, 1)), ("000-64spp", (0, False, 64))],
+)
+def test_clip_names_say_what_they_are(name, kind):
+    assert ClipKind.of(name) == kind
+
+
+def test_other_clip_names_are_refused():
+    with pytest.raises(BadInput, match="'moving' does not name a clip"):
+        ClipKind.of("moving")
+
+
+@pytest.fixture(scope="module")
+def variants(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Clip]:
+    """One moving box as it is, standing still, and with 16 spp as noisy input."""
+    quality = Quality(realisations=4, reference_spp=64)
+    profile = DataProfile(24, 24, 5, boxes={}, rooms={}, quality={"test": quality})
+    root, clips = tmp_path_factory.mktemp("variants"), {}
+    for name in ("000", "still", "000-16spp"):
+        path = root / "test" / "cornell_box_moving" / name
+        render_to(path, profile, 0, tuple(CHANNELS))
+        clips[name] = Clip(path)
+    return clips
+
+
+def test_in_a_still_clip_only_the_noise_changes(variants):
+    clip = variants["still"]
+    for name in ("albedo", "normal", "depth", "emission", "mesh_id"):
+        assert all(np.array_equal(clip.read(name, 0), clip.read(name, frame)) for frame in range(1, clip.frames))
+    assert all((clip.read("motion", frame) == 0).all() for frame in range(clip.frames))
+    assert not np.array_equal(clip.read("direct", 0), clip.read("direct", 1))
+    assert not np.array_equal(variants["000"].read("depth", 0), variants["000"].read("depth", 4))
+
+
+def test_more_samples_as_input_have_less_noise_and_the_same_reference(variants):
+    one, many = variants["000"], variants["000-16spp"]
+    assert many.facts["noisy_spp"] == 16
+    for name in ("direct_reference", "indirect_reference", "albedo", "motion", "dual_motion"):
+        assert all(np.array_equal(one.read(name, frame), many.read(name, frame)) for frame in range(one.frames))
+
+    def variance(clip: Clip) -> float:
+        noisy = [[clip.read("indirect", f, realisation=s).astype(float) for s in range(4)] for f in range(clip.frames)]
+        return float(np.var(noisy, axis=1, ddof=1).mean())
+
+    assert variance(many) < variance(one) / 12  # stratified samples gain at least as much as independent ones, a 16th
+
+
+@pytest.mark.parametrize("floor", [34.0, 40.0])
+def test_references_get_down_to_their_floor(floor, tmp_path):
+    quality = Quality(realisations=1, reference_spp=16, floor=floor)
+    profile = DataProfile(32, 32, 4, boxes={}, rooms={}, quality={"test": quality})
+    path = tmp_path / "test" / "cornell_box" / "000"
+    render_to(path, profile, 0, tuple(CHANNELS))
+    clip = Clip(path)
+    assert -10 * np.log10(clip.facts["floor_mse"]) > floor - 0.5
+    spp = clip.facts["reference_spp"]
+    assert spp > 16 and spp & (spp - 1) == 0
+
+
+def test_references_stop_at_the_most():
+    scene = build_scene("cornell_box", 0, 2)
+    assert reference_spp(scene, 2, 16, 16, Quality(1, 8, floor=90.0, most_spp=64), 1) == 64
+    assert reference_spp(scene, 2, 16, 16, Quality(1, 8), 1) == 8
+
+
+def test_what_nobody_reads_is_not_rendered(tiny):
+    clip = Dataset(tiny).clips("train")[0]
+    assert set(clip.channels) == set(rendered_channels(channels_read()))
+    with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
+        clip.read("dual_motion", 1)
+    test = Dataset(tiny).clips("test")[0]
+    assert set(test.channels) == set(CHANNELS)
+
+
+def test_a_static_diffuse_box_takes_at_most_sixty_percent(tiny):
+    clip = Dataset(tiny).clips("train")[0]
+    assert clip.scene == "cornell_box"
+    files = [clip.path / entry["file"] for n, entry in clip.channels.items() if n in AUXILIARY and "file" in entry]
+    stored, full = sum(file.stat().st_size for file in files), sum(size_in_full(clip, name) for name in AUXILIARY)
+    assert 0.2 < stored / full <= 0.6
+
+
+def test_info_shows_what_is_saved(tiny):
+    text = info(tiny)
+    channel, step = (line.split() for line in text.splitlines() if line.startswith("dual_motion"))
+    assert "not rendered" in " ".join(channel)
+    assert "% of full" in next(line for line in text.splitlines() if line.startswith("auxiliary channels"))
+    assert float(step[1]) > 0 and float(step[2]) > 0  # seconds spent on test clips, saved on the others
+
+
+def test_no_clip_of_another_scene_is_left_unrendered(tmp_path):
+    with pytest.raises(BadInput, match="room-N"):
+        render_to(Path(tmp_path / "test" / "castle" / "000"), profile_of("tiny"), 0, ())

@@ -1,0 +1,91 @@
+"""The papers' options: Halton cycles are unbiased, regularised paths are biased where they say so and nowhere else."""
+
+import numpy as np
+import pytest
+from test_path import FRAME, assert_same_mean, stock
+
+from render.clip import Options, Sampling, render_clip
+from render.gbuffer import render_gbuffer
+from render.path import PathTracer
+from render.regularise import blurred
+from render.sampler import CYCLE
+from render.stage import Stage
+from scenes import build_scene
+from scenes.extremes import repaint
+
+
+@pytest.fixture(scope="module")
+def glossy() -> Stage:
+    """The Cornell box with blocks of rough metal: they throw blurred reflections of the light on floor and walls."""
+    metal = {"type": "roughconductor", "material": "Ag", "alpha": 0.05}
+    scene = repaint(build_scene("cornell_box", 3, 24), lambda s: metal if "block" in s.name else s.bsdf)
+    stage = Stage(scene, 64, 64)
+    stage.pose(FRAME)
+    return stage
+
+
+def test_every_point_of_the_halton_cycle_is_unbiased(stage):
+    stage.pose(FRAME)
+    ray, tracer = stage.rays(stage.view(FRAME)), PathTracer(stage, halton=True)
+    images = np.stack([np.add(*tracer.radiance(ray, seed, 1, first=seed)) for seed in range(800)])
+    emission = render_gbuffer(stage, stage.view(FRAME))["emission"]
+    assert_same_mean(emission + images, np.stack([stock(stage, 3, 16, s) for s in range(60)]))
+
+
+def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
+    stage.pose(FRAME)
+    ray = stage.rays(stage.view(FRAME))
+    halton, owen = PathTracer(stage, halton=True), PathTracer(stage)
+    truth = np.add(*owen.radiance(ray, 999, 2048))
+    cycles = [np.mean([np.add(*halton.radiance(ray, s, 1, first=f)) for f in range(CYCLE)], axis=0) for s in range(4)]
+    independent = [
+        np.mean([np.add(*owen.radiance(ray, 1000 * s + f, 1)) for f in range(CYCLE)], axis=0) for s in range(4)
+    ]
+    errors = [np.mean((np.stack(images) - truth) ** 2) for images in (cycles, independent)]
+    assert errors[0] < 0.8 * errors[1]
+
+
+def test_a_clip_walks_through_the_cycle():
+    scene = build_scene("cornell_box", 3, 2).still()
+    sampling = Sampling(2, 1, 8, Options(halton=True))
+    frames = [arrays for arrays, _ in render_clip(scene, CYCLE + 2, 16, 16, sampling, 1)]
+    for frame in (0, 1):
+        assert np.array_equal(frames[frame]["direct"], frames[frame + CYCLE]["direct"])
+        assert not np.array_equal(frames[frame]["direct_reference"], frames[frame + CYCLE]["direct_reference"])
+    assert not np.array_equal(frames[0]["direct"], frames[1]["direct"])
+    assert not np.array_equal(frames[0]["direct"][0], frames[0]["direct"][1])
+
+
+def test_regularisation_changes_nothing_where_nothing_is_glossy(stage):
+    stage.pose(FRAME)
+    ray = stage.rays(stage.view(FRAME))
+    plain, regular = (PathTracer(stage, regularise=r).radiance(ray, 1, 4) for r in (False, True))
+    assert all(np.array_equal(a, b) for a, b in zip(plain, regular, strict=True))
+
+
+def test_regularisation_trades_bias_for_noise(glossy):
+    """Direct light is untouched. Indirect light has less variance, and a bias of a few percent."""
+    ray = glossy.rays(glossy.view(FRAME))
+    plain, regular = (
+        np.stack([PathTracer(glossy, regularise=r).radiance(ray, seed, 64) for seed in range(8)]).astype(float)
+        for r in (False, True)
+    )
+    assert np.array_equal(plain[:, 0], regular[:, 0])
+    noise = [images[:, 1].var(axis=0, ddof=1).mean() for images in (plain, regular)]
+    assert noise[1] < 0.7 * noise[0]
+    bias = regular[:, 1].mean() / plain[:, 1].mean() - 1
+    assert 1e-4 < abs(bias) < 0.1
+
+
+def test_blurred_materials_are_rough_and_others_unchanged():
+    rgb = {"type": "rgb", "value": [0.1, 0.2, 0.3]}
+    assert blurred({"type": "diffuse", "reflectance": rgb}) == {"type": "diffuse", "reflectance": rgb}
+    assert blurred({"type": "conductor", "material": "Au"}) == {
+        **{"type": "roughconductor", "material": "Au", "alpha": 0.3}
+    }
+    assert blurred({"type": "roughplastic", "alpha": 0.4})["alpha"] == 0.4
+    nested = blurred({"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.1}})
+    assert nested["bsdf"]["roughness"] == pytest.approx(0.3**0.5)
+    ramp = np.linspace(0, 1, 16).reshape(4, 4, 1)
+    rough = blurred({"type": "roughconductor", "alpha": {"type": "bitmap", "data": ramp}})
+    np.testing.assert_array_equal(rough["alpha"]["data"], np.maximum(ramp, 0.3))
