@@ -12,7 +12,10 @@ from errors import BadInput
 Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
 Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
 Profile = Annotated[
-    str, tyro.conf.arg(metavar="NAME", help="how much of everything: tiny (seconds), quick (minutes) or release (days)")
+    str,
+    tyro.conf.arg(
+        metavar="NAME", help="how much of everything: tiny (seconds), quick (minutes), release (days), or its sketch"
+    ),
 ]
 Precision = Annotated[
     Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
@@ -34,7 +37,18 @@ RayArgument = Annotated[
         "the data set's folder under the same path"
     ),
 ]
+Halton = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(help="draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE)"),
+]
+Regularise = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(help="blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics"),
+]
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+Scenes = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE...")]
 
 
 def data_folder(data: Path | None, profile: str) -> Path:
@@ -48,9 +62,11 @@ def dataset(
     reads: Reads = (),
     part: PartArgument = None,
     ray: RayArgument = False,
+    halton: Halton = False,
+    regularise: Regularise = False,
 ) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.job import Part, generate, render_here
+    from datasets.job import Options, Part, generate, render_here
     from models import channels_read
 
     if ray:
@@ -58,7 +74,9 @@ def dataset(
     folder = data_folder(data, profile)
     share = Part.parse(part) if part else None
     channels = channels_read(reads)
-    rendered = generate(folder, profile, seed, share, channels, render_on_cluster if ray else render_here)
+    options = Options(halton, regularise)
+    render = render_on_cluster if ray else render_here
+    rendered = generate(folder, profile, seed, share, channels, options, render)
     print(f"{folder}: {rendered} clips rendered")
 
 
@@ -74,11 +92,19 @@ def verify(folder: Folder) -> None:
     print(f"{folder}: everything is as it was written")
 
 
-def info(folder: Folder) -> None:
-    """Print what is in a data set: clips, channels, sizes, noise floors, times."""
+def info(folder: Folder, plot: Path | None = None) -> None:
+    """Print what is in a data set: clips, how hard they are, channels, sizes and what is saved, noise floors, times.
+
+    Args:
+        plot: write a histogram of how hard the clips are to this PNG as well.
+    """
     from datasets.inspect import info as describe
 
     print(describe(folder))
+    if plot:
+        from datasets.histogram import plot_difficulty
+
+        plot_difficulty(folder, plot)
 
 
 def train(
@@ -104,6 +130,36 @@ def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), pr
     run(data_folder(data, profile), runs, profile, list(names) or None)
 
 
+def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
+    """Draw a contact sheet of scenes (16 rooms, unless some are named): the middle frame of each, its own exposure."""
+    from datasets.preview import contact_sheet
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    contact_sheet(out, names or [f"room-{number}" for number in range(16)], seed, spp=spp)
+    print(out)
+
+
+def bench(
+    what: Annotated[Literal["loading", "rendering"], tyro.conf.Positional],
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+) -> None:
+    """Measure this machine.
+
+    loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
+    rendering: seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
+    """
+    if what == "rendering":
+        from datasets.bench import bench_rendering
+
+        print(bench_rendering(runs))
+    else:
+        from train.loading import bench_loading
+
+        print(bench_loading(data_folder(data, profile), runs, profile))
+
+
 def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]) -> None:
     """Write one multi-layer OpenEXR file a frame of a clip's folder (such as data/quick/test/cornell_box/000)."""
     from datasets.exr import export_clip
@@ -111,7 +167,10 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
     print(f"{out}: {export_clip(clip, out)} files")
 
 
-COMMANDS = {"dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate, "exr": exr}
+COMMANDS = {
+    **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
+    **{"exr": exr, "bench": bench},
+}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,7 +1,9 @@
 """Reading clips and data sets straight from memory maps."""
 
 import math
+import resource
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -151,4 +153,14 @@ class Dataset:
             )
         if not paths:
             raise BadInput(f"{self.path} has no clips to {split} with")
+        allow_open_files(len(paths) * len(CHANNELS))
         return [Clip(path) for path in paths]
+
+
+def allow_open_files(count: int) -> None:
+    """Raise this process's limit by `count`, as far as it may: every memory map keeps a file open; 1024 are usual."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY:
+        wanted = soft + count if hard == resource.RLIM_INFINITY else min(soft + count, hard)
+        with suppress(ValueError, OSError):  # macOS has a limit beyond the one it tells
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

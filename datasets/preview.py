@@ -1,25 +1,19 @@
 """A contact sheet of scenes, to look at before rendering hours of them."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets.display import clip_exposure, display, luminance
-from datasets.files import write_file
+from datasets.figure import DPI, plt, save_figure
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
 from scenes import build_scene
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
-DPI = 100
 CAPTION = 0.2  # inches
 
 
@@ -53,7 +47,4 @@ def contact_sheet(
         axis.set_title(name, fontsize=8, pad=2)
     top = 1 - CAPTION / sheet[1]
     figure.subplots_adjust(left=0, right=1, bottom=0, top=top, wspace=0.01, hspace=CAPTION * DPI / height)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    plt.close(figure)
-    write_file(path, buffer.getvalue())
+    save_figure(path, figure)

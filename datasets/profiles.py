@@ -59,6 +59,13 @@ DATA_PROFILES = {
         rooms={"train": 3, "val": 0, "test": 1},
         quality={"train": Quality(7, 128, 30, 512), "val": Quality(1, 256), "test": Quality(1, 256, 40, 1024)},
     ),
+    # What release is like, in minutes: as many rooms, small and short, to see how hard they are.
+    "sketch": DataProfile(
+        *(64, 64, 4),
+        boxes={"train": 0, "val": 0, "test": 0},
+        rooms={"train": 64, "val": 8, "test": 0},
+        quality={"train": Quality(1, 64, 30), "val": Quality(1, 64, 30), "test": Quality(1, 64, 30)},
+    ),
     "release": DataProfile(
         *(256, 256, 32),
         boxes={"train": 0, "val": 0, "test": 1},

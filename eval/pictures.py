@@ -1,20 +1,14 @@
 """Pictures for people."""
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
 from torch import Tensor
 
 from datasets.display import display
-from datasets.files import write_file
+from datasets.figure import DPI, plt, save_figure
 from models.operators import finite
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
-DPI = 100
 CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor
 
@@ -34,7 +28,4 @@ def save_strip(
         caption = [f"{key.upper()} {value:.3f}" for key, value in measured.items() if value is not None]
         axis.set_title("\n".join([name, "  ".join(caption)]), fontsize=8, pad=2)
     figure.subplots_adjust(left=0, right=1, bottom=0, top=1 - CAPTION / size[1], wspace=0.01)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    plt.close(figure)
-    write_file(path, buffer.getvalue())
+    save_figure(path, figure)

@@ -19,8 +19,9 @@ Image = NDArray[Any]
 Display = Callable[[Image], Image]  # radiance to what is shown, in [0, 1]
 Render = Callable[[int, int], Image]  # (seed, spp) to radiance (H, W, 3)
 
-SIZE, FRAMES, FRAME = 128, 24, 8
-FIRST_SPP, MOST_SPP, REPEATS = 32, 2048, 3
+SIZE, FRAMES, FRAME = 96, 24, 8
+FIRST_SPP, MOST_SPP, REPEATS = 32, 512, 3
+STOCK, OURS = "stock path, independent", "onespp"
 
 
 class Row(NamedTuple):
@@ -98,8 +99,8 @@ def seconds_to_floor(names: Iterable[str], target: float, display_of: Callable[[
         stage = Stage(build_scene(name, 0, FRAMES), SIZE, SIZE)
         stage.pose(FRAME)
         view = stage.view(FRAME)
-        renderers = {"stock path, independent": stock(stage, view), "onespp": ours(stage, view)}
-        display = display_of(renderers["onespp"](9, 256))
+        renderers = {STOCK: stock(stage, view), OURS: ours(stage, view)}
+        display = display_of(renderers[OURS](9, 256))
         reached = {label: enough(render, target, display) for label, render in renderers.items()}
         spent: dict[str, list[float]] = {label: [] for label in renderers}
         for repeat in range(REPEATS):  # interleaved, so that drift of the machine hits both alike

@@ -75,9 +75,10 @@ def render_clip(
             ahead["motion"] = motion_vectors(centres, depth, mesh_id, now, view)
             clock.lap("motion")
             stage.pose(frame)
+            clock.lap("gbuffer")
             if wants_dual:  # they look into the scene as it is posed in this frame
                 ahead["dual_motion"] = dual_motion(stage, depth, mesh_id, ahead["motion"], now, view)
-            clock.lap("dual_motion")
+                clock.lap("dual_motion")
 
         ray = stage.rays(view)
         spp = sampling.noisy_spp

@@ -122,6 +122,14 @@ def registry_index(pointer: Any) -> Any:
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
+def registry_table(pointers: Sequence[Any], first: int = 0) -> Any:
+    """mi.UInt32 table from registry indices to places in `pointers`, counted from `first`; 0 for all others."""
+    indices = [int(np.array(registry_index(pointer))[0]) for pointer in pointers]
+    table = np.zeros(max(indices, default=0) + 1, np.uint32)
+    table[indices] = np.arange(len(indices)) + first
+    return mi.UInt32(table)
+
+
 class MaterialTable:
     """Albedo and roughness of the BSDFs of Mitsuba shapes, looked up by registry index."""
 
@@ -129,10 +137,7 @@ class MaterialTable:
         # Objects live as long as the table does: pointers do not keep them.
         nothing = Material(constant(1), constant(1), constant(0), WHITE)  # an empty scene needs a row, too
         self.materials = [describe(shape.bsdf(), shape.id()) for shape in shapes] or [nothing]
-        indices = [int(np.array(registry_index(mi.BSDFPtr(shape.bsdf())))[0]) for shape in shapes]
-        row = np.zeros(max(indices, default=0) + 1, np.uint32)
-        row[indices] = np.arange(len(indices))
-        self.row = mi.UInt32(row)
+        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape in shapes])
         self.base, self.roughness, self.metallic = (
             mi.TexturePtr([getattr(material, name) for material in self.materials])
             for name in ("base", "roughness", "metallic")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import dr, mi
-from render.materials import registry_index
+from render.materials import registry_index, registry_table
 from render.stage import Stage, to_mitsuba
 
 LEAST_ALPHA = 0.3
@@ -47,13 +47,10 @@ class BlurredTable:
 
     def __init__(self, stage: Stage):
         loaded = {shape.id(): shape for shape in stage.mitsuba_scene.shapes()}
-        sharp = [loaded[shape.name].bsdf() for shape in stage.scene.shapes]
+        self.row = registry_table([mi.BSDFPtr(loaded[shape.name].bsdf()) for shape in stage.scene.shapes])
         # Objects live as long as the table does: pointers do not keep them.
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(shape.bsdf))) for shape in stage.scene.shapes]
-        indices = [int(np.array(registry_index(mi.BSDFPtr(bsdf)))[0]) for bsdf in sharp]
-        row = np.zeros(max(indices) + 1, np.uint32)
-        row[indices] = np.arange(len(indices))
-        self.row, self.pointers = mi.UInt32(row), mi.BSDFPtr(self.bsdfs)
+        self.pointers = mi.BSDFPtr(self.bsdfs)
 
     def after_first(self, si: Any, depth: Any) -> Any:
         """mi.BSDFPtr: the surface's own at depth 1, the blurred one from then on."""

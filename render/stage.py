@@ -1,13 +1,12 @@
 """An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.materials import MaterialTable, registry_index
+from render.materials import MaterialTable, registry_index, registry_table
 from scenes.animation import Scene, Shape
 from scenes.camera import Array, View, directions, pixel_centres
 
@@ -64,14 +63,6 @@ def upload(values: Array) -> Any:
     return mi.Float(buffer[start : start + len(values)])
 
 
-def mesh_ids(shapes: Sequence[Any]) -> Any:
-    """mi.UInt32 table from Mitsuba's registry index of a shape to its place in `shapes` plus one; 0 for no shape."""
-    indices = [int(np.array(registry_index(mi.ShapePtr(shape)))[0]) for shape in shapes]
-    table = np.zeros(max(indices, default=0) + 1, np.uint32)
-    table[indices] = np.arange(len(indices)) + 1
-    return mi.UInt32(table)
-
-
 def unit_of(scene: Scene) -> float:
     """World units that a unit of Mitsuba's stands for: 1, or a power of two for very small and very large scenes.
 
@@ -98,7 +89,7 @@ class Stage:
         loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
         shapes = [loaded[shape.name] for shape in scene.shapes]
         self.materials = MaterialTable(shapes)
-        self.mesh_id_of_shape = mesh_ids(shapes)
+        self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in shapes], first=1)
         self.posed: dict[str, NDArray[Any]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)

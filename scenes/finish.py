@@ -85,9 +85,9 @@ Finish = Callable[[Rng, Bsdf], Bsdf]
 
 # What a slot may be made of when it is not plainly diffuse, with weights.
 GLOSSY: dict[str, dict[Finish, float]] = {
-    "metal": {rough_metal: 5, mirror: 1, principled: 2},
+    "metal": {rough_metal: 10, mirror: 1, principled: 4},
     "glass": {glass: 1},
-    "body": {rough_plastic: 6, plastic: 2, principled: 6, rough_metal: 6, mirror: 1, glass: 1},
+    "body": {rough_plastic: 12, plastic: 4, principled: 12, rough_metal: 10, mirror: 1, glass: 1},
     "ceramic": {plastic: 2, rough_plastic: 3, principled: 1},
     "slat": {rough_metal: 1, rough_plastic: 1},
     "floor": {rough_plastic: 4, principled: 2, plastic: 1},

@@ -11,6 +11,7 @@ from scenes.objects import DECOR, Support, Thing
 from scenes.shell import Opening, pose, still, wall_pose
 
 Rng = np.random.Generator
+MOST_THINGS = 54  # leaves a few for what hangs
 GAP = 0.002  # m, between things that stand on or beside each other
 
 
@@ -112,7 +113,7 @@ class Layout:
     def try_add(self, group: Group, motion: RigidMotion) -> bool:
         """Add the group where `motion` takes it, if nothing is in its way."""
         box = self.swept(group.bounds + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
-        if not self.fits(box):
+        if not self.fits(box) or self.things + len(group.members) > MOST_THINGS:
             return False
         self.add(group, motion)
         return True

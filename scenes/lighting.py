@@ -58,7 +58,7 @@ def spot(layout: Layout, margin: float) -> tuple[float, float]:
 def ceiling_panel(layout: Layout) -> list[Lamp]:
     """A rectangle below the ceiling that shines down, from a spotlight's size to a big panel."""
     rng = layout.rng
-    width, depth = log_uniform(rng, 0.1, 2.0), log_uniform(rng, 0.1, 2.0)
+    width, depth = log_uniform(rng, 0.2, 2.5), log_uniform(rng, 0.2, 2.5)
     x, z = spot(layout, max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
@@ -97,7 +97,7 @@ def hanging(layout: Layout) -> list[Lamp]:
     motion = still((x, layout.size[1] - thing.bounds[1, 1] - GAP, z), 0.0)
     shade = next(part for part in thing.parts if part.slot == "shade")
     closed = trimesh.Trimesh(shade.mesh.vertices, shade.mesh.faces).is_watertight
-    lamp = Lamp(shade.mesh, motion) if closed else bulb(thing, log_uniform(layout.rng, 0.03, 0.08), motion)
+    lamp = Lamp(shade.mesh, motion) if closed else bulb(thing, log_uniform(layout.rng, 0.04, 0.1), motion)
     kept = Thing(thing.name, tuple(part for part in thing.parts if part is not shade or not closed))
     if not layout.fits(box_of(thing.bounds, motion.matrix(0))):
         return []
@@ -117,7 +117,7 @@ def standing_lamp(layout: Layout) -> list[Lamp]:
 
 def orb(layout: Layout) -> list[Lamp]:
     """A glowing ball in the air, which in half of the cases drifts."""
-    rng, radius = layout.rng, log_uniform(layout.rng, 0.03, 0.2)
+    rng, radius = layout.rng, log_uniform(layout.rng, 0.06, 0.3)
     (x, z), y = spot(layout, 0.4), rng.uniform(0.3, layout.size[1] - 0.5)
     drift = rng.uniform(-0.4, 0.4, 3) * (rng.random() < 0.5)
     start = np.array([x, y, z])
@@ -187,7 +187,7 @@ def sky_panel(layout: Layout, wall: int, opening: Opening) -> Lamp:
 
 Fixture = Callable[[Layout], list[Lamp]]
 
-OPEN: tuple[Fixture, ...] = (ceiling_panel, ceiling_panel, downlight, hanging, orb)
+OPEN: tuple[Fixture, ...] = (ceiling_panel, ceiling_panel, ceiling_panel, ceiling_panel, downlight, hanging, orb)
 HIDDEN: tuple[Fixture, ...] = (cove, behind_opening, above_furniture, standing_lamp)
 
 LIGHT_COLOURS = np.array([[1.0, 0.55, 0.25], [1.0, 0.75, 0.5], [1.0, 0.95, 0.85], [0.8, 0.9, 1.0]])  # candle to shade

@@ -15,7 +15,7 @@ from scenes.shell import Opening, floor, panel, reveal, still, wall_pose, wall_w
 
 Rng = np.random.Generator
 
-FEWEST, MOST = 15, 60  # things in a room
+FEWEST, MOST_LAMPS = 15, 4  # things and lamps in a room
 AGAINST_WALLS = ("sofa", "armchair", "bed", "shelf", "cabinet", "desk", "bench", "screen")
 
 
@@ -167,15 +167,15 @@ def lamps_of(layout: Layout, style: str) -> list[Lamp]:
     return lamps
 
 
-STYLES = {"open": 0.45, "mixed": 0.2, "hidden": 0.1, "window": 0.25}
+STYLES = {"open": 0.55, "mixed": 0.15, "hidden": 0.06, "window": 0.24}
 
 
 def room(rng: Rng, frames: int) -> Scene:
     """A random interior for a clip of `frames` frames, in metres: 15 to 60 things, 1 to 4 lamps or windows."""
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
-    layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.2, 0.6))))
+    layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.3, 0.5))))
     style = str(rng.choice(list(STYLES), p=list(STYLES.values())))
-    outside = style == "window" and rng.random() < 0.4
+    outside = style == "window" and rng.random() < 0.3
     if style == "window":
         windows(layout, int(rng.integers(1, 4)))
     elif rng.random() < 0.2:
@@ -194,7 +194,8 @@ def room(rng: Rng, frames: int) -> Scene:
     while layout.things < FEWEST:
         scattered(layout, list(DECOR.values()), FEWEST - layout.things)
     if style == "window" and not outside:
-        lamps += [sky_panel(layout, wall, hole) for wall, holes in layout.openings.items() for hole in holes]
+        panels = [sky_panel(layout, wall, hole) for wall, holes in layout.openings.items() for hole in holes]
+        lamps = (lamps + panels)[:MOST_LAMPS]
     if not lamps and not outside:
         lamps = ceiling_panel(layout) or orb(layout) or hanging(layout)
     surface = 2 * (size[0] * size[1] + size[1] * size[2] + size[0] * size[2])

@@ -23,8 +23,8 @@ from train.recipes import Recipe, recipe_for
 
 FASTEST = "rae"  # the network whose training consumes the most pixels a second
 WORKERS = (0, 1, 2)
-REPEATS = 7  # of each measurement, besides a first one that warms up; the median counts
-SEQUENCES = 100  # a measured epoch has, at least
+REPEATS = 5  # of each measurement, besides a first one that warms up; the median counts
+SEQUENCES = 300  # a measured epoch has, at least
 SIZES = (0.1e9, 5e9)  # bytes of the data sets whose memory is compared
 
 

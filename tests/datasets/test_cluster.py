@@ -1,7 +1,6 @@
 """Rendering on a Ray cluster of this machine: equal bytes, whoever dies."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -11,10 +10,10 @@ from pathlib import Path
 import pytest
 from test_dataset import ONESPP, digest
 
-from datasets.clip import Dataset
 from datasets.cluster import render_on_cluster
-from datasets.job import ClipJob, Outcome
+from datasets.job import ClipJob, Outcome, generate
 from errors import BadInput
+from models import channels_read
 
 
 def holder(lock: Path) -> int | None:
@@ -58,15 +57,14 @@ def test_a_killed_worker_costs_nothing_but_time(tiny, tmp_path):
 
 def test_a_failing_clip_does_not_stop_the_others_but_a_full_disk_does(tiny, tmp_path):
     """A negative seed fails in the renderer; a file where a folder should be stands in for trouble with the disk."""
-    root = tmp_path / "data"
-    root.mkdir()
-    shutil.copy(tiny / "dataset.json", root)
-    good = ClipJob(root / "train" / "cornell_box" / "000", "tiny", 0, tuple(Dataset(tiny).facts["channels"]["train"]))
+    root, jobs = tmp_path / "data", list[ClipJob]()
+    generate(root, "tiny", 0, reads=channels_read(), render=lambda planned: iter(jobs.extend(planned) or ()))
+    good = jobs[0]
     bad = good._replace(path=root / "val" / "cornell_box" / "000", seed=-1)
     ended = {outcome.path: outcome for outcome in render_on_cluster([bad, good])}
     assert ended[good.path] == Outcome(good.path, "rendered")
     assert ended[bad.path].ending == "failed" and "non-negative" in ended[bad.path].reason
-    assert digest(good.path) == digest(tiny / "train" / "cornell_box" / "000")
+    assert digest(good.path) == digest(tiny / good.path.relative_to(root))
     (root / "file").write_text("")
     with pytest.raises(NotADirectoryError):
         list(render_on_cluster([good._replace(path=root / "file" / "cornell_box" / "000")]))

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -270,6 +271,15 @@ def test_two_jobs_on_one_folder_share_the_work(copy, tiny):
     assert digest(copy) == digest(tiny)
 
 
+def test_two_processes_on_one_folder_share_the_work(tiny, tmp_path):
+    command = [*ONESPP, "dataset", "--data", str(tmp_path / "data"), "--profile", "tiny"]
+    jobs = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    outputs = [job.communicate(timeout=120) for job in jobs]
+    assert [job.returncode for job in jobs] == [0, 0], outputs
+    assert sum(int(re.search(r"(\d+) clips rendered", out)[1]) for out, _ in outputs) == 6
+    assert digest(tmp_path / "data") == digest(tiny)
+
+
 def test_parts_are_disjoint_and_their_union_is_the_whole(tiny, tmp_path):
     shares = [tmp_path / str(k) for k in (1, 2, 3, 4)]
     counts = [generate(share, "tiny", 0, Part.parse(f"{k}/4")) for k, share in enumerate(shares, 1)]
@@ -297,6 +307,48 @@ def test_a_clip_that_fails_does_not_stop_the_others(copy, monkeypatch):
         generate(copy, "tiny", 0)
     assert (copy / "val" / "cornell_box_moving" / "000" / "clip.json").exists()
     assert not list((copy / "val" / "cornell_box").glob("*"))
+
+
+def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(copy, monkeypatch):
+    for scene in ("cornell_box", "cornell_box_moving"):
+        shutil.rmtree(copy / "val" / scene / "000")
+    genuine = datasets.job.render_clip
+
+    def faulty(scene, *arguments):
+        for index, (channels, seconds) in enumerate(genuine(scene, *arguments)):
+            if index == 3 and not scene.moves():
+                channels["direct"][0, 5, 5:7] = np.nan
+                channels["indirect_reference"][1, 0, 0, 2] = np.inf
+            yield channels, seconds
+
+    monkeypatch.setattr(datasets.job, "render_clip", faulty)
+    assert generate(copy, "tiny", 0) == 2
+    box, moving = Dataset(copy).clips("val")
+    assert {name: count for name, count in box.facts["nonfinite"].items() if count} == {
+        "direct": 6,
+        "indirect_reference": 1,
+    }
+    assert not any(moving.facts["nonfinite"].values())
+    assert (box.read("direct", 3)[5, 5:7] == 0).all()
+    head, *rows = (
+        re.split(r"\s{2,}", line) for line in info(copy).splitlines() if re.match(r"clip |\w+/cornell", line)
+    )
+    bad = {row[0]: row[head.index("bad values")].strip() for row in rows}
+    assert bad.pop("val/cornell_box/000") == "7" and set(bad.values()) == {"0"}
+
+
+def test_more_memory_maps_than_files_may_be_open(tiny):
+    """Every map holds a file descriptor, a dozen a clip, and the usual limit is 1024."""
+    script = f"""
+import resource
+from pathlib import Path
+from datasets.clip import Dataset
+resource.setrlimit(resource.RLIMIT_NOFILE, (16, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+clips = Dataset(Path({str(tiny)!r})).clips("train")
+maps = [clip.map(name) for clip in clips for name, entry in clip.channels.items() if "file" in entry]
+assert len(maps) > 16, len(maps)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_what_a_kill_or_a_careless_hand_left_is_repaired(tiny, copy):

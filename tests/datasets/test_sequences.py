@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from datasets.channels import CHANNELS
 from datasets.clip import Dataset
@@ -53,30 +54,64 @@ def project(points: torch.Tensor, cameras: Cameras) -> torch.Tensor:
     return homogeneous[:2] / homogeneous[2:]
 
 
+def carried(frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
+    """World points (3, N) of all pixels, carried by their meshes to the previous frame, and the rotations (N, 3, 3)."""
+    mesh = frame.mesh_id[0, 0].long().flatten()
+    relative = frame.previous.object_to_world[0] @ torch.linalg.inv(frame.now.object_to_world[0])
+    relative = torch.cat([torch.eye(4, dtype=torch.float64)[None], relative])[mesh]
+    points = torch.einsum("nij,jn->in", relative[:, :3, :3], surface(frame, frame.now)) + relative[:, :3, 3].T
+    return points, relative[:, :3, :3]
+
+
 @pytest.mark.parametrize("kind", AUGMENTATIONS)
 def test_augmented_motion_and_cameras_agree(clips, kind):
     """Reproject after augmentation: every surface point lands where the augmented motion vector says."""
     checked = moved = 0
     for index in range(12):
         for frame in sequences(clips, AUGMENTATIONS[kind])[index]:
-            points = surface(frame, frame.now)
-            mesh = frame.mesh_id[0, 0].long().flatten()
-            relative = frame.previous.object_to_world[0] @ torch.linalg.inv(frame.now.object_to_world[0])
-            relative = torch.cat([torch.eye(4, dtype=torch.float64)[None], relative])[mesh]
-            carried = torch.einsum("nij,jn->in", relative[:, :3, :3], points) + relative[:, :3, 3].T
-            expected = project(carried, frame.previous)
+            expected = project(carried(frame)[0], frame.previous)
             target = (positions(frame) + frame.motion[0]).flatten(1)
-            hit = (mesh > 0) & (target.abs().amax(dim=0) < 1e4)
+            hit = (frame.mesh_id[0, 0].flatten() > 0) & (target.abs().amax(dim=0) < 1e4)
             assert (target - expected)[:, hit].abs().max() < 0.01
             checked += 1
             moved += bool(frame.motion.abs().max() > 0.1)
     assert checked == 60 and moved > 20
 
 
+@pytest.mark.parametrize("kind", AUGMENTATIONS)
+def test_augmented_images_agree_along_motion(clips, kind):
+    """Each visible pixel looked up in the frame played before: same mesh, albedo and normal, nearly the same light."""
+    compared = 0
+    for index in range(8):
+        for before, frame in pairwise(sequences(clips, AUGMENTATIONS[kind])[index]):
+            x, y = (positions(frame) + frame.motion[0]).floor().long().flatten(1)
+            points, rotations = carried(frame)
+            world_to_camera = torch.linalg.inv(frame.previous.camera_to_world[0])
+            depth = world_to_camera[2, :3] @ points + world_to_camera[2, 3]
+            now = ((frame.mesh_id[0, 0].flatten() > 0) & (x >= 0) & (x < 32) & (y >= 0) & (y < 32)).nonzero()[:, 0]
+            now = now[(before.depth[0, 0, y[now], x[now]] / depth[now] - 1).abs() < 0.01]
+            then = y[now] * 32 + x[now]
+
+            new, old = (
+                {name: f.channels[name][0].flatten(-2)[..., where] for name in ALL}
+                for f, where in ((frame, now), (before, then))
+            )
+            assert (new["mesh_id"] == old["mesh_id"]).float().mean() > 0.97
+            assert ((new["albedo"] - old["albedo"]).abs().amax(dim=0) < 0.01).float().mean() > 0.97
+            turned = torch.einsum("nij,jn->in", rotations[now].float(), new["normal"])
+            assert ((turned * old["normal"]).sum(dim=0) > 0.99).float().mean() > 0.97
+            light, light_before = (f["direct_reference"].mean(dim=(0, 1)) for f in (new, old))
+            assert ((light - light_before).abs() / (light + light_before + 1e-6)).median() < 0.1
+            compared += len(now)
+    assert compared > 10_000
+
+
 def test_rotation_turns_images_normals_and_cameras_alike(clips):
     frame = read_frame(clips[1], 4, ALL, window=(slice(8, 40), slice(20, 52)))
     turned = frame.rot90()
-    np.testing.assert_array_equal(turned.albedo[0, 0], np.rot90(frame.albedo[0, 0]))
+    for name in set(ALL) - {"motion"}:
+        images = [f.channels[name].numpy() for f in (turned, frame)]
+        np.testing.assert_array_equal(images[0], np.rot90(images[1], axes=(-2, -1)), name)
     # The same world points, only at other pixels.
     points, same = (surface(f, f.now).reshape(3, 32, 32) for f in (frame, turned))
     torch.testing.assert_close(same, torch.rot90(points, dims=(1, 2)))
@@ -94,6 +129,24 @@ def test_rotation_turns_images_normals_and_cameras_alike(clips):
     torch.testing.assert_close(four.now.camera_to_world, frame.now.camera_to_world)
 
 
+def same(a: Frame, b: Frame) -> bool:
+    cameras = [(getattr(a, when), getattr(b, when)) for when in ("now", "previous")]
+    return (
+        all(torch.equal(a.channels[name], b.channels[name]) for name in ALL)
+        and all(torch.equal(vars(one)[key], vars(two)[key]) for one, two in cameras for key in vars(one))
+        and torch.equal(a.gain, b.gain)
+    )
+
+
+def test_batches_are_the_same_whatever_the_number_of_workers(clips):
+    data = sequences(clips, AUGMENTATIONS["all"])
+    data.set_epoch(4)
+    alone, shared = (list(DataLoader(data, 2, collate_fn=collate, num_workers=workers)) for workers in (0, 2))
+    assert len(alone) == len(shared) > 1
+    for a, b in zip(alone, shared, strict=True):
+        assert all(same(x, y) for x, y in zip(a.frames, b.frames, strict=True))
+
+
 def test_an_item_depends_on_seed_epoch_and_index_only(clips):
     a, b = sequences(clips, AUGMENTATIONS["all"]), sequences(clips, AUGMENTATIONS["all"])
     for epoch in (3, 0):
@@ -101,8 +154,7 @@ def test_an_item_depends_on_seed_epoch_and_index_only(clips):
         b.set_epoch(epoch)
         a[5]  # reading another item in between changes nothing
         for x, y in zip(a[2], b[2], strict=True):
-            assert all(torch.equal(x.channels[name], y.channels[name]) for name in ALL)
-            assert torch.equal(x.gain, y.gain) and torch.equal(x.now.K, y.now.K)
+            assert same(x, y)
     first = a[0][0].direct
     a.set_epoch(1)
     assert not torch.equal(first, a[0][0].direct)

@@ -12,6 +12,7 @@ from render.path import PathTracer
 from render.stage import Stage
 from scenes import build_scene
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.extremes import repaint
 
 BLOCK = 4  # px
 FRAME = 5
@@ -75,6 +76,20 @@ def test_a_scene_may_ask_for_more_bounces():
     direct, indirect = realisations(stage, 250)
     emission = render_gbuffer(stage, stage.view(FRAME))["emission"]
     assert_same_mean(emission + direct + indirect, np.stack([stock(stage, 5, 16, s) for s in range(30)]))
+
+
+def test_metal_plastic_and_sky_average_to_the_stock_integrator():
+    """Long paths with Russian roulette over glossy materials, lit by a lamp and through the open front by the sky."""
+    metal = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
+    coated = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}
+    paint = {"short-block": metal, "tall-block": coated}
+    scene = repaint(build_scene("cornell_box", 3, 24), lambda shape: paint.get(shape.name, shape.bsdf))
+    sky = np.linspace(0.5, 2, 4 * 8 * 3).reshape(4, 8, 3)
+    stage = Stage(replace(scene, sky=sky, max_depth=6), 64, 64)
+    stage.pose(FRAME)
+    direct, indirect = realisations(stage, 600)
+    emission = render_gbuffer(stage, stage.view(FRAME))["emission"]
+    assert_same_mean(emission + direct + indirect, np.stack([stock(stage, 6, 16, s) for s in range(60)]))
 
 
 def test_a_replayed_kernel_follows_the_scene(moving):

@@ -52,7 +52,7 @@ def world(scene: Scene, frame: int) -> trimesh.collision.CollisionManager:
 def check(number: int) -> None:
     scene = room(number)
     assert 15 <= len(things(scene)) <= 60
-    assert 1 <= len(lights(scene)) + (scene.sky is not None) <= 7
+    assert 1 <= len(lights(scene)) + (scene.sky is not None) <= 5
     assert len({shape.name for shape in scene.shapes}) == len(scene.shapes)
     for shape in lights(scene):
         radiance = np.stack([shape.radiance.at(frame) for frame in range(FRAMES)])
