@@ -15,8 +15,8 @@ BINS = 16
 TITLES = (
     "share of black pixels at 1 spp",
     "relative MSE at 1 spp",
-    "99.9th percentile over mean at 1 spp",
-    "95th over 5th percentile of the reference",
+    "P99.9 over mean at 1 spp",
+    "P95 over P5 of the reference",
 )
 LOWEST = (1e-3, 1e-2, 1.0, 1.0)
 
