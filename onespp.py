@@ -100,11 +100,7 @@ def info(folder: Folder, plot: Path | None = None) -> None:
     """
     from datasets.inspect import info as describe
 
-    print(describe(folder))
-    if plot:
-        from datasets.histogram import plot_difficulty
-
-        plot_difficulty(folder, plot)
+    print(describe(folder, plot))
 
 
 def train(

@@ -37,6 +37,11 @@ def display(radiance: Image, exposure: float) -> Image:
     return exposed.clip(0, 1) ** (1 / 2.2)
 
 
+def noise_of_halves(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    """Squared error of the mean of two independent images as displayed: mean((a - b)^2) / 4."""
+    return float(((a - b) ** 2).mean() / 4)
+
+
 def psnr(mse: float) -> float:
     """min(100, -10 log10 mse) in dB, for signals in [0, 1]."""
     return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0

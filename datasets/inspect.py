@@ -114,12 +114,12 @@ def measure_frame(clip: Clip, frame: int) -> Difficulty:
     )
 
 
-def clip_row(clip: Clip, label: str, seconds: float) -> list[object]:
+def clip_row(clip: Clip, label: str, measured: Difficulty, seconds: float) -> list[object]:
     lost = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
     return [
         *(label, clip.frames, f"{clip.height}x{clip.width}", clip.realisations, clip.facts["reference_spp"]),
         *(f"{psnr(clip.facts['floor_mse']):.1f}", f"{clip.exposure:.3g}", lost),
-        *(f"{measure:.3g}" for measure in difficulty(clip)),
+        *(f"{measure:.3g}" for measure in measured),
         *(f"{size_of(clip.path) / 1e6:.1f}", f"{seconds:.1f}"),
     ]
 
@@ -130,11 +130,15 @@ CLIP_HEAD = [
 ]
 
 
-def info(root: Path) -> str:
-    """Tables of clips (size, noise floor, difficulty, render time), of channels (storage, savings) and of steps."""
+def info(root: Path, plot: Path | None = None) -> str:
+    """Tables of clips (size, noise floor, difficulty, render time), of channels (storage, savings) and of steps.
+
+    With `plot` a histogram of the difficulties is written there; raises BadInput where there is no clip to draw.
+    """
     dataset = Dataset(root)
     rows: list[list[object]] = []
     clips: list[Clip] = []
+    measures: list[Difficulty] = []
     seconds: dict[str, float] = {}
     for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
         label = str(path.relative_to(root))
@@ -142,10 +146,17 @@ def info(root: Path) -> str:
             rows.append([label, "missing"])
             continue
         clips.append(Clip(path))
+        measures.append(difficulty(clips[-1]))
         timing = read_json(path / "timing.json")
-        rows.append(clip_row(clips[-1], label, sum(timing.values())))
+        rows.append(clip_row(clips[-1], label, measures[-1], sum(timing.values())))
         for step, spent in timing.items():
             seconds[step] = seconds.get(step, 0.0) + spent
+    if plot:
+        if not measures:
+            raise BadInput(f"{root} has no clips yet: render some with `onespp dataset`")
+        from datasets.histogram import plot_difficulty  # matplotlib, which nothing else here needs
+
+        plot_difficulty(measures, plot)
     facts = dataset.facts
     title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {size_of(root) / 1e6:.1f} MB"
     if not clips:
@@ -171,7 +182,7 @@ def channel_table(clips: list[Clip]) -> str:
 
 
 def step_table(clips: list[Clip], seconds: dict[str, float]) -> str:
-    """Seconds by step, and what skipping cost: by the step's mean time a pixel in the clips that have the channel."""
+    """Seconds by step, and what skipping saved: by the step's mean time a pixel in the clips that have the channel."""
     rows = [[step, f"{spent:.2f}", ""] for step, spent in seconds.items()]
     pixels = {True: 0, False: 0}
     for clip in clips:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from datasets.display import clip_exposure, display, luminance
+from datasets.display import clip_exposure, display, luminance, noise_of_halves
 from datasets.profiles import Quality
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
@@ -29,6 +29,6 @@ def reference_spp(scene: Scene, frames: int, height: int, width: int, quality: Q
         halves.append(np.nan_to_num(images, nan=0, posinf=0, neginf=0).astype(np.float64))
     exposure = clip_exposure(luminance(np.mean(halves, axis=1)))
     shown = [display(pair + emission, exposure) for pair, emission in zip(halves, emissions, strict=True)]
-    noise = float(np.mean([((a - b) ** 2).mean() / 4 for a, b in shown]))
+    noise = float(np.mean([noise_of_halves(a, b) for a, b in shown]))
     doublings = int(np.ceil(np.log2(max(noise / 10 ** (-quality.floor / 10), 1))))
     return min(quality.reference_spp << doublings, quality.most_spp)

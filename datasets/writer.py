@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS, REFERENCES, Channel
-from datasets.display import clip_exposure, display, luminance
+from datasets.display import clip_exposure, display, luminance, noise_of_halves
 from datasets.files import write_json
 
 HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in its normal range
@@ -154,7 +154,7 @@ class ClipWriter:
             emission = self.channels["emission"].read(frame)
             halves = sum(self.channels[name].read(frame) for name in REFERENCES) + emission
             a, b = display(halves.astype(np.float64), exposure)
-            floors.append(((a - b) ** 2).mean() / 4)
+            floors.append(noise_of_halves(a, b))
         return float(np.mean(floors))
 
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:

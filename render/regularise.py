@@ -46,8 +46,7 @@ class BlurredTable:
     """For every BSDF of a stage its blurred version."""
 
     def __init__(self, stage: Stage):
-        loaded = {shape.id(): shape for shape in stage.mitsuba_scene.shapes()}
-        self.row = registry_table([mi.BSDFPtr(loaded[shape.name].bsdf()) for shape in stage.scene.shapes])
+        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape in stage.shapes])
         # Objects live as long as the table does: pointers do not keep them.
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(shape.bsdf))) for shape in stage.scene.shapes]
         self.pointers = mi.BSDFPtr(self.bsdfs)

@@ -87,9 +87,9 @@ class Stage:
         self.mitsuba_scene = mi.load_dict({"type": "scene", **meshes, **sky}, optimize=False)
         self.parameters = mi.traverse(self.mitsuba_scene)
         loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
-        shapes = [loaded[shape.name] for shape in scene.shapes]
-        self.materials = MaterialTable(shapes)
-        self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in shapes], first=1)
+        self.shapes = [loaded[shape.name] for shape in scene.shapes]
+        self.materials = MaterialTable(self.shapes)
+        self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
         self.posed: dict[str, NDArray[Any]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)

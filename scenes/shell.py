@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 from scenes.animation import Array, RigidMotion, Track
 from scenes.meshes import Surface, flat, join, sheet, slab
 
-Rng = np.random.Generator
-
 
 def still(place: ArrayLike, angle: float) -> RigidMotion:
     """At rest at `place` (3,), turned by `angle` radians about the vertical axis."""

@@ -9,7 +9,7 @@ import pytest
 import datasets.bench
 import render.bench
 from datasets.bench import bench_rendering
-from datasets.histogram import plot_difficulty
+from datasets.inspect import info
 from datasets.preview import contact_sheet
 from errors import BadInput
 from render.bench import ours, stock
@@ -53,5 +53,5 @@ def test_contact_sheet_shows_every_scene(tmp_path):
 
 
 def test_histogram_of_difficulty(tiny, tmp_path):
-    plot_difficulty(tiny, tmp_path / "difficulty.png")
+    info(tiny, tmp_path / "difficulty.png")
     assert plt.imread(tmp_path / "difficulty.png").std() > 0.05
