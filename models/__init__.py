@@ -3,9 +3,12 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
 from errors import BadInput
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
+from models.precision import fastest_precision
 from models.rae import RAE
 from models.weights import load_weights
 
@@ -24,14 +27,23 @@ def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
     return tuple(sorted({channel for name in names or DENOISERS for channel in create(name).reads}))
 
 
-def load(name: str, weights: Path | None) -> Denoiser:
-    """A denoiser ready to use: in evaluation mode, with the weights of the file if it has any.
+def load(name: str, weights: Path | None, precision: torch.dtype | None = None) -> Denoiser:
+    """A denoiser ready to use: with the weights of the file if it has any, in the form for inference.
 
-    Raises BadInput where the file is missing, damaged or of another network.
+    `precision` is by default the fastest here of those that it does not refuse.
+    Raises BadInput where the file is missing, damaged or of another network, and for a precision it refuses.
     """
     denoiser = create(name)
     if denoiser.parameter_count():
         if weights is None:
             raise BadInput(f"'{name}' needs trained weights")
         load_weights(denoiser, name, weights)
-    return denoiser.eval()
+    denoiser.prepare(precision or inference_precision(denoiser))
+    return denoiser
+
+
+def inference_precision(denoiser: Denoiser) -> torch.dtype:
+    """bfloat16 for networks that take it, where this processor is fast at it, else float32."""
+    if not denoiser.parameter_count() or torch.bfloat16 in denoiser.refuses:
+        return torch.float32
+    return torch.bfloat16 if fastest_precision(torch.device("cpu")) == "bf16-mixed" else torch.float32

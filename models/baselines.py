@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from datasets.frame import Frame
-from models.denoiser import Denoiser, State, carried
+from models.denoiser import CLASSICAL, Denoiser, State, carried
 from models.operators import Accumulation, accumulate
 
 
@@ -13,6 +13,7 @@ class Noisy(Denoiser):
     """The noisy frame itself."""
 
     reads = ("direct", "indirect", "emission")
+    refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return frame.radiance(self.signal), State(frame.shape)
@@ -22,11 +23,15 @@ class Noisy(Denoiser):
 class AccumulatedState(State):
     history: Accumulation
 
+    def pictures(self) -> dict[str, Tensor]:
+        return {"history length": self.history.length}
+
 
 class Accumulated(Denoiser):
     """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), no spatial filter."""
 
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = carried(state, AccumulatedState, frame)

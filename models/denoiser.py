@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame, Signal
+from errors import BadInput
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,13 @@ class State:
 
     shape: tuple[int, int, int]  # (B, H, W) of the frames it was made from
 
+    def pictures(self) -> dict[str, Tensor]:
+        """What to look at when debugging, by name: (B, 1 or 3, H, W), in whatever units the name tells."""
+        return {}
+
+
+# Filters without a network compute in float32 whatever the hardware: sums over windows and moments need its digits.
+CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
 S = TypeVar("S", bound=State)
 
@@ -30,10 +38,14 @@ class Denoiser(torch.nn.Module):
     Attributes:
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
         signal: what it returns; "total" denoises direct + indirect and adds emission back untouched.
+        refuses: precisions that it does not compute in, with the reason.
+        precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
     """
 
     reads: ClassVar[tuple[str, ...]]
     signal: Signal = "total"
+    refuses: ClassVar[dict[torch.dtype, str]] = {}
+    precision: torch.dtype = torch.float32
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """Radiance (B, 3, H, W) of `signal`, non-negative, and the state for the next frame.
@@ -41,6 +53,14 @@ class Denoiser(torch.nn.Module):
         `state` is None on the first frame of a sequence; a state of another image size is discarded.
         """
         raise NotImplementedError
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""
+        if precision in self.refuses:
+            raise BadInput(f"{type(self).__name__} does not compute in {precision}: {self.refuses[precision]}")
+        self.eval()
+        self.requires_grad_(False)
+        self.precision = precision
 
     def parameter_count(self) -> int:
         return sum(parameter.numel() for parameter in self.parameters())

@@ -111,9 +111,13 @@ class RAE(Denoiser):
         colour = self.compress(irradiance, scale, frame)
         depth = scale.normalised_depth(frame.depth)
         x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1))
-        x = x.contiguous(memory_format=torch.channels_last)
+        x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
-        return p[..., :height, :width].to(x.dtype), RAEState(frame.shape, hidden, scale)
+        return p[..., :height, :width].to(colour.dtype), RAEState(frame.shape, hidden, scale)
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        super().prepare(precision)
+        self.network.to(precision)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""

@@ -20,9 +20,9 @@ from datasets.files import locked, write_file
 from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
 from errors import BadInput
 from models import create
+from models.precision import fastest_precision
 from models.weights import save_weights
 from train.losses import loss_for
-from train.precision import fastest_precision
 from train.recipes import Recipe, recipe_for
 
 CHECKPOINT, BEST, WEIGHTS = "checkpoint.pt", "best.safetensors", "weights.safetensors"

@@ -1,0 +1,43 @@
+"""Kernels that Numba compiles for the processor at first use: the fast way of what models/ also says in PyTorch.
+
+They need no compiler, are kept on disk from run to run, and serve inference on CPUs. Everything else (GPUs, gradients,
+half precision) takes the PyTorch way, which the tests hold them to.
+"""
+
+import contextlib
+from collections.abc import Iterator
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+enabled = True
+
+
+@contextlib.contextmanager
+def disabled() -> Iterator[None]:
+    """Take the PyTorch way within the context: for tests and benches."""
+    global enabled
+    before, enabled = enabled, False
+    try:
+        yield
+    finally:
+        enabled = before
+
+
+def usable(*tensors: Tensor) -> bool:
+    """Whether compiled kernels can work on the tensors: float32 on a CPU, without gradients."""
+    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+    return enabled and plain and not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+
+
+def array(tensor: Tensor) -> NDArray[np.float32]:
+    """A tensor's values as a contiguous numpy array, without a copy where it is contiguous."""
+    return tensor.detach().contiguous().numpy()
+
+
+def threads() -> None:
+    """Let Numba use as many threads as PyTorch. Call it before a parallel kernel."""
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
