@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from datasets.display import LUMINANCE
 from datasets.frame import Cameras, Frame
+from models import compiled
 
 BACKGROUND = 0  # mesh id
 
@@ -21,6 +22,12 @@ def finite(x: Tensor) -> Tensor:
 def luminance(rgb: Tensor) -> Tensor:
     """Rec. 709 luminance (B, 1, H, W)."""
     return (rgb * torch.tensor(LUMINANCE).to(rgb)[:, None, None]).sum(dim=1, keepdim=True)
+
+
+def pad(x: Tensor, multiple: int) -> Tensor:
+    """Replicate the right and bottom borders until both sides are multiples of `multiple`."""
+    height, width = x.shape[-2:]
+    return F.pad(x, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 
 
 @dataclass(frozen=True)
@@ -151,12 +158,33 @@ class Reprojection:
         return (history * found).view(-1, self.height, self.width), found.view(1, self.height, self.width)
 
 
+def fetch_compiled(frame: Frame, history: Tensor, surfaces: Surfaces, item: int) -> tuple[Tensor, Tensor]:
+    """What Reprojection.fetch returns, by the compiled kernel; in the world's axes around the previous eye."""
+    from models.compiled.reproject import fetch
+
+    now, previous = frame.now, frame.previous
+    K, K_then = now.K[item], previous.K[item]
+    to_world, then_to_world = now.camera_to_world[item, :3, :3], previous.camera_to_world[item, :3, :3]
+    to_then = to_previous_camera(now, previous, item)[:, :3]
+    to_then = then_to_world @ to_then
+    turn = to_then[..., :3] @ to_world.T
+    slopes = torch.stack([1 / K.diagonal()[:2], -K[:2, 2] / K.diagonal()[:2]], dim=1)
+    axes = then_to_world @ torch.linalg.inv(K_then)
+    buffers = [[s.depth[item, 0], s.normal[item], s.mesh_id[item, 0]] for s in (Surfaces.of(frame), surfaces)]
+    limits = PLANE_TOLERANCE, NORMAL_TOLERANCE
+    matrices = (a.numpy() for a in (to_then, turn, slopes, axes.T))
+    return fetch(history[item], frame.motion[item], *buffers, *matrices, limits)
+
+
 def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
     """The previous frame's `history` (B, C, H, W) where this frame's surfaces find it, and where (B, 1, H, W).
 
     `surfaces` is the previous frame's G-buffer. The frame must have depth, normal, mesh_id and motion.
     """
-    fetched = [Reprojection(frame, history, surfaces, item).fetch() for item in range(len(history))]
+    if compiled.usable(history, frame.motion, frame.depth, surfaces.depth):
+        fetched = [fetch_compiled(frame, history, surfaces, item) for item in range(len(history))]
+    else:
+        fetched = [Reprojection(frame, history, surfaces, item).fetch() for item in range(len(history))]
     return torch.stack([value for value, _ in fetched]), torch.stack([found for _, found in fetched])
 
 
@@ -190,6 +218,7 @@ def accumulate(frame: Frame, irradiance: Tensor, history: Accumulation | None) -
 
 
 SLOWEST_RATE = 0.1  # weight of the newest frame in running estimates, once they have settled
+MEDIAN_GRID = 64  # the median depth of large images is taken from about as many rows and columns
 LUMINANCE_BLOCK = 16  # px; the logarithm of a mean over a block is far less biased than that of single samples
 
 
@@ -241,7 +270,8 @@ def running_scale(radiance: Tensor, depth: Tensor, before: RunningScale | None) 
     y = blocks.flatten(1).double()
     mean = y.mean(dim=1)
     log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)).mean(dim=1).to(radiance.dtype)
-    depths = depth.flatten(1)
+    stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
+    depths = depth[..., ::stride_y, ::stride_x].flatten(1)
     median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
     hit = ~median.isnan()
     log_depth = torch.log(torch.where(hit, median, 1))

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame
 from models.denoiser import Denoiser, State, carried
-from models.operators import RunningScale, finite, running_scale
+from models.operators import RunningScale, finite, pad, running_scale
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
@@ -87,12 +87,6 @@ class RAEState(State):
     scale: RunningScale
 
 
-def pad(x: Tensor, multiple: int = 32) -> Tensor:
-    """Replicate the right and bottom borders until both sides are multiples of `multiple`."""
-    height, width = x.shape[-2:]
-    return F.pad(x, (0, -width % multiple, 0, -height % multiple), mode="replicate")
-
-
 class RAE(Denoiser):
     """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
 
@@ -110,7 +104,7 @@ class RAE(Denoiser):
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
         colour = self.compress(irradiance, scale, frame)
         depth = scale.normalised_depth(frame.depth)
-        x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1))
+        x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.shape, hidden, scale)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
+from models import compiled
 from models.operators import Accumulation, Surfaces, accumulate, luminance, reproject, running_scale
 
 
@@ -198,3 +199,18 @@ def test_running_scale_of_sparse_noise_is_near_that_of_its_mean():
 def test_luminance_weights():
     rgb = torch.eye(3)[None, :, :, None]
     torch.testing.assert_close(luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
+
+
+def test_compiled_reprojection_equals_pytorch_s(tiny):
+    """On frames with moving meshes, moving cameras and disocclusions; a pixel in a thousand may sit on a limit."""
+    clip = Dataset(tiny).clips("test")[1]
+    names = ("direct", "indirect", "albedo", "normal", "depth", "mesh_id", "motion")
+    for index in range(1, clip.frames):
+        frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
+        history = torch.cat([before.irradiance("total"), before.depth], dim=1)
+        fast, found = reproject(frame, history, Surfaces.of(before))
+        with compiled.disabled():
+            slow, expected = reproject(frame, history, Surfaces.of(before))
+        assert (found != expected).float().mean() < 1e-3
+        close = torch.isclose(fast, slow, rtol=1e-3, atol=1e-3).all(dim=1)
+        assert close.float().mean() > 0.999

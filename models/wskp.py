@@ -1,0 +1,166 @@
+"""WSKP: weight-sharing kernel prediction of Fan et al. 2021, its multi-resolution variant and its baseline KP."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame
+from models.denoiser import Denoiser, State, carried
+from models.fusion import WINDOWS, fuse
+from models.kernels import apply_kernels
+from models.operators import Accumulation, RunningScale, accumulate, pad, running_scale
+from models.repvgg import merge, repvgg
+
+INPUTS = 10  # §5.1: displayed colour, albedo, normal, depth
+WIDTH = 24  # ours: the drawn widths are lost
+GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class WSKPState(State):
+    """Accumulated frames, running exposure and depth scale, and what the network chose between windows, to look at."""
+
+    history: Accumulation
+    scale: RunningScale
+    mixture: Tensor | None  # logits (B, M, H, W)
+
+    def pictures(self) -> dict[str, Tensor]:
+        shown = {"history length": self.history.length}
+        if self.mixture is not None:
+            windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
+            shares = torch.softmax(self.mixture, dim=1)
+            shown["mean window (px)"] = (shares * windows[:, None, None]).sum(dim=1, keepdim=True)
+        return shown
+
+
+class KernelPredictor(Denoiser):
+    """Temporal accumulation, a network that predicts how to filter, the filter on HDR irradiance, re-modulation (§4).
+
+    The network sees the accumulated radiance as displayed (causal exposure, clipped, gamma 2.2), the albedo, the
+    world-space normal scaled to [0, 1] and the depth d / (d + s) (§5.1).
+    """
+
+    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    network: nn.Module
+
+    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
+        """The network's input (B, 10, H, W) in [0, 1]."""
+        exposed = irradiance * frame.divisor * (scale.exposure() * frame.gain)
+        colour = exposed.clamp(0, 1) ** (1 / GAMMA)
+        depth = scale.normalised_depth(frame.depth)
+        return torch.cat([colour, frame.albedo, frame.normal / 2 + 0.5, depth], dim=1)
+
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any."""
+        raise NotImplementedError
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        before = carried(state, WSKPState, frame)
+        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
+        radiance = history.irradiance * frame.divisor
+        scale = running_scale(radiance, frame.depth, before.scale if before else None)
+        x = self.features(frame, history.irradiance, scale)
+        predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
+        irradiance, mixture = self.reconstruct(history.irradiance, predicted)
+        return frame.remodulate(irradiance, self.signal), WSKPState(frame.shape, history, scale, mixture)
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        super().prepare(precision)
+        merge(self.network)
+        self.network.to(precision, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+class WSKP(KernelPredictor):
+    """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
+
+    def __init__(self, layers: int = 6, windows: Sequence[int] = WINDOWS):
+        super().__init__()
+        self.windows = tuple(windows)
+        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)])
+
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
+        importance, mixture = predicted.to(irradiance.dtype).contiguous().chunk(2, dim=1)
+        return fuse(irradiance, importance, mixture, self.windows), mixture
+
+
+class KP(KernelPredictor):
+    """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel a pixel."""
+
+    window = 13
+
+    def __init__(self, layers: int = 6):
+        super().__init__()
+        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2])
+
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
+        return apply_kernels(irradiance, predicted.to(irradiance.dtype)), None
+
+
+def convolutions(inputs: int, outputs: int) -> nn.Sequential:
+    layers = [nn.Conv2d(inputs, outputs, 3, padding=1), nn.Conv2d(outputs, outputs, 3, padding=1)]
+    return nn.Sequential(layers[0], nn.ReLU(inplace=True), layers[1], nn.ReLU(inplace=True))
+
+
+class MultiResolutionNet(nn.Module):
+    """A U-Net with an output for each of its three resolutions (§5.2). The paper's widths are lost; these are ours."""
+
+    widths = (32, 48, 64)
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        fine, middle, coarse = self.widths
+        self.down = nn.ModuleList(
+            [convolutions(inputs, fine), convolutions(fine, middle), convolutions(middle, coarse)]
+        )
+        self.up = nn.ModuleList([convolutions(coarse + middle, middle), convolutions(middle + fine, fine)])
+        self.heads = nn.ModuleList(nn.Conv2d(width, outputs, 1) for width in self.widths[::-1])
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Predictions (B, outputs, H / 2^k, W / 2^k) for k = 2, 1, 0. H and W are multiples of 4."""
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(F.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        predictions = [self.heads[0](x)]
+        for block, head, skip in zip(self.up, list(self.heads)[1:], skips[-2::-1], strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip], dim=1))
+            predictions.append(head(x))
+        return predictions
+
+
+def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W)."""
+    return fine + alpha * F.interpolate(coarse - F.avg_pool2d(fine, 2), scale_factor=2.0)
+
+
+class WSKPMR(KernelPredictor):
+    """Windows 3 and 5 at three resolutions, combined from the coarsest on by Eq. 7 (§5.2, §5.3).
+
+    Eq. 7 is no convex combination: what it makes negative is cut off.
+    """
+
+    windows = (3, 5)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.network = MultiResolutionNet(INPUTS, 2 * len(self.windows) + 1)
+
+    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
+        return pad(super().features(frame, irradiance, scale), 4)
+
+    def reconstruct(self, irradiance: Tensor, predicted: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:  # type: ignore[override]
+        height, width = irradiance.shape[-2:]
+        images = [pad(irradiance, 4)]
+        for _ in predicted[1:]:
+            images.append(F.avg_pool2d(images[-1], 2))
+        output, mixture = images[-1], None
+        for level, (image, maps) in enumerate(zip(images[::-1], predicted, strict=True)):
+            maps = maps.to(image.dtype).contiguous()
+            importance, mixture = maps[:, :2], maps[:, 2:4]
+            filtered = fuse(image, importance, mixture, self.windows)
+            output = combine(filtered, output, torch.sigmoid(maps[:, 4:])) if level else filtered
+        assert mixture is not None
+        return output[..., :height, :width].clamp(min=0), mixture[..., :height, :width]

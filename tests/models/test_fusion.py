@@ -1,0 +1,122 @@
+"""Weight-shared kernel fusion against unfold and softmax in float64, at every extreme of the logits."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import functional as F
+
+from models import compiled
+from models.fusion import WINDOWS, box_sum, fuse, shared_kernel, windowed_sums
+
+
+def naive_kernel(image: torch.Tensor, logits: torch.Tensor, window: int) -> torch.Tensor:
+    """Eq. 3 and 4 as they are written: a kernel map by unfolding, softmax, weighted sum."""
+    batch, channels, height, width = image.shape
+    margin = window // 2
+    entries = F.pad(logits, (margin,) * 4, value=-torch.inf)
+    weights = torch.softmax(F.unfold(entries, window), dim=1)  # (B, k k, H W)
+    values = F.unfold(F.pad(image, (margin,) * 4), window).view(batch, channels, window**2, -1)
+    return (values * weights[:, None]).sum(dim=2).view(batch, channels, height, width)
+
+
+def naive_fuse(image, importance, mixture, windows):
+    shares = torch.softmax(mixture, dim=1)
+    return sum(shares[:, [i]] * naive_kernel(image, importance[:, [i]], k) for i, k in enumerate(windows))
+
+
+def both_ways(image, importance, mixture, windows=WINDOWS):
+    with torch.no_grad():
+        fast = fuse(image, importance, mixture, windows)
+        with compiled.disabled():
+            return fast, fuse(image, importance, mixture, windows)
+
+
+SCALES = st.sampled_from([0.0, 1.0, 30.0, 100.0, 1e4])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    height=st.integers(1, 70),
+    width=st.integers(1, 23),
+    scale=SCALES,
+    shape=st.sampled_from(["noise", "ramp", "step", "spike"]),
+    offset=st.sampled_from([0.0, 1e4, -1e4]),
+    seed=st.integers(0, 9999),
+)
+def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offset, seed):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:height, 0:width]
+    patterns = {
+        "noise": rng.uniform(-1, 1, (6, height, width)),
+        "ramp": np.broadcast_to((x + y) / max(height + width, 2) * 2 - 1, (6, height, width)),
+        "step": np.broadcast_to(np.where(x > width // 2, 1.0, -1.0), (6, height, width)),
+        "spike": (rng.random((6, height, width)) < 0.02) * 2.0 - 1,
+    }
+    importance = torch.from_numpy(np.float32(patterns[shape] * scale + offset))[None]
+    mixture = torch.from_numpy(np.float32(rng.normal(0, scale, (1, 6, height, width))))
+    image = torch.from_numpy(np.float32(10 ** rng.uniform(-7, 6.8, (1, 3, height, width))))
+    expected = naive_fuse(image.double(), importance.double(), mixture.double(), WINDOWS).numpy()
+    for result in both_ways(image, importance, mixture):
+        np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5)
+        assert (result.amin() >= image.amin() * (1 - 1e-5)) and (result.amax() <= image.amax() * (1 + 1e-5))
+
+
+def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
+    """Strips choose their path on their own: the boundary between the two must not show."""
+    torch.manual_seed(1)
+    importance, mixture = torch.randn(1, 6, 200, 40), torch.randn(1, 6, 200, 40)
+    importance[..., 100, 3] = 5000
+    image = torch.rand(1, 3, 200, 40)
+    expected = naive_fuse(image.double(), importance.double(), mixture.double(), WINDOWS)
+    for result in both_ways(image, importance, mixture):
+        torch.testing.assert_close(result.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 5, 7, 12, 13])
+def test_box_sums(window):
+    x = torch.arange(40.0).reshape(2, 20)
+    np.testing.assert_allclose(box_sum(x, window, -1), F.avg_pool1d(x, window, 1) * window, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1.0, 300.0])
+@pytest.mark.parametrize("window", [3, 5])
+def test_gradients_are_finite_differences(window, scale):
+    """gradcheck of the hand-written adjoint, on the fast and on the careful path."""
+    torch.manual_seed(0)
+    image = torch.rand(1, 2, 4, 5, dtype=torch.float64, requires_grad=True)
+    logits = torch.randn(1, 1, 4, 5, dtype=torch.float64)
+    logits[0, 0, 0, 0] = scale
+    logits.requires_grad_()
+    assert torch.autograd.gradcheck(lambda r, i: shared_kernel(r, i, window), (image, logits))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_gradients_equal_plain_autograd_of_the_naive_version(scale):
+    torch.manual_seed(2)
+    inputs = [torch.rand(2, 3, 17, 12), scale * torch.randn(2, 6, 17, 12), torch.randn(2, 6, 17, 12)]
+    mine = [t.clone().requires_grad_() for t in inputs]
+    exact = [t.double().requires_grad_() for t in inputs]
+    target = torch.rand(2, 3, 17, 12)
+    (fuse(*mine) * target).sum().backward()
+    (naive_fuse(*exact, WINDOWS) * target.double()).sum().backward()
+    for a, b in zip(mine, exact, strict=True):
+        torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-4, atol=1e-5)
+        assert torch.isfinite(a.grad).all()
+
+
+def test_relative_sums_are_sums():
+    logits, values = torch.tensor([[[[0.0, 500.0, -500.0]]]]), torch.tensor([[[[2.0, 3.0, 5.0]]]])
+    top, total = windowed_sums(logits, values, 3)
+    np.testing.assert_array_equal(top[0, 0, 0], [500, 500, 500])
+    np.testing.assert_allclose(total[0, 0, 0], [3, 3, 3], rtol=1e-6)
+
+
+def test_a_poisoned_pixel_stays_within_its_windows():
+    image = torch.ones(1, 3, 60, 60)
+    image[..., 30, 30] = torch.nan
+    zeros = torch.zeros(1, 6, 60, 60)
+    for result in both_ways(image, zeros, zeros):
+        bad = torch.isnan(result[0, 0]).nonzero()
+        assert bad.amin() >= 30 - 6 and bad.amax() <= 30 + 6

@@ -1,0 +1,96 @@
+"""WSKP: RepVGG conversion, inputs, the multi-resolution combination and the baseline, each against slow versions."""
+
+import numpy as np
+import pytest
+import torch
+from test_denoisers import run
+from test_fusion import naive_fuse
+from test_operators import flat_frame
+from torch.nn import functional as F
+
+import models
+from datasets.clip import Dataset
+from datasets.frame import read_frame
+from models.fusion import WINDOWS
+from models.operators import accumulate, running_scale
+from models.repvgg import RepVGGBlock, merge, repvgg
+from models.wskp import combine
+
+
+@pytest.mark.parametrize("widths", [(10, 24, 24, 12), (10, 24, 24, 24, 24, 24, 12), (3, 3)])
+def test_inference_form_equals_training_form(widths):
+    torch.manual_seed(0)
+    network = repvgg(widths)
+    x = torch.rand(2, widths[0], 19, 23)
+    with torch.no_grad():
+        before = network(x)
+        merge(network)
+        after = network(x)
+    torch.testing.assert_close(before, after, rtol=1e-5, atol=1e-5)
+    layers = [m for m in network.modules() if isinstance(m, torch.nn.Conv2d)]
+    assert len(layers) == len(widths) - 1 and all(layer.kernel_size == (5, 5) for layer in layers)
+    assert after.min() < 0  # the last block is linear
+
+
+def test_block_is_the_sum_of_its_branches():
+    torch.manual_seed(0)
+    block = RepVGGBlock(4, 4, relu=True)
+    x = torch.randn(1, 4, 9, 9)
+    parts = [F.conv2d(x, b.weight, b.bias, padding=b.weight.shape[-1] // 2) for b in block.branches]
+    torch.testing.assert_close(block(x), torch.relu(x + sum(parts)))
+
+
+@pytest.mark.parametrize(("name", "outputs"), [("wskp3", 12), ("wskp6", 12), ("kp", 169)])
+def test_networks_have_the_papers_layers(name, outputs):
+    layers = [m for m in models.create(name).modules() if isinstance(m, RepVGGBlock)]
+    assert len(layers) == {"wskp3": 3, "wskp6": 6, "kp": 6}[name]
+    assert layers[0].branches[0].in_channels == 10 and layers[-1].branches[0].out_channels == outputs
+
+
+def test_wskp_is_accumulation_network_fusion(tiny):
+    """The whole frame against its parts written out, with the fusion of the test in float64."""
+    torch.manual_seed(3)
+    wskp = models.create("wskp3")
+    clip = Dataset(tiny).clips("test")[1]
+    frames = [read_frame(clip, index, wskp.reads) for index in range(3)]
+    outputs = run(wskp, frames)
+    history = scale = None
+    for frame, output in zip(frames, outputs, strict=True):
+        history = accumulate(frame, (frame.direct + frame.indirect) / frame.albedo.clamp(min=0.01), history)
+        radiance = history.irradiance * frame.albedo.clamp(min=0.01)
+        scale = running_scale(radiance, frame.depth, scale)
+        exposed = (radiance * scale.exposure()).clamp(0, 1) ** (1 / 2.2)
+        x = torch.cat([exposed, frame.albedo, (frame.normal + 1) / 2, scale.normalised_depth(frame.depth)], dim=1)
+        with torch.no_grad():
+            predicted = wskp.network(x).double()
+        filtered = naive_fuse(history.irradiance.double(), predicted[:, :6], predicted[:, 6:], WINDOWS)
+        expected = filtered * frame.albedo.clamp(min=0.01) + frame.emission
+        np.testing.assert_allclose(output, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_combination_of_resolutions_is_equation_7():
+    rng = np.random.default_rng(0)
+    fine, coarse, alpha = rng.random((4, 6)), rng.random((2, 3)), rng.random((4, 6))
+    expected = np.empty((4, 6))
+    for y in range(4):
+        for x in range(6):
+            block = fine[y // 2 * 2 : y // 2 * 2 + 2, x // 2 * 2 : x // 2 * 2 + 2].mean()
+            expected[y, x] = fine[y, x] - alpha[y, x] * block + alpha[y, x] * coarse[y // 2, x // 2]
+    tensors = (torch.from_numpy(a)[None, None] for a in (fine, coarse, alpha))
+    np.testing.assert_allclose(combine(*tensors)[0, 0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])
+def test_a_constant_image_stays_constant(name):
+    frames = [flat_frame(21, 18, irradiance=torch.full((1, 3, 21, 18), 7.0)) for _ in range(2)]
+    for output in run(models.create(name), frames):
+        torch.testing.assert_close(output, torch.full_like(output, 7.0), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["wskp3", "wskp6"])
+def test_kernel_choice_can_be_seen(name):
+    wskp = models.create(name)
+    _, state = wskp(flat_frame(8, 9), None)
+    shown = state.pictures()
+    assert set(shown) == {"history length", "mean window (px)"}
+    assert shown["mean window (px)"].min() >= 3 and shown["mean window (px)"].max() <= 13
