@@ -1,0 +1,98 @@
+"""models.kernels for the processor: a row at a time, its logits in float32 in a core's cache, rows in parallel."""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from models.compiled import array, threads
+from models.compiled.exponential import exp
+
+LEAST_EXPONENT = np.float32(-87)  # exp of less is denormal in float32, which is slow; what it leaves is 2e-38
+ONE_LINE = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
+
+jit = numba.njit(cache=True, fastmath={"contract", "nsz"}, error_model="numpy", boundscheck=False)
+
+
+@jit
+def unpack_floats(row: Any, logits: Any) -> None:
+    for x in range(logits.shape[1]):
+        for tap in range(logits.shape[0]):
+            row[tap, x] = logits[tap, x]
+
+
+@jit
+def unpack_bfloats(row: Any, logits: Any) -> None:
+    """A bfloat16 is the upper half of a float32."""
+    for x in range(logits.shape[1]):
+        for tap in range(logits.shape[0]):
+            row[tap, x] = np.int32(np.int32(logits[tap, x]) << np.int32(16)).view(np.float32)
+
+
+@jit
+def raise_top(top: Any, logits: Any) -> None:
+    for x in range(top.size):
+        top[x] = max(top[x], logits[x])
+
+
+@jit
+def to_weights(logits: Any, top: Any, total: Any) -> None:
+    """In place, weights relative to the largest logit; total += weights."""
+    for x in range(top.size):
+        logits[x] = exp(max(logits[x] - top[x], LEAST_EXPONENT))
+        total[x] += logits[x]
+
+
+@jit
+def add_weighted(line: Any, weight: Any, values: Any) -> None:
+    for x in range(line.size):
+        line[x] += weight[x] * values[x]
+
+
+@jit
+def filter_row(output: Any, image: Any, row: Any, y: int, size: int) -> None:
+    """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
+
+    Slices are taken where they can be seen to be contiguous: else no loop would be vectorised.
+    """
+    channels, height, width = image.shape
+    radius = size // 2
+    top, total = row[size * radius + radius, :width].copy(), np.zeros(width, np.float32)
+    sums = np.zeros((channels, width), np.float32)
+    for gather in (False, True):
+        for dy in range(max(-radius, -y), min(radius + 1, height - y)):
+            for dx in range(max(-radius, 1 - width), min(radius + 1, width)):
+                low, high = max(0, -dx), min(width, width - dx)
+                logits = row[(dy + radius) * size + dx + radius, low:high]
+                if not gather:
+                    raise_top(top[low:high], logits)
+                    continue
+                to_weights(logits, top[low:high], total[low:high])
+                for c in range(channels):
+                    add_weighted(sums[c, low:high], logits, image[c, y + dy, low + dx : high + dx])
+    for c in range(channels):
+        output[c, y] = sums[c] / total
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def filter_image(output: Any, image: Any, logits: Any, size: int, unpack: Any) -> None:
+    _, height, width = image.shape
+    for y in numba.prange(height):
+        row = np.empty((size * size, width + ONE_LINE), np.float32)
+        unpack(row, logits[:, y])
+        filter_row(output, image, row, np.int64(y), size)  # prange counts unsigned, which would break -y
+
+
+def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
+    """See models.kernels.apply_kernels; logits are read as they lie in memory, bfloat16 without a copy."""
+    threads()
+    output = torch.empty_like(image, memory_format=torch.contiguous_format)
+    bfloat = logits.dtype == torch.bfloat16
+    bits, unpack = (logits.view(torch.int16), unpack_bfloats) if bfloat else (logits.float(), unpack_floats)
+    for item in range(len(image)):
+        values = bits[item].detach().numpy()
+        filter_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), unpack)
+    return output
