@@ -63,7 +63,7 @@ def render_to(
     scene = scene.still() if kind.still else scene
     size = profile.frames, profile.height, profile.width
     clock = Clock()
-    spp = reference_spp(scene, *size, quality, seed)
+    spp = reference_spp(scene, *size, quality, seed, options)
     clock.lap("pilot")
     frames = render_clip(scene, *size, Sampling(quality.realisations, kind.noisy_spp, spp, options), seed, channels)
     with ClipWriter(destination) as writer:

@@ -9,8 +9,7 @@ from tqdm import tqdm
 
 from datasets.display import clip_exposure, display, luminance
 from datasets.figure import DPI, plt, save_figure
-from render.gbuffer import render_gbuffer
-from render.path import PathTracer
+from render.shot import Shot
 from render.stage import Stage
 from scenes import build_scene
 
@@ -19,13 +18,9 @@ CAPTION = 0.2  # inches
 
 def picture(name: str, seed: int, frame: int, frames: int, height: int, width: int, spp: int) -> NDArray[np.float64]:
     """One frame of a scene as displayed, (H, W, 3) in [0, 1]; its own exposure."""
-    stage = Stage(build_scene(name, seed, frames), height, width)
-    stage.pose(frame)
-    view = stage.view(frame)
-    direct, indirect = PathTracer(stage).radiance(stage.rays(view), seed, spp)
-    reflected = np.nan_to_num(direct + indirect, nan=0, posinf=0, neginf=0).astype(np.float64)
-    emission = render_gbuffer(stage, view)["emission"]
-    return display(reflected + emission, clip_exposure(luminance(reflected)))
+    shot = Shot(Stage(build_scene(name, seed, frames), height, width), frame)
+    reflected = shot.reflected(seed, spp)
+    return display(reflected + shot.emission, clip_exposure(luminance(reflected)))
 
 
 def contact_sheet(

@@ -6,16 +6,13 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.gbuffer import render_gbuffer
-from render.path import PathTracer
+from render.shot import Image, Shot, finite
 from render.stage import Stage
 from scenes import build_scene
 from scenes.camera import View
 
-Image = NDArray[Any]
 Display = Callable[[Image], Image]  # radiance to what is shown, in [0, 1]
 Render = Callable[[int, int], Image]  # (seed, spp) to radiance (H, W, 3)
 
@@ -46,26 +43,14 @@ def perspective(stage: Stage, view: View) -> Any:
     return mi.load_dict({"type": "perspective", "fov": float(x_fov), "to_world": to_world, "film": film, **nearest})
 
 
-def stock(stage: Stage, view: View) -> Render:
+def stock(shot: Shot) -> Render:
     """`mi.render` with the `path` integrator and the `independent` sampler: all radiance."""
-    integrator = mi.load_dict({"type": "path", "max_depth": stage.scene.max_depth})
-    sensor = perspective(stage, view)
+    integrator = mi.load_dict({"type": "path", "max_depth": shot.stage.scene.max_depth})
+    sensor = perspective(shot.stage, shot.view)
 
     def render(seed: int, spp: int) -> Image:
-        return np.array(
-            mi.render(stage.mitsuba_scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
-        )
-
-    return render
-
-
-def ours(stage: Stage, view: View) -> Render:
-    """Our path tracer, which also tells direct from indirect; with the emission, which costs no samples."""
-    tracer, ray = PathTracer(stage), stage.rays(view)
-    emission = render_gbuffer(stage, view)["emission"]
-
-    def render(seed: int, spp: int) -> Image:
-        return np.add(*tracer.radiance(ray, seed, spp)) + emission
+        scene = shot.stage.mitsuba_scene
+        return finite(np.array(mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)))
 
     return render
 
@@ -96,10 +81,8 @@ def seconds_to_floor(names: Iterable[str], target: float, display_of: Callable[[
     `display_of` makes the display transform from radiance (H, W, 3); both renderers share the one of ours.
     """
     for name in names:
-        stage = Stage(build_scene(name, 0, FRAMES), SIZE, SIZE)
-        stage.pose(FRAME)
-        view = stage.view(FRAME)
-        renderers = {STOCK: stock(stage, view), OURS: ours(stage, view)}
+        shot = Shot(Stage(build_scene(name, 0, FRAMES), SIZE, SIZE), FRAME)
+        renderers = {STOCK: stock(shot), OURS: shot.radiance}
         display = display_of(renderers[OURS](9, 256))
         reached = {label: enough(render, target, display) for label, render in renderers.items()}
         spent: dict[str, list[float]] = {label: [] for label in renderers}

@@ -76,7 +76,11 @@ def only_sky(rng: Rng, frames: int) -> Scene:
     """Nothing at all before a sky; the camera turns."""
     turn = rng.uniform(-np.pi, np.pi) + np.linspace(0, 0.02 * frames, 5)
     target: Array = np.stack([np.cos(turn), np.full(5, 0.3), np.sin(turn)], axis=1)
-    return Scene((), Camera(Track.constant([0.0, 0.0, 0.0]), Track(target, 0, max(frames - 1, 1))), sky=sky(rng))
+    return Scene(
+        (),
+        Camera(Track.constant([0.0, 0.0, 0.0]), Track(target, 0, max(frames - 1, 1))),
+        sky=sky(rng, sun=np.array([1.0, 1.0, 1.0])),
+    )
 
 
 def mirrors(rng: Rng, frames: int) -> Scene:

@@ -95,7 +95,7 @@ GLOSSY: dict[str, dict[Finish, float]] = {
 }
 ELSE: dict[Finish, float] = {rough_plastic: 4, principled: 2, plastic: 1, rough_metal: 1}
 ALWAYS = ("metal", "glass")
-WHITENED = {"wall": 0.7, "floor": 0.3, "dark wall": 0.0}
+WHITENED = {"wall": 0.5, "floor": 0.1, "dark wall": 0.0}
 
 
 def finish(rng: Rng, slot: str, gloss: float, size: float) -> Bsdf:

@@ -71,7 +71,7 @@ def ceiling_panel(layout: Layout) -> list[Lamp]:
 def downlight(layout: Layout) -> list[Lamp]:
     """A lamp deep in a dark tube under the ceiling: a bright pool of light, the rest in shadow."""
     rng, radius = layout.rng, log_uniform(layout.rng, 0.05, 0.15)
-    tall, (x, z) = radius * rng.uniform(1.0, 3.0), spot(layout, 0.5)
+    tall, (x, z) = radius * rng.uniform(0.7, 2.0), spot(layout, 0.5)
     y = layout.size[1] - tall - 0.01
     box = np.array([[x - radius, y - GAP, z - radius], [x + radius, y + tall, z + radius]])
     if not layout.fits(box):
@@ -142,7 +142,7 @@ def cove(layout: Layout) -> list[Lamp]:
         return []
     layout.reserve(box)
     layout.build("ledge", ledge, frame)
-    strip = floor(length * 0.95, 0.04)
+    strip = floor(length * 0.95, 0.08)
     return [Lamp(moved(moved(strip, turned(1, 0, 0, y + 0.005, depth * 0.4)), frame), HERE)]
 
 
@@ -153,7 +153,7 @@ def behind_opening(layout: Layout) -> list[Lamp]:
         return []
     width, height = wall_width(wall, layout.size), layout.size[1]
     if rng.random() < 0.6:  # parallel slits
-        count, thin, tall = int(rng.integers(1, 6)), rng.uniform(0.04, 0.2), rng.uniform(0.6, 1.6)
+        count, thin, tall = int(rng.integers(1, 6)), rng.uniform(0.1, 0.3), rng.uniform(0.6, 1.6)
         start, y = rng.uniform(-width / 2 + 0.3, width / 2 - 0.3 - count * 0.25), rng.uniform(0.2, height - tall - 0.2)
         holes = [Opening((start + 0.25 * i, y), (start + 0.25 * i + thin, y + tall)) for i in range(count)]
     else:
@@ -162,8 +162,8 @@ def behind_opening(layout: Layout) -> list[Lamp]:
         holes = [Opening((x, y), (x + side, y + side))]
     layout.openings[wall] = holes
     x, y = holes[0].middle
-    size, away = rng.uniform(0.5, 1.5), rng.uniform(0.1, 0.6)
-    shift = x + rng.uniform(-0.5, 0.5), y + rng.uniform(-0.3, 0.8), -away
+    size, away = rng.uniform(0.5, 1.5), rng.uniform(0.1, 0.4)
+    shift = x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.5), -away
     lamp = moved(floor(size, size), turned(0, np.pi / 2, *shift))
     return [Lamp(moved(lamp, wall_pose(wall, layout.size)), HERE)]
 
@@ -222,15 +222,26 @@ def shine(layout: Layout, lamps: list[Lamp], flux: float) -> list[Shape]:
     return shapes
 
 
-def sky(rng: Rng, height: int = 64) -> Array:
-    """Radiance (height, 2 * height, 3) of a sky with or without a sun over dark ground; latitude-longitude, y up."""
+def sky(rng: Rng, sun: Array | None, height: int = 64) -> Array:
+    """Radiance (height, 2 * height, 3) of a sky over dark ground; latitude-longitude, y up.
+
+    `sun` is the direction to the sun, (3,) with y up, or None under clouds. A clear day's sun gives a few times the
+    light of its sky (0.3 to 30 times here).
+    """
     rows = (np.arange(height) + 0.5) / height
     up = np.cos(np.pi * rows)[:, None, None]
     zenith, horizon, ground = (rng.uniform(0.3, 1.0, 3) * tone for tone in ([0.4, 0.6, 1.0], [0.9, 0.95, 1.0], 0.2))
     blend = np.clip(up, 0, 1) ** 0.5
     image = np.where(up > 0, zenith * blend + horizon * (1 - blend), ground)
     image = np.repeat(image, 2 * height, axis=1)
-    if rng.random() < 0.6:
-        row, column = int(height * rng.uniform(0.15, 0.45)), int(rng.integers(2 * height))
-        image[row, column] += light_colour(rng) * log_uniform(rng, 100, 3000)
+    if sun is not None:
+        x, y, z = sun / np.linalg.norm(sun)
+        row, column = np.arccos(y) / np.pi * height, np.arctan2(x, -z) / np.pi % 2 * height
+        image[int(row), int(column)] += light_colour(rng) * log_uniform(rng, 300, 20000)
     return np.asarray(image)
+
+
+def sun_through(rng: Rng, wall: int, size: Array) -> Array:
+    """A direction (3,) from which the sun shines in through openings of a wall."""
+    aside, elevation = rng.uniform(-1, 1), rng.uniform(0.2, 1.0)
+    return np.asarray(wall_pose(wall, size)[:3, :3] @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])

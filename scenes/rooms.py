@@ -8,7 +8,19 @@ from scenes.animation import RigidMotion, Scene, Shape, Track
 from scenes.finish import finish
 from scenes.flight import look, path
 from scenes.layout import GAP, Group, Layout, laden
-from scenes.lighting import HIDDEN, OPEN, Lamp, ceiling_panel, hanging, orb, shine, sky, sky_panel, standing_lamp
+from scenes.lighting import (
+    HIDDEN,
+    OPEN,
+    Lamp,
+    ceiling_panel,
+    hanging,
+    orb,
+    shine,
+    sky,
+    sky_panel,
+    standing_lamp,
+    sun_through,
+)
 from scenes.meshes import slab
 from scenes.objects import DECOR, FURNITURE, Maker, blind, chair, curtain, picture, table
 from scenes.shell import Opening, floor, panel, reveal, still, wall_pose, wall_width
@@ -41,7 +53,7 @@ def windows(layout: Layout, count: int) -> None:
 def partition(layout: Layout) -> None:
     """A wall that parts the room up to a gap, so that light comes around its end."""
     rng = layout.rng
-    x, gap = layout.size[0] * rng.uniform(-0.2, 0.2), rng.uniform(0.4, 1.1)
+    x, gap = layout.size[0] * rng.uniform(-0.2, 0.2), rng.uniform(0.8, 1.6)
     depth = layout.size[2] - gap
     wall = slab(0.1, layout.size[1], depth).at(x, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
     layout.build("partition", [wall], np.eye(4))
@@ -139,8 +151,9 @@ def shell(layout: Layout) -> list[Shape]:
     rng, (width, height, depth) = layout.rng, layout.size
     below, above = floor(width + 0.1, depth + 0.1), floor(width + 0.1, depth + 0.1)
     above.apply_transform(np.array([[1, 0, 0, 0], [0, -1, 0, height], [0, 0, -1, 0], [0, 0, 0, 1.0]]))
-    wall_slot = "dark wall" if rng.random() < 0.3 else "wall"
-    tone = rng.uniform(0.05, 0.4, 3) if rng.random() < 0.2 else rng.uniform(0.6, 0.85, 3)
+    dark = rng.random() < 0.3  # shadows get their light from the walls: deep ones need dark walls
+    wall_slot = "dark wall" if dark else "wall"
+    tone = rng.uniform(0.02, 0.2, 3) if dark else rng.uniform(0.4, 0.85, 3)
     plain = {"type": "diffuse", "reflectance": {"type": "rgb", "value": tone.tolist()}}
     shapes = [Shape("floor", below, finish(rng, "floor", layout.gloss, 1.0)), Shape("ceiling", above, plain)]
     paint = finish(rng, wall_slot, layout.gloss / 3, 1.0)
@@ -157,7 +170,7 @@ def lamps_of(layout: Layout, style: str) -> list[Lamp]:
     rng = layout.rng
     small = (ceiling_panel, hanging, orb, standing_lamp)
     kinds = {"open": OPEN, "mixed": (*OPEN, *HIDDEN), "hidden": HIDDEN, "window": small}[style]
-    wanted = {"open": (1, 5), "mixed": (1, 5), "hidden": (1, 3), "window": (0, 3)}[style]
+    wanted = {"open": (1, 4), "mixed": (1, 5), "hidden": (1, 3), "window": (0, 3)}[style]
     lamps: list[Lamp] = []
     count = int(rng.integers(*wanted))
     for _ in range(8 * count):
@@ -167,7 +180,7 @@ def lamps_of(layout: Layout, style: str) -> list[Lamp]:
     return lamps
 
 
-STYLES = {"open": 0.55, "mixed": 0.15, "hidden": 0.06, "window": 0.24}
+STYLES = {"open": 0.5, "mixed": 0.15, "hidden": 0.06, "window": 0.29}
 
 
 def room(rng: Rng, frames: int) -> Scene:
@@ -175,10 +188,10 @@ def room(rng: Rng, frames: int) -> Scene:
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
     layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.3, 0.5))))
     style = str(rng.choice(list(STYLES), p=list(STYLES.values())))
-    outside = style == "window" and rng.random() < 0.3
+    outside = style == "window" and rng.random() < 0.5
     if style == "window":
         windows(layout, int(rng.integers(1, 4)))
-    elif rng.random() < 0.2:
+    elif rng.random() < 0.15:
         partition(layout)
     eye = path(layout)
     way = len(layout.boxes)
@@ -202,4 +215,7 @@ def room(rng: Rng, frames: int) -> Scene:
     shapes = [*shell(layout), *layout.shapes, *shine(layout, lamps, surface * float(rng.uniform(0.5, 2)))]
     glassy = any("dielectric" in shape.bsdf["type"] for shape in shapes)
     camera = look(layout, eye, layout.boxes[way:])
-    return Scene(tuple(shapes), camera, 7 if glassy else 5, sky(rng) if outside else None)
+    sun = sun_through(rng, next(iter(layout.openings)), size) if rng.random() < 0.75 and layout.openings else None
+    # The papers' one bounce after the first, or more, which fill shadows; light through solid glass takes two of them.
+    depth = int(rng.choice([3, 4, 5], p=[0.5, 0.25, 0.25])) + 2 * glassy
+    return Scene(tuple(shapes), camera, depth, sky(rng, sun) if outside else None)

@@ -12,7 +12,8 @@ from datasets.bench import bench_rendering
 from datasets.inspect import info
 from datasets.preview import contact_sheet
 from errors import BadInput
-from render.bench import ours, stock
+from render.bench import stock
+from render.shot import Shot
 from render.stage import Stage
 from scenes import build_scene
 
@@ -20,12 +21,10 @@ from scenes import build_scene
 @pytest.mark.parametrize("name", ["cornell_box_moving", "extremes-large", "room-3"])
 def test_both_renderers_see_the_same_frame(name):
     size, block = 48, 8
-    stage = Stage(build_scene(name, 0, 24), size, size)
-    stage.pose(8)
-    view = stage.view(8)
+    shot = Shot(Stage(build_scene(name, 0, 24), size, size), 8)
     images = [
         render(1, 256).reshape(size // block, block, size // block, block, 3).mean(axis=(1, 3))
-        for render in (stock(stage, view), ours(stage, view))
+        for render in (stock(shot), shot.radiance)
     ]
     a, b = (np.minimum(image, np.percentile(image, 90)) for image in images)  # without the edges of lamps
     assert np.abs(a - b).mean() < 0.05 * a.mean()

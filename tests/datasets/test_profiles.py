@@ -9,10 +9,12 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.inspect import info, size_in_full
 from datasets.job import render_to
-from datasets.pilot import reference_spp
+from datasets.pilot import noise_of_reference, reference_spp
 from datasets.profiles import ClipKind, DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
 from models import channels_read
+from render.clip import PLAIN
+from render.stage import Stage
 from scenes import build_scene
 
 AUXILIARY = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
@@ -93,6 +95,16 @@ def test_references_get_down_to_their_floor(floor, tmp_path):
     assert -10 * np.log10(clip.facts["floor_mse"]) > floor - 0.5
     spp = clip.facts["reference_spp"]
     assert spp > 16 and spp & (spp - 1) == 0
+
+
+def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
+    scene = build_scene("room-5", 0, 2)  # in which few samples see little of the noise that many have
+    quality = Quality(1, 16, floor=26.0, most_spp=1024)
+    stage = Stage(scene, 24, 24)
+    few = noise_of_reference(stage, 2, 16, 1, PLAIN)
+    spp = reference_spp(scene, 2, 24, 24, quality, 1)
+    assert spp > 16 * few / 10**-2.6
+    assert spp == 1024 or noise_of_reference(stage, 2, spp, 1, PLAIN) <= 10**-2.6
 
 
 def test_references_stop_at_the_most():
