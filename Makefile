@@ -11,7 +11,7 @@ SOURCES := onespp.py errors.py scenes render datasets models train eval tests
 LLVM := libllvm19
 
 .NOTPARALLEL:
-.PHONY: all setup dataset train eval test test-all lint clean
+.PHONY: all setup dataset train eval bench test test-all lint clean
 
 all: dataset train eval
 
@@ -37,6 +37,9 @@ train: $(READY)
 
 eval: $(READY)
 	$(BIN)/onespp eval --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
+
+bench: $(READY)
+	$(BIN)/onespp bench denoisers --runs $(RUNS)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q

@@ -135,18 +135,53 @@ def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int 
     print(out)
 
 
-def bench(
-    what: Annotated[Literal["loading", "rendering"], tyro.conf.Positional],
-    data: Data = None,
+def show(
+    clip: Folder,
+    names: Names = (),
+    out: Path = Path("runs/show"),
     runs: Runs = Path("runs"),
     profile: Profile = "quick",
 ) -> None:
+    """Draw a clip's folder as denoisers (all that can run, unless some are named) show it: PNGs into --out.
+
+    A contact sheet with errors, difference maps, and what each denoiser carries from frame to frame.
+    """
+    from eval.show import show as draw
+
+    for path in draw(clip, out, runs, profile, names):
+        print(path)
+
+
+def bench(
+    what: Annotated[Literal["denoisers", "fusion", "loading", "rendering"], tyro.conf.Positional],
+    names: Names = (),
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    size: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH...")] = ("1280x720",),
+    threads: int | None = None,
+) -> None:
     """Measure this machine.
 
+    denoisers: milliseconds and memory a frame, next to OIDN, of all denoisers unless some are named.
+    fusion: weight-shared kernel fusion, next to the straightforward way.
     loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
     rendering: seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
+
+    Args:
+        size: of images, for the denoisers (one or several) and fusion (the first).
+        threads: for the denoisers and fusion; by default as many as PyTorch takes.
     """
-    if what == "rendering":
+    if what == "denoisers":
+        from eval.bench import bench_denoisers
+
+        print(bench_denoisers(runs, names, size, threads))
+    elif what == "fusion":
+        from eval.bench import parse_size
+        from eval.fusion_bench import bench_fusion
+
+        print(bench_fusion(runs, *parse_size(size[0]), threads))
+    elif what == "rendering":
         from datasets.bench import bench_rendering
 
         print(bench_rendering(runs))
@@ -165,7 +200,7 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
 
 COMMANDS = {
     **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
-    **{"exr": exr, "bench": bench},
+    **{"show": show, "exr": exr, "bench": bench},
 }
 
 

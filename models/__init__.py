@@ -1,18 +1,32 @@
 """From a noisy frame and a state to a denoised image."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from errors import BadInput
+from models import oidn
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
+from models.oidn import OIDN, OIDNAccumulated
 from models.precision import fastest_precision
 from models.rae import RAE
 from models.weights import load_weights
+from models.wskp import KP, WSKP, WSKPMR
 
-DENOISERS: dict[str, Callable[[], Denoiser]] = {"noisy": Noisy, "accumulated": Accumulated, "rae": RAE}
+DENOISERS: dict[str, Callable[[], Denoiser]] = {
+    "noisy": Noisy,
+    "accumulated": Accumulated,
+    "oidn": OIDN,
+    "oidn-accumulated": OIDNAccumulated,
+    "rae": RAE,
+    "wskp3": partial(WSKP, layers=3),
+    "wskp6": partial(WSKP, layers=6),
+    "wskp-mr": WSKPMR,
+    "kp": KP,
+}
 
 
 def create(name: str) -> Denoiser:
@@ -20,6 +34,11 @@ def create(name: str) -> Denoiser:
     if name not in DENOISERS:
         raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}")
     return DENOISERS[name]()
+
+
+def unavailable(name: str) -> str | None:
+    """Why a denoiser cannot run on this machine, with what to install; None where it can."""
+    return oidn.unavailable() if isinstance(create(name), OIDN) else None
 
 
 def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:

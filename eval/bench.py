@@ -1,0 +1,253 @@
+"""`onespp bench denoisers`: what a frame costs, from noisy Frame to radiance, next to OIDN in the same run."""
+
+import ctypes
+import multiprocessing
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tabulate import tabulate
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from datasets.files import write_json
+from datasets.frame import Frame
+from errors import BadInput
+from eval.synthetic import synthetic_frame
+from models import DENOISERS, compiled, create, unavailable
+from models.denoiser import Denoiser, State
+from models.oidn import OIDN
+
+BASELINE, FAST = "oidn", "oidn (fast)"
+COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+WARM_UP, REPEATS = 2, 10  # frames
+COUNTING_SIZE = 128  # px; a side that no network needs to pad
+
+Size = tuple[int, int]  # height, width
+
+
+class Variant(NamedTuple):
+    """A denoiser in one of the ways it can run. Networks have fresh weights: speed does not depend on training."""
+
+    label: str
+    name: str
+    dtype: str = "float32"
+    compiled: bool = True
+
+    def build(self) -> Denoiser:
+        """As it stands before `prepare`."""
+        torch.manual_seed(0)
+        return OIDN("fast") if self.label == FAST else create(self.name)
+
+    def way(self) -> AbstractContextManager[None]:
+        return nullcontext() if self.compiled else compiled.disabled()
+
+
+def variants(names: Sequence[str]) -> list[Variant]:
+    """All ways to run the named denoisers, or else all that can run here.
+
+    Raises BadInput where a named one is unknown or cannot run.
+    """
+    found = []
+    for name in names or DENOISERS:
+        if reason := unavailable(name):
+            if names:
+                raise BadInput(reason)
+            print(f"{name}: skipped, {reason}")
+            continue
+        denoiser = create(name)
+        dtypes = [dtype for dtype, precision in PRECISIONS.items() if precision not in denoiser.refuses]
+        found += [Variant(name, name, dtype) for dtype in dtypes]
+        found += [Variant(f"{name} (PyTorch)", name, compiled=False)] if name in COMPILED else []
+        found += [Variant(FAST, name)] if name == BASELINE else []
+    return found
+
+
+@dataclass
+class Contender:
+    """One variant on its way through the sequence."""
+
+    variant: Variant
+    denoiser: Denoiser
+    state: State | None = None
+    seconds: list[float] = field(default_factory=list)  # a frame
+    in_network: list[float] = field(default_factory=list)  # of that; empty without a network
+
+    @staticmethod
+    def of(variant: Variant) -> "Contender":
+        denoiser = variant.build()
+        denoiser.prepare(PRECISIONS[variant.dtype])
+        contender = Contender(variant, denoiser)
+        if network := network_of(denoiser):
+            network.register_forward_pre_hook(lambda *_: contender.in_network.append(-time.perf_counter()))
+            network.register_forward_hook(lambda *_: contender.leave_network())
+        return contender
+
+    def leave_network(self) -> None:
+        self.in_network[-1] += time.perf_counter()
+
+    def step(self, frame: Frame) -> None:
+        with self.variant.way():
+            start = time.perf_counter()
+            _, self.state = self.denoiser(frame, self.state)
+            self.seconds.append(time.perf_counter() - start)
+
+    def row(self, size: Size, threads: int) -> dict[str, Any]:
+        """A row of results.json, in its form."""
+        p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds[WARM_UP:], (10, 50, 90)))
+        with multiprocessing.get_context("spawn").Pool(1) as process:
+            peak = process.apply(peak_memory, (self.variant, size, threads))
+        return {
+            **{"denoiser": self.variant.label, "height": size[0], "width": size[1], "dtype": self.variant.dtype},
+            **{"ms_median": median, "ms_p10": p10, "ms_p90": p90, "peak_mb": peak},
+            "parameters": None if isinstance(self.denoiser, OIDN) else self.denoiser.parameter_count(),
+            "macs_per_pixel": macs_per_pixel(self.variant),
+        }
+
+    def share_of_network(self) -> float | None:
+        if not self.in_network:
+            return None
+        return float(np.median(np.divide(self.in_network, self.seconds)[WARM_UP:]))
+
+
+def network_of(denoiser: Denoiser) -> nn.Module | None:
+    network = getattr(denoiser, "network", None)
+    return network if isinstance(network, nn.Module) else None
+
+
+@torch.inference_mode()
+def macs_per_pixel(variant: Variant) -> float | None:
+    """Multiply-accumulates of the network's convolutions a pixel, in the form for inference; None without a network."""
+    denoiser = variant.build()
+    denoiser.prepare()
+    network, macs = network_of(denoiser), 0
+
+    def count(layer: nn.Module, inputs: Any, output: Tensor) -> None:
+        nonlocal macs
+        assert isinstance(layer, nn.Conv2d)
+        macs += output.numel() * layer.weight[0].numel()
+
+    if network is None:
+        return None
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d):
+            layer.register_forward_hook(count)
+    denoiser(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE), None)
+    return macs / COUNTING_SIZE**2
+
+
+@torch.inference_mode()
+def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
+    """How far resident memory rises in two frames of a sequence, in MB; Linux only, else None. In a fresh process.
+
+    That is the state and everything in between, without the frame itself, the weights and the code.
+    """
+    torch.set_num_threads(threads)
+    contender = Contender.of(variant)
+    contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
+    frames = [synthetic_frame(index, *size) for index in range(2)]
+    contender.state = None
+
+    def play() -> None:
+        for frame in frames:
+            contender.step(frame)
+
+    return growth_mb(play)
+
+
+def growth_mb(work: Callable[[], object]) -> float | None:
+    """How far this process's resident memory rises above where it stands, at most, while it does `work`; Linux only."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the work would fit into that unseen
+        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+    except (OSError, AttributeError):
+        return None
+    before = status_mb("VmRSS")
+    work()
+    return max(0.0, status_mb("VmHWM") - before)
+
+
+def status_mb(field: str) -> float:
+    match = re.search(rf"{field}:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    assert match
+    return int(match[1]) / 1e3
+
+
+@contextmanager
+def thread_count(threads: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@torch.inference_mode()
+def race(variants: Sequence[Variant], size: Size) -> list[Contender]:
+    """Time all variants on one sequence: each frame by each of them in turn, so that drift of the machine hits all."""
+    contenders = [Contender.of(variant) for variant in variants]
+    with tqdm(total=(WARM_UP + REPEATS) * len(contenders), desc=f"{size[1]}x{size[0]}", leave=False) as progress:
+        for index in range(WARM_UP + REPEATS):
+            frame = synthetic_frame(index, *size)
+            for contender in contenders:
+                progress.set_postfix_str(contender.variant.label)
+                contender.step(frame)
+                progress.update()
+    return contenders
+
+
+def parse_size(text: str) -> Size:
+    """(height, width) of "1280x720". Raises BadInput."""
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if not match:
+        raise BadInput(f"'{text}' is not a size such as 1280x720")
+    return int(match[2]), int(match[1])
+
+
+def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], threads: int | None = None) -> str:
+    """Measure the named denoisers, or all that can run here: a table, and RUNS/bench/results.json.
+
+    `threads` are by default as many as PyTorch has. Raises BadInput for unknown names, sizes and numbers of threads.
+    """
+    if threads is not None and threads < 1:
+        raise BadInput(f"{threads} threads cannot work: name at least 1")
+    pixels, entrants = [parse_size(size) for size in sizes], variants(names)
+    threads = threads or torch.get_num_threads()
+    folder = runs / "bench"
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    lines: list[dict[str, Any]] = []
+    with thread_count(threads):
+        for size in pixels:
+            contenders = race(entrants, size)
+            measured = [c.row(size, threads) for c in tqdm(contenders, "memory", leave=False)]
+            lines += table_lines(contenders, measured)
+            rows += measured
+    write_json(folder / "results.json", {"schema": 1, "device": "cpu", "threads": threads, "rows": rows})
+    return tabulate(lines, "keys", floatfmt=".3g", missingval="-")
+
+
+def table_lines(contenders: Sequence[Contender], rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The rows for people: times next to OIDN's, and how they divide between the network and the rest."""
+    baseline = next((row["ms_median"] for row in rows if row["denoiser"] == BASELINE), None)
+    for contender, row in zip(contenders, rows, strict=True):
+        share = contender.share_of_network()
+        yield {
+            **{"denoiser": row["denoiser"], "size": f"{row['width']}x{row['height']}", "dtype": row["dtype"]},
+            **{"ms": row["ms_median"], "p10": row["ms_p10"], "p90": row["ms_p90"]},
+            "times oidn": row["ms_median"] / baseline if baseline else None,
+            "prediction": f"{share:.0%}" if share is not None else None,
+            "reconstruction": f"{1 - share:.0%}" if share is not None else None,
+            "peak MB": row["peak_mb"],
+            "parameters": row["parameters"],
+            "as trained": contender.variant.build().parameter_count() if share is not None else None,
+            "MACs/pixel": row["macs_per_pixel"],
+        }

@@ -1,0 +1,95 @@
+"""`onespp show`: pictures of a clip for people."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from datasets.clip import Clip, Dataset
+from errors import BadInput
+from eval.show import play, show
+from models import create
+from models.denoiser import Denoiser, State
+from onespp import main
+
+
+def clip_of(tiny: Path) -> Path:
+    return Dataset(tiny).planned(["test"])[0]
+
+
+def test_pictures_of_a_clip(tiny, tmp_path, capsys):
+    main(["show", str(clip_of(tiny)), "accumulated", "--out", str(tmp_path / "s"), "--runs", str(tmp_path)])
+    paths = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert [path.name for path in paths] == ["sheet.png", "differences.png", "state-accumulated.png"]
+    assert sorted((tmp_path / "s").iterdir()) == sorted(paths)
+    sheet, differences, state = (image.imread(path)[..., :3] for path in paths)
+    assert sheet.shape[1] > 3 * 192 and sheet.shape[0] > 4 * 192  # noisy, accumulated, reference; four frames
+    assert all(picture.std() > 0.05 for picture in (sheet, differences, state))
+
+
+def test_what_the_panels_hold(tiny):
+    """Captions are measured against the reference; states are pictured in the same colours in all frames."""
+    clip = Clip(clip_of(tiny))
+    (noisy, accumulated), references = play(
+        clip, {"noisy": create("noisy"), "accumulated": create("accumulated")}, [0, 7]
+    )
+    truth = np.clip(clip.exposure * clip.reference(7).mean(axis=0), 0, 1) ** (1 / 2.2)
+    np.testing.assert_allclose(references[1].image, truth, atol=2e-3)
+    rmse = np.sqrt(((noisy.images[1].image - truth) ** 2).mean())
+    name, words = noisy.images[1].caption.split("\n")
+    assert name == "noisy" and float(words.split()[1]) == pytest.approx(rmse, abs=2e-4)
+    assert float(words.split()[2]) == pytest.approx(-20 * np.log10(rmse), abs=0.02)
+    np.testing.assert_allclose(noisy.differences[1].image, np.abs(noisy.images[1].image - truth).mean(2), atol=2e-3)
+    assert not noisy.pictures
+    ((first, last),) = [c for c in accumulated.state_columns() if c[0].caption == "history length"]
+    assert first.image.shape == (64, 64) and (first.image == 1).all() and last.image.max() == pytest.approx(8)
+    assert (first.low, first.high) == (last.low, last.high) == pytest.approx((1, 8))
+
+
+class Painter(Denoiser):
+    """Its state has a picture in colour and one with unusable numbers."""
+
+    reads = ("direct", "indirect", "emission")
+
+    def forward(self, frame, state):
+        radiance = frame.radiance("total")
+
+        class Pictures(State):
+            def pictures(self):
+                return {"colour": radiance, "number": radiance[:, :1] * np.nan}
+
+        return radiance, Pictures(frame.shape)
+
+
+def test_states_in_colour(tiny):
+    clip = Clip(clip_of(tiny))
+    (track,), _ = play(clip, {"painter": Painter()}, [3])
+    colour, number = track.state_columns()
+    assert np.array_equal(colour[0].image, track.images[0].image) and colour[0].image.shape == (64, 64, 3)
+    assert np.array_equal(number[0].image, np.zeros((64, 64)))
+
+
+def test_clip_without_reference_or_some_channel(tiny, tmp_path, capsys):
+    """What can run is shown; the rest is skipped with a word, or an error where it was asked for."""
+    copy = shutil.copytree(clip_of(tiny), tmp_path / "clip")
+    facts = json.loads((copy / "clip.json").read_text())
+    for channel in ("direct_reference", "motion"):
+        del facts["channels"][channel]
+    (copy / "clip.json").write_text(json.dumps(facts))
+    paths = show(copy, tmp_path / "out", tmp_path, "tiny", ["noisy"])
+    assert [path.name for path in paths] == ["sheet.png"]
+    with pytest.raises(BadInput, match="no 'motion'"):
+        show(copy, tmp_path / "out", tmp_path, "tiny", ["accumulated"])
+    show(copy, tmp_path / "out", tmp_path, "tiny")
+    out = capsys.readouterr().out
+    assert "accumulated: skipped, the clip holds no motion" in out and "rae: skipped, it has no weights" in out
+
+
+def test_no_clip_is_an_error(tiny, tmp_path):
+    for path in (tmp_path / "nowhere", tiny):
+        with pytest.raises(BadInput, match="there is no clip at"):
+            show(path, tmp_path / "out", tmp_path, "tiny")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,147 @@
+"""OIDN as a denoiser: what it is fed and gives back. How well it denoises is its authors' to test."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from test_operators import flat_frame
+
+import models
+from datasets.clip import Dataset
+from datasets.frame import Frame, read_frame
+from errors import BadInput
+from models.oidn import OIDN, OIDNAccumulated
+
+pytest.importorskip("pyoidn")
+
+CHANNELS = (*OIDNAccumulated.reads, "direct_reference", "indirect_reference")
+LEVELS = (1e-7, 1e-3, 1.0, 65504.0)
+
+
+def frames_of(tiny, count: int = 4) -> list[Frame]:
+    clip = Dataset(tiny).clips("test")[0]
+    return [read_frame(clip, i, CHANNELS) for i in range(count)]
+
+
+def last(denoiser, frames) -> torch.Tensor:
+    state = None
+    for frame in frames:
+        output, state = denoiser(frame, state)
+    return output
+
+
+def error(radiance: torch.Tensor, frame: Frame) -> float:
+    truth = frame.remodulate(frame.reference_irradiance("total"), "total")
+    return float((radiance.clamp(max=2) - truth.clamp(max=2)).square().mean())
+
+
+def noisy_wall(height: int, width: int, level: float = 1.0) -> Frame:
+    """One pixel in four lit, `level` in the mean."""
+    lit = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(0)) < 0.25
+    return flat_frame(height, width, irradiance=(4 * level * lit).repeat(1, 3, 1, 1).clamp(max=65504.0))
+
+
+def test_denoises_and_accumulation_helps(tiny):
+    frames = frames_of(tiny, 6)
+    noisy, plain, accumulated = (last(models.create(n), frames) for n in ("noisy", "oidn", "oidn-accumulated"))
+    assert error(plain, frames[-1]) < 0.2 * error(noisy, frames[-1])
+    assert error(accumulated, frames[-1]) < error(plain, frames[-1])
+
+
+def test_quality_is_a_setting(tiny):
+    (frame,) = frames_of(tiny, 1)
+    high, fast = (OIDN(quality)(frame, None)[0] for quality in ("high", "fast"))
+    assert not torch.equal(high, fast)
+    assert error(fast, frame) < 0.3 * error(frame.radiance("total"), frame)
+
+
+@pytest.mark.parametrize("quality", ["high", "fast"])
+def test_any_level_of_light(quality):
+    """A noisy wall comes out at its mean level, from almost no light to the most that float16 holds."""
+    denoiser = OIDN(quality)
+    for level in LEVELS:
+        frame = noisy_wall(64, 64, level / 4)
+        output, _ = denoiser(frame, None)
+        assert torch.isfinite(output).all() and (output >= 0).all()
+        assert output.mean().item() == pytest.approx(frame.direct.mean().item(), rel=0.25)
+
+
+def test_brightness_scales(tiny):
+    (frame,) = frames_of(tiny, 1)
+    (bright,) = frames_of(tiny, 1)
+    for name in ("direct", "indirect", "emission"):
+        bright.channels[name] = 1000 * bright.channels[name]
+    one, thousand = (OIDN()(f, None)[0] for f in (frame, bright))
+    torch.testing.assert_close(1000 * one, thousand, rtol=1e-2, atol=1e-2)
+
+
+def test_emission_is_untouched():
+    """Lamps are added after denoising: no light bleeds from them, and no noise of theirs is made."""
+    dark, lamp = flat_frame(16, 16), flat_frame(16, 16)
+    lamp.emission[..., 8:] = 50.0
+    denoiser = OIDN()
+    torch.testing.assert_close(denoiser(lamp, None)[0] - denoiser(dark, None)[0], lamp.emission)
+    denoiser.signal = "indirect"
+    assert (denoiser(lamp, None)[0] < 0.1).all()  # all light is direct
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf, -5.0])
+def test_unusable_pixels_count_as_black(poison):
+    black, poisoned = noisy_wall(20, 24), noisy_wall(20, 24)
+    black.direct[0, :, 5, 6] = 0
+    poisoned.direct[0, :, 5, 6] = poison
+    for denoiser in (OIDN(), OIDNAccumulated()):
+        torch.testing.assert_close(denoiser(poisoned, None)[0], denoiser(black, None)[0])
+
+
+def test_the_filter_is_made_once_a_size_and_thread_count(monkeypatch):
+    denoiser = OIDN("fast")
+    filters = []
+    for size in ((20, 30), (20, 30), (30, 20), (30, 20)):
+        denoiser(flat_frame(*size), None)
+        filters.append(denoiser.filter)
+    assert filters[0] is filters[1] and filters[2] is filters[3] and filters[1] is not filters[2]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    denoiser(flat_frame(30, 20), None)
+    assert denoiser.filter is not filters[3] and denoiser.filter.device.get_int("numThreads") == 1
+
+
+def test_outputs_are_not_overwritten_by_the_next_frame():
+    denoiser = OIDN("fast")
+    first, _ = denoiser(noisy_wall(16, 16), None)
+    kept = first.clone()
+    denoiser(noisy_wall(16, 16, 9.0), None)
+    assert torch.equal(first, kept)
+
+
+def test_native_objects_are_released(monkeypatch):
+    import pyoidn
+
+    released = []
+    for kind in (pyoidn.Device, pyoidn.Filter):
+        monkeypatch.setattr(kind, "release", lambda self, kind=kind, r=kind.release: (released.append(kind), r(self)))
+    denoiser = OIDN("fast")
+    denoiser(flat_frame(4, 4), None)
+    del denoiser
+    assert released == [pyoidn.Filter, pyoidn.Device]
+
+
+def test_missing_or_broken_oidn_is_a_clear_error(monkeypatch):
+    assert models.unavailable("oidn") is None and models.unavailable("noisy") is None
+    monkeypatch.setattr("pyoidn.Device.get_error", lambda self: "unsupported hardware")
+    assert "unsupported hardware" in models.unavailable("oidn")
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    for name in ("oidn", "oidn-accumulated"):
+        assert "pip install 'onespp[oidn]'" in models.unavailable(name)
+        with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
+            models.load(name, None)
+        with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
+            models.create(name)(flat_frame(4, 4), None)
+    assert models.channels_read(["oidn"])  # what it reads is known all the same
+
+
+def test_it_chooses_its_own_precision():
+    assert models.create("oidn").parameter_count() == 0
+    with pytest.raises(BadInput, match="chooses its own precision"):
+        models.create("oidn").prepare(torch.bfloat16)
