@@ -18,6 +18,11 @@ Signal = Literal["total", "indirect"]
 ALBEDO_FLOOR = 0.01
 
 
+def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
+    """Whether a surface was hidden in the previous frame, (B, 1, H, W): where the vectors differ by more than 1/64 px."""
+    return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
+
+
 @dataclass(frozen=True)
 class Cameras:
     """What projects a frame's surfaces; float64.
@@ -83,6 +88,15 @@ class Frame:
     def divisor(self) -> Tensor:
         """What demodulation divides by: max(albedo, 0.01), (B, 3, H, W)."""
         return self.albedo.clamp(min=ALBEDO_FLOOR)
+
+    def finite(self) -> "Frame":
+        """The frame with NaN and infinities as 0, in whatever channel: one bad pixel must not poison a filter.
+
+        A sum tells whether there are any, at a fraction of the cost of looking at every pixel.
+        """
+        bad = [name for name, tensor in self.channels.items() if not torch.isfinite(tensor.sum())]
+        mended = {name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0) for name in bad}
+        return replace(self, channels=self.channels | mended) if bad else self
 
     def radiance(self, signal: Signal) -> Tensor:
         """Noisy radiance (B, 3, H, W): emission + direct + indirect, or indirect alone."""

@@ -143,9 +143,21 @@ def macs_per_pixel(variant: Variant) -> float | None:
     return macs / COUNTING_SIZE**2
 
 
+def growth_mb(run: Callable[[], object]) -> float | None:
+    """How far resident memory rises while `run` is called, in MB; Linux only, else None."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the rise would fit into that unseen
+        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+    except (OSError, AttributeError):
+        return None
+    before = status_mb("VmRSS")
+    run()
+    return max(0.0, status_mb("VmHWM") - before)
+
+
 @torch.inference_mode()
 def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
-    """How far resident memory rises in two frames of a sequence, in MB; Linux only, else None. In a fresh process.
+    """What two frames of a sequence add to resident memory, in MB, in a fresh process.
 
     That is the state and everything in between, without the frame itself, the weights and the code.
     """
@@ -154,24 +166,7 @@ def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
     contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
     frames = [synthetic_frame(index, *size) for index in range(2)]
     contender.state = None
-
-    def play() -> None:
-        for frame in frames:
-            contender.step(frame)
-
-    return growth_mb(play)
-
-
-def growth_mb(work: Callable[[], object]) -> float | None:
-    """How far this process's resident memory rises above where it stands, at most, while it does `work`; Linux only."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the work would fit into that unseen
-        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    except (OSError, AttributeError):
-        return None
-    before = status_mb("VmRSS")
-    work()
-    return max(0.0, status_mb("VmHWM") - before)
+    return growth_mb(lambda: [contender.step(frame) for frame in frames])
 
 
 def status_mb(field: str) -> float:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from datasets.frame import Frame, Signal
 from errors import BadInput
+from models.allocator import keep_freed_memory
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,15 @@ class Denoiser(torch.nn.Module):
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
     """
 
-    reads: ClassVar[tuple[str, ...]]
+    reads: tuple[str, ...]
     signal: Signal = "total"
     refuses: ClassVar[dict[torch.dtype, str]] = {}
     precision: torch.dtype = torch.float32
+
+    def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        """What `forward` makes of the frame's finite part: pixels that are NaN or infinite count as 0."""
+        result: tuple[Tensor, State] = super().__call__(frame.finite(), state)
+        return result
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """Radiance (B, 3, H, W) of `signal`, non-negative, and the state for the next frame.
@@ -58,6 +64,7 @@ class Denoiser(torch.nn.Module):
         """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""
         if precision in self.refuses:
             raise BadInput(f"{type(self).__name__} does not compute in {precision}: {self.refuses[precision]}")
+        keep_freed_memory()
         self.eval()
         self.requires_grad_(False)
         self.precision = precision

@@ -111,7 +111,7 @@ class SharedKernel(torch.autograd.Function):
 
 def shared_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:
     """Filter `image` (B, C, H, W) with the kernels that `logits` (B, 1, H, W) encode (Eq. 3, 4). `window` is odd."""
-    filtered: Tensor = SharedKernel.apply(image, logits, window)  # type: ignore[no-untyped-call]
+    filtered: Tensor = SharedKernel.apply(image, logits, window)
     return filtered
 
 

@@ -170,10 +170,9 @@ def fetch_compiled(frame: Frame, history: Tensor, surfaces: Surfaces, item: int)
     turn = to_then[..., :3] @ to_world.T
     slopes = torch.stack([1 / K.diagonal()[:2], -K[:2, 2] / K.diagonal()[:2]], dim=1)
     axes = then_to_world @ torch.linalg.inv(K_then)
-    buffers = [[s.depth[item, 0], s.normal[item], s.mesh_id[item, 0]] for s in (Surfaces.of(frame), surfaces)]
-    limits = PLANE_TOLERANCE, NORMAL_TOLERANCE
-    matrices = (a.numpy() for a in (to_then, turn, slopes, axes.T))
-    return fetch(history[item], frame.motion[item], *buffers, *matrices, limits)
+    here, there = ([s.depth[item, 0], s.normal[item], s.mesh_id[item, 0]] for s in (Surfaces.of(frame), surfaces))
+    matrices = [to_then, turn, slopes, axes.T, torch.tensor([PLANE_TOLERANCE, NORMAL_TOLERANCE])]
+    return fetch(history[item], frame.motion[item], here, there, [matrix.numpy() for matrix in matrices])
 
 
 def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:

@@ -18,23 +18,25 @@ class RepVGGBlock(nn.Module):
     def __init__(self, inputs: int, outputs: int, relu: bool):
         super().__init__()
         self.relu, self.has_identity = relu, inputs == outputs
-        self.branches = nn.ModuleList(nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in SIZES)
+        self.branches: Sequence[nn.Conv2d] = nn.ModuleList(  # type: ignore[assignment]
+            nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in SIZES
+        )
         self.merged: nn.Conv2d | None = None
 
     def merge(self) -> None:
         """Replace the branches; there is no way back to training."""
-        size, first = SIZES[-1], self.branches[-1]
-        assert isinstance(first, nn.Conv2d)
-        merged = nn.Conv2d(first.in_channels, first.out_channels, size, padding=size // 2)
-        weight, bias = torch.zeros_like(merged.weight), torch.zeros_like(first.bias)  # type: ignore[arg-type]
+        size, largest = SIZES[-1], self.branches[-1]
+        merged = nn.Conv2d(largest.in_channels, largest.out_channels, size, padding=size // 2)
+        weight, bias = torch.zeros_like(largest.weight), torch.zeros(largest.out_channels).to(largest.weight)
         for branch in self.branches:
             margin = (size - branch.weight.shape[-1]) // 2
             weight += F.pad(branch.weight, (margin,) * 4)
+            assert branch.bias is not None
             bias += branch.bias
         if self.has_identity:
             weight[:, :, size // 2, size // 2] += torch.eye(len(weight), device=weight.device)
         merged.weight, merged.bias = nn.Parameter(weight, False), nn.Parameter(bias, False)
-        self.merged, self.branches = merged, nn.ModuleList()
+        self.merged, self.branches = merged, nn.ModuleList()  # type: ignore[assignment]
 
     def forward(self, x: Tensor) -> Tensor:
         if self.merged is not None:

@@ -102,8 +102,8 @@ def gather_in_steps(top: Any, total: Any, entries: Any, values: Any, taps: int) 
     total[:] = 0
     for tap in range(taps):
         for x in range(top.size):
-            weight = exp(max(entries[tap, x] - top[x], LEAST_EXPONENT))
-            weight = weight if entries[tap, x] > OUTSIDE else np.float32(0)
+            inside = np.float32(entries[tap, x] > OUTSIDE)
+            weight = inside * exp(max(entries[tap, x] - top[x], LEAST_EXPONENT))
             for c in range(4):
                 total[c, x] += weight * values[c, tap, x]
 

@@ -35,7 +35,7 @@ def consistent(x: int, y: int, mesh: float, point: Any, normal: Any, then: Any, 
 @jit
 def expected(x: int, y: int, now: Any, to_then: Any, turn: Any, rays: Any, point: Any, normal: Any) -> None:
     """Where the surface point of pixel (x, y) and its normal were: directions of the world, from the previous eye."""
-    mesh, depth = int(now[2][y, x]), now[0][y, x]
+    mesh, depth = min(int(now[2][y, x]), to_then.shape[0] - 1), now[0][y, x]
     ray = (
         (rays[0, 0] * (np.float32(x) + HALF) + rays[0, 1]) * depth,
         (rays[1, 0] * (np.float32(y) + HALF) + rays[1, 1]) * depth,
@@ -50,7 +50,7 @@ def expected(x: int, y: int, now: Any, to_then: Any, turn: Any, rays: Any, point
 
 
 @jit
-def gather(fetched: Any, history: Any, x: int, y: int, weight: float) -> None:
+def gather(fetched: Any, history: Any, x: int, y: int, weight: Any) -> None:
     for c in range(history.shape[0]):
         fetched[c] += weight * history[c, y, x]
 
@@ -115,29 +115,21 @@ def fetch_image(past: Any, found: Any, history: Any, motion: Any, now: Any, then
 
 
 def fetch(
-    history: Tensor,
-    motion: Tensor,
-    now: Sequence[Tensor],
-    then: Sequence[Tensor],
-    to_then: NDArray[np.float64],
-    turn: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    limits: tuple[float, float],
+    history: Tensor, motion: Tensor, now: Sequence[Tensor], then: Sequence[Tensor], matrices: Sequence[NDArray[Any]]
 ) -> tuple[Tensor, Tensor]:
     """The history (C, H, W) of every pixel, 0 where none was found, and whether it was found (1, H, W).
 
     Args:
-        history: (C, H, W). motion: (2, H, W). now, then: depth (H, W), normal (3, H, W), mesh id (H, W) of
-            this frame and the previous one.
-        to_then: (M + 1, 3, 4) by mesh id, from this camera's frame to the world's axes around the previous eye.
-        turn: (M + 1, 3, 3), of world-space normals. rays: (2, 2), slope and intercept of a ray over x, and over y.
-        axes: (3, 3), the previous camera's rays as x axes[0] + y axes[1] + axes[2]. limits: of plane and normal.
+        history: (C, H, W). motion: (2, H, W). now, then: depth (H, W), normal (3, H, W), mesh id (H, W) of this frame
+            and the previous one.
+        matrices: to_then (M + 1, 3, 4) by mesh id, from this camera's frame to the world's axes around the previous
+            eye; turn (M + 1, 3, 3), of world-space normals; rays (2, 2), slope and intercept over x and over y; axes
+            (3, 3), the previous camera's rays as x axes[0] + y axes[1] + axes[2]; limits (2,), of plane and normal.
     """
     threads()
     past = torch.empty_like(history, memory_format=torch.contiguous_format)
     found = torch.empty((1, *history.shape[1:]), dtype=torch.bool)
-    small = (np.ascontiguousarray(a, np.float32) for a in (to_then, turn, rays, axes, limits))
     surfaces = (tuple(array(tensor) for tensor in buffer) for buffer in (now, then))
+    small = (np.ascontiguousarray(matrix, np.float32) for matrix in matrices)
     fetch_image(past.numpy(), found.numpy(), array(history), array(motion), *surfaces, *small)
     return past, found

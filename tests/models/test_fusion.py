@@ -7,23 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
+from eval.fusion_bench import unfold_fuse
 from models import compiled
 from models.fusion import WINDOWS, box_sum, fuse, shared_kernel, windowed_sums
-
-
-def naive_kernel(image: torch.Tensor, logits: torch.Tensor, window: int) -> torch.Tensor:
-    """Eq. 3 and 4 as they are written: a kernel map by unfolding, softmax, weighted sum."""
-    batch, channels, height, width = image.shape
-    margin = window // 2
-    entries = F.pad(logits, (margin,) * 4, value=-torch.inf)
-    weights = torch.softmax(F.unfold(entries, window), dim=1)  # (B, k k, H W)
-    values = F.unfold(F.pad(image, (margin,) * 4), window).view(batch, channels, window**2, -1)
-    return (values * weights[:, None]).sum(dim=2).view(batch, channels, height, width)
-
-
-def naive_fuse(image, importance, mixture, windows):
-    shares = torch.softmax(mixture, dim=1)
-    return sum(shares[:, [i]] * naive_kernel(image, importance[:, [i]], k) for i, k in enumerate(windows))
 
 
 def both_ways(image, importance, mixture, windows=WINDOWS):
@@ -57,7 +43,7 @@ def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offs
     importance = torch.from_numpy(np.float32(patterns[shape] * scale + offset))[None]
     mixture = torch.from_numpy(np.float32(rng.normal(0, scale, (1, 6, height, width))))
     image = torch.from_numpy(np.float32(10 ** rng.uniform(-7, 6.8, (1, 3, height, width))))
-    expected = naive_fuse(image.double(), importance.double(), mixture.double(), WINDOWS).numpy()
+    expected = unfold_fuse(image.double(), importance.double(), mixture.double()).numpy()
     for result in both_ways(image, importance, mixture):
         np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5)
         assert (result.amin() >= image.amin() * (1 - 1e-5)) and (result.amax() <= image.amax() * (1 + 1e-5))
@@ -69,7 +55,7 @@ def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
     importance, mixture = torch.randn(1, 6, 200, 40), torch.randn(1, 6, 200, 40)
     importance[..., 100, 3] = 5000
     image = torch.rand(1, 3, 200, 40)
-    expected = naive_fuse(image.double(), importance.double(), mixture.double(), WINDOWS)
+    expected = unfold_fuse(image.double(), importance.double(), mixture.double())
     for result in both_ways(image, importance, mixture):
         torch.testing.assert_close(result.double(), expected, rtol=1e-5, atol=1e-6)
 
@@ -100,7 +86,7 @@ def test_gradients_equal_plain_autograd_of_the_naive_version(scale):
     exact = [t.double().requires_grad_() for t in inputs]
     target = torch.rand(2, 3, 17, 12)
     (fuse(*mine) * target).sum().backward()
-    (naive_fuse(*exact, WINDOWS) * target.double()).sum().backward()
+    (unfold_fuse(*exact) * target.double()).sum().backward()
     for a, b in zip(mine, exact, strict=True):
         torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-4, atol=1e-5)
         assert torch.isfinite(a.grad).all()

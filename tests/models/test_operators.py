@@ -1,5 +1,7 @@
 """Shared operators against hand-computed images and slow, obvious versions in float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -34,8 +36,19 @@ def flat_frame(height: int, width: int, motion=(0.0, 0.0), depth=2.0, mesh_id=No
         "mesh_id": ones if mesh_id is None else mesh_id.float(),
         "motion": torch.tensor(motion)[None, :, None, None].expand(1, 2, height, width).contiguous(),
     }
+    channels["dual_motion"] = channels["motion"].clone()  # nothing is hidden
     bodies = torch.eye(4, dtype=torch.float64).expand(1, 9, 4, 4)
     return Frame(channels, Cameras(K, now, bodies), Cameras(K, before, bodies), torch.ones(1, 3, 1, 1), "test")
+
+
+def chain(frames: list[Frame]) -> list[Frame]:
+    """The frames as a sequence: each one's previous camera is moved to where the frame before it has its own."""
+    chained = frames[:1]
+    for frame in frames[1:]:
+        last, step = chained[-1].now, frame.previous.camera_to_world.inverse() @ frame.now.camera_to_world
+        now = replace(frame.now, camera_to_world=last.camera_to_world @ step)
+        chained.append(replace(frame, now=now, previous=replace(last, K=frame.previous.K)))
+    return chained
 
 
 def ramp(height: int, width: int) -> torch.Tensor:

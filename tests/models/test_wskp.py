@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import torch
 from test_denoisers import run
-from test_fusion import naive_fuse
 from test_operators import flat_frame
 from torch.nn import functional as F
 
 import models
 from datasets.clip import Dataset
 from datasets.frame import read_frame
-from models.fusion import WINDOWS
+from eval.fusion_bench import unfold_fuse
 from models.operators import accumulate, running_scale
 from models.repvgg import RepVGGBlock, merge, repvgg
 from models.wskp import combine
@@ -63,7 +62,7 @@ def test_wskp_is_accumulation_network_fusion(tiny):
         x = torch.cat([exposed, frame.albedo, (frame.normal + 1) / 2, scale.normalised_depth(frame.depth)], dim=1)
         with torch.no_grad():
             predicted = wskp.network(x).double()
-        filtered = naive_fuse(history.irradiance.double(), predicted[:, :6], predicted[:, 6:], WINDOWS)
+        filtered = unfold_fuse(history.irradiance.double(), predicted[:, :6], predicted[:, 6:])
         expected = filtered * frame.albedo.clamp(min=0.01) + frame.emission
         np.testing.assert_allclose(output, expected, rtol=1e-4, atol=1e-5)
 
