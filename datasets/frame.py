@@ -19,7 +19,7 @@ ALBEDO_FLOOR = 0.01
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
-    """Whether a surface was hidden in the previous frame, (B, 1, H, W): where the vectors differ by more than 1/64 px."""
+    """Whether what a pixel shows was hidden in the previous frame, (B, 1, H, W): vectors differ by over 1/64 px."""
     return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
 
 

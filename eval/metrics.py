@@ -7,6 +7,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from datasets.display import display, psnr
+from datasets.frame import disoccluded
 from models.operators import finite, luminance
 
 EPSILON = 0.01
@@ -83,10 +84,10 @@ class TemporalMetrics:
 def disocclusion_l1(
     output: Tensor, halves: Tensor, exposure: float, motion: Tensor, dual_motion: Tensor
 ) -> float | None:
-    """Display L1 on disoccluded pixels: where the dual motion vector differs by more than 1/64 px; None without any."""
-    disoccluded = (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
-    if not disoccluded.any():
+    """Display L1 on disoccluded pixels; None without any."""
+    hidden = disoccluded(motion, dual_motion)
+    if not hidden.any():
         return None
     reference = halves.double().mean(dim=0, keepdim=True)
     error = (display(finite(output).double(), exposure) - display(reference, exposure)).abs()
-    return error.mean(dim=1, keepdim=True)[disoccluded].mean().item()
+    return error.mean(dim=1, keepdim=True)[hidden].mean().item()

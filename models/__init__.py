@@ -10,6 +10,7 @@ from errors import BadInput
 from models import oidn
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
+from models.ntd import NTD
 from models.oidn import OIDN, OIDNAccumulated
 from models.precision import fastest_precision
 from models.rae import RAE
@@ -26,6 +27,9 @@ DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "wskp6": partial(WSKP, layers=6),
     "wskp-mr": WSKPMR,
     "kp": KP,
+    "ntd-a": partial(NTD, vectors="motion"),
+    "ntd-b": NTD,
+    "ntd": NTD,
 }
 
 

@@ -73,5 +73,5 @@ def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
         from models.compiled.kernels import apply_kernels as apply_compiled
 
         return apply_compiled(image, logits)
-    filtered: Tensor = ApplyKernels.apply(image, logits)  # type: ignore[no-untyped-call]
+    filtered: Tensor = ApplyKernels.apply(image, logits)
     return filtered

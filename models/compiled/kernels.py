@@ -53,7 +53,7 @@ def add_weighted(line: Any, weight: Any, values: Any) -> None:
 
 
 @jit
-def filter_row(output: Any, image: Any, row: Any, y: int, size: int) -> None:
+def filter_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
     """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
 
     Slices are taken where they can be seen to be contiguous: else no loop would be vectorised.

@@ -1,0 +1,185 @@
+"""NTD: neural temporal denoising for indirect illumination, Zeng et al. 2021."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal, disoccluded
+from models.convolution import ConvReLU
+from models.denoiser import Denoiser, State, carried
+from models.kernels import apply_kernels
+from models.operators import RunningScale, pad, running_scale
+
+INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
+WIDTHS = (32, 48, 64, 80, 96)  # the paper's are lost
+TAPS = 25  # of a 5 x 5 kernel
+MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
+
+
+class Decode(nn.Module):
+    """Two convolutions of the upsampled features beside those skipped to here.
+
+    The first one is a sum of two, one a source: the same as one over both concatenated, without writing that down.
+    """
+
+    def __init__(self, below: int, skip: int):
+        super().__init__()
+        self.skip, self.up = nn.Conv2d(skip, skip, 3, padding=1, bias=False), ConvReLU(below, skip)
+        self.second = ConvReLU(skip, skip)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        return self.second(self.up(F.interpolate(x, scale_factor=2.0), self.skip(skip)))
+
+
+class KernelNet(nn.Module):
+    """A U-Net (Ronneberger et al. 2015) that predicts kernels and weights in its last three layers (Fig. 6).
+
+    What the paper does not say is ours: two 3 x 3 convolutions and ReLU a level, nearest upsampling, 1 x 1 heads.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        inputs = (INPUTS, *WIDTHS[:-1])
+        self.encode = nn.ModuleList(
+            nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
+        )
+        self.decode = nn.ModuleList(Decode(WIDTHS[i + 1], WIDTHS[i]) for i in reversed(range(len(WIDTHS) - 1)))
+        outputs = (TAPS + 1, TAPS + 1, 2 * TAPS + 1)
+        self.heads = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(WIDTHS[2::-1], outputs, strict=True))
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                nn.init.xavier_uniform_(layer.weight)  # §5
+                if layer.bias is not None:
+                    nn.init.zeros_(layer.bias)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Predictions at 1/4 and 1/2 (26 channels) and at full resolution (51), from x (B, 13, H, W)."""
+        skips: list[Tensor] = []
+        for level, encode in enumerate(self.encode):
+            x = encode(F.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        predictions = []
+        for decode, skip in zip(self.decode, skips[-2::-1], strict=True):
+            x = decode(x, skip)
+            predictions.append(x)
+        return [head(x) for head, x in zip(self.heads, predictions[-3:], strict=True)]
+
+
+def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """image(p + motion(p)), bilinear (Eq. 3), and whether p + motion(p) is inside the image, (B, 1, H, W).
+
+    Outside, the border continues. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
+    """
+    height, width = image.shape[-2:]
+    x = torch.arange(width, device=motion.device) + 0.5
+    y = torch.arange(height, device=motion.device) + 0.5
+    grid = torch.stack([(x + motion[:, 0]) * (2 / width), (y[:, None] + motion[:, 1]) * (2 / height)], dim=-1) - 1
+    inside = (grid.abs() <= 1).all(dim=-1)[:, None]
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
+
+
+def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+    """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D takes the maximum of 2 x 2 pixels, U is bilinear.
+
+    U is linear and so applied once. `fine` (B, C, H, W); `coarse`, and `alpha` (B, 1, ·, ·), have half the size,
+    rounded up.
+    """
+    height, width = fine.shape[-2:]
+    change = alpha * (coarse - F.max_pool2d(fine, 2, ceil_mode=True))
+    return fine + F.interpolate(change, scale_factor=2.0, mode="bilinear")[..., :height, :width]
+
+
+def reconstruct(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
+
+    Args:
+        noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
+        predictions: of the network, coarse to fine, at least as large as the images.
+    """
+    pyramid = [noisy]
+    for _ in predictions[1:]:  # averages: maxima of noise would be biased
+        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
+    output, alpha = pyramid[-1], None
+    for image, prediction in zip(pyramid[::-1], predictions, strict=True):
+        prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
+        filtered = apply_kernels(image, prediction[:, :TAPS])
+        output = filtered if alpha is None else combine(filtered, output, alpha)
+        alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
+    assert alpha is not None
+    return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS]), output, alpha), alpha
+
+
+@dataclass(frozen=True)
+class NTDState(State):
+    """The output to reproject, demodulated, and the running scales; the rest is to look at."""
+
+    irradiance: Tensor  # (B, 3, H, W)
+    scale: RunningScale
+    warped: Tensor  # (B, 3, H, W), irradiance
+    alpha: Tensor  # (B, 1, H, W)
+    motion: Tensor
+    dual_motion: Tensor | None
+
+    def pictures(self) -> dict[str, Tensor]:
+        shown = {"alpha_t": self.alpha, "warped previous": self.warped}
+        if self.dual_motion is not None:
+            shown["disocclusion mask"] = disoccluded(self.motion, self.dual_motion).float()
+        return shown
+
+
+class NTD(Denoiser):
+    """Predicts kernels for this frame's noise at three resolutions and for the previous output, reprojected.
+
+    Where the motion vector leaves the image there is no previous output, and this frame's noise stands in for it, as
+    it does for all of the first frame (§5): so what comes into view, and all of the image where a cut moves the camera
+    far away, starts anew. The paper leaves that to the network and tests no surfaces, and neither do we.
+
+    Args:
+        vectors: "dual_motion", or "motion" for the ablation A of the paper (§6.3).
+        signal: "indirect" as in the paper, or "total".
+    """
+
+    refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+
+    def __init__(self, vectors: Literal["motion", "dual_motion"] = "dual_motion", signal: Signal = "indirect") -> None:
+        super().__init__()
+        self.vectors, self.signal = vectors, signal
+        lights = ("indirect",) if signal == "indirect" else ("direct", "indirect", "emission")
+        # The traditional vectors tell what is disoccluded, for the loss and for pictures.
+        self.reads = (*lights, "albedo", "normal", "depth", *dict.fromkeys(("motion", vectors)))
+        self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        super().prepare(precision)
+        self.network.to(precision)
+
+    def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
+        """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
+        x = irradiance * (scale.exposure() * frame.gain)
+        return torch.log1p(x.abs()).copysign(x)
+
+    def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
+        """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state."""
+        before = carried(state, NTDState, frame)
+        noisy = frame.irradiance(self.signal).clamp(min=0)
+        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None)
+        warped = noisy
+        if before:
+            previous, inside = warp(before.irradiance, getattr(frame, self.vectors))
+            warped = torch.where(inside, previous, noisy)
+        colours = (self.compress(image, scale, frame) for image in (noisy, warped))
+        x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
+        x = x.to(self.precision, memory_format=torch.channels_last)
+        predictions = self.network(pad(x, MULTIPLE))
+        irradiance, alpha = reconstruct(noisy, warped, predictions)
+        dual = frame.dual_motion if self.vectors == "dual_motion" else None
+        return irradiance, NTDState(frame.shape, irradiance, scale, warped, alpha, frame.motion, dual)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        irradiance, after = self.predict(frame, state)
+        after = replace(after, irradiance=irradiance.clamp(min=0))
+        return frame.remodulate(after.irradiance, self.signal), after

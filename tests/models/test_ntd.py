@@ -1,0 +1,331 @@
+"""NTD: warping, the pyramid and Eq. 4 against slow versions in float64, blending, state, precision and invariances."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_operators import flat_frame
+from torch import Tensor
+from torch.nn import functional as F
+
+from datasets.clip import Dataset
+from datasets.frame import Frame, read_frame
+from errors import BadInput
+from models import create
+from models import ntd as ntd_module
+from models.convolution import ConvReLU
+from models.ntd import NTD, NTDState, combine, reconstruct, warp
+
+OUTPUTS = (26, 26, 51)
+
+
+@pytest.fixture(scope="module")
+def ntd() -> NTD:
+    torch.manual_seed(0)
+    return NTD().eval()
+
+
+@pytest.fixture(scope="module")
+def frames(tiny) -> list[Frame]:
+    """Three frames in which a mesh and the camera move."""
+    clip = Dataset(tiny).clips("test")[1]
+    return [read_frame(clip, index, NTD("motion", "total").reads + NTD().reads) for index in range(2, 5)]
+
+
+@torch.no_grad()
+def run(ntd: NTD, frames: list[Frame]) -> tuple[list[Tensor], NTDState]:
+    outputs, state = [], None
+    for frame in frames:
+        output, state = ntd(frame, state)
+        outputs.append(output)
+    assert isinstance(state, NTDState)
+    return outputs, state
+
+
+def copy(frame: Frame, **channels: Tensor) -> Frame:
+    return replace(frame, channels=frame.channels | channels)
+
+
+# --- Operators --------------------------------------------------------------------------------------------------------
+
+
+def naive_warp(image: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(C, H, W) fetched bilinearly at p + motion(p), pixel by pixel; taps outside are the nearest ones inside."""
+    _, height, width = image.shape
+    out, inside = np.zeros_like(image), np.zeros((height, width), bool)
+    for y in range(height):
+        for x in range(width):
+            u, v = x + motion[0, y, x], y + motion[1, y, x]
+            inside[y, x] = -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
+            left, top = int(np.floor(u)), int(np.floor(v))
+            for j in (0, 1):
+                for i in (0, 1):
+                    weight = (u - left if i else left + 1 - u) * (v - top if j else top + 1 - v)
+                    row, column = min(max(top + j, 0), height - 1), min(max(left + i, 0), width - 1)
+                    out[:, y, x] += weight * image[:, row, column]
+    return out, inside
+
+
+@pytest.mark.parametrize("size", [(7, 9), (1, 1), (1, 6), (5, 1)])
+def test_warp_equals_the_naive_version(size):
+    rng = np.random.default_rng(0)
+    image, motion = rng.uniform(0, 1, (3, *size)), rng.uniform(-4, 4, (2, *size))
+    warped, inside = warp(*(torch.from_numpy(a).float()[None] for a in (image, motion)))
+    expected, expected_inside = naive_warp(image, motion)
+    np.testing.assert_array_equal(inside[0, 0], expected_inside)
+    np.testing.assert_allclose(warped[0], expected, atol=1e-5)
+
+
+def naive_upsampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Twice the size, bilinear between pixel centres, the border continued; cut to (C, H, W)."""
+    out = np.zeros((len(image), height, width))
+    for y in range(height):
+        for x in range(width):
+            v, u = (y + 0.5) / 2 - 0.5, (x + 0.5) / 2 - 0.5
+            for j in (0, 1):
+                for i in (0, 1):
+                    top, left = int(np.floor(v)), int(np.floor(u))
+                    weight = (v - top if j else top + 1 - v) * (u - left if i else left + 1 - u)
+                    row, column = (
+                        min(max(a, 0), n - 1) for a, n in zip((top + j, left + i), image.shape[1:], strict=True)
+                    )
+                    out[:, y, x] += weight * image[:, row, column]
+    return out
+
+
+def naive_combine(fine: np.ndarray, coarse: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Eq. 4 as the paper writes it."""
+    maxima = np.zeros_like(coarse)
+    for y in range(maxima.shape[1]):
+        for x in range(maxima.shape[2]):
+            maxima[:, y, x] = fine[:, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].max(axis=(1, 2))
+    size = fine.shape[1:]
+    return fine - naive_upsampled(alpha * maxima, *size) + naive_upsampled(alpha * coarse, *size)
+
+
+@pytest.mark.parametrize("size", [(8, 6), (7, 5), (1, 1), (1, 4), (3, 2)])
+def test_combination_equals_eq_4(size):
+    rng = np.random.default_rng(0)
+    half = -(-size[0] // 2), -(-size[1] // 2)
+    fine, coarse, alpha = rng.uniform(0, 5, (3, *size)), rng.uniform(0, 5, (3, *half)), rng.uniform(0, 1, (1, *half))
+    result = combine(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
+    np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha), atol=1e-12)
+
+
+def predictions(height: int, width: int, alpha: tuple[float, float, float], kernel: float = 0.0) -> list[Tensor]:
+    """Logits at 1/4, 1/2 and full size: `kernel` for the centre tap against 0 for others, `alpha` of each level."""
+    result = []
+    for level, outputs, a in zip((4, 2, 1), OUTPUTS, alpha, strict=True):
+        logits = torch.zeros(1, outputs, -(-height // level), -(-width // level))
+        logits[:, 12:outputs:25] = kernel
+        logits[:, -1] = a
+        result.append(logits)
+    return result
+
+
+@pytest.mark.parametrize("size", [(8, 12), (5, 7), (1, 1)])
+def test_the_pyramid_is_unbiased(size, monkeypatch):
+    """Its pixels are means of 2 x 2 and 4 x 4 pixels, of fewer at odd borders; nothing changes a constant image."""
+    height, width = size
+    noisy, ones = torch.rand(1, 3, height, width), torch.ones(1, 3, height, width)
+    seen: list[Tensor] = []
+    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
+    reconstruct(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
+    for image, block in zip(seen, (4, 2, 1), strict=False):
+        assert image.shape[2:] == (-(-height // block), -(-width // block))
+        for y in range(height // block):
+            for x in range(width // block):
+                part = noisy[0, :, y * block : (y + 1) * block, x * block : (x + 1) * block]
+                torch.testing.assert_close(image[0, :, y, x], part.mean(dim=(1, 2)))
+        assert image.min() >= noisy.min() - 1e-6 and image.max() <= noisy.max() + 1e-6
+    monkeypatch.undo()
+    flat, _ = reconstruct(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))
+    torch.testing.assert_close(flat, ones)
+
+
+def test_reconstruction_equals_eq_4_at_both_levels():
+    """The whole of Fig. 6 on an odd size, with kernels that pass pixels through."""
+    rng = np.random.default_rng(1)
+    noisy, warped = rng.uniform(0, 5, (2, 3, 7, 10))
+    half = np.array(
+        [[[c[y : y + 2, x : x + 2].mean() for x in range(0, 10, 2)] for y in range(0, 7, 2)] for c in noisy]
+    )
+    quarter = np.array(
+        [[[c[y : y + 2, x : x + 2].mean() for x in range(0, 5, 2)] for y in range(0, 4, 2)] for c in half]
+    )
+    a4, a2, a_t = (1 / (1 + np.exp(-np.array([0.3, -0.6, 1.2])))).tolist()
+    middle = naive_combine(half, quarter, np.full((1, 2, 3), a4))
+    fine = naive_combine(noisy, middle, np.full((1, 4, 5), a2))
+    maps = predictions(7, 10, (0.3, -0.6, 1.2), kernel=80.0)
+    result, alpha = reconstruct(*(torch.from_numpy(a).float()[None] for a in (noisy, warped)), maps)
+    np.testing.assert_allclose(result[0], a_t * fine + (1 - a_t) * warped, atol=1e-5)
+    assert alpha.shape == (1, 1, 7, 10) and alpha.flatten()[0].item() == pytest.approx(a_t)
+
+
+def test_alpha_t_is_the_weight_of_the_current_frame():
+    noisy, warped = torch.rand(1, 3, 9, 11), torch.rand(1, 3, 9, 11) + 10
+    other = torch.rand(1, 3, 9, 11)
+    now, then = (predictions(9, 11, (0, 0, logit)) for logit in (200.0, -200.0))
+    assert torch.equal(reconstruct(noisy, warped, now)[0], reconstruct(noisy, other, now)[0])
+    assert torch.equal(reconstruct(noisy, warped, then)[0], reconstruct(other, warped, then)[0])
+    mean = F.avg_pool2d(warped, 5, 1, 2, count_include_pad=False)  # what equal logits make of a window
+    torch.testing.assert_close(reconstruct(noisy, warped, then)[0], mean)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_fused_convolutions_equal_pytorch_s(dtype):
+    torch.manual_seed(0)
+    layer = ConvReLU(5, 8).to(dtype).to(memory_format=torch.channels_last)
+    x = torch.randn(2, 5, 9, 10).to(dtype).contiguous(memory_format=torch.channels_last)
+    other = torch.randn(2, 8, 9, 10).to(dtype).contiguous(memory_format=torch.channels_last)
+    for extra in (None, other):
+        expected = layer(x, extra).detach()
+        with torch.no_grad():
+            fused = layer(x, None if extra is None else extra.clone())
+        assert fused.dtype == dtype and (fused == 0).any() and (fused >= 0).all()
+        rounding = 0.02 if dtype == torch.bfloat16 else 1e-5
+        torch.testing.assert_close(fused, expected, rtol=rounding, atol=rounding)
+
+
+# --- The denoiser -----------------------------------------------------------------------------------------------------
+
+
+def test_the_network_is_the_one_described(ntd, frames, monkeypatch):
+    seen: list[Tensor] = []
+    genuine = ntd.network.forward
+    monkeypatch.setattr(ntd.network, "forward", lambda x: seen.append(x) or genuine(x))
+    _, state = run(ntd, frames[:2])
+    assert [tuple(p.shape[1:]) for p in genuine(seen[1])] == [(26, 16, 16), (26, 32, 32), (51, 64, 64)]
+    x, frame = seen[1], frames[1]
+    exposure = state.scale.exposure()
+    assert x.shape == (1, 13, 64, 64)
+    torch.testing.assert_close(x[:, :3], torch.log1p(exposure * frame.indirect / frame.divisor))
+    torch.testing.assert_close(x[:, 3:6], torch.log1p(exposure * state.warped))
+    assert torch.equal(x[:, 6:9], frame.albedo) and torch.equal(x[:, 9:12], frame.normal)
+    torch.testing.assert_close(x[:, 12:], state.scale.normalised_depth(frame.depth))
+    assert x[:, :6].min() >= 0 and x[:, :6].max() < 12
+    with pytest.raises(BadInput, match="float16"):
+        NTD().prepare(torch.float16)
+
+
+def test_what_it_reads(ntd):
+    assert set(ntd.reads) == {"indirect", "albedo", "normal", "depth", "motion", "dual_motion"}
+    assert set(NTD("motion").reads) == {"indirect", "albedo", "normal", "depth", "motion"}
+    assert {"direct", "emission"} <= set(NTD(signal="total").reads)
+    assert [create(name).vectors for name in ("ntd-a", "ntd-b", "ntd")] == ["motion", "dual_motion", "dual_motion"]
+    assert {create(name).signal for name in ("ntd-a", "ntd-b", "ntd")} == {"indirect"}
+
+
+def test_the_previous_output_is_warped_by_the_dual_vectors(ntd, frames):
+    now = copy(frames[1], dual_motion=frames[1].dual_motion + 7.3, motion=frames[1].motion + 7.3)
+    (_, state), before = run(ntd, [frames[0], now]), run(ntd, frames[:1])[1]
+    warped, inside = naive_warp(before.irradiance[0].double().numpy(), now.dual_motion[0].double().numpy())
+    noisy = (now.indirect / now.divisor)[0].numpy()
+    assert 0.5 < inside.mean() < 1
+    np.testing.assert_allclose(state.warped[0], np.where(inside, warped, noisy), rtol=1e-3, atol=1e-4)
+    mask = (frames[1].dual_motion - frames[1].motion).abs().amax(dim=1, keepdim=True) > 1 / 64
+    pictures = state.pictures()
+    assert torch.equal(pictures["disocclusion mask"], mask.float()) and 0 < mask.float().mean() < 0.5
+    assert pictures["alpha_t"].shape == (1, 1, 64, 64) and pictures["warped previous"].shape == (1, 3, 64, 64)
+
+
+def test_equal_vectors_make_it_the_ablation_with_traditional_ones(ntd, frames):
+    traditional = NTD("motion").eval()
+    traditional.load_state_dict(ntd.state_dict())
+    same = [copy(frame, dual_motion=frame.motion) for frame in frames]
+    for a, b in zip(run(ntd, same)[0], run(traditional, frames)[0], strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(run(ntd, frames)[0][1], run(traditional, frames)[0][1])
+    assert "disocclusion mask" not in run(traditional, frames)[1].pictures()
+
+
+def test_the_first_frame_s_noise_is_its_previous_output(ntd, frames):
+    state = run(ntd, frames[:1])[1]
+    assert torch.equal(state.warped, frames[0].indirect / frames[0].divisor)
+
+
+def test_where_vectors_leave_the_image_it_starts_anew(ntd, frames):
+    """After a cut to a camera far away nothing of the old shot is left."""
+    far = torch.full_like(frames[1].motion, 1e5)
+    cut = copy(frames[1], motion=far, dual_motion=far)
+    bright = copy(frames[0], indirect=frames[0].indirect * 1.5 + 1)
+    states = [run(ntd, [first, cut])[1] for first in (frames[0], bright)]
+    assert torch.equal(*(state.warped for state in states))
+    assert torch.equal(states[0].warped, cut.indirect / cut.divisor)
+
+
+def test_state_carries_over(ntd, frames):
+    """Two calls with the state equal one run over two frames; without it the second comes out differently."""
+    with torch.no_grad():
+        _, state = ntd(frames[0], None)
+        with_state, _ = ntd(frames[1], state)
+        without, _ = ntd(frames[1], None)
+    assert torch.equal(with_state, run(ntd, frames[:2])[0][1])
+    assert not torch.allclose(with_state, without)
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_a_poisoned_pixel_does_not_persist(ntd, poison):
+    for name in ("indirect", "albedo", "normal", "depth", "motion", "dual_motion"):
+        first, second = flat_frame(20, 24), flat_frame(20, 24)
+        first.channels["indirect"] = second.channels["indirect"] = torch.rand(1, 3, 20, 24)
+        first.channels[name] = first.channels[name].clone()
+        first.channels[name][..., 7, 9] = poison
+        outputs, state = run(ntd, [first, second])
+        assert all(torch.isfinite(output).all() for output in outputs), name
+        assert all(torch.isfinite(picture).all() for picture in state.pictures().values()), name
+
+
+def test_bfloat16_is_close_to_float32(ntd, frames):
+    half = NTD()
+    half.load_state_dict(ntd.state_dict())
+    half.prepare(torch.bfloat16)
+    for a, b in zip(run(ntd, frames)[0], run(half, frames)[0], strict=True):
+        assert b.dtype == torch.float32
+        assert (a - b).abs().mean() < 0.01 * a.mean()
+
+
+def test_it_is_blind_to_the_scene_s_brightness(ntd, frames):
+    bright = [copy(frame, indirect=frame.indirect * 1000) for frame in frames]
+    for a, b in zip(run(ntd, frames)[0], run(ntd, bright)[0], strict=True):
+        torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3 * 1000 * a.mean().item())
+
+
+def test_outputs_of_both_signals(ntd, frames):
+    """The same irradiance through both: "total" adds emission, untouched, and is filtered from direct + indirect."""
+    total = NTD(signal="total").eval()
+    total.load_state_dict(ntd.state_dict())
+    for frame in frames:
+        both = copy(frame, direct=torch.zeros_like(frame.direct))
+        torch.testing.assert_close(run(total, [both])[0][0], run(ntd, [frame])[0][0] + frame.emission)
+        dark = copy(frame, direct=frame.indirect, indirect=torch.zeros_like(frame.indirect))
+        assert torch.equal(run(total, [dark])[0][0], run(total, [both])[0][0])
+
+
+def test_training_sees_what_inference_cuts_off(frames):
+    """`predict` returns values below 0 where Eq. 4 makes them, and gradients reach back through the warped output."""
+    torch.manual_seed(0)
+    ntd = NTD()
+    with torch.no_grad():  # pass single pixels through, and take the coarse image instead of their maxima
+        ntd.network.heads[2].bias[12] = ntd.network.heads[2].bias[50] = ntd.network.heads[1].bias[25] = 9.0
+    raw, state = ntd.predict(frames[0], None)
+    assert (raw < 0).any() and torch.equal(state.irradiance, raw)
+    output, after = ntd(frames[0], None)
+    assert (output >= 0).all() and torch.equal(after.irradiance, raw.clamp(min=0))
+    first = raw.detach().requires_grad_()
+    second, _ = ntd.predict(frames[1], replace(state, irradiance=first))
+    second.sum().backward()
+    assert first.grad is not None and first.grad.abs().sum() > 0
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in ntd.parameters())
+
+
+def test_gain_changes_what_the_network_sees_and_not_the_filtered_light(ntd, frames):
+    frame = frames[0]
+    gained = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
+    _, state = run(ntd, [frame])
+    light = torch.rand(1, 3, 4, 4)
+    plain, tinted = (ntd.compress(light, state.scale, f) for f in (frame, gained))
+    torch.testing.assert_close(torch.expm1(tinted), torch.expm1(plain) * gained.gain)
+    torch.testing.assert_close(ntd.compress(-light, state.scale, frame), -plain)
+    assert torch.equal(run(ntd, [gained])[1].warped, state.warped)
