@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,10 +114,12 @@ class Clip:
         mesh_id = self.read("mesh_id", frame, window)[..., 0]
         return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
 
-    def reference(self, frame: int) -> NDArray[np.float32]:
-        """Both halves (2, H, W, 3) of the reference radiance: emission + direct + indirect."""
-        names = ("direct_reference", "indirect_reference", "emission")
-        direct, indirect, emission = (self.read(name, frame).astype(np.float32) for name in names)
+    def reference(self, frame: int, signal: Literal["total", "indirect"] = "total") -> NDArray[np.float32]:
+        """Both halves (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone."""
+        indirect = self.read("indirect_reference", frame).astype(np.float32)
+        if signal == "indirect":
+            return indirect
+        direct, emission = (self.read(name, frame).astype(np.float32) for name in ("direct_reference", "emission"))
         return direct + indirect + emission
 
 

@@ -1,6 +1,6 @@
 """The evaluation harness: every denoiser over every test clip, one streaming pass a clip."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -13,22 +13,25 @@ from torch import Tensor
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.display import psnr
+from datasets.display import display, noise_of_halves, psnr
 from datasets.files import write_json
-from datasets.frame import Frame, read_frame, to_tensor
+from datasets.frame import Frame, Signal, read_frame, to_tensor
 from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics
 from eval.pictures import save_strip
-from models import DENOISERS, create, load
+from models import DENOISERS, create, load, unavailable
 from models.denoiser import Denoiser, State
 from train.loop import WEIGHTS, run_folder
 
 METRICS_CHANNELS = ("motion", "dual_motion")
+BASELINES = ("noisy", "accumulated")
+SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 
 
 @dataclass
 class Track:
     """One denoiser's way through one clip."""
 
+    name: str
     denoiser: Denoiser
     weights: str | None
     state: State | None = None
@@ -58,18 +61,29 @@ def is_still(clip: Clip) -> bool:
     return all(np.array_equal(a, b) for view in views for a, b in zip(first, view, strict=True))
 
 
+def signals_of(tracks: Sequence[Track]) -> list[Signal]:
+    present = {track.denoiser.signal for track in tracks}
+    return [signal for signal in SIGNALS if signal in present]
+
+
 @torch.no_grad()
-def evaluate_clip(clip: Clip, tracks: Mapping[str, Track], picture: Path) -> None:
-    """Run all denoisers over a clip frame by frame, in memory that does not grow with its length; save a picture."""
-    channels = sorted({name for track in tracks.values() for name in track.denoiser.reads} | set(METRICS_CHANNELS))
+def evaluate_clip(clip: Clip, tracks: Sequence[Track], pictures: Mapping[Signal, Path]) -> None:
+    """Run all denoisers over a clip frame by frame, in memory that does not grow with its length.
+
+    Each is held to the reference of the signal that it returns; a picture of one frame is saved for each signal.
+    """
+    channels = sorted({name for track in tracks for name in track.denoiser.reads} | set(METRICS_CHANNELS))
     still, shown = is_still(clip), clip.frames * 3 // 4
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)
-        halves = to_tensor(clip.reference(index), has_halves=True)[0]
-        outputs = {name: track.step(frame, halves, clip.exposure, still) for name, track in tracks.items()}
-        if index == shown:
-            errors = {name: track.per_frame[-1] for name, track in tracks.items()}
-            save_strip(picture, outputs | {"reference": halves.mean(dim=0, keepdim=True)}, errors, clip.exposure)
+        for signal in signals_of(tracks):
+            halves = to_tensor(clip.reference(index, signal), has_halves=True)[0]
+            ours = [track for track in tracks if track.denoiser.signal == signal]
+            outputs = {track.name: track.step(frame, halves, clip.exposure, still) for track in ours}
+            if index == shown:
+                errors = {track.name: track.per_frame[-1] for track in ours}
+                images = outputs | {"reference": halves.mean(dim=0, keepdim=True)}
+                save_strip(pictures[signal], images, errors, clip.exposure)
 
 
 def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[str, tuple[Denoiser, str | None]]:
@@ -79,6 +93,9 @@ def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[s
     """
     ready: dict[str, tuple[Denoiser, str | None]] = {}
     for name in names or DENOISERS:
+        if not names and (reason := unavailable(name)):
+            print(f"{name}: skipped, {reason}")
+            continue
         trained = create(name).parameter_count() > 0
         weights = run_folder(runs, name, profile) / WEIGHTS if trained else None
         if weights and not weights.exists() and not names:
@@ -88,8 +105,25 @@ def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[s
     return ready
 
 
+def tracks_of(denoisers: Mapping[str, tuple[Denoiser, str | None]]) -> list[Track]:
+    """A track for each denoiser.
+
+    Beside one that returns indirect light alone, the baselines that were asked for run a second time, on that alone.
+    """
+    tracks = [Track(name, denoiser, weights) for name, (denoiser, weights) in denoisers.items()]
+    if "indirect" in signals_of(tracks):
+        for name in [name for name in BASELINES if name in denoisers]:
+            baseline = load(name, None)
+            baseline.signal = "indirect"
+            tracks.append(Track(name, baseline, None))
+    return tracks
+
+
 def evaluate(data: Path, runs: Path, profile: str, names: list[str] | None = None) -> dict[str, Any]:
-    """Evaluate over the test clips; writes `RUNS/eval/results.json` and a PNG strip a clip. Returns the results."""
+    """Evaluate over the test clips; writes `RUNS/eval/results.json` and a PNG strip a clip and signal.
+
+    Returns the results. Strips of indirect light have names that end in `-indirect`.
+    """
     dataset = Dataset(data)
     clips = dataset.clips("test")
     denoisers = ready_denoisers(names, runs, profile)
@@ -97,11 +131,11 @@ def evaluate(data: Path, runs: Path, profile: str, names: list[str] | None = Non
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for clip in clips:
-        tracks = {name: Track(denoiser, weights) for name, (denoiser, weights) in denoisers.items()}
-        evaluate_clip(clip, tracks, folder / f"{clip.scene}-{clip.name}.png")
+        tracks, label = tracks_of(denoisers), f"{clip.scene}-{clip.name}"
+        evaluate_clip(clip, tracks, {"total": folder / f"{label}.png", "indirect": folder / f"{label}-indirect.png"})
         rows += [
             {
-                "denoiser": name,
+                "denoiser": track.name,
                 "signal": track.denoiser.signal,
                 "weights": track.weights,
                 "scene": clip.scene,
@@ -110,7 +144,7 @@ def evaluate(data: Path, runs: Path, profile: str, names: list[str] | None = Non
                 "metrics": track.means(),
                 "nonfinite": track.nonfinite,
             }
-            for name, track in tracks.items()
+            for track in tracks
         ]
     results = {
         "schema": 1,
@@ -135,21 +169,31 @@ COLUMNS = {
 }
 
 
+def noise_floor(clip: Clip, signal: Signal) -> float:
+    """Mean squared error as displayed of the reference itself, of all light or of indirect light alone."""
+    if signal == "total":
+        return float(clip.facts["floor_mse"])
+    halves = (display(clip.reference(index, signal), clip.exposure) for index in range(clip.frames))
+    return float(np.mean([noise_of_halves(a, b) for a, b in halves]))
+
+
+def cells(metrics: Mapping[str, float | None]) -> list[str]:
+    values = [(metrics.get(key), form) for key, (_, form) in COLUMNS.items()]
+    return [form.format(value) if value is not None else "-" for value, form in values]
+
+
 def table(results: dict[str, Any], clips: list[Clip]) -> str:
-    """Results for people: a row a clip and denoiser, and the reference's own noise floor below each clip."""
+    """Results for people: a row a clip, signal and denoiser, and the reference's own noise floor below each signal."""
     lines = []
     for clip in clips:
-        rows = [row for row in results["rows"] if (row["scene"], row["clip"]) == (clip.scene, clip.name)]
         label = f"{clip.scene}/{clip.name}"
-        for row in rows:
-            cells = [
-                form.format(row["metrics"][key]) if row["metrics"][key] is not None else "-"
-                for key, (_, form) in COLUMNS.items()
-            ]
-            lines.append([label, row["denoiser"], *cells, row["nonfinite"]])
-        floor = clip.facts["floor_mse"]
-        floors = {"rmse": floor**0.5, "psnr": psnr(floor), "temporal_error": rows[0]["metrics"]["temporal_error_floor"]}
-        cells = [form.format(floors[key]) if floors.get(key) is not None else "-" for key, (_, form) in COLUMNS.items()]
-        lines.append([label, "(noise floor)", *cells, ""])
-    head = ["clip", "denoiser", *(title for title, _ in COLUMNS.values()), "non-finite"]
+        for signal in SIGNALS:
+            key = clip.scene, clip.name, signal
+            rows = [row for row in results["rows"] if (row["scene"], row["clip"], row["signal"]) == key]
+            lines += [[label, row["denoiser"], signal, *cells(row["metrics"]), row["nonfinite"]] for row in rows]
+            if rows:
+                mse, temporal = noise_floor(clip, signal), rows[0]["metrics"]["temporal_error_floor"]
+                floor = {"rmse": mse**0.5, "psnr": psnr(mse), "temporal_error": temporal}
+                lines.append([label, "(noise floor)", signal, *cells(floor), ""])
+    head = ["clip", "denoiser", "signal", *(title for title, _ in COLUMNS.values()), "non-finite"]
     return tabulate(lines, head, disable_numparse=True)

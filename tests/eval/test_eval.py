@@ -1,5 +1,7 @@
 """Metrics against independent implementations, and the harness end to end."""
 
+import contextlib
+import io
 import json
 import math
 
@@ -9,9 +11,11 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import peak_signal_noise_ratio as torch_psnr
 
+import models
 from datasets.clip import Dataset
 from datasets.display import display
 from errors import BadInput
+from eval import harness
 from eval.harness import evaluate
 from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics, luminance
 from models import create
@@ -128,62 +132,100 @@ METRICS = {
 }
 
 
+TRAINED = ("rae", "ntd")
+ROWS = {
+    *(("noisy", "total"), ("accumulated", "total"), ("rae", "total")),
+    *(("noisy", "indirect"), ("accumulated", "indirect"), ("ntd", "indirect")),
+}
+
+
 @pytest.fixture(scope="module")
 def runs(tiny, tmp_path_factory):
-    """Results of all denoisers on the tiny data, RAE with fresh weights."""
+    """Results on the tiny data, of networks with fresh weights; the table that was printed is in table.txt."""
     runs = tmp_path_factory.mktemp("runs")
-    folder = run_folder(runs, "rae", "tiny")
-    folder.mkdir(parents=True)
     torch.manual_seed(0)
-    save_weights(create("rae"), "rae", {}, folder / "weights.safetensors")
-    evaluate(tiny, runs, "tiny")
+    for name in TRAINED:
+        folder = run_folder(runs, name, "tiny")
+        folder.mkdir(parents=True)
+        save_weights(create(name), name, {}, folder / "weights.safetensors")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        evaluate(tiny, runs, "tiny", ["noisy", "accumulated", *TRAINED])
+    (runs / "table.txt").write_text(printed.getvalue())
     return runs
 
 
 def test_results_file_has_the_agreed_form(runs, tiny):
     results = json.loads((runs / "eval" / "results.json").read_text())
     assert results.keys() == {"schema", "dataset", "device", "versions", "rows"} and results["schema"] == 1
-    assert len(results["rows"]) == 3 * 2
+    assert len(results["rows"]) == len(ROWS) * 2
+    assert {(row["denoiser"], row["signal"]) for row in results["rows"]} == ROWS
     for row in results["rows"]:
         assert row.keys() == {"denoiser", "signal", "weights", "scene", "clip", "frames", "metrics", "nonfinite"}
         assert row["metrics"].keys() == METRICS
-        assert (row["weights"] is None) == (row["denoiser"] != "rae")
+        assert (row["weights"] is None) == (row["denoiser"] not in TRAINED)
         assert row["frames"] == 8 and row["nonfinite"] == 0
         assert row["metrics"]["flicker"] is None  # the camera moves
 
 
-def test_results_are_the_means_of_frames(runs, tiny):
-    """The row of `noisy`, recomputed with numpy from the files."""
+@pytest.mark.parametrize(
+    ("signal", "lights"), [("total", ("direct", "indirect", "emission")), ("indirect", ("indirect",))]
+)
+def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
+    """The rows of `noisy`, and the noise floors below them, recomputed with numpy from the files."""
     results = json.loads((runs / "eval" / "results.json").read_text())
     clip = Dataset(tiny).clips("test")[0]
-    row = next(r for r in results["rows"] if (r["denoiser"], r["scene"]) == ("noisy", clip.scene))
-    mse, rmse = [], []
+    key = ("noisy", signal, clip.scene)
+    (row,) = (r for r in results["rows"] if (r["denoiser"], r["signal"], r["scene"]) == key)
+    mse, rmse, floor = [], [], []
     for i in range(clip.frames):
-        noisy = sum(np.float32(clip.read(name, i)) for name in ("direct", "indirect", "emission"))
-        halves = (
-            np.float64(clip.read("direct_reference", i)) + clip.read("indirect_reference", i) + clip.read("emission", i)
-        )
-        x, r = (np.clip(clip.exposure * v, 0, 1) ** (1 / 2.2) for v in (noisy, halves.mean(0)))
+        noisy = sum(np.float32(clip.read(name, i)) for name in lights)
+        references = (name if name == "emission" else f"{name}_reference" for name in lights)
+        halves = sum(np.float64(clip.read(name, i)) for name in references)
+        x, r, a, b = (np.clip(clip.exposure * v, 0, 1) ** (1 / 2.2) for v in (noisy, halves.mean(0), *halves))
         mse.append(((x - r) ** 2).mean())
         rmse.append(np.sqrt(mse[-1]))
+        floor.append(((a - b) ** 2).mean() / 4)
     assert row["metrics"]["mse"] == pytest.approx(np.mean(mse), rel=1e-4)
     assert row["metrics"]["rmse"] == pytest.approx(np.mean(rmse), rel=1e-4)
+    lines = (line.split() for line in (runs / "table.txt").read_text().splitlines())
+    (printed,) = (line for line in lines if line[:4] == [f"{clip.scene}/{clip.name}", "(noise", "floor)", signal])
+    assert float(printed[4]) == pytest.approx(np.sqrt(np.mean(floor)), abs=1e-4)
 
 
 def test_pictures_show_every_denoiser_and_the_reference(runs):
     from matplotlib import image
 
     for scene in ("cornell_box", "cornell_box_moving"):
-        picture = image.imread(runs / "eval" / f"{scene}-000.png")
-        assert picture.shape[1] == pytest.approx(4 * 256, abs=4) and picture.shape[0] >= 256
-        panels = np.array_split(picture[60:, :, :3], 4, axis=1)
-        assert all(panel.std() > 0.02 for panel in panels)
-        assert panels[0][:, :250].tobytes() != panels[3][:, :250].tobytes()
+        for ending in ("", "-indirect"):
+            picture = image.imread(runs / "eval" / f"{scene}-000{ending}.png")
+            assert picture.shape[1] == pytest.approx(4 * 256, abs=4) and picture.shape[0] >= 256
+            panels = np.array_split(picture[60:, :, :3], 4, axis=1)
+            assert all(panel.std() > 0.02 for panel in panels)
+            assert panels[0][:, :250].tobytes() != panels[3][:, :250].tobytes()
+        whole, indirect = (
+            image.imread(runs / "eval" / f"{scene}-000{e}.png")[60:, -250:, :3] for e in ("", "-indirect")
+        )
+        assert indirect.mean() < 0.8 * whole.mean()  # the references: direct light is most of it
 
 
-def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["noisy", "rae"], {("noisy", "total"), ("rae", "total")}),
+        (["ntd", "noisy"], {("ntd", "indirect"), ("noisy", "total"), ("noisy", "indirect")}),
+        (["ntd"], {("ntd", "indirect")}),
+    ],
+)
+def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expected):
+    tracks = harness.tracks_of({name: (create(name), None) for name in names})
+    assert {(track.name, track.denoiser.signal) for track in tracks} == expected and len(tracks) == len(expected)
+
+
+def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch):
     with pytest.raises(BadInput, match="onespp train rae"):
         evaluate(tiny, tmp_path, "tiny", ["rae"])
+    few = {name: models.DENOISERS[name] for name in ("noisy", "accumulated", "rae")}
+    monkeypatch.setattr(harness, "DENOISERS", few)
     results = evaluate(tiny, tmp_path, "tiny")
     assert {row["denoiser"] for row in results["rows"]} == {"noisy", "accumulated"}
     assert "rae: skipped" in capsys.readouterr().out
