@@ -4,7 +4,7 @@ import ctypes
 import multiprocessing
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,6 +99,10 @@ class Contender:
             _, self.state = self.denoiser(frame, self.state)
             self.seconds.append(time.perf_counter() - start)
 
+    def play(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            self.step(frame)
+
     def row(self, size: Size, threads: int) -> dict[str, Any]:
         """A row of results.json, in its form."""
         p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds[WARM_UP:], (10, 50, 90)))
@@ -166,7 +170,7 @@ def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
     contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
     frames = [synthetic_frame(index, *size) for index in range(2)]
     contender.state = None
-    return growth_mb(lambda: [contender.step(frame) for frame in frames])
+    return growth_mb(lambda: contender.play(frames))
 
 
 def status_mb(field: str) -> float:
