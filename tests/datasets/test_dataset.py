@@ -63,7 +63,7 @@ def test_plan_and_layout(tiny):
     for path in Dataset(tiny).planned():
         names = {file.name for file in path.iterdir()}
         assert {"clip.json", "timing.json", "direct.npy", "depth.npy"} <= names
-        assert ("dual_motion.npy" in names) == (path.parts[-3] == "test")  # nobody who trains reads it
+        assert set(Clip(path).channels) == set(facts["channels"][path.parts[-3]])
         assert not any(name.endswith(".raw") for name in names)
     assert verify(tiny) == []
 

@@ -8,11 +8,11 @@ import pytest
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.inspect import info, size_in_full
-from datasets.job import render_to
+from datasets.job import generate, render_to
 from datasets.pilot import noise_of_reference, reference_spp
 from datasets.profiles import ClipKind, DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
-from models import channels_read
+from models import channels_read, create
 from render.clip import PLAIN
 from render.stage import Stage
 from scenes import build_scene
@@ -113,25 +113,42 @@ def test_references_stop_at_the_most():
     assert reference_spp(scene, 2, 16, 16, Quality(1, 8), 1) == 8
 
 
-def test_what_nobody_reads_is_not_rendered(tiny):
-    clip = Dataset(tiny).clips("train")[0]
-    assert set(clip.channels) == set(rendered_channels(channels_read()))
+READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot be derived
+
+
+@pytest.fixture(scope="module")
+def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny data set as made for denoisers that do not read all channels."""
+    root = tmp_path_factory.mktemp("lean")
+    generate(root, "tiny", seed=0, reads=READS)
+    return root
+
+
+def test_what_nobody_reads_is_not_rendered(lean):
+    clip = Dataset(lean).clips("train")[0]
+    assert set(clip.channels) == set(rendered_channels(READS)) < set(CHANNELS)
     with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
         clip.read("dual_motion", 1)
-    test = Dataset(tiny).clips("test")[0]
+    test = Dataset(lean).clips("test")[0]
     assert set(test.channels) == set(CHANNELS)
 
 
-def test_a_static_diffuse_box_takes_at_most_sixty_percent(tiny):
-    clip = Dataset(tiny).clips("train")[0]
+def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
+    assert "dual_motion" in create("ntd").reads
+    for split in ("train", "val"):
+        assert all("dual_motion" in clip.channels for clip in Dataset(tiny).clips(split))
+
+
+def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
+    clip = Dataset(lean).clips("train")[0]
     assert clip.scene == "cornell_box"
     files = [clip.path / entry["file"] for n, entry in clip.channels.items() if n in AUXILIARY and "file" in entry]
     stored, full = sum(file.stat().st_size for file in files), sum(size_in_full(clip, name) for name in AUXILIARY)
     assert 0.2 < stored / full <= 0.6
 
 
-def test_info_shows_what_is_saved(tiny):
-    text = info(tiny)
+def test_info_shows_what_is_saved(lean):
+    text = info(lean)
     channel, step = (line.split() for line in text.splitlines() if line.startswith("dual_motion"))
     assert "not rendered" in " ".join(channel)
     assert "% of full" in next(line for line in text.splitlines() if line.startswith("auxiliary channels"))
