@@ -74,11 +74,11 @@ def render_clip(
             depth, mesh_id = ahead["depth"][..., 0].astype(np.float64), ahead["mesh_id"][..., 0]
             ahead["motion"] = motion_vectors(centres, depth, mesh_id, now, view)
             clock.lap("motion")
-            stage.pose(frame)
-            clock.lap("gbuffer")
-            if wants_dual:  # they look into the scene as it is posed in this frame
-                ahead["dual_motion"] = dual_motion(stage, depth, mesh_id, ahead["motion"], now, view)
-                clock.lap("dual_motion")
+        stage.pose(frame)
+        clock.lap("gbuffer")
+        if more and wants_dual:  # they look into the scene as it is posed in this frame
+            ahead["dual_motion"] = dual_motion(stage, depth, mesh_id, ahead["motion"], now, view)
+            clock.lap("dual_motion")
 
         ray = stage.rays(view)
         spp = sampling.noisy_spp

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from errors import BadInput
+from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes import build_scene
@@ -111,3 +112,12 @@ def test_mesh_ids_are_scene_order():
     a, b = (Stage(s, 32, 32) for s in (scene, reordered))
     ids = [render_gbuffer(s, s.view(0))["mesh_id"] for s in (a, b)]
     assert np.array_equal(ids[0], len(scene.shapes) + 1 - ids[1])
+
+
+def test_every_frame_is_posed_for_itself():
+    """Radiance and G-buffer of the last frame are those that it has in a longer clip: meshes and lights stand right."""
+    scene = build_scene("cornell_box_moving", 3, 24)
+    short, long = ([arrays for arrays, _ in render_clip(scene, n, 24, 24, Sampling(1, 1, 8), 0)] for n in (3, 5))
+    for a, b in zip(short, long, strict=False):
+        for name in a:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
