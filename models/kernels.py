@@ -49,14 +49,16 @@ class ApplyKernels(torch.autograd.Function):
         return output
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor]:
         image, logits, top, total, output = ctx.saved_tensors
         (gradient,) = gradients
-        to_image, to_logits = torch.zeros_like(image), torch.zeros_like(logits)
+        to_image = torch.zeros_like(image) if ctx.needs_input_grad[0] else None
+        to_logits = torch.zeros_like(logits)
         mean = (gradient * output).sum(dim=1, keepdim=True)
         for index, here, there in taps(logits):
             weight = torch.exp(logits[:, index, None][here] - top[here]) / total[here]
-            to_image[there].addcmul_(weight, gradient[here])
+            if to_image is not None:
+                to_image[there].addcmul_(weight, gradient[here])
             product = (gradient[here] * image[there]).sum(dim=1, keepdim=True)
             to_logits[:, index, None][here] = weight * (product - mean[here])
         return to_image, to_logits
@@ -73,5 +75,6 @@ def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
         from models.compiled.kernels import apply_kernels as apply_compiled
 
         return apply_compiled(image, logits)
-    filtered: Tensor = ApplyKernels.apply(image, logits)
+    # Taps that lie apart in memory would be gathered one by one, several times each.
+    filtered: Tensor = ApplyKernels.apply(image, logits.contiguous())
     return filtered
