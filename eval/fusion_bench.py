@@ -44,9 +44,9 @@ def method(label: str) -> Callable[..., Tensor]:
     if label == UNFOLD:
         return unfold_fuse
 
-    def run(*inputs: Tensor) -> Tensor:
+    def run(image: Tensor, importance: Tensor, mixture: Tensor) -> Tensor:
         with compiled.disabled() if label == PYTORCH else nullcontext():
-            return fuse(*inputs)
+            return fuse(image, importance, mixture)
 
     return run
 

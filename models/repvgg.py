@@ -1,6 +1,7 @@
 """RepVGG blocks (Ding et al. 2021, as varied by Fan et al. 2021, §4.1): many branches to train, one to run."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -48,7 +49,7 @@ class RepVGGBlock(nn.Module):
 
 def repvgg(widths: Sequence[int]) -> nn.Sequential:
     """Blocks from widths[0] channels to widths[-1], the last one linear."""
-    pairs = list(zip(widths, widths[1:], strict=False))
+    pairs = list(pairwise(widths))
     return nn.Sequential(*(RepVGGBlock(a, b, relu=i + 1 < len(pairs)) for i, (a, b) in enumerate(pairs)))
 
 

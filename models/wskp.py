@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.frame import Frame
+from datasets.frame import ALBEDO_FLOOR, Frame
+from models import compiled
 from models.denoiser import Denoiser, State, carried
 from models.fusion import WINDOWS, fuse
 from models.kernels import apply_kernels
@@ -36,6 +39,19 @@ class WSKPState(State):
         return shown
 
 
+def features_compiled(frame: Frame, irradiance: Tensor, exposure: Tensor, scale: RunningScale) -> Tensor:
+    from models.compiled.features import features
+
+    def constants(item: int) -> NDArray[np.float64]:
+        return np.array([scale.log_depth.value[item].exp(), ALBEDO_FLOOR, 1 / GAMMA])
+
+    items = [
+        features(*(t[item] for t in (irradiance, frame.albedo, frame.normal, frame.depth)), gain, constants(item))
+        for item, gain in enumerate(exposure.expand(-1, 3, 1, 1).flatten(1).numpy())
+    ]
+    return torch.stack([item.permute(1, 2, 0) for item in items]).permute(0, 3, 1, 2) if items[1:] else items[0][None]
+
+
 class KernelPredictor(Denoiser):
     """Temporal accumulation, a network that predicts how to filter, the filter on HDR irradiance, re-modulation (§4).
 
@@ -48,8 +64,10 @@ class KernelPredictor(Denoiser):
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         """The network's input (B, 10, H, W) in [0, 1]."""
-        exposed = irradiance * frame.divisor * (scale.exposure() * frame.gain)
-        colour = exposed.clamp(0, 1) ** (1 / GAMMA)
+        exposure = scale.exposure() * frame.gain
+        if compiled.usable(irradiance, frame.albedo, frame.normal, frame.depth):
+            return features_compiled(frame, irradiance, exposure, scale)
+        colour = (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA)
         depth = scale.normalised_depth(frame.depth)
         return torch.cat([colour, frame.albedo, frame.normal / 2 + 0.5, depth], dim=1)
 
@@ -82,7 +100,7 @@ class WSKP(KernelPredictor):
         self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)])
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
-        importance, mixture = predicted.to(irradiance.dtype).contiguous().chunk(2, dim=1)
+        importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
         return fuse(irradiance, importance, mixture, self.windows), mixture
 
 
@@ -158,7 +176,7 @@ class WSKPMR(KernelPredictor):
             images.append(F.avg_pool2d(images[-1], 2))
         output, mixture = images[-1], None
         for level, (image, maps) in enumerate(zip(images[::-1], predicted, strict=True)):
-            maps = maps.to(image.dtype).contiguous()
+            maps = maps.to(image.dtype)
             importance, mixture = maps[:, :2], maps[:, 2:4]
             filtered = fuse(image, importance, mixture, self.windows)
             output = combine(filtered, output, torch.sigmoid(maps[:, 4:])) if level else filtered

@@ -21,3 +21,22 @@ def exp(x: float) -> float:
     p = C1 + f * p
     p = np.float32(1) + f * p
     return p * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+MANTISSA, ONE = np.int32(0x7FFFFF), np.int32(0x3F800000)
+L3, L5, L7, L9 = (np.float32(1 / n) for n in (3, 5, 7, 9))
+
+
+@numba.njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def log(x: float) -> float:
+    """ln x for normal positive x: exponent and mantissa apart, and the series of 2 artanh((m - 1) / (m + 1))."""
+    bits = np.float32(x).view(np.int32)
+    m = np.int32((bits & MANTISSA) | ONE).view(np.float32)
+    e = np.float32((bits >> np.int32(23)) - np.int32(127))
+    large = m > np.float32(1.4142135)
+    m = m * np.float32(0.5) if large else m
+    e = e + np.float32(1) if large else e
+    t = (m - np.float32(1)) / (m + np.float32(1))
+    s = t * t
+    series = np.float32(1) + s * (L3 + s * (L5 + s * (L7 + s * L9)))
+    return e / LOG2E + np.float32(2) * t * series

@@ -53,32 +53,46 @@ def mix(fused: Any, total: Any, share: Any) -> None:
 
 
 @jit
-def softmax(shares: Any, logits: Any) -> None:
-    """shares (M, W) = softmax over M of logits (M, W)."""
-    count, width = logits.shape
-    for x in range(width):
-        top = logits[0, x]
-        for i in range(1, count):
-            top = max(top, logits[i, x])
-        total = np.float32(0)
-        for i in range(count):
-            shares[i, x] = exp(max(logits[i, x] - top, LEAST_EXPONENT))
-            total += shares[i, x]
-        for i in range(count):
-            shares[i, x] /= total
+def unpack(planes: Any, maps: Any) -> None:
+    """planes (rows, W) = maps (rows, W), of any strides."""
+    for y in range(planes.shape[0]):
+        line = planes[y]
+        for x in range(line.size):
+            line[x] = maps[y, x]
 
 
 @jit
-def filter_strip(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, stop: int) -> None:
-    """Add a window's share to rows start to stop - 1 where the logits around them lie within SAFE_RANGE."""
-    height, width = logits.shape
-    low, high = max(start - radius, 0), min(stop + radius, height)
-    shift = (logits[low:high].min() + logits[low:high].max()) / np.float32(2)
-    weighted = np.empty((4, high - low, width), np.float32)
-    for y in range(high - low):
+def softmax(shares: Any) -> None:
+    """shares (M, W) become their softmax over M."""
+    count, width = shares.shape
+    top, total = shares[0].copy(), np.zeros(width, np.float32)
+    for i in range(1, count):
+        for x in range(width):
+            top[x] = max(top[x], shares[i, x])
+    for i in range(count):
+        for x in range(width):
+            shares[i, x] = exp(max(shares[i, x] - top[x], LEAST_EXPONENT))
+            total[x] += shares[i, x]
+    for i in range(count):
+        for x in range(width):
+            shares[i, x] /= total[x]
+
+
+@jit
+def filter_strip(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
+    """Add a window's share to a strip of rows from `start` on.
+
+    `fused` and `image` (3, H, W) are whole; `logits` (rows, W), from row `low` on, cover the windows of the strip
+    and lie within SAFE_RANGE; `shares` (strip, W).
+    """
+    height, width = image.shape[1:]
+    rows, stop = len(logits), start + len(shares)
+    shift = (logits.min() + logits.max()) / np.float32(2)
+    weighted = np.empty((4, rows, width), np.float32)
+    for y in range(rows):
         line = weighted[3, y]
         for x in range(width):
-            line[x] = exp(logits[low + y, x] - shift)
+            line[x] = exp(logits[y, x] - shift)
         for c in range(3):
             for x in range(width):
                 weighted[c, y, x] = image[c, low + y, x] * line[x]
@@ -109,21 +123,23 @@ def gather_in_steps(top: Any, total: Any, entries: Any, values: Any, taps: int) 
 
 
 @jit
-def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, stop: int) -> None:
+def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
     """The same for any finite logits: relative to the largest of every window, columns first, then rows."""
-    height, width = logits.shape
+    height, width = image.shape[1:]
     taps = 2 * radius + 1
     entries = np.empty((taps, width), np.float32)
     values = np.zeros((4, taps, width), np.float32)
     top, tops = np.empty(width, np.float32), np.full(width + 2 * radius, OUTSIDE)
     total, totals = np.empty((4, width), np.float32), np.zeros((4, width + 2 * radius), np.float32)
-    for y in range(start, stop):
-        low, high = max(y - radius, 0), min(y + radius + 1, height)
-        for tap in range(high - low):
-            entries[tap] = logits[low + tap]
-            values[:3, tap] = image[:, low + tap]
+    for y in range(start, start + len(shares)):
+        first, last = max(y - radius, 0), min(y + radius + 1, height)
+        for tap in range(last - first):
+            entries[tap] = logits[first + tap - low]
+            values[:3, tap] = image[:, first + tap]
             values[3, tap] = 1
-        gather_in_steps(tops[radius : radius + width], totals[:, radius : radius + width], entries, values, high - low)
+        gather_in_steps(
+            tops[radius : radius + width], totals[:, radius : radius + width], entries, values, last - first
+        )
         for tap in range(taps):
             entries[tap] = tops[tap : tap + width]
             values[:, tap] = totals[:, tap : tap + width]
@@ -131,29 +147,35 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
         mix(fused[:, y], total, shares[y - start])
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+IMAGE, MAPS = numba.float32[:, :, ::1], numba.float32[:, :, :]
+
+
+@numba.njit(numba.void(IMAGE, IMAGE, MAPS, MAPS, numba.int64[::1]), cache=True, parallel=True, error_model="numpy")
 def fuse_image(fused: Any, image: Any, importance: Any, mixture: Any, windows: Any) -> None:
-    height, width = mixture.shape[1:]
+    height, width = image.shape[1:]
     for strip in numba.prange((height + STRIP - 1) // STRIP):
         start, stop = strip * STRIP, min((strip + 1) * STRIP, height)
         shares = np.empty((windows.size, stop - start, width), np.float32)
-        for y in range(start, stop):
-            softmax(shares[:, y - start], mixture[:, y])
+        for i in range(windows.size):
+            unpack(shares[i], mixture[i, start:stop])
+        for y in range(stop - start):
+            softmax(shares[:, y])
         for i in range(windows.size):
             radius = windows[i] // 2
-            around = importance[i, max(start - radius, 0) : min(stop + radius, height)]
-            if around.max() - around.min() <= SAFE_RANGE:
-                filter_strip(fused, image, importance[i], shares[i], radius, start, stop)
+            low, high = max(start - radius, 0), min(stop + radius, height)
+            logits = np.empty((high - low, width), np.float32)
+            unpack(logits, importance[i, low:high])
+            if logits.max() - logits.min() <= SAFE_RANGE:
+                filter_strip(fused, image, logits, shares[i], radius, start, low)
             else:
-                filter_strip_in_steps(fused, image, importance[i], shares[i], radius, start, stop)
+                filter_strip_in_steps(fused, image, logits, shares[i], radius, start, low)
 
 
 def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int]) -> Tensor:
-    """See models.fusion.fuse; the image has three channels."""
+    """See models.fusion.fuse; the image has three channels. The maps may have any strides."""
     threads()
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
-        fuse_image(
-            fused[item].numpy(), array(image[item]), array(importance[item]), array(mixture[item]), np.array(windows)
-        )
+        maps = importance[item].detach().numpy(), mixture[item].detach().numpy()
+        fuse_image(fused[item].numpy(), array(image[item]), *maps, np.array(windows))
     return fused

@@ -1,5 +1,7 @@
 """WSKP: RepVGG conversion, inputs, the multi-resolution combination and the baseline, each against slow versions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,10 @@ from torch.nn import functional as F
 
 import models
 from datasets.clip import Dataset
-from datasets.frame import read_frame
+from datasets.frame import Frame, read_frame
 from eval.fusion_bench import unfold_fuse
+from models import compiled
+from models.compiled.exponential import exp, log
 from models.operators import accumulate, running_scale
 from models.repvgg import RepVGGBlock, merge, repvgg
 from models.wskp import combine
@@ -93,3 +97,22 @@ def test_kernel_choice_can_be_seen(name):
     shown = state.pictures()
     assert set(shown) == {"history length", "mean window (px)"}
     assert shown["mean window (px)"].min() >= 3 and shown["mean window (px)"].max() <= 13
+
+
+def test_compiled_features_equal_pytorch_s(tiny):
+    wskp = models.create("wskp3")
+    clip = Dataset(tiny).clips("test")[1]
+    frame = Frame.stack([read_frame(clip, index, wskp.reads) for index in (2, 3)])
+    frame = replace(frame, gain=torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 0.0]])[..., None, None])
+    irradiance = frame.irradiance("total")
+    scale = running_scale(irradiance, frame.depth, None)
+    fast = wskp.features(frame, irradiance, scale)
+    with compiled.disabled():
+        torch.testing.assert_close(fast, wskp.features(frame, irradiance, scale), rtol=1e-5, atol=1e-6)
+
+
+def test_compiled_functions_are_the_mathematical_ones():
+    x = np.float32(np.concatenate([np.linspace(-80, 80, 999), [0.0, 1e-20, -1e-20]]))
+    np.testing.assert_allclose([exp(v) for v in x], np.exp(x.astype(np.float64)), rtol=1e-5)
+    positive = np.float32(10 ** np.linspace(-30, 30, 999))
+    np.testing.assert_allclose([log(v) for v in positive], np.log(positive.astype(np.float64)), rtol=1e-6, atol=1e-7)
