@@ -45,7 +45,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -q
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -q -m ''
+	$(BIN)/python -m pytest -q -m '' --hypothesis-profile thorough
 
 lint: $(READY)
 	$(BIN)/ruff check $(SOURCES)

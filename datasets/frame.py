@@ -52,6 +52,14 @@ class Cameras:
 
 
 @dataclass(frozen=True)
+class Moment:
+    """What identifies a frame among those of a sequence: its size (B, H, W) and cameras."""
+
+    shape: tuple[int, int, int]
+    cameras: Cameras
+
+
+@dataclass(frozen=True)
 class Frame:
     """One frame of one noise realisation: tensors (B, C, H, W), float32, as attributes named like the channels.
 
@@ -83,6 +91,20 @@ class Frame:
     def shape(self) -> tuple[int, int, int]:
         """(B, H, W)."""
         return (len(self.gain), *self.size)
+
+    @property
+    def moment(self) -> Moment:
+        return Moment(self.shape, self.now)
+
+    def follows(self, moment: Moment) -> bool:
+        """Whether this frame continues a sequence: of the same size, and moved to it from the cameras of `moment`.
+
+        So a cut needs no flag: the first frame of another place names other previous cameras.
+        """
+        return moment.shape == self.shape and all(
+            a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, atol=1e-12)
+            for a, b in zip(vars(self.previous).values(), vars(moment.cameras).values(), strict=True)
+        )
 
     @property
     def divisor(self) -> Tensor:

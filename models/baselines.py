@@ -16,7 +16,7 @@ class Noisy(Denoiser):
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        return frame.radiance(self.signal), State(frame.shape)
+        return frame.radiance(self.signal), State(frame.moment)
 
 
 @dataclass(frozen=True)
@@ -36,4 +36,4 @@ class Accumulated(Denoiser):
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = carried(state, AccumulatedState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
-        return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.shape, history)
+        return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.moment, history)

@@ -6,7 +6,7 @@ from typing import ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame, Signal
+from datasets.frame import Frame, Moment, Signal
 from errors import BadInput
 from models.allocator import keep_freed_memory
 
@@ -15,7 +15,7 @@ from models.allocator import keep_freed_memory
 class State:
     """What a denoiser carries from frame to frame: tensors. Each denoiser has a subclass of its own."""
 
-    shape: tuple[int, int, int]  # (B, H, W) of the frames it was made from
+    moment: Moment  # the frame after which it stands
 
     def pictures(self) -> dict[str, Tensor]:
         """What to look at when debugging, by name: (B, 1 or 3, H, W), in whatever units the name tells."""
@@ -29,8 +29,8 @@ S = TypeVar("S", bound=State)
 
 
 def carried(state: State | None, kind: type[S], frame: Frame) -> S | None:
-    """The state as one's own kind, or None where a frame of another image or batch size starts a new sequence."""
-    return state if isinstance(state, kind) and state.shape == frame.shape else None
+    """The state as one's own kind, or None where the frame does not follow it: another size, or a cut."""
+    return state if isinstance(state, kind) and frame.follows(state.moment) else None
 
 
 class Denoiser(torch.nn.Module):
@@ -56,7 +56,7 @@ class Denoiser(torch.nn.Module):
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """Radiance (B, 3, H, W) of `signal`, non-negative, and the state for the next frame.
 
-        `state` is None on the first frame of a sequence; a state of another image size is discarded.
+        `state` is None on the first frame of a sequence; one that the frame does not follow is discarded.
         """
         raise NotImplementedError
 

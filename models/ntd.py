@@ -177,7 +177,7 @@ class NTD(Denoiser):
         predictions = self.network(pad(x, MULTIPLE))
         irradiance, alpha = reconstruct(noisy, warped, predictions)
         dual = frame.dual_motion if self.vectors == "dual_motion" else None
-        return irradiance, NTDState(frame.shape, irradiance, scale, warped, alpha, frame.motion, dual)
+        return irradiance, NTDState(frame.moment, irradiance, scale, warped, alpha, frame.motion, dual)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         irradiance, after = self.predict(frame, state)

@@ -123,7 +123,7 @@ class OIDN(Denoiser):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         reflected = frame.indirect if self.signal == "indirect" else frame.direct + frame.indirect
-        return self.denoise(frame, reflected), State(frame.shape)
+        return self.denoise(frame, reflected), State(frame.moment)
 
 
 class OIDNAccumulated(OIDN):
@@ -134,4 +134,4 @@ class OIDNAccumulated(OIDN):
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = carried(state, AccumulatedState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
-        return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.shape, history)
+        return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.moment, history)

@@ -26,8 +26,8 @@ def luminance(rgb: Tensor) -> Tensor:
 
 def pad(x: Tensor, multiple: int) -> Tensor:
     """Replicate the right and bottom borders until both sides are multiples of `multiple`."""
-    height, width = x.shape[-2:]
-    return F.pad(x, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+    right, bottom = -x.shape[-1] % multiple, -x.shape[-2] % multiple
+    return F.pad(x, (0, right, 0, bottom), mode="replicate") if right or bottom else x
 
 
 @dataclass(frozen=True)

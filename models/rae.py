@@ -107,7 +107,7 @@ class RAE(Denoiser):
         x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
-        return p[..., :height, :width].to(colour.dtype), RAEState(frame.shape, hidden, scale)
+        return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         super().prepare(precision)

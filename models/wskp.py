@@ -83,7 +83,7 @@ class KernelPredictor(Denoiser):
         x = self.features(frame, history.irradiance, scale)
         predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
         irradiance, mixture = self.reconstruct(history.irradiance, predicted)
-        return frame.remodulate(irradiance, self.signal), WSKPState(frame.shape, history, scale, mixture)
+        return frame.remodulate(irradiance, self.signal), WSKPState(frame.moment, history, scale, mixture)
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         super().prepare(precision)
@@ -114,7 +114,7 @@ class KP(KernelPredictor):
         self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2])
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
-        return apply_kernels(irradiance, predicted.to(irradiance.dtype)), None
+        return apply_kernels(irradiance, predicted), None
 
 
 def convolutions(inputs: int, outputs: int) -> nn.Sequential:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +12,11 @@ from models import channels_read
 from render.stage import Stage
 from scenes import build_scene
 from scenes.animation import Camera, Scene, Shape, Track
+
+# Of tests that do not say themselves how many examples to try; `make test-all` takes the thorough ones.
+hypothesis.settings.register_profile("quick", max_examples=10)
+hypothesis.settings.register_profile("thorough", max_examples=300)
+hypothesis.settings.load_profile("quick")
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ half precision) takes the PyTorch way, which the tests hold them to.
 """
 
 import contextlib
+import functools
 from collections.abc import Iterator
 
 import numba
@@ -38,6 +39,22 @@ def array(tensor: Tensor) -> NDArray[np.float32]:
     return tensor.detach().contiguous().numpy()
 
 
+@numba.njit(parallel=True, cache=True)
+def nothing() -> None:
+    for _ in numba.prange(2):
+        pass
+
+
+@functools.cache
+def start() -> None:
+    """Start Numba's threads. They share PyTorch's OpenMP, whose number of threads that sets to all cores: set it back."""
+    count = torch.get_num_threads()
+    numba.set_num_threads(1)
+    nothing()
+    torch.set_num_threads(count)
+
+
 def threads() -> None:
     """Let Numba use as many threads as PyTorch. Call it before a parallel kernel."""
+    start()
     numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]

@@ -61,7 +61,7 @@ class Painter(Denoiser):
             def pictures(self):
                 return {"colour": radiance, "number": radiance[:, :1] * np.nan}
 
-        return radiance, Pictures(frame.shape)
+        return radiance, Pictures(frame.moment)
 
 
 def test_states_in_colour(tiny):

@@ -1,0 +1,241 @@
+"""Numerical stability at the extremes (docs/stability.md), for every registered denoiser: a new one needs no new test.
+
+`onespp`'s list: finite in, finite out; nothing below zero; a poisoned pixel counts as black and is gone; convex filters
+stay in range; thousands of frames stay bounded; half precision is close or refused; any size; cuts start anew.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_operators import chain, flat_frame
+
+import models
+from datasets.channels import REFERENCES
+from datasets.clip import Dataset
+from datasets.display import display, psnr
+from datasets.frame import Cameras, Frame, read_frame
+from errors import BadInput
+
+NAMES = [name for name in models.DENOISERS if not models.unavailable(name)]
+THREADS = torch.get_num_threads()
+CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")
+ALL = tuple(models.channels_read())
+
+
+@pytest.fixture(scope="module")
+def denoisers():
+    torch.set_num_threads(1)  # on images this small further threads only wait
+    torch.manual_seed(0)
+    made = {name: models.create(name) for name in NAMES}
+    for denoiser in made.values():
+        denoiser.prepare()
+    yield made
+    torch.set_num_threads(THREADS)
+
+
+@torch.no_grad()
+def run(denoiser, frames, state=None):
+    outputs = []
+    for frame in frames:
+        output, state = denoiser(frame, state)
+        outputs.append(output)
+    return outputs
+
+
+# --- Frames at the extremes -------------------------------------------------------------------------------------------
+
+LEVELS = st.sampled_from([0.0, 1e-7, 1e-3, 1.0, 100.0, 6e4])
+DEPTHS = st.sampled_from([0.0, 1e-4, 1.0, 1e6])
+MOTIONS = st.sampled_from([(0.0, 0.0), (0.4, -0.7), (3.0, 0.0), (1e5, -1e5), (-1e30, 1e30)])
+
+
+@st.composite
+def frames_strategy(draw, longest=4, largest=19):
+    """A sequence: any size, light from black to blinding, fireflies, surfaces near and far or none, any motion."""
+    height, width = draw(st.integers(1, largest)), draw(st.integers(1, largest))
+    depth, albedo = draw(DEPTHS), draw(st.sampled_from([0.0, 0.02, 0.5, 1.0]))
+    roughness = draw(st.sampled_from([0.0, 1.0]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
+    frames = []
+    for _ in range(draw(st.integers(1, longest))):
+        motion = draw(MOTIONS)
+        light = draw(LEVELS) * rng.choice([0.0, 1.0, 10.0], (1, 3, height, width), p=[0.5, 0.4, 0.1])
+        light = np.minimum(light, 65504)
+        if draw(st.booleans()):
+            light[..., rng.integers(height), rng.integers(width)] = 65504
+        frame = flat_frame(height, width, motion if abs(motion[0]) < 1e4 else (0.0, 0.0), depth=max(depth, 1e-4))
+        frame.channels.update(
+            direct=torch.from_numpy(np.float32(light)),
+            indirect=torch.from_numpy(np.float32(light[:, ::-1].copy())),
+            albedo=torch.full((1, 3, height, width), albedo),
+            roughness=torch.full((1, 1, height, width), roughness),
+        )
+        if depth == 0:
+            frame.channels.update(depth=torch.zeros(1, 1, height, width), mesh_id=torch.zeros(1, 1, height, width))
+            frame.channels.update(normal=torch.zeros(1, 3, height, width))
+        for name in ("motion", "dual_motion"):
+            frame.channels[name] = torch.tensor(motion)[None, :, None, None].expand(1, 2, height, width).contiguous()
+        frames.append(frame)
+    return chain(frames)
+
+
+# How many examples: see tests/conftest.py.
+SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@SETTINGS
+@given(frames=frames_strategy())
+def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
+    for frame, output in zip(frames, run(denoisers[name], frames), strict=True):
+        assert output.shape == (1, 3, *frame.size) and output.dtype == torch.float32
+        assert torch.isfinite(output).all()
+        assert (output >= 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "noisy"])
+@SETTINGS
+@given(
+    frames=frames_strategy(),
+    poison=st.sampled_from([np.nan, np.inf, -np.inf]),
+    channel=st.sampled_from(["direct", "indirect", "albedo", "normal", "depth", "emission", "motion", "dual_motion"]),
+    place=st.tuples(st.integers(0, 18), st.integers(0, 18)),
+)
+def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channel, place):
+    """So it can spread no further than an ordinary pixel, in its frame or through the state; in any channel."""
+    y, x = place[0] % frames[0].size[0], place[1] % frames[0].size[1]
+
+    def with_pixel(value):
+        tensor = frames[0].channels[channel].clone()
+        tensor[0, :, y, x] = value
+        return [replace(frames[0], channels=frames[0].channels | {channel: tensor}), *frames[1:]]
+
+    poisoned, black = (run(denoisers[name], with_pixel(value)) for value in (poison, 0.0))
+    for a, b in zip(poisoned, black, strict=True):
+        assert torch.isfinite(a).all()
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", [name for name in CONVEX if name in NAMES])
+@SETTINGS
+@given(frames=frames_strategy())
+def test_convex_filters_stay_in_range(denoisers, name, frames):
+    low, high = np.inf, 0.0
+    for frame, output in zip(frames, run(denoisers[name], frames), strict=True):
+        parts = [frame.irradiance("total")]
+        if name == "svgf":  # filters direct and indirect on their own, so their ranges add up
+            parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
+        low = min(low, sum(float(part.min()) for part in parts)) if name != "svgf" else 0.0
+        high = max(high, sum(float(part.max()) for part in parts))
+        filtered = (output - frame.emission) / frame.divisor
+        assert filtered.min() >= low * (1 - 1e-4) and filtered.max() <= high * (1 + 1e-4)
+
+
+# --- Long sequences ---------------------------------------------------------------------------------------------------
+
+
+def noisy_sequence(count: int, size: int = 8):
+    """Frames of unit irradiance under 1-spp noise, with now and then a firefly, a black frame and a jolt."""
+    rng = np.random.default_rng(0)
+    for index in range(count):
+        light = 4.0 * (rng.random((1, 1, size, size)) < 0.25) * np.ones((1, 3, 1, 1))
+        if index % 37 == 5:
+            light[..., 3, 4] = 65504
+        if index % 101 == 7:
+            light[:] = 0
+        yield flat_frame(size, size, irradiance=torch.from_numpy(np.float32(light)))
+
+
+@torch.no_grad()
+def bounded_after(denoiser, count: int) -> None:
+    state = None
+    for frame in noisy_sequence(count):
+        output, state = denoiser(frame, state)
+    assert torch.isfinite(output).all() and output.max() <= 65504 * 2
+    for picture in state.pictures().values():
+        assert torch.isfinite(picture).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hundred_frames_stay_bounded(denoisers, name):
+    bounded_after(denoisers[name], 110)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_ten_thousand_frames_stay_bounded(denoisers, name):
+    bounded_after(denoisers[name], 10_000)
+
+
+# --- Precision --------------------------------------------------------------------------------------------------------
+
+
+def shown_psnr(images, others, exposure) -> float:
+    shown = [[display(image.double().numpy(), exposure) for image in sequence] for sequence in (images, others)]
+    return psnr(float(np.mean(np.square(np.subtract(*shown)))))
+
+
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("name", NAMES)
+def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, name, precision):
+    half = models.create(name)
+    if precision in half.refuses:
+        with pytest.raises(BadInput, match=re.escape(half.refuses[precision])):
+            half.prepare(precision)
+        return
+    torch.manual_seed(0)
+    full = models.create(name)
+    half.load_state_dict(full.state_dict())
+    full.prepare()
+    half.prepare(precision)
+    clip = Dataset(tiny).clips("test")[1]
+    frames = [read_frame(clip, index, (*full.reads, *REFERENCES)) for index in range(clip.frames)]
+    truth = [frame.remodulate(frame.reference_irradiance(full.signal), full.signal) for frame in frames]
+    exact, rounded = run(full, frames), run(half, frames)
+    assert abs(shown_psnr(rounded, truth, clip.exposure) - shown_psnr(exact, truth, clip.exposure)) < 0.1
+    assert shown_psnr(exact, rounded, clip.exposure) > 35
+
+
+# --- Cuts -------------------------------------------------------------------------------------------------------------
+
+
+def sequence(clip, start: int, count: int) -> list[Frame]:
+    return [read_frame(clip, index, ALL) for index in range(start, start + count)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_scene_cut_starts_anew(tiny, denoisers, name):
+    """Frames of another place in the middle of a sequence come out as if they were the first."""
+    here, there = Dataset(tiny).clips("test")[:2]
+    after = sequence(there, 4, 3)
+    cut = run(denoisers[name], sequence(here, 0, 4) + after)[4:]
+    for a, b in zip(cut, run(denoisers[name], after), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=8, deadline=None)
+@given(
+    first=st.tuples(st.integers(1, 40), st.integers(1, 40)), second=st.tuples(st.integers(1, 40), st.integers(1, 40))
+)
+def test_a_change_of_resolution_starts_anew(denoisers, name, first, second):
+    frames = [flat_frame(*first), flat_frame(*first)]
+    light = torch.full((1, 3, *second), 1000.0)
+    after = [flat_frame(*second, depth=50.0, irradiance=light)]
+    together = run(denoisers[name], frames + after)[-1]
+    if first != second:
+        assert torch.equal(together, run(denoisers[name], after)[0])
+
+
+def test_cameras_tell_a_cut(tiny):
+    """What the cut is known by: the cameras that a frame follows are not those of the frame before it."""
+    clip = Dataset(tiny).clips("test")[1]
+    a, b, d = (read_frame(clip, index, ("albedo",)) for index in (2, 3, 5))
+    assert b.follows(a.moment) and not d.follows(a.moment) and not a.follows(a.moment)
+    still = replace(a, previous=Cameras(*vars(a.now).values()))
+    assert still.follows(a.moment)
