@@ -10,16 +10,20 @@ from errors import BadInput
 from models import oidn
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
+from models.eaw import EAW
 from models.ntd import NTD
 from models.oidn import OIDN, OIDNAccumulated
 from models.precision import fastest_precision
 from models.rae import RAE
+from models.svgf import SVGF
 from models.weights import load_weights
 from models.wskp import KP, WSKP, WSKPMR
 
 DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "noisy": Noisy,
     "accumulated": Accumulated,
+    "eaw": EAW,
+    "svgf": SVGF,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,

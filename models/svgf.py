@@ -1,0 +1,196 @@
+"""SVGF: spatiotemporal variance-guided filtering (Schied et al. 2017).
+
+Where the paper is silent, we choose:
+
+- A sample's history length counts the sample itself; "< 4 frames" (§4.2) compares it, rounded, with 4.
+- The temporal variance, that of single samples, is the first level's as it is, although integration has averaged it.
+- Depths are along the viewing axis (clip-space depth is affine in them). ∇z takes, along each axis, the smaller of the
+  differences to the two neighbours of the same mesh, so that it never sees across a silhouette; 0 without any.
+- ε of Eq. 3 is relative to the depth, so that the scene's scale cancels; ε of Eq. 5 is below any radiance's square.
+- The spatial estimate (§4.2) averages the integrated moments over its 7 × 7 pixels with the weights w_z · w_n.
+- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis.
+- Background has no normal: its weight is 0 except for itself, so it is neither filtered nor mixed with surfaces.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal
+from models import compiled
+from models.atrous import CENTRE, LEVELS, RADIUS, WindowSum, b3_spline, taps
+from models.compiled import svgf as kernels
+from models.denoiser import CLASSICAL, Denoiser, State, carried
+from models.operators import Surfaces, finite, luminance, reproject
+
+ALPHA = 0.2  # §4.1: weight of the newest sample
+RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
+SPATIAL_RADIUS = 3  # §4.2: 7 x 7
+SIGMA_Z, SIGMA_L = 1.0, 4.0  # §4.4
+SQUARINGS = 7  # σ_n = 128 = 2^7
+EPSILON_Z = 1e-3  # of the depth
+EPSILON_L = 1e-20  # luminance²
+SMALLEST = 1e-30
+BRIGHTEST = 1e16  # luminance; its square must stay finite
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """The temporally integrated samples of S signals, which are the next frame's history (§4.1, §4.2).
+
+    colour (B, S, 3, H, W): irradiance; moments (B, S, 2, H, W): raw moments of its luminance; length (B, 1, H, W).
+    """
+
+    colour: Tensor
+    moments: Tensor
+    length: Tensor
+    surfaces: Surfaces
+
+
+def integrate(frame: Frame, colour: Tensor, history: Integrated | None) -> Integrated:
+    """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1)."""
+    y = luminance(colour.flatten(0, 1)).clamp(-BRIGHTEST, BRIGHTEST).unflatten(0, colour.shape[:2])
+    moments = torch.cat([y, y.square()], dim=2)
+    length = torch.ones_like(frame.depth)
+    if history is not None:
+        before = [history.colour.flatten(1, 2), history.moments.flatten(1, 2), history.length]
+        past, found = reproject(frame, torch.cat(before, dim=1), history.surfaces)
+        alpha = torch.where(found, ALPHA, 1)
+        past_colour, past_moments, past_length = past.split([part.shape[1] for part in before], dim=1)
+        colour = torch.lerp(past_colour.view_as(colour), colour, alpha[:, None])
+        moments = torch.lerp(past_moments.view_as(moments), moments, alpha[:, None])
+        length = torch.where(found, past_length + 1, 1)
+    return Integrated(colour, moments, length, Surfaces.of(frame))
+
+
+def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
+    """Change of depth per pixel along `dim`, from the nearer in depth of the two neighbours on the same mesh."""
+    depth, mesh_id = depth.movedim(dim, -1), mesh_id.movedim(dim, -1)
+    step = torch.where(mesh_id[..., 1:] == mesh_id[..., :-1], depth.diff(dim=-1), torch.inf)
+    ahead, behind = F.pad(step, (0, 1), value=torch.inf), F.pad(step, (1, 0), value=torch.inf)
+    smaller = torch.where(ahead.abs() < behind.abs(), ahead, behind)
+    return torch.where(smaller.isinf(), 0, smaller).movedim(-1, dim)
+
+
+def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
+    """What stops the filters at the edges of surfaces, (B, 1, 7, H, W).
+
+    Unit normal (3; 0 for background), depth, σ_z ∇z (2: along x and y, per pixel), ε of Eq. 3.
+    """
+    if compiled.usable(depth, normal, mesh_id):
+        return kernels.pack_geometry(depth, normal, mesh_id, SIGMA_Z, EPSILON_Z, SMALLEST)
+    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=SMALLEST), 0)
+    gradient = [SIGMA_Z * slope(depth, mesh_id, dim) for dim in (-1, -2)]
+    epsilon = EPSILON_Z * depth.abs() + SMALLEST
+    return torch.cat([unit, depth, *gradient, epsilon], dim=1)[:, None]
+
+
+def geometry_weight(p: Tensor, q: Tensor, dx: int, dy: int) -> Tensor:
+    """w_z · w_n (Eq. 3 and 4) of q = p + (dx, dy), like one channel of the geometry (..., 7, h, w) at p and q."""
+    x, y, z, depth, along_x, along_y, epsilon = p.split(1, dim=-3)
+    to_x, to_y, to_z, to_depth = q.split(1, dim=-3)[:4]
+    w_n = (x * to_x).addcmul_(y, to_y).addcmul_(z, to_z).clamp_(min=0)
+    for _ in range(SQUARINGS):
+        w_n.square_()
+    expected = (along_x * dx).add_(along_y, alpha=dy).abs_()
+    return w_n.mul_((depth - to_depth).abs_().div_(expected.add_(epsilon)).neg_().exp_())
+
+
+def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
+    """Variance (B, S, 1, H, W) of luminance, replaced `where` (B, 1, H, W) by a 7 x 7 bilateral estimate (§4.2).
+
+    `variance` and `mean` (B, S, 1, H, W) are of the integrated moments. The estimate is the mean of the variances plus
+    the variance of the means about the window's centre: the number that the averaged moments give, without their
+    cancellation.
+    """
+    if compiled.usable(variance, mean, geometry):
+        return kernels.spatial_variance(variance, mean, geometry, where, SPATIAL_RADIUS)
+    total, spread = WindowSum(torch.ones_like(geometry[:, :, :1]), 1), WindowSum(variance, 1)
+    first, second = torch.zeros_like(mean), torch.zeros_like(mean)
+    for tap in taps(mean.shape[-2:], SPATIAL_RADIUS):
+        weight = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
+        off = mean[tap.q] - mean[tap.p]
+        total.add(tap, weight)
+        spread.add(tap, weight)
+        first[tap.p].addcmul_(weight, off)
+        second[tap.p].addcmul_(weight, off.square_())
+    estimate = (spread.sum + second) / total.sum - (first / total.sum).square()
+    return torch.where(where[:, None], estimate.clamp(min=0), variance)
+
+
+def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
+    """Variance (B, S, 1, H, W) of luminance: temporal, or spatial while the history is short (§4.2)."""
+    mean, square = integrated.moments.split(1, dim=2)
+    variance = (square - mean.square()).clamp(min=0)
+    short = integrated.length.round() < RELIABLE  # interpolated from whole numbers, not always exactly
+    return spatial_variance(variance, mean, geometry, short) if short.any() else variance
+
+
+def edge_scale(variance: Tensor) -> Tensor:
+    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W)."""
+    total, mean = WindowSum(torch.ones_like(variance), 1 / 4), WindowSum(variance, 1 / 4)
+    for tap in taps(variance.shape[-2:], 1):
+        weight = variance.new_tensor(1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy)))
+        total.add(tap, weight)
+        mean.add(tap, weight)
+    return 1 / (SIGMA_L * (mean.sum / total.sum + EPSILON_L).sqrt())
+
+
+def filter_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
+    """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered."""
+    if compiled.usable(colour, variance, geometry):
+        return kernels.filter_level(colour, variance, geometry, step, SIGMA_L, EPSILON_L)
+    y = luminance(colour.flatten(0, 1)).view_as(variance)
+    scale = edge_scale(variance)
+    total = WindowSum(torch.ones_like(variance), CENTRE)
+    mean, spread = WindowSum(colour, CENTRE), WindowSum(variance, CENTRE**2)
+    for tap in taps(variance.shape[-2:], RADIUS, step):
+        w_l = (y[tap.p] - y[tap.q]).abs_().mul_(scale[tap.p]).neg_().exp_()
+        w_zn = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
+        weight = w_l.mul_(w_zn.mul_(b3_spline(tap, step)))
+        total.add(tap, weight)
+        mean.add(tap, weight)
+        spread.add(tap, weight.square_())
+    return mean.sum / total.sum, spread.sum / total.sum.square()
+
+
+@dataclass(frozen=True)
+class SVGFState(State):
+    """What is integrated in the next frame, and the estimated variance (B, S, 1, H, W) of this one."""
+
+    history: Integrated
+    variance: Tensor
+
+    def pictures(self) -> dict[str, Tensor]:
+        names = ("variance direct", "variance indirect")[-self.variance.shape[1] :]
+        variances = dict(zip(names, self.variance.unbind(dim=1), strict=True))
+        return {"history length": self.history.length} | variances
+
+
+def irradiances(frame: Frame, signal: Signal) -> Tensor:
+    """Noisy demodulated direct and indirect, (B, 2, 3, H, W), or indirect alone, (B, 1, 3, H, W)."""
+    parts = [frame.direct, frame.indirect] if signal == "total" else [frame.indirect]
+    return finite(torch.stack([part / frame.divisor for part in parts], dim=1))
+
+
+class SVGF(Denoiser):
+    """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset.
+
+    Their sum so stays within the sums of these limits.
+    """
+
+    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    refuses = CLASSICAL
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        before = carried(state, SVGFState, frame)
+        integrated = integrate(frame, irradiances(frame, self.signal), before.history if before else None)
+        geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
+        estimated = estimate_variance(integrated, geometry)
+        colour, variance = filter_level(integrated.colour, estimated, geometry, 1)
+        history = replace(integrated, colour=colour)  # §4.3: the first level's output
+        for level in range(1, LEVELS):
+            colour, variance = filter_level(colour, variance, geometry, 2**level)
+        return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)

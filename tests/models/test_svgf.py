@@ -1,0 +1,446 @@
+"""SVGF and EAW step by step against slow versions in float64 that follow the papers' formulas pixel by pixel."""
+
+import contextlib
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_operators import flat_frame
+
+from eval.synthetic import synthetic_frame
+from models import compiled, eaw, svgf
+from models.baselines import Accumulated
+from models.eaw import EAW
+from models.operators import Surfaces, running_scale
+from models.svgf import SVGF, Integrated
+
+H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])
+WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Images are tiny: threads would only wait for each other, for long where other processes keep a core busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(params=WAYS)
+def way(request):
+    """The test runs with compiled kernels and the PyTorch way."""
+    with WAYS[request.param]():
+        yield request.param
+
+
+@torch.no_grad()
+def run(denoiser, frames):
+    state, outputs = None, []
+    for frame in frames:
+        output, state = denoiser(frame, state)
+        outputs.append(output)
+    return outputs, state
+
+
+def surfaces(rng, height, width):
+    """Depth, normal and mesh id (numpy, float64) of tilted, rough planes of two meshes beside sky."""
+    y, x = np.mgrid[0:height, 0:width]
+    mesh = rng.integers(0, 3, (height // 4 + 1, width // 4 + 1)).repeat(4, 0).repeat(4, 1)[:height, :width]
+    depth = np.float32(np.where(mesh > 0, 2 + mesh + 0.01 * x - 0.02 * y + 0.005 * rng.random((height, width)), 0))
+    normal = np.array([0, 0, -1.0])[:, None, None] + 0.1 * rng.standard_normal((3, height, width))
+    return depth.astype(float), np.float32(normal * (mesh > 0)).astype(float), mesh
+
+
+def to_torch(array, *shape):
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32)).view(shape or (1, -1, *array.shape[-2:]))
+
+
+def packed(depth, normal, mesh):
+    return svgf.pack_geometry(to_torch(depth), to_torch(normal), to_torch(mesh.astype(float)))
+
+
+# --- Slow versions ----------------------------------------------------------------------------------------------------
+
+
+def naive_slope(depth, mesh, y, x, dy, dx):
+    height, width = depth.shape
+    found = []
+    for sign in (1, -1):
+        r, c = y + sign * dy, x + sign * dx
+        if 0 <= r < height and 0 <= c < width and mesh[r, c] == mesh[y, x]:
+            found.append(sign * (depth[r, c] - depth[y, x]))
+    return min(found, key=abs, default=0.0)
+
+
+def naive_geometry_weight(depth, normal, mesh, p, q):
+    """Eq. 3 and 4, sigma_z = 1, sigma_n = 128."""
+    if depth[p] == 0 or depth[q] == 0:
+        return 0.0
+    gradient = naive_slope(depth, mesh, *p, 0, 1) * (p[1] - q[1]) + naive_slope(depth, mesh, *p, 1, 0) * (p[0] - q[0])
+    w_z = math.exp(-abs(depth[p] - depth[q]) / (abs(gradient) + 1e-3 * depth[p]))
+    a, b = normal[:, *p] / np.linalg.norm(normal[:, *p]), normal[:, *q] / np.linalg.norm(normal[:, *q])
+    return w_z * max(0.0, a @ b) ** 128
+
+
+def window(p, size, radius, step=1):
+    """Places q in the image, with their offsets in steps; p itself among them."""
+    for j in range(-radius, radius + 1):
+        for i in range(-radius, radius + 1):
+            q = p[0] + j * step, p[1] + i * step
+            if 0 <= q[0] < size[0] and 0 <= q[1] < size[1]:
+                yield q, j, i
+
+
+def naive_edge_scale(variance, p):
+    """sigma_l sqrt(g(Var)) of Eq. 5, sigma_l = 4."""
+    g = {q: 2.0 ** -(abs(j) + abs(i)) for q, j, i in window(p, variance.shape, 1)}
+    return 4 * math.sqrt(sum(w * variance[q] for q, w in g.items()) / sum(g.values()))
+
+
+def naive_level(colour, variance, depth, normal, mesh, step):
+    """Eq. 1 and the variance's: colour (3, H, W), variance (H, W)."""
+    y = np.tensordot([0.2126, 0.7152, 0.0722], colour, 1)
+    out, spread = np.zeros_like(colour), np.zeros_like(variance)
+    for p in np.ndindex(variance.shape):
+        total, scale = 0.0, naive_edge_scale(variance, p)
+        for q, j, i in window(p, variance.shape, 2, step):
+            w = H[j + 2] * H[i + 2]
+            if q != p:
+                w *= naive_geometry_weight(depth, normal, mesh, p, q) * math.exp(-abs(y[p] - y[q]) / scale)
+            total += w
+            out[:, *p] += w * colour[:, *q]
+            spread[p] += w * w * variance[q]
+        out[:, *p] /= total
+        spread[p] /= total * total
+    return out, spread
+
+
+def naive_spatial_variance(moments, depth, normal, mesh):
+    out = np.zeros(depth.shape)
+    for p in np.ndindex(depth.shape):
+        total, mean, square = 0.0, 0.0, 0.0
+        for q, _, _ in window(p, depth.shape, 3):
+            w = 1.0 if q == p else naive_geometry_weight(depth, normal, mesh, p, q)
+            total, mean, square = total + w, mean + w * moments[0][q], square + w * moments[1][q]
+        out[p] = square / total - (mean / total) ** 2
+    return out
+
+
+SIZES = st.tuples(st.integers(1, 11), st.integers(1, 11))
+EXAMPLES = settings(max_examples=15, deadline=None)
+
+
+# --- Temporal filtering (§4.1) and variance (§4.2) --------------------------------------------------------------------
+
+
+def wall(direct, indirect, **kwargs):
+    """A flat wall's 4 x 6 frame with grey direct and indirect irradiance."""
+    frame = flat_frame(4, 6, irradiance=torch.full((1, 3, 4, 6), direct), **kwargs)
+    frame.channels["indirect"] = torch.full((1, 3, 4, 6), indirect)
+    return frame
+
+
+def test_samples_and_moments_are_integrated_with_alpha_a_fifth():
+    """The first sample is taken as it is; then C' = 0.2 C + 0.8 C', for colour, luminance and its square alike."""
+    values, history, expected = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0)], None, None
+    for n, both in enumerate(values):
+        frame = wall(*both)
+        history = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
+        new = np.array([(v, v, v * v) for v in both])
+        expected = new if expected is None else 0.2 * new + 0.8 * expected
+        for s in range(2):
+            torch.testing.assert_close(history.colour[0, s], torch.full((3, 4, 6), expected[s, 0]))
+            torch.testing.assert_close(history.moments[0, s, 0], torch.full((4, 6), expected[s, 1]))
+            torch.testing.assert_close(history.moments[0, s, 1], torch.full((4, 6), expected[s, 2]))
+        assert (history.length == n + 1).all()
+
+
+def test_disoccluded_pixels_begin_with_their_sample():
+    mesh = torch.ones(1, 1, 4, 6)
+    mesh[..., 3:] = 2
+    before = wall(5.0, 5.0, mesh_id=mesh)
+    history = replace(svgf.integrate(before, svgf.irradiances(before, "total"), None), length=torch.full_like(mesh, 7))
+    frame = wall(2.0, 1.0)
+    now = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
+    # Column 3 finds mesh 1 beside it, in the 3 x 3 pixels of the second try.
+    assert (now.length[..., 4:] == 1).all() and (now.length[..., :4] == 8).all()
+    assert (now.colour[0, 0, ..., 4:] == 2).all() and (now.moments[0, 1, :, :, 4:] == 1).all()
+    torch.testing.assert_close(now.colour[0, 0, ..., :4], torch.full((3, 4, 4), 0.2 * 2 + 0.8 * 5))
+
+
+def integrated(rng, depth, lengths):
+    """Random moments of two signals on surfaces of `depth`, with history `lengths` (H, W)."""
+    mean = rng.random((2, *depth.shape)) * 3
+    square = mean**2 + rng.random(mean.shape)
+    moments = to_torch(np.stack([mean, square], axis=1), 1, 2, 2, *depth.shape)
+    nothing = torch.zeros(1, 1, *depth.shape)
+    where = Surfaces(nothing, nothing, nothing)
+    return Integrated(torch.zeros(1, 2, 3, *depth.shape), moments, to_torch(lengths), where)
+
+
+@EXAMPLES
+@given(size=SIZES, seed=st.integers(0, 9999))
+@pytest.mark.parametrize("name", WAYS)
+def test_variance_is_temporal_from_four_frames_on_and_spatial_before(name, size, seed):
+    rng = np.random.default_rng(seed)
+    depth, normal, mesh = surfaces(rng, *size)
+    lengths = rng.choice([1.0, 2.0, 3.0, 3.4, 3.9999998, 4.0, 9.0], size)
+    history = integrated(rng, depth, lengths)
+    with WAYS[name]():
+        variance = svgf.estimate_variance(history, packed(depth, normal, mesh))[0, :, 0].numpy()
+    for s in range(2):
+        moments = history.moments[0, s].double().numpy()
+        temporal = moments[1] - moments[0] ** 2
+        expected = np.where(lengths < 3.5, naive_spatial_variance(moments, depth, normal, mesh), temporal)
+        np.testing.assert_allclose(variance[s], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_variance_of_a_flickering_wall(way):
+    """0 and 2 by turns: the temporal variance nears 1; a constant has none, in space or time, whatever its level."""
+    frames = [wall(2.0 * (n % 2), 1e4) for n in range(40)]
+    state = None
+    for n, frame in enumerate(frames):
+        _, state = SVGF()(frame, state)
+        direct, indirect = state.pictures()["variance direct"], state.pictures()["variance indirect"]
+        assert indirect.max() < 1e-6 * 1e8
+        assert direct.min() > 0.5 if n >= 8 else direct.min() >= 0
+    assert direct.max() < 1.01
+    assert (state.pictures()["history length"] == 40).all()
+
+
+# --- Edge-stopping functions (§4.4) -----------------------------------------------------------------------------------
+
+
+def weight(geometry, p, dy, dx):
+    """w_z · w_n between p and p + (dy, dx)."""
+    (y, x), (r, c) = p, (p[0] + dy, p[1] + dx)
+    here, there = geometry[..., y : y + 1, x : x + 1], geometry[..., r : r + 1, c : c + 1]
+    return svgf.geometry_weight(here, there, dx, dy).item()
+
+
+def plane(height, width, across=0.0, down=0.0):
+    y, x = np.mgrid[0:height, 0:width]
+    depth = 50 + across * x + down * y
+    return depth, np.array([0, 0, -1.0])[:, None, None] * np.ones_like(depth), np.ones((height, width))
+
+
+@pytest.mark.parametrize("across, down", [(3.0, 0.0), (0.0, -2.0), (2.0, 1.0), (-1.0, 3.0)])
+def test_on_a_tilted_plane_depth_costs_a_factor_e(way, across, down):
+    """|z(p) - z(q)| is what ∇z · (p - q) expects: w_z = exp(-1), but for ε."""
+    geometry = packed(*plane(9, 9, across, down))
+    for dy, dx in [(0, 1), (2, 0), (-3, 4), (-1, -1), (4, 3)]:
+        expected = abs(across * dx + down * dy)
+        z = geometry[0, 0, 3, 4, 4].item()
+        assert weight(geometry, (4, 4), dy, dx) == pytest.approx(math.exp(-expected / (expected + 1e-3 * z)), rel=1e-4)
+
+
+def test_a_wall_that_faces_the_camera_is_one_surface_and_a_step_in_depth_an_edge(way):
+    depth, normal, mesh = plane(5, 8)
+    assert weight(packed(depth, normal, mesh), (2, 2), 2, -2) == pytest.approx(1, abs=1e-4)
+    depth[:, 4:] += 2
+    same_mesh, other_mesh = packed(depth, normal, mesh), packed(depth, normal, mesh + (np.arange(8) > 3))
+    for geometry in (same_mesh, other_mesh):  # of a pixel's two neighbours, the nearer in depth tells the slope
+        for x, dx in [(3, 1), (4, -1), (2, 3)]:
+            assert weight(geometry, (2, x), 0, dx) < 1e-10
+        assert weight(geometry, (2, 3), 0, -2) == pytest.approx(1, abs=1e-4)
+
+
+def test_slopes_never_see_another_mesh_nor_past_the_border(way):
+    depth, normal, mesh = plane(1, 4, across=1.0)
+    mesh[0] = [1, 1, 2, 0]
+    depth[0] = [5, 6, 100, 0]
+    geometry = packed(depth, normal, mesh)[0, 0]
+    assert geometry[4, 0].tolist() == [1, 1, 0, 0]
+    assert geometry[5, 0].tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("degrees", [0, 3, 8, 90, 180])
+def test_normals_weigh_by_the_128th_power_of_their_cosine(way, degrees):
+    depth, normal, mesh = plane(1, 2)
+    angle = math.radians(degrees)
+    normal[:, 0, 1] = 7 * np.array([math.sin(angle), 0, -math.cos(angle)])  # of whatever length
+    assert weight(packed(depth, normal, mesh), (0, 0), 0, 1) == pytest.approx(max(0, math.cos(angle)) ** 128, rel=1e-3)
+
+
+def test_luminance_weighs_by_the_standard_deviation_around(way):
+    """Two pixels on a wall: by hand."""
+    geometry = packed(*plane(1, 2))
+    colour = torch.tensor([[1.0, 3.0], [1.0, 1.0], [1.0, 2.0]]).view(1, 1, 3, 1, 2)
+    variance = torch.tensor([0.04, 0.01]).view(1, 1, 1, 1, 2)
+    difference = 0.2126 * 2 + 0.0722 * 1
+    sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
+    out, spread = svgf.filter_level(colour, variance, geometry, 1)
+    centre, side = 9 / 64, 3 / 32
+    for x in range(2):
+        w = side * math.exp(-difference / (4 * sigma[x]))
+        red = (centre * colour[0, 0, 0, 0, x] + w * colour[0, 0, 0, 0, 1 - x]) / (centre + w)
+        assert out[0, 0, 0, 0, x].item() == pytest.approx(red.item(), rel=1e-5)
+        v = (centre**2 * variance[..., x] + w**2 * variance[..., 1 - x]) / (centre + w) ** 2
+        assert spread[..., x].item() == pytest.approx(v.item(), rel=1e-5)
+    # Without variance, nothing that differs mixes.
+    out, spread = svgf.filter_level(colour, torch.zeros_like(variance), geometry, 1)
+    torch.testing.assert_close(out, colour)
+    assert (spread == 0).all()
+
+
+# --- The à-trous transform (§4.3) -------------------------------------------------------------------------------------
+
+
+@EXAMPLES
+@given(size=SIZES, step=st.sampled_from([1, 2, 4, 16]), seed=st.integers(0, 9999))
+@pytest.mark.parametrize("name", WAYS)
+def test_a_level_is_the_paper_s(name, size, step, seed):
+    rng = np.random.default_rng(seed)
+    depth, normal, mesh = surfaces(rng, *size)
+    colour, variance = np.float32(rng.random((2, 3, *size))), np.float32(rng.random((2, *size)) / 4)
+    with WAYS[name]():
+        images = to_torch(colour, 1, 2, 3, *size), to_torch(variance, 1, 2, 1, *size)
+        out, spread = svgf.filter_level(*images, packed(depth, normal, mesh), step)
+    for s in range(2):
+        expected = naive_level(colour[s].astype(float), variance[s].astype(float), depth, normal, mesh, step)
+        np.testing.assert_allclose(out[0, s].numpy(), expected[0], rtol=1e-4)
+        np.testing.assert_allclose(spread[0, s, 0].numpy(), expected[1], rtol=1e-4)
+
+
+def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
+    """Far from the border and with all weights 1, a level multiplies the variance by (Σ h²)²."""
+    geometry = packed(*plane(65, 65))
+    colour, variance = torch.ones(1, 1, 3, 65, 65), torch.full((1, 1, 1, 65, 65), 0.5)
+    _, spread = svgf.filter_level(colour, variance, geometry, 4)
+    assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
+
+
+def test_five_levels_and_the_first_is_the_history(monkeypatch):
+    frame = synthetic_frame(3, 24, 32)
+    seen, original = [], svgf.filter_level
+    monkeypatch.setattr(
+        svgf, "filter_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
+    )
+    (output,), state = run(SVGF(), [frame])
+    assert [step for step, _, _ in seen] == [1, 2, 4, 8, 16]
+    assert state.history.colour is seen[0][1]
+    torch.testing.assert_close(output, frame.emission + seen[-1][1].sum(dim=1) * frame.albedo.clamp(min=0.01))
+
+
+# --- The whole --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("denoiser", [SVGF, EAW])
+@pytest.mark.parametrize("signal", ["total", "indirect"])
+def test_compiled_and_plain_agree(denoiser, signal):
+    frames = [synthetic_frame(index, 41, 70) for index in range(6)]
+    made = denoiser()
+    made.signal = signal
+    torch.set_num_threads(2)
+    fast = run(made, frames)[0]
+    torch.set_num_threads(1)
+    with compiled.disabled():
+        slow = run(made, frames)[0]
+    for a, b in zip(fast, slow, strict=True):
+        torch.testing.assert_close(a, b, rtol=2e-4, atol=1e-5)
+
+
+def test_indirect_alone_is_what_total_makes_of_it():
+    frames = [synthetic_frame(index, 24, 32) for index in range(5)]
+    alone, total = SVGF(), SVGF()
+    alone.signal = "indirect"
+    a, state = run(alone, frames)
+    assert list(state.pictures()) == ["history length", "variance indirect"]
+    dark = [replace(f, channels=f.channels | {"direct": 0 * f.direct, "emission": 0 * f.direct}) for f in frames]
+    for x, y in zip(a, run(total, dark)[0], strict=True):
+        torch.testing.assert_close(x, y)
+
+
+@EXAMPLES
+@given(size=SIZES, seed=st.integers(0, 9999), level=st.sampled_from([1e-7, 1.0, 6.5e4]))
+@pytest.mark.parametrize("denoiser", [SVGF, EAW])
+@pytest.mark.parametrize("name", WAYS)
+def test_the_output_stays_in_the_range_of_the_input(name, denoiser, size, seed, level):
+    rng = np.random.default_rng(seed)
+    depth, normal, mesh = surfaces(rng, *size)
+    low, high, state, made = np.inf, -np.inf, None, denoiser()
+    made.signal = "indirect"
+    for _ in range(5):
+        frame = flat_frame(*size, mesh_id=to_torch(mesh.astype(float)))
+        light = level * to_torch(rng.choice([0.2, 0.9, 1.0], (3, *size)) * rng.random((3, *size)))
+        frame.channels.update(indirect=light, depth=to_torch(depth), normal=to_torch(normal))
+        low, high = min(low, light.min().item()), max(high, light.max().item())
+        with WAYS[name]():
+            output, state = made(frame, state)
+        assert output.min() >= low * (1 - 1e-5) and output.max() <= high * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("denoiser", [SVGF, EAW])
+def test_a_thousand_times_the_light_is_a_thousand_times_the_output(denoiser):
+    frames = [synthetic_frame(index, 30, 40) for index in range(5)]
+    lights = ("direct", "indirect", "emission")
+    bright = [replace(f, channels=f.channels | {name: 1000 * f.channels[name] for name in lights}) for f in frames]
+    for a, b in zip(run(denoiser(), frames)[0], run(denoiser(), bright)[0], strict=True):
+        torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("denoiser", [SVGF, EAW])
+def test_noise_on_a_wall_is_gone_and_the_sky_is_left_alone(denoiser):
+    """Against accumulation alone; the noise of the sky, of which real frames have none, neither leaves nor changes."""
+    generator = torch.Generator().manual_seed(0)
+    mesh = torch.ones(1, 1, 48, 48)
+    mesh[..., 30:] = 0
+    frames = []
+    for _ in range(8):
+        light = (torch.rand(1, 1, 48, 48, generator=generator) < 0.25).float().repeat(1, 3, 1, 1) * 4
+        light[..., 30:] = 100
+        frame = flat_frame(48, 48, irradiance=light, mesh_id=mesh)
+        frame.channels.update(depth=frame.depth * mesh, normal=frame.normal * mesh)
+        frames.append(frame)
+    filtered, accumulated = (run(d, frames)[0][-1] for d in (denoiser(), Accumulated()))
+    torch.testing.assert_close(filtered[..., 30:], torch.full((1, 3, 48, 18), 100.0))
+    errors = [(image[..., :30] - 1).square().mean() for image in (filtered, accumulated)]
+    assert errors[0] < 0.3 * errors[1]
+
+
+# --- EAW --------------------------------------------------------------------------------------------------------------
+
+
+@EXAMPLES
+@given(size=SIZES, step=st.sampled_from([1, 2, 8]), seed=st.integers(0, 9999))
+@pytest.mark.parametrize("name", WAYS)
+def test_a_level_of_eaw(name, size, step, seed):
+    rng = np.random.default_rng(seed)
+    colour, features = np.float32(rng.random((3, *size))), np.float32(rng.random((9, *size)))
+    with WAYS[name]():
+        out = eaw.filter_level(to_torch(colour), to_torch(features), step)[0].numpy()
+    for p in np.ndindex(size):
+        total, sums = 0.0, np.zeros(3)
+        for q, j, i in window(p, size, 2, step):
+            w = H[j + 2] * H[i + 2] * math.exp(-np.square(features[:, *p] - features[:, *q]).sum())
+            total, sums = total + w, sums + w * colour[:, *q]
+        np.testing.assert_allclose(out[:, *p], sums / total, rtol=1e-5)
+
+
+def test_eaw_s_features(monkeypatch):
+    """Exposed colour over σ_c, which halves from level to level; normal; position over the median depth."""
+    frame = synthetic_frame(2, 20, 30)
+    seen = []
+    monkeypatch.setattr(eaw, "filter_level", lambda colour, features, step: seen.append((features, step)) or colour)
+    run(EAW(), [frame])
+    irradiance = frame.irradiance("total")
+    exposure = running_scale(irradiance * frame.divisor, frame.depth, None).exposure()
+    assert [step for _, step in seen] == [1, 2, 4, 8, 16]
+    median = frame.depth[frame.depth > 0].median()
+    hit = (frame.depth > 0)[0, 0]
+    for level, (features, _) in enumerate(seen):
+        torch.testing.assert_close(features[:, :3], irradiance * exposure * 2**level / eaw.SIGMA_COLOUR)
+        torch.testing.assert_close(features[:, 3:6], frame.normal / eaw.SIGMA_NORMAL)
+        positions = features[0, 6:] * eaw.SIGMA_POSITION * median
+        torch.testing.assert_close(positions[2, hit], frame.depth[0, 0, hit], rtol=0.02, atol=0)
+        # Projected back, positions are where their pixels are.
+        pixel = torch.einsum("ij,jn->in", frame.now.K[0].float(), positions[:, hit])
+        y, x = torch.nonzero(hit, as_tuple=True)
+        torch.testing.assert_close(pixel[0] / pixel[2], x + 0.5, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(pixel[1] / pixel[2], y + 0.5, rtol=1e-4, atol=1e-3)
+        assert (features[0, 6:, ~hit] == eaw.BACKGROUND).all()
