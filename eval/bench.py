@@ -103,13 +103,14 @@ class Contender:
         for frame in frames:
             self.step(frame)
 
-    def row(self, size: Size, threads: int) -> dict[str, Any]:
-        """A row of results.json, in its form."""
+    def row(self, frames: Sequence[Frame], threads: int) -> dict[str, Any]:
+        """A row of results.json, in its form. `frames` are the sequence's first two."""
+        height, width = frames[0].size
         p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds[WARM_UP:], (10, 50, 90)))
         with multiprocessing.get_context("spawn").Pool(1) as process:
-            peak = process.apply(peak_memory, (self.variant, size, threads))
+            peak = process.apply(peak_memory, (self.variant, frames, threads))
         return {
-            **{"denoiser": self.variant.label, "height": size[0], "width": size[1], "dtype": self.variant.dtype},
+            **{"denoiser": self.variant.label, "height": height, "width": width, "dtype": self.variant.dtype},
             **{"ms_median": median, "ms_p10": p10, "ms_p90": p90, "peak_mb": peak},
             "parameters": None if isinstance(self.denoiser, OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
@@ -160,7 +161,7 @@ def growth_mb(run: Callable[[], object]) -> float | None:
 
 
 @torch.inference_mode()
-def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
+def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> float | None:
     """What two frames of a sequence add to resident memory, in MB, in a fresh process.
 
     That is the state and everything in between, without the frame itself, the weights and the code.
@@ -168,7 +169,6 @@ def peak_memory(variant: Variant, size: Size, threads: int) -> float | None:
     torch.set_num_threads(threads)
     contender = Contender.of(variant)
     contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
-    frames = [synthetic_frame(index, *size) for index in range(2)]
     contender.state = None
     return growth_mb(lambda: contender.play(frames))
 
@@ -227,7 +227,8 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
     with thread_count(threads):
         for size in pixels:
             contenders = race(entrants, size)
-            measured = [c.row(size, threads) for c in tqdm(contenders, "memory", leave=False)]
+            frames = [synthetic_frame(index, *size) for index in range(2)]
+            measured = [c.row(frames, threads) for c in tqdm(contenders, "memory", leave=False)]
             lines += table_lines(contenders, measured)
             rows += measured
     write_json(folder / "results.json", {"schema": 1, "device": "cpu", "threads": threads, "rows": rows})

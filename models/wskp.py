@@ -46,7 +46,7 @@ def features_compiled(frame: Frame, irradiance: Tensor, exposure: Tensor, scale:
         return np.array([scale.log_depth.value[item].exp(), ALBEDO_FLOOR, 1 / GAMMA])
 
     items = [
-        features(*(t[item] for t in (irradiance, frame.albedo, frame.normal, frame.depth)), gain, constants(item))
+        features([t[item] for t in (irradiance, frame.albedo, frame.normal, frame.depth)], gain, constants(item))
         for item, gain in enumerate(exposure.expand(-1, 3, 1, 1).flatten(1).numpy())
     ]
     return torch.stack([item.permute(1, 2, 0) for item in items]).permute(0, 3, 1, 2) if items[1:] else items[0][None]

@@ -1,5 +1,7 @@
 """exp in float32 as arithmetic that LLVM vectorises; a call to the mathematical library would keep loops scalar."""
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -9,7 +11,7 @@ C1, C2, C3, C4, C5, C6 = (np.float32(np.log(2) ** i / f) for i, f in enumerate((
 
 
 @numba.njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def exp(x: float) -> float:
+def exp(x: Any) -> Any:
     """e^x for x in [-87, 88], within 4e-7 of relative error."""
     t = x * LOG2E
     n = np.floor(t + np.float32(0.5))
@@ -28,7 +30,7 @@ L3, L5, L7, L9 = (np.float32(1 / n) for n in (3, 5, 7, 9))
 
 
 @numba.njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def log(x: float) -> float:
+def log(x: Any) -> Any:
     """ln x for normal positive x: exponent and mantissa apart, and the series of 2 artanh((m - 1) / (m + 1))."""
     bits = np.float32(x).view(np.int32)
     m = np.int32((bits & MANTISSA) | ONE).view(np.float32)

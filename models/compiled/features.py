@@ -1,5 +1,6 @@
 """The inputs of models.wskp's networks for the processor, in one pass and in the order that convolutions like."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -38,17 +39,16 @@ def feature_image(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: An
         feature_row(out[y], irradiance[:, y], albedo[:, y], normal[:, y], depth[y], gain, scale)
 
 
-def features(
-    irradiance: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor, gain: NDArray[Any], scale: NDArray[Any]
-) -> Tensor:
+def features(images: Sequence[Tensor], gain: NDArray[np.floating[Any]], scale: NDArray[np.floating[Any]]) -> Tensor:
     """Displayed colour, albedo, normal in [0, 1] and d / (d + s): (10, H, W), channels last in memory.
 
     Args:
-        irradiance, albedo, normal: (3, H, W). depth: (1, H, W). gain: (3,), what radiance is multiplied by.
+        images: irradiance, albedo, normal (3, H, W) and depth (1, H, W). gain: (3,), what radiance is multiplied by.
         scale: (3,), the depth s, the least albedo of re-modulation, and the exponent of the display transform.
     """
     threads()
+    irradiance, albedo, normal, depth = (array(image) for image in images)
     out = torch.empty(*depth.shape[1:], 10)
-    images = (array(t) for t in (irradiance, albedo, normal, depth[0]))
-    feature_image(out.numpy(), *images, gain.astype(np.float32), scale.astype(np.float32))
+    constants = gain.astype(np.float32), scale.astype(np.float32)
+    feature_image(out.numpy(), irradiance, albedo, normal, depth[0], *constants)
     return out.permute(2, 0, 1)
