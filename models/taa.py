@@ -46,9 +46,18 @@ def fetch(history: Tensor, motion: Tensor) -> Tensor:
     return F.grid_sample(history, grid, "bicubic", "border", align_corners=False).clamp(min=0)
 
 
+def largest_around(image: Tensor) -> Tensor:
+    """The largest value of the 3 × 3 pixels around each pixel; much faster than F.max_pool2d on a processor."""
+    for dim, border in ((-1, (1, 1, 0, 0)), (-2, (0, 0, 1, 1))):
+        wide, length = F.pad(image, border, value=-torch.inf), image.shape[dim]
+        left, middle, right = (wide.narrow(dim, start, length) for start in range(3))
+        image = torch.maximum(torch.maximum(left, middle), right)
+    return image
+
+
 def resolve(current: Tensor, history: Tensor, found: Tensor) -> Tensor:
     """Blend compressed images (B, 4, H, W), the history within the range of the 3 x 3 pixels around each pixel."""
-    low, high = -F.max_pool2d(-current, 3, 1, padding=1), F.max_pool2d(current, 3, 1, padding=1)
+    low, high = -largest_around(-current), largest_around(current)
     return torch.lerp(torch.clamp(history, low, high), current, torch.where(found, NEWEST, 1))
 
 

@@ -10,7 +10,7 @@ from errors import BadInput
 from models.baselines import Accumulated, Noisy
 from models.denoiser import CLASSICAL
 from models.rae import RAE
-from models.taa import Antialiased, compress, expand
+from models.taa import Antialiased, compress, expand, largest_around
 
 
 @torch.no_grad()
@@ -92,6 +92,12 @@ def test_compression_and_back():
     torch.testing.assert_close(expand(compress(rgb)), rgb, rtol=1e-4, atol=0)
     grey = compress(torch.full((1, 3, 1, 1), 3.0))
     torch.testing.assert_close(grey[0, :, 0, 0], torch.tensor([0.75, 0.0, 0.0, 0.25]))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (6, 1), (7, 8)])
+def test_the_range_around_a_pixel_is_of_its_nine_neighbours(size):
+    image = torch.randn(2, 4, *size)
+    assert torch.equal(largest_around(image), torch.nn.functional.max_pool2d(image, 3, 1, padding=1))
 
 
 def test_brightness_does_not_matter():
