@@ -152,6 +152,20 @@ def show(
         print(path)
 
 
+def figure(
+    what: Annotated[Literal["variance"], tyro.conf.Positional], out: Annotated[Path, tyro.conf.arg(metavar="PNG")]
+) -> None:
+    """Reproduce a figure of the papers.
+
+    variance: SVGF's estimate of variance, spatial and temporal, on noise that grows from left to right (Fig. 9).
+    """
+    from eval.variance import variance_figure
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    variance_figure(out)
+    print(out)
+
+
 def bench(
     what: Annotated[Literal["denoisers", "fusion", "loading", "rendering"], tyro.conf.Positional],
     names: Names = (),
@@ -200,7 +214,7 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
 
 COMMANDS = {
     **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
-    **{"show": show, "exr": exr, "bench": bench},
+    **{"show": show, "figure": figure, "exr": exr, "bench": bench},
 }
 
 

@@ -18,7 +18,7 @@ from datasets.files import write_json
 from datasets.frame import Frame, Signal, read_frame, to_tensor
 from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics
 from eval.pictures import save_strip
-from models import DENOISERS, create, load, unavailable
+from models import DENOISERS, create, load, unavailable, without_taa
 from models.denoiser import Denoiser, State
 from train.loop import WEIGHTS, run_folder
 
@@ -97,7 +97,7 @@ def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[s
             print(f"{name}: skipped, {reason}")
             continue
         trained = create(name).parameter_count() > 0
-        weights = run_folder(runs, name, profile) / WEIGHTS if trained else None
+        weights = run_folder(runs, without_taa(name), profile) / WEIGHTS if trained else None
         if weights and not weights.exists() and not names:
             print(f"{name}: skipped, it has no weights at {weights}; train them with `onespp train {name}`")
             continue

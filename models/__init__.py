@@ -16,9 +16,11 @@ from models.oidn import OIDN, OIDNAccumulated
 from models.precision import fastest_precision
 from models.rae import RAE
 from models.svgf import SVGF
+from models.taa import Antialiased
 from models.weights import load_weights
 from models.wskp import KP, WSKP, WSKPMR
 
+TAA = "+taa"
 DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "noisy": Noisy,
     "accumulated": Accumulated,
@@ -38,15 +40,25 @@ DENOISERS: dict[str, Callable[[], Denoiser]] = {
 
 
 def create(name: str) -> Denoiser:
-    """A denoiser by its name, with fresh weights where it has any. Raises BadInput for an unknown name."""
+    """A denoiser by its name, with fresh weights where it has any. Raises BadInput for an unknown name.
+
+    A name that ends in "+taa" means that denoiser with temporal antialiasing after it.
+    """
+    if name.endswith(TAA):
+        return Antialiased(create(without_taa(name)))
     if name not in DENOISERS:
-        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}")
+        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}")
     return DENOISERS[name]()
+
+
+def without_taa(name: str) -> str:
+    """The name of the denoiser alone: what its weights are called."""
+    return name.removesuffix(TAA)
 
 
 def unavailable(name: str) -> str | None:
     """Why a denoiser cannot run on this machine, with what to install; None where it can."""
-    return oidn.unavailable() if isinstance(create(name), OIDN) else None
+    return oidn.unavailable() if isinstance(create(without_taa(name)), OIDN) else None
 
 
 def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
@@ -64,7 +76,8 @@ def load(name: str, weights: Path | None, precision: torch.dtype | None = None) 
     if denoiser.parameter_count():
         if weights is None:
             raise BadInput(f"'{name}' needs trained weights")
-        load_weights(denoiser, name, weights)
+        trained = denoiser.inner if isinstance(denoiser, Antialiased) else denoiser
+        load_weights(trained, without_taa(name), weights)
     denoiser.prepare(precision or inference_precision(denoiser))
     return denoiser
 

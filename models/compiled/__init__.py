@@ -47,7 +47,7 @@ def nothing() -> None:
 
 @functools.cache
 def start() -> None:
-    """Start Numba's threads, which share PyTorch's OpenMP: that sets its number of threads to all cores, so set it back."""
+    """Start Numba's threads. They share PyTorch's OpenMP, which that sets to all cores: set it back."""
     count = torch.get_num_threads()
     numba.set_num_threads(1)
     nothing()

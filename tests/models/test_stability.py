@@ -21,7 +21,7 @@ from datasets.display import display, psnr
 from datasets.frame import Cameras, Frame, read_frame
 from errors import BadInput
 
-NAMES = [name for name in models.DENOISERS if not models.unavailable(name)]
+NAMES = [name for name in (*models.DENOISERS, "noisy+taa", "wskp3+taa") if not models.unavailable(name)]
 THREADS = torch.get_num_threads()
 CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")
 ALL = tuple(models.channels_read())
