@@ -2,7 +2,7 @@
 
 import multiprocessing
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from statistics import median
@@ -33,10 +33,10 @@ def unfold_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:
     return (values * weights[:, None]).sum(dim=2).view(batch, channels, height, width)
 
 
-def unfold_fuse(image: Tensor, importance: Tensor, mixture: Tensor) -> Tensor:
+def unfold_fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
     """Eq. 5: what models.fusion.fuse computes, in the straightforward way; any dtype."""
     shares = torch.softmax(mixture, dim=1)
-    parts = [shares[:, [i]] * unfold_kernel(image, importance[:, [i]], k) for i, k in enumerate(WINDOWS)]
+    parts = [shares[:, [i]] * unfold_kernel(image, importance[:, [i]], k) for i, k in enumerate(windows)]
     return torch.stack(parts).sum(dim=0)
 
 

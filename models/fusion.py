@@ -5,6 +5,7 @@ the ratio of two box sums. No kernel is ever written out, and the cost hardly gr
 """
 
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -138,11 +139,16 @@ def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[i
     Returns (B, C, H, W): a convex combination of the image's pixels within the largest window, taps outside the image
     left out. Differentiable in the first three.
     """
-    if compiled.usable(image, importance, mixture) and image.shape[1] == 3:
-        from models.compiled.fusion import fuse as fuse_compiled
-
-        return fuse_compiled(image, importance, mixture, windows)
     training = torch.is_grad_enabled() and any(t.requires_grad for t in (image, importance, mixture))
+    colour = image.shape[1] == 3
+    if colour and compiled.usable(image, importance, mixture):
+        from models.compiled.fusion import fuse as fuse_on_processor
+
+        return fuse_on_processor(image, importance, mixture, windows)
+    if colour and not training and image.is_cuda and compiled.enabled and find_spec("triton"):
+        from models.compiled.fusion_triton import fuse as fuse_on_gpu
+
+        return fuse_on_gpu(image, importance, mixture, windows)
     if training or image.device.type != "cpu":
         return fuse_whole(image, importance, mixture, windows)
     fused = torch.empty_like(image)

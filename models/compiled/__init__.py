@@ -1,7 +1,7 @@
 """Kernels that Numba compiles for the processor at first use: the fast way of what models/ also says in PyTorch.
 
-They need no compiler, are kept on disk from run to run, and serve inference on CPUs. Everything else (GPUs, gradients,
-half precision) takes the PyTorch way, which the tests hold them to.
+They need no compiler, are kept on disk from run to run, and serve inference on CPUs. Everything else (gradients, half
+precision, and GPUs but for fusion_triton.py) takes the PyTorch way, which the tests hold them to.
 """
 
 import contextlib

@@ -1,5 +1,9 @@
 """Weight-shared kernel fusion against unfold and softmax in float64, at every extreme of the logits."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -106,3 +110,25 @@ def test_a_poisoned_pixel_stays_within_its_windows():
     for result in both_ways(image, zeros, zeros):
         bad = torch.isnan(result[0, 0]).nonzero()
         assert bad.amin() >= 30 - 6 and bad.amax() <= 30 + 6
+
+
+ON_GPU = """
+import torch
+from eval.fusion_bench import unfold_fuse
+from models.compiled.fusion_triton import fuse
+
+device = "cuda" if torch.cuda.is_available() else "cpu"
+for scale in (1.0, 1e4):
+    torch.manual_seed(0)
+    inputs = [torch.rand(2, 3, 3, 135), scale * torch.randn(2, 3, 3, 135), scale * torch.randn(2, 3, 3, 135)]
+    expected = unfold_fuse(*(t.double() for t in inputs), (3, 5, 13))
+    fused = fuse(*(t.to(device) for t in inputs), (3, 5, 13)).cpu()
+    torch.testing.assert_close(fused.double(), expected, rtol=1e-5, atol=0)
+"""
+
+
+def test_triton_kernel_is_exact():
+    """On a GPU where there is one, else through Triton's interpreter, which must be chosen before the import."""
+    pytest.importorskip("triton")
+    environment = os.environ | ({} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"})
+    subprocess.run([sys.executable, "-W", "ignore", "-c", ON_GPU], env=environment, check=True)

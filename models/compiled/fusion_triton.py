@@ -1,0 +1,68 @@
+"""models.fusion for CUDA devices, with Triton (which comes with PyTorch's CUDA builds): one kernel for all windows."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+BLOCK = 128  # pixels of a row, a program
+
+
+@triton.jit  # type: ignore[untyped-decorator]
+def fuse_rows(
+    fused: Any, image: Any, importance: Any, mixture: Any, radii: Any, height: Any, width: Any,
+    COUNT: tl.constexpr, BLOCK: tl.constexpr,
+) -> None:  # fmt: skip
+    """Every window relative to its largest logit: one way over its taps for that, one for the sums."""
+    x, y, item = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1), tl.program_id(2).to(tl.int64)
+    plane, within = height * width, x < width
+    at = y * width + x
+    image += item * 3 * plane
+    fused += item * 3 * plane
+    importance += item * COUNT * plane
+    mixture += item * COUNT * plane
+    top = tl.full((BLOCK,), -float("inf"), tl.float32)
+    for i in range(COUNT):
+        top = tl.maximum(top, tl.load(mixture + i * plane + at, within, 0))
+    total = tl.zeros((BLOCK,), tl.float32)
+    red, green, blue = total, total, total
+    for i in range(COUNT):
+        logits, radius = importance + i * plane, tl.load(radii + i)
+        largest = tl.full((BLOCK,), -float("inf"), tl.float32)
+        for v in range(tl.maximum(y - radius, 0), tl.minimum(y + radius + 1, height)):
+            for dx in range(-radius, radius + 1):
+                inside = (x + dx >= 0) & (x + dx < width)
+                largest = tl.maximum(largest, tl.load(logits + v * width + x + dx, inside, -float("inf")))
+        weight = tl.zeros((BLOCK,), tl.float32)
+        r, g, b = weight, weight, weight
+        for v in range(tl.maximum(y - radius, 0), tl.minimum(y + radius + 1, height)):
+            for dx in range(-radius, radius + 1):
+                inside = (x + dx >= 0) & (x + dx < width)
+                tap = v * width + x + dx
+                e = tl.exp(tl.load(logits + tap, inside, -float("inf")) - largest)
+                weight += e
+                r += e * tl.load(image + tap, inside, 0)
+                g += e * tl.load(image + plane + tap, inside, 0)
+                b += e * tl.load(image + 2 * plane + tap, inside, 0)
+        share = tl.exp(tl.load(mixture + i * plane + at, within, 0) - top)
+        total += share
+        red += share * r / weight
+        green += share * g / weight
+        blue += share * b / weight
+    tl.store(fused + at, red / total, within)
+    tl.store(fused + plane + at, green / total, within)
+    tl.store(fused + 2 * plane + at, blue / total, within)
+
+
+def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int]) -> Tensor:
+    """See models.fusion.fuse; the image has three channels."""
+    batch, _, height, width = image.shape
+    fused = torch.empty_like(image, memory_format=torch.contiguous_format)
+    radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)
+    tensors = (tensor.float().contiguous() for tensor in (image, importance, mixture))
+    grid = (triton.cdiv(width, BLOCK), height, batch)
+    fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), BLOCK)
+    return fused
