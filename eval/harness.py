@@ -21,6 +21,7 @@ from eval.pictures import save_strip
 from models import DENOISERS, create, load, unavailable, without_taa
 from models.denoiser import Denoiser, State
 from train.loop import WEIGHTS, run_folder
+from train.recipes import TRAINABLE
 
 METRICS_CHANNELS = ("motion", "dual_motion")
 BASELINES = ("noisy", "accumulated")
@@ -99,7 +100,8 @@ def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[s
         trained = create(name).parameter_count() > 0
         weights = run_folder(runs, without_taa(name), profile) / WEIGHTS if trained else None
         if weights and not weights.exists() and not names:
-            print(f"{name}: skipped, it has no weights at {weights}; train them with `onespp train {name}`")
+            remedy = f"; train them with `onespp train {name}`" if name in TRAINABLE else ""
+            print(f"{name}: skipped, it has no weights at {weights}{remedy}")
             continue
         ready[name] = load(name, weights), str(weights) if weights else None
     return ready

@@ -58,6 +58,7 @@ def save_grid(path: Path, columns: Sequence[Column], row_names: Sequence[str]) -
         axis.set_title(panel.caption, fontsize=8, pad=2)
         if panel.image.ndim == 2:
             figure.colorbar(drawn, ax=axis, fraction=0.05, pad=0.02).ax.tick_params(labelsize=7)
+    figure.get_layout_engine().set(rect=(CAPTION / 2 / size[0], 0, 1 - CAPTION / 2 / size[0], 1))  # type: ignore
     for axis, name in zip(axes[:, 0], row_names, strict=True):
         axis.set_ylabel(name, fontsize=8)
     save_figure(path, figure)
