@@ -1,6 +1,6 @@
 """The Frame: the one type that flows from the data set to denoisers and metrics."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -99,7 +99,8 @@ class Frame:
     def follows(self, moment: Moment) -> bool:
         """Whether this frame continues a sequence: of the same size, and moved to it from the cameras of `moment`.
 
-        So a cut needs no flag: the first frame of another place names other previous cameras.
+        So a cut needs no flag: the first frame of another place names other previous cameras. Where neither camera nor
+        meshes differ, as between two still shots from one place, nothing tells it: pass None as the state there.
         """
         return moment.shape == self.shape and all(
             a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, atol=1e-12)
@@ -119,6 +120,10 @@ class Frame:
         bad = [name for name, tensor in self.channels.items() if not torch.isfinite(tensor.sum())]
         mended = {name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0) for name in bad}
         return replace(self, channels=self.channels | mended) if bad else self
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
+        """The frame with `function` of every channel."""
+        return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})
 
     def radiance(self, signal: Signal) -> Tensor:
         """Noisy radiance (B, 3, H, W): emission + direct + indirect, or indirect alone."""

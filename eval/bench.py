@@ -23,6 +23,7 @@ from eval.synthetic import synthetic_frame
 from models import DENOISERS, compiled, create, unavailable
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN
+from models.taa import Antialiased
 
 BASELINE, FAST = "oidn", "oidn (fast)"
 COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
@@ -56,7 +57,7 @@ def variants(names: Sequence[str]) -> list[Variant]:
     Raises BadInput where a named one is unknown or cannot run.
     """
     found = []
-    for name in names or DENOISERS:
+    for name in dict.fromkeys([*names, *([BASELINE] if not unavailable(BASELINE) else [])]) if names else DENOISERS:
         if reason := unavailable(name):
             if names:
                 raise BadInput(reason)
@@ -112,7 +113,7 @@ class Contender:
         return {
             **{"denoiser": self.variant.label, "height": height, "width": width, "dtype": self.variant.dtype},
             **{"ms_median": median, "ms_p10": p10, "ms_p90": p90, "peak_mb": peak},
-            "parameters": None if isinstance(self.denoiser, OIDN) else self.denoiser.parameter_count(),
+            "parameters": None if isinstance(plain(self.denoiser), OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
         }
 
@@ -122,8 +123,13 @@ class Contender:
         return float(np.median(np.divide(self.in_network, self.seconds)[WARM_UP:]))
 
 
+def plain(denoiser: Denoiser) -> Denoiser:
+    """The denoiser without antialiasing."""
+    return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser
+
+
 def network_of(denoiser: Denoiser) -> nn.Module | None:
-    network = getattr(denoiser, "network", None)
+    network = getattr(plain(denoiser), "network", None)
     return network if isinstance(network, nn.Module) else None
 
 
@@ -170,6 +176,7 @@ def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> floa
     contender = Contender.of(variant)
     contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
     contender.state = None
+    frames = [frame.map(torch.clone) for frame in frames]  # what comes from another process is resident once touched
     return growth_mb(lambda: contender.play(frames))
 
 

@@ -13,7 +13,6 @@ from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.ntd import NTD
 from models.oidn import OIDN, OIDNAccumulated
-from models.precision import fastest_precision
 from models.rae import RAE
 from models.svgf import SVGF
 from models.taa import Antialiased
@@ -83,7 +82,7 @@ def load(name: str, weights: Path | None, precision: torch.dtype | None = None) 
 
 
 def inference_precision(denoiser: Denoiser) -> torch.dtype:
-    """bfloat16 for networks that take it, where this processor is fast at it, else float32."""
-    if not denoiser.parameter_count() or torch.bfloat16 in denoiser.refuses:
-        return torch.float32
-    return torch.bfloat16 if fastest_precision(torch.device("cpu")) == "bf16-mixed" else torch.float32
+    """bfloat16 for networks that take it, where this processor has instructions for it, else float32."""
+    takes = denoiser.parameter_count() > 0 and torch.bfloat16 not in denoiser.refuses
+    has = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    return torch.bfloat16 if takes and has else torch.float32

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+FUSED = "_convolution_pointwise"  # what PyTorch's compiler uses; it is not documented and may go
+
 
 class ConvReLU(nn.Conv2d):
     """relu(convolution(x) + other), size k x k, the image's size kept by zeros around it.
@@ -30,6 +32,6 @@ class ConvReLU(nn.Conv2d):
 def fusable(x: Tensor) -> bool:
     """Whether oneDNN's fused operators, which know neither gradients nor autocast, can take `x`."""
     plain = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
-    if not plain or not torch.backends.mkldnn.is_available():
+    if not plain or not torch.backends.mkldnn.is_available() or not hasattr(torch.ops.mkldnn, FUSED):
         return False
     return x.dtype == torch.float32 or (x.dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -62,7 +62,8 @@ class RayTracingFilter:
 
         self.device, self.filter = device, pyoidn.Filter(device)
         self.close = weakref.finalize(self, release, self.device, self.filter)  # at exit at the latest
-        self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
+        with torch.inference_mode(False):  # else they could not be written to outside of it
+            self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
         for name, image in self.images.items():
             self.filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
         self.filter.set_bool("hdr", True)

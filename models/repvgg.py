@@ -26,6 +26,8 @@ class RepVGGBlock(nn.Module):
 
     def merge(self) -> None:
         """Replace the branches; there is no way back to training."""
+        if self.merged is not None:
+            return
         size, largest = SIZES[-1], self.branches[-1]
         merged = nn.Conv2d(largest.in_channels, largest.out_channels, size, padding=size // 2)
         weight, bias = torch.zeros_like(largest.weight), torch.zeros(largest.out_channels).to(largest.weight)

@@ -15,7 +15,7 @@ from scenes.animation import Camera, Scene, Shape, Track
 
 # Of tests that do not say themselves how many examples to try; `make test-all` takes the thorough ones.
 hypothesis.settings.register_profile("quick", max_examples=10)
-hypothesis.settings.register_profile("thorough", max_examples=300)
+hypothesis.settings.register_profile("thorough", max_examples=100)
 hypothesis.settings.load_profile("quick")
 
 

@@ -1,6 +1,7 @@
 """models.fusion for CUDA devices, with Triton (which comes with PyTorch's CUDA builds): one kernel for all windows."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -64,5 +65,6 @@ def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[i
     radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)
     tensors = (tensor.float().contiguous() for tensor in (image, importance, mixture))
     grid = (triton.cdiv(width, BLOCK), height, batch)
-    fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), BLOCK)
+    with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
+        fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), BLOCK)
     return fused

@@ -18,18 +18,16 @@ jit = numba.njit(cache=True, fastmath={"contract", "nsz"}, error_model="numpy", 
 
 
 @jit
-def unpack_floats(row: Any, logits: Any) -> None:
-    for x in range(logits.shape[1]):
-        for tap in range(logits.shape[0]):
-            row[tap, x] = logits[tap, x]
-
-
-@jit
-def unpack_bfloats(row: Any, logits: Any) -> None:
-    """A bfloat16 is the upper half of a float32."""
-    for x in range(logits.shape[1]):
-        for tap in range(logits.shape[0]):
-            row[tap, x] = np.int32(np.int32(logits[tap, x]) << np.int32(16)).view(np.float32)
+def unpack(row: Any, logits: Any, bfloat: bool) -> None:
+    """Rows (taps, W) of float32, or of the bits of bfloat16, which are the upper half of a float32."""
+    if bfloat:
+        for x in range(logits.shape[1]):
+            for tap in range(logits.shape[0]):
+                row[tap, x] = np.int32(np.int32(logits[tap, x]) << np.int32(16)).view(np.float32)
+    else:
+        for x in range(logits.shape[1]):
+            for tap in range(logits.shape[0]):
+                row[tap, x] = logits[tap, x]
 
 
 @jit
@@ -78,11 +76,11 @@ def filter_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def filter_image(output: Any, image: Any, logits: Any, size: int, unpack: Any) -> None:
+def filter_image(output: Any, image: Any, logits: Any, size: int, bfloat: bool) -> None:
     _, height, width = image.shape
     for y in numba.prange(height):
         row = np.empty((size * size, width + ONE_LINE), np.float32)
-        unpack(row, logits[:, y])
+        unpack(row, logits[:, y], bfloat)
         filter_row(output, image, row, np.int64(y), size)  # prange counts unsigned, which would break -y
 
 
@@ -91,8 +89,8 @@ def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
     threads()
     output = torch.empty_like(image, memory_format=torch.contiguous_format)
     bfloat = logits.dtype == torch.bfloat16
-    bits, unpack = (logits.view(torch.int16), unpack_bfloats) if bfloat else (logits.float(), unpack_floats)
+    bits = logits.view(torch.int16) if bfloat else logits.float()
     for item in range(len(image)):
         values = bits[item].detach().numpy()
-        filter_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), unpack)
+        filter_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), bfloat)
     return output

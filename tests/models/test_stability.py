@@ -1,4 +1,4 @@
-"""Numerical stability at the extremes (docs/stability.md), for every registered denoiser: a new one needs no new test.
+"""Numerical stability at the extremes (docs/denoisers.md), for every registered denoiser: a new one needs no new test.
 
 `onespp`'s list: finite in, finite out; nothing below zero; a poisoned pixel counts as black and is gone; convex filters
 stay in range; thousands of frames stay bounded; half precision is close or refused; any size; cuts start anew.
@@ -103,7 +103,9 @@ def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
 @given(
     frames=frames_strategy(),
     poison=st.sampled_from([np.nan, np.inf, -np.inf]),
-    channel=st.sampled_from(["direct", "indirect", "albedo", "normal", "depth", "emission", "motion", "dual_motion"]),
+    channel=st.sampled_from(
+        ["direct", "indirect", "albedo", "normal", "depth", "emission", "roughness", "mesh_id", "motion", "dual_motion"]
+    ),
     place=st.tuples(st.integers(0, 18), st.integers(0, 18)),
 )
 def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channel, place):
@@ -219,7 +221,7 @@ def test_a_scene_cut_starts_anew(tiny, denoisers, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=8, deadline=None)
+@SETTINGS
 @given(
     first=st.tuples(st.integers(1, 40), st.integers(1, 40)), second=st.tuples(st.integers(1, 40), st.integers(1, 40))
 )
@@ -239,3 +241,14 @@ def test_cameras_tell_a_cut(tiny):
     assert b.follows(a.moment) and not d.follows(a.moment) and not a.follows(a.moment)
     still = replace(a, previous=Cameras(*vars(a.now).values()))
     assert still.follows(a.moment)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_preparing_twice_changes_nothing(name):
+    torch.manual_seed(0)
+    denoiser = models.create(name)
+    frame = flat_frame(9, 7)
+    denoiser.prepare()
+    once = run(denoiser, [frame])[0]
+    denoiser.prepare()
+    assert torch.equal(run(denoiser, [frame])[0], once)
