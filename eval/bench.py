@@ -23,7 +23,7 @@ from eval.synthetic import synthetic_frame
 from models import DENOISERS, compiled, create, unavailable
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN
-from models.taa import Antialiased
+from models.taa import unwrapped
 
 BASELINE, FAST = "oidn", "oidn (fast)"
 COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
@@ -57,7 +57,8 @@ def variants(names: Sequence[str]) -> list[Variant]:
     Raises BadInput where a named one is unknown or cannot run.
     """
     found = []
-    for name in dict.fromkeys([*names, *([BASELINE] if not unavailable(BASELINE) else [])]) if names else DENOISERS:
+    baseline = () if unavailable(BASELINE) else (BASELINE,)
+    for name in dict.fromkeys((*names, *baseline)) if names else DENOISERS:
         if reason := unavailable(name):
             if names:
                 raise BadInput(reason)
@@ -113,7 +114,7 @@ class Contender:
         return {
             **{"denoiser": self.variant.label, "height": height, "width": width, "dtype": self.variant.dtype},
             **{"ms_median": median, "ms_p10": p10, "ms_p90": p90, "peak_mb": peak},
-            "parameters": None if isinstance(plain(self.denoiser), OIDN) else self.denoiser.parameter_count(),
+            "parameters": None if isinstance(unwrapped(self.denoiser), OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
         }
 
@@ -123,13 +124,8 @@ class Contender:
         return float(np.median(np.divide(self.in_network, self.seconds)[WARM_UP:]))
 
 
-def plain(denoiser: Denoiser) -> Denoiser:
-    """The denoiser without antialiasing."""
-    return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser
-
-
 def network_of(denoiser: Denoiser) -> nn.Module | None:
-    network = getattr(plain(denoiser), "network", None)
+    network = getattr(unwrapped(denoiser), "network", None)
     return network if isinstance(network, nn.Module) else None
 
 

@@ -15,7 +15,7 @@ from models.ntd import NTD
 from models.oidn import OIDN, OIDNAccumulated
 from models.rae import RAE
 from models.svgf import SVGF
-from models.taa import Antialiased
+from models.taa import Antialiased, unwrapped
 from models.weights import load_weights
 from models.wskp import KP, WSKP, WSKPMR
 
@@ -75,8 +75,7 @@ def load(name: str, weights: Path | None, precision: torch.dtype | None = None) 
     if denoiser.parameter_count():
         if weights is None:
             raise BadInput(f"'{name}' needs trained weights")
-        trained = denoiser.inner if isinstance(denoiser, Antialiased) else denoiser
-        load_weights(trained, without_taa(name), weights)
+        load_weights(unwrapped(denoiser), without_taa(name), weights)
     denoiser.prepare(precision or inference_precision(denoiser))
     return denoiser
 

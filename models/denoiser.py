@@ -67,6 +67,7 @@ class Denoiser(torch.nn.Module):
         keep_freed_memory()
         self.eval()
         self.requires_grad_(False)
+        self.to(precision)
         self.precision = precision
 
     def parameter_count(self) -> int:

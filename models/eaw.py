@@ -12,9 +12,10 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.atrous import CENTRE, LEVELS, RADIUS, WindowSum, b3_spline, taps
+from models.baselines import Accumulated, AccumulatedState
 from models.compiled import eaw as kernels
 from models.denoiser import CLASSICAL, Denoiser, State, carried
-from models.operators import Accumulation, RunningScale, accumulate, finite, rays, running_scale
+from models.operators import RunningScale, accumulate, finite, rays, running_scale
 
 SIGMA_COLOUR = 4.0  # exposed irradiance, at the first level; halved from level to level
 SIGMA_NORMAL = 0.4
@@ -56,24 +57,21 @@ def filter_level(colour: Tensor, features: Tensor, step: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class EAWState(State):
-    history: Accumulation
+class EAWState(AccumulatedState):
     scale: RunningScale
-
-    def pictures(self) -> dict[str, Tensor]:
-        return {"history length": self.history.length}
 
 
 class EAW(Denoiser):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    reads = Accumulated.reads
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = carried(state, EAWState, frame)
-        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
-        radiance = finite(frame.irradiance(self.signal)) * frame.divisor
+        irradiance = finite(frame.irradiance(self.signal))
+        history = accumulate(frame, irradiance, before.history if before else None)
+        radiance = irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
         colour, geometry = history.irradiance, guides(frame, scale)
         for level in range(LEVELS):

@@ -153,10 +153,6 @@ class NTD(Denoiser):
         self.reads = (*lights, "albedo", "normal", "depth", *dict.fromkeys(("motion", vectors)))
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        super().prepare(precision)
-        self.network.to(precision)
-
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
         x = irradiance * (scale.exposure() * frame.gain)

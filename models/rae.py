@@ -109,10 +109,6 @@ class RAE(Denoiser):
         p, hidden = self.network(x, before.hidden if before else None)
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
 
-    def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        super().prepare(precision)
-        self.network.to(precision)
-
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""
         return (irradiance * scale.exposure() * frame.gain) ** POWER

@@ -97,12 +97,12 @@ class Antialiased(Denoiser):
         self.inner.signal = signal
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        super().prepare(precision)
         self.inner.prepare(precision)
+        super().prepare(precision)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = carried(state, AntialiasedState, frame)
-        output, inner = self.inner(frame, before.inner if before else None)
+        output, inner = self.inner.forward(frame, before.inner if before else None)
         scale = running_scale(output, frame.depth, before.scale if before else None)
         if before:
             exposure = scale.exposure()
@@ -110,3 +110,8 @@ class Antialiased(Denoiser):
             past = compress(fetch(before.output, frame.motion) * exposure)
             output = expand(resolve(compress(output * exposure), past, found)) / exposure
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
+
+
+def unwrapped(denoiser: Denoiser) -> Denoiser:
+    """The denoiser without antialiasing."""
+    return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser

@@ -11,10 +11,11 @@ from torch.nn import functional as F
 
 from datasets.frame import ALBEDO_FLOOR, Frame
 from models import compiled
+from models.baselines import Accumulated, AccumulatedState
 from models.denoiser import Denoiser, State, carried
 from models.fusion import WINDOWS, fuse
 from models.kernels import apply_kernels
-from models.operators import Accumulation, RunningScale, accumulate, pad, running_scale
+from models.operators import RunningScale, accumulate, pad, running_scale
 from models.repvgg import merge, repvgg
 
 INPUTS = 10  # §5.1: displayed colour, albedo, normal, depth
@@ -23,15 +24,14 @@ GAMMA = 2.2
 
 
 @dataclass(frozen=True)
-class WSKPState(State):
+class WSKPState(AccumulatedState):
     """Accumulated frames, running exposure and depth scale, and what the network chose between windows, to look at."""
 
-    history: Accumulation
     scale: RunningScale
     mixture: Tensor | None  # logits (B, M, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
-        shown = {"history length": self.history.length}
+        shown = super().pictures()
         if self.mixture is not None:
             windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
             shares = torch.softmax(self.mixture, dim=1)
@@ -59,7 +59,7 @@ class KernelPredictor(Denoiser):
     world-space normal scaled to [0, 1] and the depth d / (d + s) (§5.1).
     """
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    reads = Accumulated.reads
     network: nn.Module
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
@@ -86,9 +86,9 @@ class KernelPredictor(Denoiser):
         return frame.remodulate(irradiance, self.signal), WSKPState(frame.moment, history, scale, mixture)
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        merge(self.network)  # in the precision of training
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         super().prepare(precision)
-        merge(self.network)
-        self.network.to(precision, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 class WSKP(KernelPredictor):

@@ -16,6 +16,11 @@ from torch import Tensor
 
 enabled = True
 
+# Inputs are finite, and sums may be taken in any order.
+jit = numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"}, error_model="numpy", boundscheck=False)
+# Numba counts rows of a prange without a sign: np.int64(row), before anything is subtracted from it.
+jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
+
 
 @contextlib.contextmanager
 def disabled() -> Iterator[None]:

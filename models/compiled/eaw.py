@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled import array, threads
-from models.compiled.svgf import SPLINE, decay, jit, jit_parallel
+from models.compiled import array, jit, jit_parallel, threads
+from models.compiled.svgf import SPLINE, decay, reach
 
 
 @jit
@@ -46,8 +46,8 @@ def filter_row(out: Any, row: Any, colour: Any, features: Any, step: int) -> Non
     for j in range(-2, 3):
         for i in range(-2, 3):
             dx, dy = i * step, j * step
-            left, right = max(0, -dx), min(width, width - dx)
-            if (dx == 0 and dy == 0) or row + dy < 0 or row + dy >= height or left >= right:
+            left, right = reach(row, dx, dy, height, width)
+            if left >= right:
                 continue
             apart = space[: right - left]
             distances(apart, features, row, left, dx, dy)

@@ -9,16 +9,13 @@ import torch
 from numba.np.ufunc.parallel import get_thread_id
 from torch import Tensor
 
-from models.compiled import array, threads
+from models.compiled import array, jit, threads
 from models.compiled.exponential import exp
 
 STRIP = 32  # rows
 SAFE_RANGE = np.float32(80)  # see models.fusion
 LEAST_EXPONENT = np.float32(-80)
 OUTSIDE = np.float32(-1e30)
-
-jit = numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"}, error_model="numpy", boundscheck=False)
-
 
 # Loops run over rows that are sliced off as wholes: indices that are sums might be negative, which NumPy takes from the
 # end, and slices of several dimensions might have any stride. Neither is vectorised.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from datasets.display import LUMINANCE
 from models.atrous import B3_SPLINE
-from models.compiled import array, threads
+from models.compiled import array, jit, jit_parallel, threads
 from models.compiled.exponential import exp
 
 RED, GREEN, BLUE = (np.float32(weight) for weight in LUMINANCE)
@@ -19,15 +19,18 @@ LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 LEAST_WEIGHT = np.float32(1e-15)
 BLOCK = 64  # px; the spatial estimate is made for all of a block where one needs it
 
-jit = numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"}, error_model="numpy", boundscheck=False)
-# Numba counts rows of a prange without a sign: np.int64(row), before anything is subtracted from it.
-jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
-
 
 @jit
 def decay(a: Any) -> Any:
     """e^-a for a >= 0."""
     return exp(-min(a, NEGLIGIBLE)) if a < NEGLIGIBLE else np.float32(0)
+
+
+@jit
+def reach(row: Any, dx: int, dy: int, height: int, width: int) -> Any:
+    """The columns, first and beyond the last, of a row whose tap at (dx, dy) is another pixel of the image."""
+    outside = (dx == 0 and dy == 0) or row + dy < 0 or row + dy >= height
+    return (0, 0) if outside else (max(0, -dx), min(width, width - dx))
 
 
 @jit
@@ -145,8 +148,8 @@ def filter_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edge:
     for j in range(-2, 3):
         for i in range(-2, 3):
             dx, dy = i * step, j * step
-            left, right = max(0, -dx), min(width, width - dx)
-            if (dx == 0 and dy == 0) or row + dy < 0 or row + dy >= height or left >= right:
+            left, right = reach(row, dx, dy, height, width)
+            if left >= right:
                 continue
             weight = space[: right - left]
             geometry_weights(weight, geometry, row, left, dx, dy)
