@@ -110,13 +110,21 @@ def train(
     profile: Profile = "quick",
     seed: int = 0,
     precision: Precision = None,
+    at_once: int | None = None,
 ) -> None:
-    """Train denoisers (all that can be, unless some are named), or go on where a training was interrupted."""
-    from train.loop import train as train_one
-    from train.recipes import TRAINABLE
+    """Train denoisers (rae, wskp6 and ntd, unless some are named), or go on where a training was interrupted.
 
-    for name in names or TRAINABLE:
-        print(f"{name}: trained, {train_one(name, data_folder(data, profile), runs, profile, seed, precision)}")
+    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. A batch is shared by all processes,
+    so the steps stay the same.
+
+    Args:
+        at_once: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
+    """
+    from train.loop import task_for, train_network
+    from train.recipes import DEFAULT
+
+    for name in names or DEFAULT:
+        train_network(task_for(name, data_folder(data, profile), runs, profile, seed, precision, at_once))
 
 
 def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
@@ -153,21 +161,25 @@ def show(
 
 
 def figure(
-    what: Annotated[Literal["variance"], tyro.conf.Positional], out: Annotated[Path, tyro.conf.arg(metavar="PNG")]
+    what: Annotated[Literal["variance", "unbiased"], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(metavar="PNG")],
 ) -> None:
-    """Reproduce a figure of the papers.
+    """Draw a figure of the papers or of the docs.
 
     variance: SVGF's estimate of variance, spatial and temporal, on noise that grows from left to right (Fig. 9).
+    unbiased: an image's plain and unbiased MSE against references of 16 to 1024 spp, and how true noise floors are.
     """
-    from eval.variance import variance_figure
-
     out.parent.mkdir(parents=True, exist_ok=True)
-    variance_figure(out)
+    if what == "variance":
+        from eval.variance import variance_figure as draw
+    else:
+        from eval.unbiased import unbiased_figure as draw
+    draw(out)
     print(out)
 
 
 def bench(
-    what: Annotated[Literal["denoisers", "fusion", "loading", "rendering"], tyro.conf.Positional],
+    what: Annotated[Literal["denoisers", "fusion", "loading", "rendering", "training"], tyro.conf.Positional],
     names: Names = (),
     data: Data = None,
     runs: Runs = Path("runs"),
@@ -181,6 +193,7 @@ def bench(
     fusion: weight-shared kernel fusion, next to the straightforward way.
     loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
     rendering: seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
+    training: milliseconds a step of rae, wskp6 and ntd, unless some are named, and where they go.
 
     Args:
         size: of images, for the denoisers (one or several) and fusion (the first).
@@ -199,10 +212,70 @@ def bench(
         from datasets.bench import bench_rendering
 
         print(bench_rendering(runs))
+    elif what == "training":
+        from train.speed import bench_training
+
+        print(bench_training(data_folder(data, profile), runs, profile, names))
     else:
         from train.loading import bench_loading
 
         print(bench_loading(data_folder(data, profile), runs, profile))
+
+
+def stress(
+    names: Names = (),
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    long: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    precision: Annotated[
+        Literal["float32", "bfloat16", "float16"], tyro.conf.arg(help="of networks; at all extremes")
+    ] = "float32",
+) -> None:
+    """Put denoisers (all that can run, unless some are named) to the extremes: tables, results.json, a picture.
+
+    Networks have the weights trained in this profile, or else fresh ones. Exits with 1 if a requirement is broken.
+
+    Args:
+        long: play sequences of 10 000 frames as well (minutes).
+    """
+    from eval.stress import stress as run
+
+    if not run(runs, names, profile, long, precision):
+        sys.exit(1)
+
+
+def ablate(
+    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd"], tyro.conf.Positional],
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    seeds: int = 1,
+) -> None:
+    """Repeat an ablation of the papers, or go on with it: table beside the paper's findings, plot, results.json.
+
+    rae-inputs: what RAE gains by demodulation, normals, depth and roughness (Fig. 3).
+    rae-loss: what the gradient and temporal terms of its loss add to the spatial one (§4.4).
+    wskp-windows: windows of 3 to 13 pixels alone and together (WSKP, Fig. 9 and 10).
+    wskp-repvgg: wskp6 and kp with and without RepVGG blocks (WSKP, Table 5).
+    ntd: ntd-a, ntd-b and ntd where meshes move (NTD §6.3).
+
+    Args:
+        seeds: trainings of each network, whose mean and spread are shown.
+    """
+    from eval.ablation import ablate as run
+
+    print(run(what, data_folder(data, profile), runs, profile, seeds))
+
+
+def report(
+    runs: Runs = Path("runs"),
+    megabytes: Annotated[float, tyro.conf.arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
+) -> None:
+    """Make one page of all results, RUNS/report/index.html, which needs no network; and an animated picture a clip."""
+    from eval.report import report as make
+
+    for path in make(runs, megabytes):
+        print(path)
 
 
 def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]) -> None:
@@ -214,7 +287,8 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
 
 COMMANDS = {
     **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
-    **{"show": show, "figure": figure, "exr": exr, "bench": bench},
+    **{"show": show, "figure": figure, "exr": exr, "bench": bench, "stress": stress, "ablate": ablate},
+    **{"report": report},
 }
 
 

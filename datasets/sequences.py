@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import REFERENCES
-from datasets.clip import Clip
+from datasets.clip import Clip, Window
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 
@@ -23,28 +23,49 @@ class Augmentation:
     gain: bool = False  # a factor in [0, 2] of its own for each colour channel
 
 
-class TrainingSequences(TorchDataset[list[Frame]]):
-    """Sequences of `length` frames and `crop` x `crop` pixels; item i of epoch e depends on (seed, e, i) only.
+def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
+    """Raises BadInput where a clip is shorter than `length` frames or smaller than a crop."""
+    for clip in clips:
+        if clip.frames < length or min(clip.height, clip.width) < (crop or 1):
+            size = f" of {crop}x{crop}" if crop else ""
+            raise BadInput(
+                f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small to train on "
+                f"{length} frames{size}; train with a smaller profile"
+            )
 
-    An epoch holds as many sequences as it takes to see as many pixels as the clips have.
-    Raises BadInput where a clip is shorter than a sequence or smaller than a crop.
+
+def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> Window:
+    """`crop` x `crop` pixels somewhere in the image, or all of it."""
+    if crop is None:
+        return slice(0, clip.height), slice(0, clip.width)
+    top, left = (int(rng.integers(size - crop + 1)) for size in (clip.height, clip.width))
+    return slice(top, top + crop), slice(left, left + crop)
+
+
+class TrainingSequences(TorchDataset[list[Frame]]):
+    """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames).
+
+    Item i of epoch e depends on (seed, e, i) only. An epoch holds as many sequences as it takes to see as many pixels
+    as the clips have. Raises BadInput where a clip is shorter than a sequence or smaller than a crop.
     """
 
     def __init__(
-        self, clips: Sequence[Clip], reads: Sequence[str], length: int, crop: int, augmentation: Augmentation, seed: int
+        self,
+        clips: Sequence[Clip],
+        reads: Sequence[str],
+        length: int,
+        crop: int | None,
+        augmentation: Augmentation,
+        seed: int,
     ):
-        for clip in clips:
-            if clip.frames < length or min(clip.height, clip.width) < crop:
-                raise BadInput(
-                    f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small for "
-                    f"training sequences of {length} frames of {crop}x{crop}; train with a smaller profile"
-                )
+        check_fits(clips, length, crop)
         self.clips, self.length, self.crop = clips, length, crop
         self.channels = tuple(dict.fromkeys([*reads, *REFERENCES]))
         self.augmentation, self.seed, self.epoch = augmentation, seed, 0
         pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
         self.share = pixels / pixels.sum()
-        self.count = max(1, round(pixels.sum() / (length * crop * crop)))
+        area = crop * crop if crop else pixels.sum() / sum(clip.frames for clip in clips)
+        self.count = max(1, round(pixels.sum() / (length * area)))
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch whose sequences come next."""
@@ -57,8 +78,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         rng = np.random.default_rng([self.seed, self.epoch, index])
         clip = self.clips[rng.choice(len(self.clips), p=self.share)]
         playback = self._playback(clip, rng)
-        top, left = (int(rng.integers(size - self.crop + 1)) for size in (clip.height, clip.width))
-        window = (slice(top, top + self.crop), slice(left, left + self.crop))
+        window = random_window(clip, self.crop, rng)
         # Dealt out rather than drawn, so that a stopped camera sees new noise as long as there are realisations.
         deal = rng.permutation(clip.realisations)
         turns = int(rng.integers(4)) if self.augmentation.rotate else 0

@@ -1,6 +1,6 @@
 """RAE: the recurrent denoising autoencoder of Chaitanya et al. 2017."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,12 @@ POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
 ENCODER = (32, 32, 43, 57, 76, 101, 101)
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
+# The auxiliary inputs (§3.2): how many channels each has, and how they are made.
+AUXILIARY: dict[str, tuple[int, Callable[[Frame, RunningScale], Tensor]]] = {
+    "normal": (2, lambda frame, scale: frame.view_normal()[:, :2]),
+    "depth": (1, lambda frame, scale: scale.normalised_depth(frame.depth)),
+    "roughness": (1, lambda frame, scale: frame.roughness),
+}
 
 
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
@@ -88,13 +94,21 @@ class RAEState(State):
 
 
 class RAE(Denoiser):
-    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
+    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2).
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+    Args:
+        auxiliary: inputs beside irradiance, names of AUXILIARY; fewer for the paper's ablation (§5.1).
+    """
 
-    def __init__(self) -> None:
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+
+    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY)) -> None:
         super().__init__()
-        self.network = RecurrentAutoencoder().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.auxiliary = tuple(auxiliary)
+        needed = {*auxiliary, "depth"}  # depth has its running scale in any case
+        self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
+        network = RecurrentAutoencoder(3 + sum(AUXILIARY[name][0] for name in auxiliary))
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
@@ -103,11 +117,15 @@ class RAE(Denoiser):
         irradiance = finite(frame.irradiance(self.signal)).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
         colour = self.compress(irradiance, scale, frame)
-        depth = scale.normalised_depth(frame.depth)
-        x = pad(torch.cat([colour, frame.view_normal()[:, :2], depth, frame.roughness], dim=1), 32)
+        auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.auxiliary)
+        x = pad(torch.cat([colour, *auxiliary], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
+
+    def target(self, frame: Frame) -> Tensor:
+        """What training holds the output to, irradiance (B, 3, H, W)."""
+        return frame.reference_irradiance(self.signal)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""

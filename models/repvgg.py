@@ -13,31 +13,40 @@ SIZES = (1, 3, 5)
 class RepVGGBlock(nn.Module):
     """Parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, and identity where widths match, summed; then ReLU or nothing.
 
-    `merge` turns the branches into one 5 x 5 convolution with the same output up to rounding.
+    The sum of the branches is one convolution with the sum of their kernels. It is computed that way in training too:
+    gradients reach every branch through the sum, and the images are convolved once. `merge` does it for good.
+    One size alone, without identity, is a plain convolution.
     """
 
-    def __init__(self, inputs: int, outputs: int, relu: bool):
+    def __init__(self, inputs: int, outputs: int, relu: bool, sizes: Sequence[int] = SIZES):
         super().__init__()
-        self.relu, self.has_identity = relu, inputs == outputs
+        self.relu, self.has_identity = relu, inputs == outputs and len(sizes) > 1
         self.branches: Sequence[nn.Conv2d] = nn.ModuleList(  # type: ignore[assignment]
-            nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in SIZES
+            nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in sizes
         )
         self.merged: nn.Conv2d | None = None
+
+    def kernel(self) -> tuple[Tensor, Tensor]:
+        """Weight (outputs, inputs, k, k), k the largest size, and bias (outputs,) of the branches' sum."""
+        size = max(branch.kernel_size[0] for branch in self.branches)
+        weights, biases = [], []
+        for branch in self.branches:
+            margin = (size - branch.kernel_size[0]) // 2
+            weights.append(F.pad(branch.weight, (margin,) * 4))
+            assert branch.bias is not None
+            biases.append(branch.bias)
+        if self.has_identity:
+            eye = torch.eye(len(biases[0]), dtype=biases[0].dtype, device=biases[0].device)
+            weights.append(F.pad(eye[:, :, None, None], (size // 2,) * 4))
+        return torch.stack(weights).sum(dim=0), torch.stack(biases).sum(dim=0)
 
     def merge(self) -> None:
         """Replace the branches; there is no way back to training."""
         if self.merged is not None:
             return
-        size, largest = SIZES[-1], self.branches[-1]
-        merged = nn.Conv2d(largest.in_channels, largest.out_channels, size, padding=size // 2)
-        weight, bias = torch.zeros_like(largest.weight), torch.zeros(largest.out_channels).to(largest.weight)
-        for branch in self.branches:
-            margin = (size - branch.weight.shape[-1]) // 2
-            weight += F.pad(branch.weight, (margin,) * 4)
-            assert branch.bias is not None
-            bias += branch.bias
-        if self.has_identity:
-            weight[:, :, size // 2, size // 2] += torch.eye(len(weight), device=weight.device)
+        weight, bias = self.kernel()
+        outputs, inputs, size = weight.shape[:3]
+        merged = nn.Conv2d(inputs, outputs, size, padding=size // 2)
         merged.weight, merged.bias = nn.Parameter(weight, False), nn.Parameter(bias, False)
         self.merged, self.branches = merged, nn.ModuleList()  # type: ignore[assignment]
 
@@ -45,14 +54,15 @@ class RepVGGBlock(nn.Module):
         if self.merged is not None:
             y = self.merged(x)
         else:
-            y = sum((branch(x) for branch in self.branches), start=x if self.has_identity else torch.zeros(()).to(x))
+            weight, bias = self.kernel()
+            y = F.conv2d(x, weight, bias, padding=weight.shape[-1] // 2)
         return F.relu(y, inplace=True) if self.relu else y
 
 
-def repvgg(widths: Sequence[int]) -> nn.Sequential:
+def repvgg(widths: Sequence[int], sizes: Sequence[int] = SIZES) -> nn.Sequential:
     """Blocks from widths[0] channels to widths[-1], the last one linear."""
     pairs = list(pairwise(widths))
-    return nn.Sequential(*(RepVGGBlock(a, b, relu=i + 1 < len(pairs)) for i, (a, b) in enumerate(pairs)))
+    return nn.Sequential(*(RepVGGBlock(a, b, i + 1 < len(pairs), sizes) for i, (a, b) in enumerate(pairs)))
 
 
 @torch.no_grad()

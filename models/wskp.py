@@ -1,7 +1,7 @@
 """WSKP: weight-sharing kernel prediction of Fan et al. 2021, its multi-resolution variant and its baseline KP."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from models.denoiser import Denoiser, State, carried
 from models.fusion import WINDOWS, fuse
 from models.kernels import apply_kernels
 from models.operators import RunningScale, accumulate, pad, running_scale
-from models.repvgg import merge, repvgg
+from models.repvgg import SIZES, merge, repvgg
 
 INPUTS = 10  # §5.1: displayed colour, albedo, normal, depth
 WIDTH = 24  # ours: the drawn widths are lost
@@ -60,6 +60,7 @@ class KernelPredictor(Denoiser):
     """
 
     reads = Accumulated.reads
+    filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
     network: nn.Module
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
@@ -75,15 +76,24 @@ class KernelPredictor(Denoiser):
         """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any."""
         raise NotImplementedError
 
-    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+    def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
+        """The state after a frame, before any filter: accumulated irradiance and running scales."""
         before = carried(state, WSKPState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
-        x = self.features(frame, history.irradiance, scale)
+        return WSKPState(frame.moment, history, scale, None)
+
+    def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
+        """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any."""
+        x = self.features(frame, irradiance, scale)
         predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
-        irradiance, mixture = self.reconstruct(history.irradiance, predicted)
-        return frame.remodulate(irradiance, self.signal), WSKPState(frame.moment, history, scale, mixture)
+        return self.reconstruct(irradiance, predicted)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        after = self.accumulate(frame, state)
+        irradiance, mixture = self.filter(frame, after.history.irradiance, after.scale)
+        return frame.remodulate(irradiance, self.signal), replace(after, mixture=mixture)
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         merge(self.network)  # in the precision of training
@@ -94,10 +104,10 @@ class KernelPredictor(Denoiser):
 class WSKP(KernelPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
-    def __init__(self, layers: int = 6, windows: Sequence[int] = WINDOWS):
+    def __init__(self, layers: int = 6, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = SIZES):
         super().__init__()
         self.windows = tuple(windows)
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)])
+        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)], sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
@@ -109,9 +119,9 @@ class KP(KernelPredictor):
 
     window = 13
 
-    def __init__(self, layers: int = 6):
+    def __init__(self, layers: int = 6, sizes: Sequence[int] = SIZES):
         super().__init__()
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2])
+        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2], sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         return apply_kernels(irradiance, predicted), None

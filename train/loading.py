@@ -5,7 +5,7 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from itertools import count, cycle, islice
+from itertools import count, cycle
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -18,7 +18,8 @@ from datasets.clip import Clip, Dataset
 from datasets.files import write_json
 from datasets.inspect import size_of
 from models import create
-from train.loop import Training, loader
+from train.data import Items, items, loader, micro_batches
+from train.loop import Training, task_for
 from train.recipes import Recipe, recipe_for
 
 FASTEST = "rae"  # the network whose training consumes the most pixels a second
@@ -41,6 +42,7 @@ def bench_loading(data: Path, runs: Path, profile: str) -> str:
         rates[f"loading, {workers} workers"] = loading_rate(clips, recipe, workers)
     trainer, rates["training"] = training_rate(data, profile)
     memory = [memory_of(clips, recipe, folder, size) for size in tqdm(SIZES, "memory", leave=False)]
+    assert recipe.crop
     pixels = recipe.length * recipe.crop**2
     speeds = [
         {
@@ -66,26 +68,32 @@ def median_seconds(work: Callable[[], object]) -> float:
     return median(seconds[1:])
 
 
+def sequences_of(clips: list[Clip], recipe: Recipe) -> Items:
+    return items(clips, recipe, create(FASTEST), True, 0, Path())  # sequences need no cache
+
+
 def loading_rate(clips: list[Clip], recipe: Recipe, workers: int) -> float:
     """Augmented sequences a second as the training loop gets them, start of the workers included."""
-    short = len(loader(clips, recipe, create(FASTEST).reads, True, 0)) * recipe.batch
-    batches = loader(clips * -(-SEQUENCES // short), recipe, create(FASTEST).reads, True, 0, workers)
+    sequences = sequences_of(clips, recipe)
+    steps = -(-SEQUENCES // recipe.batch)
+    batches = micro_batches(0, steps, recipe.batch, recipe.batch)
     epochs = count()
 
     def epoch() -> None:
-        batches.dataset.set_epoch(next(epochs))  # type: ignore[attr-defined]
-        for _ in batches:
+        sequences.set_epoch(next(epochs))
+        for _ in loader(sequences, batches, workers):
             pass
 
-    return len(batches) * recipe.batch / median_seconds(epoch)
+    return steps * recipe.batch / median_seconds(epoch)
 
 
 def training_rate(data: Path, profile: str) -> tuple[str, float]:
     """What was trained, and how many sequences a second, with loading left out."""
     with TemporaryDirectory() as folder:
-        training = Training(FASTEST, data, Path(folder), profile, 0, None)
-        batches = cycle(list(islice(training.train_data, 2)))
-        seconds = median_seconds(lambda: float(training.step(next(batches))["loss"]))  # float waits for a GPU
+        training = Training(task_for(FASTEST, data, Path(folder), profile))
+        batch = training.recipe.batch
+        batches = cycle(list(loader(training.items, micro_batches(0, 2, batch, batch))))
+        seconds = median_seconds(lambda: training.step([next(batches)]))
     return f"{FASTEST}, {training.precision}, {training.fabric.device.type}", training.recipe.batch / seconds
 
 
@@ -110,8 +118,10 @@ def copy_clips(clips: list[Clip], folder: Path, size: float) -> Iterator[Path]:
 
 def anonymous_memory(paths: list[Path], recipe: Recipe) -> tuple[float | str, float | str]:
     """Megabytes before and after an epoch. Pages of memory-mapped files are not among them: they can go at any time."""
-    batches = loader([Clip(path) for path in paths], recipe, create(FASTEST).reads, True, 0)
-    next(iter(batches))
+    sequences = sequences_of([Clip(path) for path in paths], recipe)
+    steps = max(1, len(sequences) // recipe.batch)
+    batches = iter(loader(sequences, micro_batches(0, steps, recipe.batch, recipe.batch)))
+    next(batches)
     before = rss_anon()
     for _ in batches:
         pass

@@ -2,8 +2,11 @@
 
 import io
 import os
-from collections.abc import Iterator
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -11,24 +14,25 @@ from typing import Any
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor
-from torch.utils.data import DataLoader
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from datasets.clip import Clip, Dataset
+from datasets.clip import Dataset
 from datasets.files import locked, write_file
-from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
 from errors import BadInput
 from models import create
-from models.precision import fastest_precision
+from models.denoiser import Denoiser
 from models.weights import save_weights
-from train.losses import loss_for
+from train.data import in_parts, items, loader, micro_batches, most_at_once, split
+from train.log import Log, logging, loss_curve, sample_picture
+from train.losses import NetworkLoss, loss_for
+from train.precision import fastest_precision
 from train.recipes import Recipe, recipe_for
 
 CHECKPOINT, BEST, WEIGHTS = "checkpoint.pt", "best.safetensors", "weights.safetensors"
-VALIDATIONS = 10  # in a training, besides the last epoch
+VALIDATIONS = 10  # in a training
+SAVE_SECONDS = 60.0  # between checkpoints: what a kill loses at most
 MOST_SKIPPED_IN_A_ROW = 20
-COUNTERS = ("epoch", "best", "skipped", "skipped_in_a_row")
+COUNTERS = ("done", "best", "skipped", "skipped_in_a_row")
 
 
 def run_folder(runs: Path, name: str, profile: str) -> Path:
@@ -36,56 +40,96 @@ def run_folder(runs: Path, name: str, profile: str) -> Path:
     return runs / "train" / f"{name}-{profile}"
 
 
-def loader(
-    clips: list[Clip], recipe: Recipe, reads: tuple[str, ...], augment: bool, seed: int, workers: int = 0
-) -> DataLoader[Batch]:
-    augmentation = recipe.augmentation if augment else Augmentation()
-    sequences = TrainingSequences(clips, reads, recipe.length, recipe.crop, augmentation, seed)
-    # A smaller last batch would weigh its sequences more (and single ones are not reproducible bit for bit on CPUs).
-    whole = len(sequences) >= recipe.batch
-    return DataLoader(sequences, recipe.batch, collate_fn=collate, drop_last=whole, num_workers=workers)  # type: ignore[arg-type]
+@dataclass(frozen=True)
+class Task:
+    """What is trained, on what, and where that is kept. `create` makes the network with fresh weights."""
+
+    name: str
+    create: Callable[[], Denoiser]
+    recipe: Recipe
+    profile: str
+    data: Dataset
+    folder: Path  # of this training
+    cache: Path  # of accumulated frames, which trainings share
+    seed: int = 0
+    precision: str | None = None  # Fabric's name of one; by default the fastest here
+    at_once: int | None = None  # items in memory together; by default what fits a few gigabytes
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Raises BadInput where the file is damaged."""
     try:
-        return dict(torch.load(path, weights_only=True))
+        return dict(torch.load(path, weights_only=True, map_location="cpu"))
     except (RuntimeError, EOFError, UnpicklingError, ValueError, TypeError) as error:
         raise BadInput(f"{path} is damaged ({str(error).splitlines()[0]}): delete {path.parent}") from None
+
+
+def fabric_here(precision: str = "32-true") -> Fabric:
+    """Fabric for this machine: one GPU or the CPU, or under torchrun as many processes as that has started (DDP)."""
+    accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    here, world = (int(os.environ.get(name, 1)) for name in ("LOCAL_WORLD_SIZE", "WORLD_SIZE"))
+    strategy = "ddp" if world > 1 else "auto"
+    nodes = world // here
+    fabric = Fabric(accelerator=accelerator, strategy=strategy, devices=here, num_nodes=nodes, precision=precision)  # type: ignore[arg-type]
+    fabric.launch()
+    return fabric
 
 
 class Training:
     """One run: network, optimiser, data, and where it stands. Everything random follows from (seed, epoch, item)."""
 
-    def __init__(self, name: str, data: Path, runs: Path, profile: str, seed: int, precision: str | None):
-        self.name, self.recipe = name, recipe_for(name, profile)
-        self.folder = run_folder(runs, name, profile)
-        dataset = Dataset(data)
-        torch.manual_seed(seed)
-        denoiser = create(name)
-        self.train_data = loader(dataset.clips("train"), self.recipe, denoiser.reads, True, seed)
-        self.val_data = loader(dataset.clips("val"), self.recipe, denoiser.reads, False, seed)
+    def __init__(self, task: Task):
+        self.task, self.recipe, self.folder = task, task.recipe, task.folder
+        torch.backends.mkldnn.deterministic = True  # type: ignore[assignment]
+        torch.manual_seed(task.seed)
+        denoiser = task.create()
+        loss = loss_for(denoiser, self.recipe)
+        fabric = fabric_here()
+        self.share_work(fabric.world_size)
+        with fabric.rank_zero_first():  # the others find the accumulated frames that the first has cached
+            self.clips = {split: task.data.clips(split) for split in ("train", "val")}
+            make = partial(items, recipe=self.recipe, denoiser=denoiser, seed=task.seed, cache=task.cache)
+            self.items, self.val_items = (
+                make(self.clips["train"], training=True),
+                make(self.clips["val"], training=False),
+            )
+        self.per_epoch = max(1, round(len(self.items) / self.recipe.batch))
+        self.total = self.recipe.epochs * self.per_epoch
+        self.done, self.best, self.skipped, self.skipped_in_a_row = 0, float("inf"), 0, 0
 
-        checkpoint = self.folder / CHECKPOINT
-        saved = load_checkpoint(checkpoint) if checkpoint.exists() else {}
-        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
-        # A resumed run keeps its precision, however the measurement would turn out this time.
-        if saved and precision and saved.get("precision") != precision:
+        saved = load_checkpoint(self.folder / CHECKPOINT) if (self.folder / CHECKPOINT).exists() else {}
+        self.precision = fabric.broadcast(self.choose_precision(loss, saved, fabric))
+        self.fabric = fabric_here(self.precision)
+        betas = self.recipe.betas
+        optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=betas)
+        self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
+        made_with = {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")}
+        self.facts = {"profile": task.profile, "seed": task.seed, "data": made_with, **asdict(self.recipe)}
+        self.facts["parameters"] = denoiser.parameter_count()
+        if saved:
+            self.resume(saved)
+
+    def share_work(self, world: int) -> None:
+        """Set how many parts this process's share of a batch comes in. Raises BadInput where it cannot be shared."""
+        batch, at_once = self.recipe.batch, self.task.at_once
+        if batch % world:
+            raise BadInput(f"a batch of {batch} cannot be shared by {world} processes: start a divisor of {batch}")
+        if at_once is not None and at_once < 1:
+            raise BadInput(f"{at_once} items at once are none: use 1 or more")
+        self.at_once = at_once or most_at_once(self.recipe, self.task.data.clips("train")[0])
+        self.parts = len(split(batch // world, self.at_once))
+
+    def choose_precision(self, loss: NetworkLoss, saved: dict[str, Any], fabric: Fabric) -> str:
+        """A resumed run keeps its precision, however the measurement would turn out this time."""
+        wanted = self.task.precision
+        if saved and wanted and saved.get("precision") != wanted:
             raise BadInput(
                 f"{self.folder} holds a training in {saved.get('precision')}: delete it or use another --runs"
             )
-        self.precision = saved.get("precision") or precision or fastest_precision(torch.device(accelerator))
-        self.fabric = Fabric(accelerator=accelerator, devices=1, precision=self.precision)  # type: ignore[arg-type]
-        loss = loss_for(denoiser, name)
-        optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
-        self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
-
-        made_with = {key: dataset.facts[key] for key in ("profile", "seed", "generator", "scenes")}
-        self.facts = {"profile": profile, "seed": seed, "data": made_with, **asdict(self.recipe)}
-        self.facts["parameters"] = denoiser.parameter_count()
-        self.epoch, self.best, self.skipped, self.skipped_in_a_row = 0, float("inf"), 0, 0
-        if saved:
-            self.resume(saved)
+        if kept := saved.get("precision") or wanted:
+            return str(kept)
+        first = micro_batches(0, 1, self.recipe.batch, self.at_once, 0, fabric.world_size)[:1]
+        return fastest_precision(loss, next(iter(loader(self.items, first))), fabric.device.type)
 
     def resume(self, saved: dict[str, Any]) -> None:
         if saved.get("facts") != self.facts:
@@ -110,28 +154,55 @@ class Training:
         torch.save(content, buffer)
         write_file(self.folder / CHECKPOINT, buffer.getvalue())
 
-    def steps(self) -> Iterator[tuple[float, dict[str, Tensor]]]:
-        """One epoch: update the weights batch by batch; yields learning rate and losses of each step."""
-        count = len(self.train_data)
-        self.train_data.dataset.set_epoch(self.epoch)  # type: ignore[attr-defined]
-        for index, batch in enumerate(self.train_data):
-            rate = self.recipe.learning_rate(self.epoch + index / count)
-            for group in self.optimiser.param_groups:
-                group["lr"] = rate
-            yield rate, self.step(batch)
+    def steps(self) -> Iterator[dict[str, float]]:
+        """Update the weights step by step until the last epoch's end; yields what is worth noting of each step."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        while self.done < self.total:
+            epoch, first = divmod(self.done, self.per_epoch)
+            self.items.set_epoch(epoch)
+            batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.at_once, rank, world)
+            for batch in in_parts(loader(self.items, batches), self.parts):
+                noted = self.step(batch)
+                self.done += 1
+                yield noted
 
-    def step(self, batch: Batch) -> dict[str, Tensor]:
-        """Update the weights once. Returns the loss and its parts."""
-        loss, parts = self.loss(batch.to(self.fabric.device))
-        self.fabric.backward(loss)
+    def step(self, batch: Iterable[Any]) -> dict[str, float]:
+        """Update the weights once, from the parts of a batch. Returns its loss, its terms, rate and milliseconds."""
+        start = ready = time.perf_counter()
+        loading = 0.0
+        rate = self.recipe.learning_rate(self.done / self.per_epoch)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.loss.module.progress = self.done / self.total
+        sums: dict[str, Tensor] = {}
+        for index, part in enumerate(batch):
+            loading += time.perf_counter() - ready
+            with self.fabric.no_backward_sync(self.loss, enabled=index + 1 < self.parts):
+                loss, terms = self.loss(part.to(self.fabric.device))
+                self.fabric.backward(loss / self.parts)
+            for name, term in {"loss": loss.detach(), **terms}.items():
+                sums[name] = sums.get(name, torch.zeros_like(term)) + term / self.parts
+            ready = time.perf_counter()
+        values = {name: float(self.reduce(term, "mean")) for name, term in sums.items()}
+        self.update(values["loss"])
+        times = {"step_ms": 1e3 * (time.perf_counter() - start), "loading_ms": 1e3 * loading}
+        return {"learning_rate": rate, **values, **times}
+
+    def reduce(self, value: Tensor, how: str) -> Tensor:
+        """The mean or sum of every process's `value`."""
+        reduced = self.fabric.all_reduce(value, reduce_op=how)
+        assert isinstance(reduced, Tensor)
+        return reduced
+
+    def update(self, loss: float) -> None:
+        """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision."""
         gradients = [parameter.grad for parameter in self.loss.parameters() if parameter.grad is not None]
-        if torch.isfinite(loss) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
+        if torch.isfinite(torch.tensor(loss)) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
             self.skipped_in_a_row = 0
             self.optimiser.step()
         else:
             self.skip_step()
         self.optimiser.zero_grad()
-        return {"loss": loss.detach(), **parts}
 
     def skip_step(self) -> None:
         """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""
@@ -146,61 +217,103 @@ class Training:
     @torch.no_grad()
     def validate(self) -> float:
         """Mean loss over the validation clips, always the same crops."""
-        losses = [self.loss(batch.to(self.fabric.device))[0].item() for batch in self.val_data]
-        return sum(losses) / len(losses)
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        numbers = range(len(self.val_items))
+        batches = [list(numbers[i : i + self.at_once]) for i in range(0, len(numbers), self.at_once)][rank::world]
+        network: NetworkLoss = self.loss.module.eval()  # not through DDP: processes may differ in how much they have
+        total = torch.zeros(2, device=self.fabric.device)
+        for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
+            with self.fabric.autocast():
+                loss, _ = network(batch.to(self.fabric.device))
+            total += len(chosen) * torch.stack([loss, torch.ones_like(loss)])
+        network.train()
+        total = self.reduce(total, "sum")
+        return float(total[0] / total[1])
 
     def keep_best(self, validation: float) -> None:
         if validation < self.best:  # never true of NaN
             self.best = validation
-            denoiser = self.loss.module.denoiser
-            save_weights(
-                denoiser, self.name, {**self.facts, "epoch": self.epoch, "validation": validation}, self.folder / BEST
-            )
+            facts = {**self.facts, "step": self.done, "validation": validation}
+            save_weights(self.loss.module.denoiser, self.task.name, facts, self.folder / BEST)
 
 
 def run(training: Training) -> None:
-    """Train until the recipe's last epoch, with a checkpoint after each, and keep the best weights by validation."""
-    epochs, steps = training.recipe.epochs, len(training.train_data)
-    every = max(1, epochs // VALIDATIONS)
-    done = training.epoch * steps
-    label = f"{training.name} ({training.precision})"
+    """Train to the end, and keep the best weights by validation. The first process writes checkpoints and the log."""
+    every = max(1, training.total // VALIDATIONS)
+    if not training.fabric.is_global_zero:
+        for _ in training.steps():
+            if training.done % every == 0 or training.done == training.total:
+                training.validate()
+        return
+    label = f"{training.task.name} ({training.precision})"
+    saved = time.monotonic()
     with (
-        SummaryWriter(str(training.folder), purge_step=done) as board,
-        tqdm(total=epochs * steps, initial=done, desc=label, unit="step") as bar,
+        logging(training.folder, training.done, training.total) as log,
+        tqdm(total=training.total, initial=training.done, desc=label, unit="step") as bar,
     ):
-        while training.epoch < epochs:
-            for rate, parts in training.steps():
-                board.add_scalar("learning_rate", rate, bar.n)
-                for part, value in parts.items():
-                    board.add_scalar(f"train/{part}", value, bar.n)
-                bar.set_postfix(loss=f"{parts['loss']:.3f}", val=f"{training.best:.3f}", skipped=training.skipped)
-                bar.update()
-            training.epoch += 1
-            if training.epoch % every == 0 or training.epoch == epochs:
-                validation = training.validate()
-                board.add_scalar("val/loss", validation, bar.n)
-                training.keep_best(validation)
-            training.save()
+        for noted in training.steps():
+            log.step({**noted, "skipped": training.skipped})
+            bar.set_postfix_str(progress(training, noted), refresh=False)
+            bar.update()
+            if training.done % every == 0 or training.done == training.total:
+                judge(training, log)
+            log.write(training.done)
+            if time.monotonic() - saved > SAVE_SECONDS or training.done == training.total:
+                training.save()
+                saved = time.monotonic()
 
 
-def train(name: str, data: Path, runs: Path, profile: str, seed: int = 0, precision: str | None = None) -> Path:
-    """Train a denoiser, or go on where an interrupted training stopped. Returns the path of its weights.
+def progress(training: Training, noted: dict[str, float]) -> str:
+    loss = f"loss {noted['loss']:.4f}, best on validation {training.best:.4f}"
+    return f"{loss}, {noted['step_ms']:.0f} ms" + f", skipped {training.skipped}" * (training.skipped > 0)
 
-    Args:
-        name: the denoiser. data: the data set's folder. runs: where `train/NAME-PROFILE/` is written.
-        precision: Fabric's name of one, by default the fastest here.
-    Raises BadInput for an unknown name or profile, unusable data, or a run of another recipe in the folder.
+
+def judge(training: Training, log: Log) -> None:
+    """Validate, keep the weights if they are the best, and show what they do."""
+    validation = training.validate()
+    training.keep_best(validation)
+    log.write(training.done, {"val_loss": validation})
+    denoiser, clip = training.loss.module.denoiser, training.clips["val"][0]
+    with training.fabric.autocast():
+        log.picture(training.done, sample_picture(denoiser, clip, training.fabric.device))
+
+
+def train_network(task: Task) -> Path:
+    """Train, or go on where an interrupted training stopped. Returns the path of the weights.
+
+    Raises BadInput for unusable data, or where the folder holds another training.
     """
-    training = Training(name, data, runs, profile, seed, precision)
-    training.folder.mkdir(parents=True, exist_ok=True)
-    best, weights = training.folder / BEST, training.folder / WEIGHTS
-    with locked(training.folder / ".lock") as ours:
+    training = Training(task)
+    folder = training.folder
+    best, weights = folder / BEST, folder / WEIGHTS
+    folder.mkdir(parents=True, exist_ok=True)
+    first = training.fabric.is_global_zero
+    with locked(folder / ".lock") if first else nullcontext(True) as ours:
         if not ours:
-            raise BadInput(f"another process is training in {training.folder}: wait for it or use another --runs")
-        if training.epoch < training.recipe.epochs:
+            raise BadInput(f"another process is training in {folder}: wait for it or use another --runs")
+        if training.done < training.total:
             run(training)
-        if best.exists():  # only a finished training has WEIGHTS
+        if first and best.exists():  # only a finished training has WEIGHTS
+            loss_curve(folder, f"{task.name}, {task.profile}")
             os.replace(best, weights)
+    training.fabric.barrier()
     if not weights.exists():
-        raise BadInput(f"{training.folder} holds a finished training but no weights: delete it and train again")
+        raise BadInput(f"{folder} holds a finished training but no weights: delete it and train again")
+    if first:
+        print(f"{task.name}: trained, {weights}")
     return weights
+
+
+def task_for(
+    name: str,
+    data: Path,
+    runs: Path,
+    profile: str,
+    seed: int = 0,
+    precision: str | None = None,
+    at_once: int | None = None,
+) -> Task:
+    """The training of a denoiser in a profile. Raises BadInput for an unknown name or profile, or no data set."""
+    recipe, folder = recipe_for(name, profile), run_folder(runs, name, profile)
+    network = partial(create, name)
+    return Task(name, network, recipe, profile, Dataset(data), folder, runs / "accumulated", seed, precision, at_once)

@@ -1,214 +1,229 @@
-"""Losses by hand, the schedule, and that training learns, resumes and refuses as it should."""
+"""The loop: it resumes to the same bits, skips what is not finite, survives a full disk, and shows what it does."""
 
+import csv
 import math
+import os
 import resource
 import shutil
 import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 from safetensors import safe_open
-from scipy.ndimage import gaussian_laplace
 
-from datasets.clip import Dataset
-from datasets.sequences import Augmentation, Batch, TrainingSequences, collate
 from errors import BadInput
-from models.rae import RAE
-from train.loop import Training, run_folder, train
-from train.losses import RAELoss, laplacian_of_gaussian
-from train.recipes import RECIPES, recipe_for
+from train import loop
+from train.log import Log, read_metrics, smooth
+from train.loop import Training, run_folder, task_for, train_network
+from train.losses import RAELoss
+from train.precision import fastest_precision
+from train.recipes import RECIPES
+
+FLOAT32 = "32-true"
 
 
-def batch_of(tiny, count: int = 2, crop: int = 32) -> Batch:
-    clips = Dataset(tiny).clips("train")
-    data = TrainingSequences(clips, RAE.reads, 7, crop, Augmentation(), seed=0)
-    return collate([data[index] for index in range(count)])
-
-
-def test_log_kernel_is_that_of_scipy():
-    """The response to an impulse, away from truncation, and to a picture."""
-    kernel = laplacian_of_gaussian().numpy()
-    impulse = np.zeros((31, 31))
-    impulse[15, 15] = 1
-    scipy = gaussian_laplace(impulse, 1.5, truncate=8)[8:23, 8:23]
-    np.testing.assert_allclose(kernel, scipy, atol=2e-4 * np.abs(scipy).max() + 1e-4)
-    assert abs(kernel.sum()) < 1e-12
-    picture = np.random.default_rng(0).uniform(0, 1, (40, 50))
-    ours = RAELoss(RAE()).edges(torch.from_numpy(picture).float().expand(2, 3, 40, 50))[1, 2].numpy()
-    np.testing.assert_allclose(ours, gaussian_laplace(picture, 1.5, mode="nearest"), atol=2e-3)
-
-
-def test_rae_loss_by_hand(tiny, monkeypatch):
-    """With a network that returns known outputs, every term follows from §4.4's equations, in numpy and float64."""
-    batch = batch_of(tiny)
-    rae = RAE()
-    loss = RAELoss(rae)
-    outputs, targets = [], []
-    generator = torch.Generator().manual_seed(0)
-    genuine = RAE.predict
-
-    def predict(frame, state):
-        _, state = genuine(rae, frame, state)
-        outputs.append(torch.rand(frame.albedo.shape, generator=generator))
-        reference = (frame.direct_reference + frame.indirect_reference).mean(dim=1) / frame.albedo.clamp(min=0.01)
-        targets.append((state.scale.exposure() * reference) ** 0.2)
-        return outputs[-1], state
-
-    monkeypatch.setattr(rae, "predict", predict)
-    value, parts = loss(batch)
-    weights = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)
-    p, t = (torch.stack(x).double().numpy() for x in (outputs, targets))
-    error = p - t
-    spatial = sum(w * np.abs(e).mean() for w, e in zip(weights, error, strict=True))
-    log = np.array([[[gaussian_laplace(c, 1.5, mode="nearest") for c in item] for item in e] for e in error])
-    gradient = sum(w * np.abs(e).mean() for w, e in zip(weights, log, strict=True))
-    dp, dt = np.diff(p, axis=0), np.diff(t, axis=0)
-    temporal = sum(w * np.abs(a - b).mean() for w, a, b in zip(weights[1:], dp, dt, strict=True))
-    assert parts["spatial"].item() == pytest.approx(spatial, rel=1e-5)
-    assert parts["gradient"].item() == pytest.approx(gradient, rel=5e-3)
-    assert parts["temporal"].item() == pytest.approx(temporal, rel=1e-5)
-    assert value.item() == pytest.approx(0.8 * spatial + 0.1 * gradient + 0.1 * temporal, rel=1e-3)
-
-
-def test_gains_scale_input_and_target_alike(tiny):
-    batch = batch_of(tiny, 1)
-    rae = RAE()
-    frame = batch.frames[0]
-    _, state = rae.predict(frame, None)
-    tinted = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
-    reference = frame.reference_irradiance("total")
-    plain, gained = (rae.compress(reference, state.scale, f) for f in (frame, tinted))
-    torch.testing.assert_close(gained, plain * torch.tensor([0.5, 1.0, 2.0])[None, :, None, None] ** 0.2)
-
-
-@pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
-@pytest.mark.parametrize("gain", [0.0, 1.0, 2.0])
-def test_loss_and_gradients_are_finite_at_the_extremes(tiny, level, gain):
-    batch = batch_of(tiny, 1)
-    for frame in batch.frames:
-        for name in ("direct", "indirect", "direct_reference", "indirect_reference"):
-            frame.channels[name] = torch.full_like(frame.channels[name], level)
-        frame.gain.fill_(gain)
-    loss = RAELoss(RAE())
-    value, _ = loss(batch)
-    value.backward()
-    assert torch.isfinite(value)
-    assert all(torch.isfinite(p.grad).all() for p in loss.parameters())
-
-
-def test_gradients_through_time_equal_finite_differences(tiny):
-    """The loss of the last frame alone, in float64, along a random change of the first frame's light."""
-    batch = batch_of(tiny, 1)
-    torch.manual_seed(2)
-    loss = RAELoss(RAE()).double()
-    loss.denoiser.precision = torch.float64
-    loss.frame_weights = (0.0,) * 6 + (1.0,)
-    loss.temporal = 0.0  # it would reach one frame back without any recurrence
-    for frame in batch.frames:
-        frame.channels.update({name: tensor.double() for name, tensor in frame.channels.items()})
-        frame.gain.data = frame.gain.double()
-        frame.channels["direct"] = frame.direct + 0.1  # away from zero, where the power's slope is infinite
-    first = batch.frames[0]
-    light = first.direct
-    direction = torch.randn_like(light) * light
-
-    def value(step: float) -> torch.Tensor:
-        first.channels["direct"] = light + step * direction
-        return loss(batch)[0]
-
-    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(value(step), step)
-    with torch.no_grad():
-        # Small, lest it crosses kinks of the rectifiers and of the absolute values; float64 leaves six digits.
-        difference = (value(1e-7) - value(-1e-7)) / 2e-7
-    assert abs(slope) > 1e-7
-    assert slope.item() == pytest.approx(difference.item(), rel=1e-3)
-
-
-def test_learning_rate_is_the_paper_s():
-    recipe = RECIPES["rae", "paper"]
-    assert recipe.learning_rate(0) == pytest.approx(1e-4)
-    assert recipe.learning_rate(5) == pytest.approx(1e-4 * 10**0.5)
-    assert recipe.learning_rate(10) == pytest.approx(1e-3)
-    assert recipe.learning_rate(40) == pytest.approx(5e-4)
-    assert (recipe.batch, recipe.length, recipe.crop, recipe.epochs, recipe.betas) == (4, 7, 128, 500, (0.9, 0.99))
-    assert recipe.augmentation == Augmentation(True, True, True, True)
+def train(name: str, data: Path, runs: Path, seed: int = 0, precision: str | None = None) -> Path:
+    return train_network(task_for(name, data, runs, "tiny", seed, precision))
 
 
 @pytest.fixture
 def short(monkeypatch):
-    """A recipe of four short epochs in the tiny profile."""
-    monkeypatch.setitem(RECIPES, ("rae", "tiny"), replace(RECIPES["rae", "tiny"], epochs=4, batch=4))
+    """Some ten steps in the tiny profile, whatever the network."""
+    for name, epochs in (("rae", 4), ("wskp6", 1), ("ntd", 1)):
+        monkeypatch.setitem(RECIPES, (name, "tiny"), replace(RECIPES[name, "tiny"], epochs=epochs))
 
 
-def tensors(path) -> dict[str, torch.Tensor]:
+def tensors(path: Path) -> dict[str, torch.Tensor]:
     with safe_open(path, "pt") as file:
         return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
 
 
-def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, short, monkeypatch):
-    """Interrupted in the middle of the third epoch; the weights equal those of an undisturbed run bit for bit."""
-    whole = train("rae", tiny, tmp_path / "whole", "tiny", precision="32-true")
-    genuine, calls = Training.steps, 0
+def same(a: Path, b: Path) -> bool:
+    x, y = tensors(a), tensors(b)
+    return x.keys() == y.keys() and all(torch.equal(x[key], y[key]) for key in x)
 
-    def interrupted(self):
-        for step in genuine(self):
-            nonlocal calls
-            calls += 1
-            if calls == 2 * len(self.train_data) + 1:
+
+def interrupt_after(monkeypatch, count: int) -> None:
+    genuine = Training.steps
+
+    def steps(self: Training) -> Iterator[dict[str, float]]:
+        for number, step in enumerate(genuine(self)):
+            if number == count:
                 raise KeyboardInterrupt
             yield step
 
-    monkeypatch.setattr(Training, "steps", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train("rae", tiny, tmp_path / "resumed", "tiny", precision="32-true")
-    folder = run_folder(tmp_path / "resumed", "rae", "tiny")
-    assert not (folder / "weights.safetensors").exists()  # unfinished does not look finished
-    monkeypatch.setattr(Training, "steps", genuine)
-    resumed = train("rae", tiny, tmp_path / "resumed", "tiny", precision="32-true")
-    a, b = tensors(whole), tensors(resumed)
-    assert a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
-    # A finished training is left as it is, and another recipe or seed is refused.
-    before = resumed.stat().st_mtime_ns
-    assert train("rae", tiny, tmp_path / "resumed", "tiny") == resumed and resumed.stat().st_mtime_ns == before
+    monkeypatch.setattr(Training, "steps", steps)
+
+
+@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, short, monkeypatch, name):
+    """Interrupted in the middle of an epoch; the weights equal those of an undisturbed run bit for bit."""
+    monkeypatch.setattr(loop, "SAVE_SECONDS", 0.0)
+    whole = train(name, tiny, tmp_path / "whole", precision=FLOAT32)
+    with monkeypatch.context() as patched:
+        interrupt_after(patched, 5)
+        with pytest.raises(KeyboardInterrupt):
+            train(name, tiny, tmp_path / "resumed", precision=FLOAT32)
+    assert not (run_folder(tmp_path / "resumed", name, "tiny") / "weights.safetensors").exists()
+    resumed = train(name, tiny, tmp_path / "resumed", precision=FLOAT32)
+    assert same(whole, resumed)
+    rows = [read_metrics(path.parent / "metrics.csv") for path in (whole, resumed)]
+    assert [r["loss"] for r in rows[0]] == [r["loss"] for r in rows[1]]
+    assert [r["step"] for r in rows[0]] == list(range(1, len(rows[0]) + 1))
+
+
+def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, short):
+    weights = train("rae", tiny, tmp_path, precision=FLOAT32)
+    before = weights.stat().st_mtime_ns
+    assert train("rae", tiny, tmp_path) == weights and weights.stat().st_mtime_ns == before
     with pytest.raises(BadInput, match="another recipe, seed or data set"):
-        train("rae", tiny, tmp_path / "resumed", "tiny", seed=1)
+        train("rae", tiny, tmp_path, seed=1)
     with pytest.raises(BadInput, match="a training in 32-true"):
-        train("rae", tiny, tmp_path / "resumed", "tiny", precision="bf16-mixed")
-    resumed.unlink()
+        train("rae", tiny, tmp_path, precision="bf16-mixed")
+    weights.unlink()
     with pytest.raises(BadInput, match="no weights"):
-        train("rae", tiny, tmp_path / "resumed", "tiny")
-    checkpoint = folder / "checkpoint.pt"
+        train("rae", tiny, tmp_path)
+    checkpoint = weights.with_name("checkpoint.pt")
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(BadInput, match=r"checkpoint.pt is damaged"):
-        train("rae", tiny, tmp_path / "resumed", "tiny")
+        train("rae", tiny, tmp_path)
 
 
-def test_training_writes_recipe_and_curves(tiny, tmp_path, short):
-    weights = train("rae", tiny, tmp_path, "tiny", precision="bf16-mixed")
+KILLED = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from train import loop
+from train.recipes import RECIPES
+loop.SAVE_SECONDS = 0.0
+name, data, runs, epochs = sys.argv[1:]
+RECIPES[name, "tiny"] = replace(RECIPES[name, "tiny"], epochs=int(epochs), crop=16)
+loop.train_network(loop.task_for(name, Path(data), Path(runs), "tiny", precision="32-true"))
+"""
+
+
+def start(name: str, data: Path, runs: Path, epochs: int) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(
+        [sys.executable, "-c", KILLED, name, str(data), str(runs), str(epochs)], stderr=subprocess.DEVNULL
+    )
+
+
+def kill_once(name: str, data: Path, runs: Path, epochs: int, row: int) -> bool:
+    """Start a training and SIGKILL it once its log has `row` rows. Returns whether it was still at work."""
+    process, metrics = start(name, data, runs, epochs), run_folder(runs, name, "tiny") / "metrics.csv"
+    while process.poll() is None and (not metrics.exists() or metrics.read_text().count("\n") < row):
+        time.sleep(0.002)
+    process.kill()
+    return process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    "name, epochs, rows",
+    [
+        ("ntd", 1, (4,)),
+        *(
+            pytest.param(name, epochs, range(3, 24, 2), marks=pytest.mark.slow)
+            for name, epochs in (("rae", 12), ("wskp6", 2), ("ntd", 3))
+        ),
+    ],
+)
+def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, epochs, rows):
+    assert start(name, tiny, tmp_path / "whole", epochs).wait() == 0
+    kills = [kill_once(name, tiny, tmp_path / "killed", epochs, row) for row in rows]
+    assert any(kills)
+    assert start(name, tiny, tmp_path / "killed", epochs).wait() == 0
+    folders = [run_folder(tmp_path / which, name, "tiny") for which in ("whole", "killed")]
+    assert same(*(folder / "weights.safetensors" for folder in folders))
+    assert not [path for path in folders[1].iterdir() if path.suffix == ".tmp"]
+
+
+def test_gradients_of_parts_add_up_to_those_of_the_batch(tiny, tmp_path, short):
+    """Four sequences at once, two, and one: the same loss and weights up to rounding."""
+    results = []
+    for at_once in (4, 2, 1):
+        training = Training(
+            replace(task_for("rae", tiny, tmp_path / str(at_once), "tiny", precision=FLOAT32), at_once=at_once)
+        )
+        assert training.parts == 4 // at_once
+        steps = training.steps()
+        losses = [next(steps)["loss"] for _ in range(3)]
+        results.append((losses, torch.cat([p.detach().flatten() for p in training.loss.parameters()])))
+    for losses, weights in results[1:]:
+        assert losses == pytest.approx(results[0][0], rel=1e-4)
+        assert torch.dist(weights, results[0][1]) < 1e-3 * results[0][1].norm()
+    with pytest.raises(BadInput, match="use 1 or more"):
+        Training(replace(task_for("rae", tiny, tmp_path / "none", "tiny"), at_once=0))
+
+
+def test_training_shows_what_it_does(tiny, tmp_path, short):
+    weights = train("rae", tiny, tmp_path, precision="bf16-mixed")
+    folder = weights.parent
     with safe_open(weights, "pt") as file:
         metadata = file.metadata()
     assert metadata["denoiser"] == "rae" and '"epochs": 4' in metadata["recipe"] and '"crop": 32' in metadata["recipe"]
-    assert list(weights.parent.glob("events.out.tfevents.*"))
     assert all(t.dtype == torch.float32 and torch.isfinite(t).all() for t in tensors(weights).values())
+    assert list(folder.glob("events.out.tfevents.*"))
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    wanted = {
+        "step",
+        "learning_rate",
+        "loss",
+        "spatial",
+        "gradient",
+        "temporal",
+        "skipped",
+        "step_ms",
+        "loading_ms",
+        "val_loss",
+    }
+    assert set(rows[0]) == wanted and rows[-1]["val_loss"]
+    assert imread(folder / "sample.png").shape[:2] == (64, 4 * 64)
+    assert imread(folder / "loss.png").ndim == 3
+    assert not (folder / ".lock").exists()
 
 
-def test_rae_learns_one_batch(tiny):
-    """Eighty steps on one batch bring the loss below a third of where it began."""
-    torch.manual_seed(0)
-    loss = RAELoss(RAE())
-    optimiser = torch.optim.Adam(loss.parameters(), 1e-3, betas=(0.9, 0.99))
-    batch = batch_of(tiny, 1)
-    values = []
-    for _ in range(80):
-        value, _ = loss(batch)
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        values.append(value.item())
-    assert np.mean(values[-5:]) < values[0] / 3
+def test_a_log_averages_and_forgets_what_a_kill_left(tmp_path):
+    log = Log(tmp_path, 0, 6000)  # three steps a row
+    for step in range(1, 8):
+        log.step({"loss": float(step)})
+        log.write(step, {"val_loss": 9.0} if step == 7 else None)
+    assert [(r["step"], r["loss"]) for r in read_metrics(log.path)] == [(3, 2.0), (6, 5.0), (7, 7.0)]
+    assert read_metrics(log.path)[-1]["val_loss"] == 9.0
+    with log.path.open("a") as file:
+        file.write("9,8.0")  # cut off
+    resumed = Log(tmp_path, 6, 6000)
+    assert [r["step"] for r in read_metrics(resumed.path)] == [3, 6]
+    assert smooth(np.ones((1001, 2))).shape[0] <= 210
+
+
+def test_precision_is_measured(monkeypatch):
+    """The faster one wins, whichever that is."""
+
+    class Slow(torch.nn.Module):
+        def __init__(self, slow: bool):
+            super().__init__()
+            self.slow, self.weight = slow, torch.nn.Parameter(torch.ones(()))
+
+        def forward(self, batch):
+            if torch.is_autocast_enabled("cpu") == self.slow:
+                time.sleep(0.02)
+            return self.weight * 1, {}
+
+    class Nothing:
+        def to(self, _):
+            return self
+
+    assert fastest_precision(Slow(True), Nothing(), "cpu") == "32-true"
+    assert fastest_precision(Slow(False), Nothing(), "cpu") == "bf16-mixed"
 
 
 def test_non_finite_losses_are_skipped_counted_and_finally_refused(tiny, tmp_path, short, monkeypatch):
@@ -223,17 +238,18 @@ def test_non_finite_losses_are_skipped_counted_and_finally_refused(tiny, tmp_pat
         return (value * math.nan if calls in broken or not broken else value), parts
 
     monkeypatch.setattr(RAELoss, "forward", forward)
-    monkeypatch.setattr("train.loop.MOST_SKIPPED_IN_A_ROW", 3)
-    training = Training("rae", tiny, tmp_path / "one", "tiny", 0, "32-true")
+    monkeypatch.setattr(loop, "MOST_SKIPPED_IN_A_ROW", 3)
+    training = Training(task_for("rae", tiny, tmp_path / "one", "tiny", precision=FLOAT32))
     training.folder.mkdir(parents=True)
-    for _ in training.steps():
-        pass
-    assert training.skipped == 1
+    steps = training.steps()
+    next(steps)
+    next(steps)
+    assert training.skipped == 1 and training.skipped_in_a_row == 0
     assert all(torch.isfinite(p).all() for p in training.loss.parameters())
     # A finite loss with a gradient that is not is skipped too.
     before = [p.clone() for p in training.loss.parameters()]
     hook = next(training.loss.parameters()).register_hook(lambda gradient: gradient * math.nan)
-    next(training.steps())
+    next(steps)
     hook.remove()
     assert training.skipped == 2
     assert all(torch.equal(p, q) for p, q in zip(before, training.loss.parameters(), strict=True))
@@ -241,24 +257,20 @@ def test_non_finite_losses_are_skipped_counted_and_finally_refused(tiny, tmp_pat
     assert not (training.folder / "best.safetensors").exists()
     broken.clear()
     with pytest.raises(BadInput, match="not finite in 3 steps in a row"):
-        train("rae", tiny, tmp_path / "all", "tiny", precision="32-true")
+        train("rae", tiny, tmp_path / "all", precision=FLOAT32)
 
 
-def test_unusable_input_is_named(tiny, tmp_path):
-    with pytest.raises(BadInput, match="'accumulated' is not a network"):
-        recipe_for("accumulated", "tiny")
-    with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
-        recipe_for("rae", "huge")
+def test_missing_clips_are_named(tiny, tmp_path):
     copy = shutil.copytree(tiny, tmp_path / "copy")
     shutil.rmtree(copy / "val" / "cornell_box")
     with pytest.raises(BadInput, match="'val' are missing"):
-        train("rae", copy, tmp_path, "tiny")
+        train("rae", copy, tmp_path)
     assert not (tmp_path / "train").exists()
 
 
 def test_full_disk_is_one_clear_line_and_keeps_the_earlier_checkpoint(tiny, tmp_path, short):
     """A limit on file size stands in for a full disk."""
-    training = Training("rae", tiny, tmp_path, "tiny", 0, "32-true")
+    training = Training(task_for("rae", tiny, tmp_path, "tiny", precision=FLOAT32))
     training.folder.mkdir(parents=True)
     training.save()
     checkpoint = training.folder / "checkpoint.pt"
@@ -276,3 +288,33 @@ def test_full_disk_is_one_clear_line_and_keeps_the_earlier_checkpoint(tiny, tmp_
         signal.signal(signal.SIGXFSZ, handler)
     assert checkpoint.read_bytes() == before
     assert not [path for path in training.folder.iterdir() if path.name.startswith(".") or "safetensors" in path.name]
+
+
+def torchrun(processes: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [*command, "-m", "onespp", "train", *arguments], env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.mark.parametrize("name", ["wskp6", pytest.param("rae", marks=pytest.mark.slow)])
+def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name):
+    """The same global batch, shared: the losses of the first steps agree to rounding, and one of them writes."""
+    common = ("--data", str(tiny), "--profile", "tiny", "--precision", FLOAT32)
+    result = torchrun(2, name, "--runs", str(tmp_path / "two"), *common)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.stdout.count("trained") == 1
+    one = train(name, tiny, tmp_path / "one", precision=FLOAT32)
+    two = run_folder(tmp_path / "two", name, "tiny")
+    curves = [[row["loss"] for row in read_metrics(folder / "metrics.csv")] for folder in (one.parent, two)]
+    assert len(curves[0]) == len(curves[1])
+    assert curves[1][:10] == pytest.approx(curves[0][:10], rel=1e-3)
+    assert np.mean(curves[1][-10:]) == pytest.approx(np.mean(curves[0][-10:]), rel=0.1)
+    assert tensors(two / "weights.safetensors").keys() == tensors(one).keys()
+
+
+@pytest.mark.slow
+def test_a_batch_that_cannot_be_shared_is_refused(tiny, tmp_path):
+    result = torchrun(2, "ntd", "--runs", str(tmp_path), "--data", str(tiny), "--profile", "tiny")
+    assert result.returncode != 0 and "a batch of 1 cannot be shared by 2 processes" in result.stderr

@@ -1,0 +1,321 @@
+"""Losses against hand-computed values and other libraries, at the extremes, and through time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_laplace
+from torch import Tensor
+from torchmetrics.functional import symmetric_mean_absolute_percentage_error
+
+from datasets.clip import Dataset
+from datasets.frame import Frame
+from datasets.sequences import Batch
+from models import create
+from models.ntd import NTD
+from models.rae import RAE
+from models.wskp import WSKP
+from train.accumulated import Crops
+from train.data import items, loader
+from train.losses import LOSSES, NetworkLoss, NTDLoss, RAELoss, SMAPELoss, laplacian_of_gaussian, loss_for, smape
+from train.recipes import TRAINABLE, NTDTerms, RAETerms, Recipe, recipe_for
+
+LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
+
+
+@pytest.fixture(scope="module")
+def batch_of(tiny, tmp_path_factory) -> Callable[..., Any]:
+    """Makes a batch that a network is trained on in the tiny profile, without augmentation."""
+    cache = tmp_path_factory.mktemp("accumulated")
+
+    def make(name: str, count: int = 1, **changes: Any) -> Batch | Crops:
+        recipe: Recipe = replace(recipe_for(name, "tiny"), **changes)
+        data = items(Dataset(tiny).clips("val"), recipe, create(name), False, 0, cache)
+        return next(iter(loader(data, [list(range(count))])))
+
+    return make
+
+
+def frames_of(batch: Batch | Crops) -> list[Frame]:
+    return batch.frames if isinstance(batch, Batch) else [batch.frame]
+
+
+def test_log_kernel_is_that_of_scipy():
+    """The response to an impulse, away from truncation, and to a picture."""
+    kernel = laplacian_of_gaussian().numpy()
+    impulse = np.zeros((31, 31))
+    impulse[15, 15] = 1
+    scipy = gaussian_laplace(impulse, 1.5, truncate=8)[8:23, 8:23]
+    np.testing.assert_allclose(kernel, scipy, atol=2e-4 * np.abs(scipy).max() + 1e-4)
+    assert abs(kernel.sum()) < 1e-12
+    picture = np.random.default_rng(0).uniform(0, 1, (40, 50))
+    ours = RAELoss(RAE()).edges(torch.from_numpy(picture).float().expand(2, 3, 40, 50))[1, 2].numpy()
+    np.testing.assert_allclose(ours, gaussian_laplace(picture, 1.5, mode="nearest"), atol=2e-3)
+
+
+def test_rae_loss_by_hand(batch_of, monkeypatch):
+    """With a network that returns known outputs, every term follows from §4.4's equations, in numpy and float64."""
+    batch = batch_of("rae", 2)
+    rae = RAE()
+    loss = RAELoss(rae)
+    outputs, targets = [], []
+    generator = torch.Generator().manual_seed(0)
+    genuine = RAE.predict
+
+    def predict(frame, state):
+        _, state = genuine(rae, frame, state)
+        outputs.append(torch.rand(frame.albedo.shape, generator=generator))
+        reference = (frame.direct_reference + frame.indirect_reference).mean(dim=1) / frame.albedo.clamp(min=0.01)
+        targets.append((state.scale.exposure() * reference) ** 0.2)
+        return outputs[-1], state
+
+    monkeypatch.setattr(rae, "predict", predict)
+    value, parts = loss(batch)
+    weights = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)
+    p, t = (torch.stack(x).double().numpy() for x in (outputs, targets))
+    error = p - t
+    spatial = sum(w * np.abs(e).mean() for w, e in zip(weights, error, strict=True))
+    log = np.array([[[gaussian_laplace(c, 1.5, mode="nearest") for c in item] for item in e] for e in error])
+    gradient = sum(w * np.abs(e).mean() for w, e in zip(weights, log, strict=True))
+    dp, dt = np.diff(p, axis=0), np.diff(t, axis=0)
+    temporal = sum(w * np.abs(a - b).mean() for w, a, b in zip(weights[1:], dp, dt, strict=True))
+    assert parts["spatial"].item() == pytest.approx(spatial, rel=1e-5)
+    assert parts["gradient"].item() == pytest.approx(gradient, rel=5e-3)
+    assert parts["temporal"].item() == pytest.approx(temporal, rel=1e-5)
+    assert value.item() == pytest.approx(0.8 * spatial + 0.1 * gradient + 0.1 * temporal, rel=1e-3)
+
+
+def test_gains_scale_input_and_target_alike(batch_of):
+    frame = batch_of("rae").frames[0]
+    rae = RAE()
+    _, state = rae.predict(frame, None)
+    tinted = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
+    reference = frame.reference_irradiance("total")
+    plain, gained = (rae.compress(reference, state.scale, f) for f in (frame, tinted))
+    torch.testing.assert_close(gained, plain * torch.tensor([0.5, 1.0, 2.0])[None, :, None, None] ** 0.2)
+
+
+def test_smape_is_that_of_the_paper_and_of_torchmetrics():
+    rng = np.random.default_rng(0)
+    r, t = (rng.lognormal(0, 2, (2, 3, 8, 9)) for _ in range(2))
+    by_hand = sum(abs(a - b) / (abs(a) + abs(b) + 0.01) for a, b in zip(r.flat, t.flat, strict=True)) / r.size
+    r, t = torch.from_numpy(r), torch.from_numpy(t)
+    assert smape(r, t, 0.01).item() == pytest.approx(by_hand, rel=1e-12)
+    assert smape(r, t, 0.0).item() == pytest.approx(symmetric_mean_absolute_percentage_error(r, t).item() / 2, rel=1e-9)
+    assert smape(r, r, 0.01) == 0
+
+
+def test_smape_loss_compares_radiance_as_exposed(batch_of, monkeypatch):
+    """Emission included, albedo multiplied back, at the exposure of the accumulated frames."""
+    batch = batch_of("wskp6", 3)
+    wskp = WSKP()
+    guess = torch.rand_like(batch.irradiance)
+    monkeypatch.setattr(wskp, "filter", lambda frame, irradiance, scale: (guess, None))
+    value, _ = SMAPELoss(wskp)(batch)
+    frame, exposure = batch.frame, 0.18 * np.exp(-batch.scale.log_luminance.value.numpy())[:, None, None, None]
+    albedo = np.maximum(frame.albedo.numpy(), 0.01)
+    output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
+    reference = exposure * (frame.direct_reference + frame.indirect_reference + frame.emission[:, None]).mean(1).numpy()
+    expected = (abs(output - reference) / (abs(output) + abs(reference) + 0.01)).mean()
+    assert value.item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_ntd_loss_by_hand(batch_of, monkeypatch):
+    """Eq. 5 and 6 with known outputs, in numpy and float64: masks of this frame and the two before it."""
+    batch = batch_of("ntd", 2, length=5)
+    ntd = NTD()
+    outputs, scales = [], []
+    generator = torch.Generator().manual_seed(0)
+    genuine = NTD.predict
+
+    def predict(frame, state):
+        _, state = genuine(ntd, frame, state)
+        outputs.append(torch.rand(frame.albedo.shape, generator=generator))
+        scales.append(state.scale.exposure())
+        return outputs[-1], state
+
+    monkeypatch.setattr(ntd, "predict", predict)
+    for index, frame in enumerate(batch.frames):  # more to see than what happens to be disoccluded in a crop
+        frame.channels["dual_motion"] = frame.motion.clone()
+        frame.channels["dual_motion"][:, 0, index : index + 4] += 0.1
+    loss = NTDLoss(ntd)
+    _, parts = loss(batch)
+
+    references = [f.indirect_reference.mean(dim=1) / f.albedo.clamp(min=0.01) for f in batch.frames]
+    compressed = [
+        [np.log1p((e * image).double().numpy()) for e, image in zip(scales, images, strict=True)]
+        for images in (outputs, references)
+    ]
+    error = np.array(compressed[0]) - np.array(compressed[1])
+    assert parts["spatial"].item() == pytest.approx(np.abs(error).mean(), rel=1e-5)
+    assert parts["temporal"].item() == pytest.approx(np.abs(np.diff(error, axis=0)).mean(), rel=1e-5)
+    m = np.array([(f.dual_motion != f.motion).any(dim=1, keepdim=True).numpy() for f in batch.frames])
+    weight = [1.0 * m[i] + 0.8 * m[i - 1 if i >= 1 else i] + 0.6 * m[i - 2 if i >= 2 else i] for i in range(5)]
+    assert parts["occlusion"].item() == pytest.approx((np.abs(error) * np.array(weight)).mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize("progress, training, counts", [(0.49, True, False), (0.5, True, True), (0.0, False, True)])
+def test_occlusion_loss_joins_in_the_second_half(batch_of, progress, training, counts):
+    loss = NTDLoss(NTD()).train(training)
+    loss.progress = progress
+    batch = batch_of("ntd", length=3)
+    for frame in batch.frames:
+        frame.channels["dual_motion"] = frame.motion + 0.1
+    value, parts = loss(batch)
+    expected = parts["spatial"] + parts["temporal"] + counts * parts["occlusion"]
+    assert parts["occlusion"] > 0 and value.item() == pytest.approx(expected.item(), rel=1e-6)
+    ablated = NTDLoss(loss.denoiser, NTDTerms(occlusion=0.0)).eval()
+    assert ablated(batch)[0].item() == pytest.approx((parts["spatial"] + parts["temporal"]).item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+@pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
+def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level):
+    torch.manual_seed(0)
+    batch = batch_of(name)
+    for frame in frames_of(batch):
+        frame.channels.update(
+            {light: torch.full_like(frame.channels[light], level) for light in LIGHT if light in frame.channels}
+        )
+    if isinstance(batch, Crops):
+        batch.irradiance.fill_(level)
+    loss = loss_for(create(name), recipe_for(name, "tiny"))
+    value, _ = loss(batch)
+    value.backward()
+    assert torch.isfinite(value)
+    gradients = [p.grad for p in loss.parameters()]
+    assert all(g is not None and torch.isfinite(g).all() for g in gradients)
+
+
+@pytest.mark.parametrize("gain", [0.0, 2.0])
+def test_gradients_are_finite_at_extreme_gains(batch_of, gain):
+    batch = batch_of("rae")
+    for frame in batch.frames:
+        frame.gain.fill_(gain)
+    loss = RAELoss(RAE())
+    value, _ = loss(batch)
+    value.backward()
+    assert torch.isfinite(value) and all(torch.isfinite(p.grad).all() for p in loss.parameters())
+
+
+@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+def test_equal_images_have_no_loss_and_finite_gradients(batch_of, name, monkeypatch):
+    batch, denoiser = batch_of(name, crop=16), create(name)
+    leaves: list[Tensor] = []
+
+    def known(truth: Tensor) -> Tensor:
+        leaves.append(truth.clone().requires_grad_())
+        return leaves[-1]
+
+    if isinstance(denoiser, WSKP):
+        signal = denoiser.signal
+        monkeypatch.setattr(denoiser, "filter", lambda f, *_: (known(f.reference_irradiance(signal)), None))
+    else:
+        genuine = denoiser.predict
+
+        def predict(frame, state):
+            _, state = genuine(frame, state)
+            truth = frame.reference_irradiance(denoiser.signal)
+            return known(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth), state
+
+        monkeypatch.setattr(denoiser, "predict", predict)
+    value, _ = loss_for(denoiser, recipe_for(name, "tiny"))(batch)
+    value.backward()
+    assert value.item() == pytest.approx(0, abs=1e-6)
+    assert all(leaf.grad is not None and torch.isfinite(leaf.grad).all() for leaf in leaves)
+
+
+def in_double(batch: Batch) -> Batch:
+    for frame in batch.frames:
+        frame.channels.update({name: tensor.double() for name, tensor in frame.channels.items()})
+        frame.gain.data = frame.gain.double()
+        for name in ("direct", "indirect"):
+            if name in frame.channels:
+                frame.channels[name] = frame.channels[name] + 0.1  # off zero, where the slope of a power is infinite
+    return batch
+
+
+@pytest.mark.parametrize("name", ["rae", "ntd"])
+def test_gradients_through_time_equal_finite_differences(batch_of, name):
+    """The last frame's output, in float64, along a random change of the first frame's light."""
+    batch = in_double(batch_of(name, crop=16))
+    torch.manual_seed(2)
+    denoiser = create(name).double()
+    denoiser.precision = torch.float64
+    first, light = batch.frames[0], batch.frames[0].indirect
+    direction = torch.randn_like(light) * light
+
+    def value(step: float | Tensor) -> Tensor:
+        first.channels["indirect"] = light + step * direction
+        state = None
+        for frame in batch.frames:
+            output, state = denoiser.predict(frame, state)
+        return (output - 0.3).abs().mean()
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(value(step), step)
+    with torch.no_grad():
+        # Small, lest it crosses kinks of the rectifiers and of the absolute values; float64 leaves six digits.
+        difference = (value(1e-7) - value(-1e-7)) / 2e-7
+    assert abs(slope) > 1e-7
+    assert slope.item() == pytest.approx(difference.item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+@torch.no_grad()
+def test_sequences_of_a_batch_do_not_leak_into_one_another(batch_of, name):
+    """What the first one shows is the same, bit for bit, whatever the light of the second."""
+    torch.manual_seed(0)
+    denoiser, batch = create(name), batch_of(name, 2, crop=16)
+
+    def outputs() -> list[Tensor]:
+        if isinstance(batch, Crops):
+            return [denoiser.filter(batch.frame, batch.irradiance, batch.scale)[0]]
+        shown, state = [], None
+        for frame in batch.frames[:3]:
+            output, state = denoiser.predict(frame, state)
+            shown.append(output)
+        return shown
+
+    before = outputs()
+    if isinstance(batch, Crops):
+        batch.irradiance[1] *= 3
+    for frame in frames_of(batch):
+        for light in {"direct", "indirect"} & frame.channels.keys():
+            frame.channels[light][1] *= 3
+    for a, b in zip(before, outputs(), strict=True):
+        assert torch.equal(a[0], b[0]) and not torch.equal(a[1], b[1])
+
+
+def test_every_recipe_has_a_loss_for_its_terms():
+    for name in TRAINABLE:
+        recipe = recipe_for(name, "paper")
+        assert isinstance(loss_for(create(name), recipe), LOSSES[type(recipe.loss)])
+    assert RAELoss(RAE()).terms == RAETerms()
+
+
+STEPS, RATE = 40, 2e-3
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+def test_every_network_learns_one_batch(batch_of, name):
+    """Forty steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.
+
+    The other networks begin as filters already, so that less is left to learn.
+    """
+    torch.manual_seed(0)
+    loss: NetworkLoss = loss_for(create(name), recipe_for(name, "tiny")).train()
+    loss.progress = 1.0
+    optimiser = torch.optim.Adam(loss.parameters(), RATE)
+    batch = batch_of(name, 1, crop=24)
+    values = []
+    for _ in range(STEPS):
+        value, _ = loss(batch)
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+        values.append(value.item())
+    assert np.mean(values[-5:]) < (0.5 if name == "rae" else 0.8) * values[0]

@@ -1,0 +1,62 @@
+"""The paper recipes are the papers', and profiles change nothing but the budget."""
+
+from dataclasses import fields, replace
+
+import pytest
+
+from datasets.sequences import Augmentation
+from errors import BadInput
+from models import DENOISERS, create
+from train.recipes import DEFAULT, RECIPES, TRAINABLE, NTDTerms, RAETerms, SMAPETerms, recipe_for
+
+BUDGET = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
+
+
+def test_rae_is_the_paper_s():
+    recipe = recipe_for("rae", "paper")
+    assert recipe.learning_rate(0) == pytest.approx(1e-4)
+    assert recipe.learning_rate(5) == pytest.approx(1e-4 * 10**0.5)
+    assert recipe.learning_rate(10) == pytest.approx(1e-3)
+    assert recipe.learning_rate(40) == pytest.approx(5e-4)
+    assert (recipe.batch, recipe.length, recipe.crop, recipe.epochs, recipe.betas) == (4, 7, 128, 500, (0.9, 0.99))
+    assert recipe.augmentation == Augmentation(True, True, True, True)
+    assert recipe.loss == RAETerms(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
+
+
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])
+def test_wskp_is_the_paper_s(name):
+    recipe = recipe_for(name, "paper")
+    assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (64, 128, (80, 20), 500, 1e-3)
+    assert recipe.loss == SMAPETerms(0.01) and recipe.augmentation == Augmentation()
+    assert recipe.learning_rate(0) == recipe.learning_rate(499) == 1e-3
+
+
+@pytest.mark.parametrize("name, occlusion", [("ntd-a", 0.0), ("ntd-b", 0.0), ("ntd", 1.0)])
+def test_ntd_is_the_paper_s(name, occlusion):
+    recipe = recipe_for(name, "paper")
+    assert (recipe.batch, recipe.length, recipe.trained, recipe.crop, recipe.epochs) == (1, 10, 9, None, 200)
+    assert recipe.loss == NTDTerms(1.0, 1.0, occlusion, (1.0, 0.8, 0.6), 0.5)
+    assert recipe.learning_rate(0) == recipe.learning_rate(199) == 1e-4 and recipe.augmentation == Augmentation()
+
+
+def test_profiles_scale_the_budget_never_the_method():
+    for (name, profile), recipe in RECIPES.items():
+        paper = RECIPES[name, "paper"]
+        same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in BUDGET}
+        assert replace(paper, **same) == recipe, (name, profile)
+        assert (
+            recipe.epochs <= paper.epochs and recipe.crop and recipe.crop <= (paper.crop or recipe.crop)
+        ) or paper == recipe
+
+
+def test_every_network_has_recipes_for_all_profiles():
+    networks = {name for name in DENOISERS if create(name).parameter_count()}
+    assert set(TRAINABLE) == networks and set(DEFAULT) <= networks
+    assert set(RECIPES) == {(name, profile) for name in networks for profile in ("tiny", "quick", "release", "paper")}
+
+
+def test_unknown_names_are_told_apart():
+    with pytest.raises(BadInput, match="'accumulated' is not a network"):
+        recipe_for("accumulated", "tiny")
+    with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
+        recipe_for("rae", "huge")

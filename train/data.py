@@ -1,0 +1,66 @@
+"""What a training step reads: batches of sequences or of accumulated crops, and who reads which."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch.utils.data import DataLoader
+
+from datasets.clip import Clip
+from datasets.sequences import Augmentation, TrainingSequences, collate
+from models.denoiser import Denoiser
+from models.wskp import KernelPredictor
+from train.accumulated import AccumulatedCrops, Crops
+from train.recipes import Recipe
+
+Items = TrainingSequences | AccumulatedCrops
+
+PIXELS_AT_ONCE = 2**20  # of all frames of the sequences that are in memory together, if not told otherwise
+
+
+def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool, seed: int, cache: Path) -> Items:
+    """The training or validation items of `clips`. Accumulated frames are kept in the folder `cache`.
+
+    Raises BadInput where a clip is too short or too small for the recipe.
+    """
+    if recipe.crops:
+        assert isinstance(denoiser, KernelPredictor)
+        return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
+    length = recipe.trained or recipe.length if training else recipe.length
+    augmentation = recipe.augmentation if training else Augmentation()
+    return TrainingSequences(clips, denoiser.reads, length, recipe.crop, augmentation, seed)
+
+
+def most_at_once(recipe: Recipe, clip: Clip) -> int:
+    """How many items of a batch are in memory together by default."""
+    area = recipe.crop**2 if recipe.crop else clip.height * clip.width
+    return max(1, min(recipe.batch, PIXELS_AT_ONCE // (recipe.length * area)))
+
+
+def split(count: int, most: int) -> list[range]:
+    """The fewest equal parts of range(count) of at most `most`: equal, so that a mean of their means is the mean."""
+    parts = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= most)
+    return [range(i, i + count // parts) for i in range(0, count, count // parts)]
+
+
+def micro_batches(first: int, stop: int, batch: int, at_once: int, rank: int = 0, world: int = 1) -> list[list[int]]:
+    """Item numbers of the steps `first` to `stop`: `batch` a step, of which process `rank` of `world` takes its share.
+
+    A share comes in parts of at most `at_once`, the same number of parts every step.
+    """
+    share = batch // world
+    start = [step * batch + rank * share for step in range(first, stop)]
+    return [[s + i for i in part] for s in start for part in split(share, at_once)]
+
+
+def loader(items: Items, batches: Sequence[list[int]], workers: int = 0) -> DataLoader[Any]:
+    """Yields Batches or Crops with these item numbers."""
+    together: Any = Crops.stack if isinstance(items, AccumulatedCrops) else collate
+    return DataLoader(items, batch_sampler=batches, collate_fn=together, num_workers=workers)
+
+
+def in_parts(loader: DataLoader[Any], parts: int) -> Iterator[Iterator[Any]]:
+    """The batches of a loader, `parts` at a time, each loaded when it is asked for."""
+    iterator = iter(loader)
+    for _ in range(len(loader) // parts):
+        yield (next(iterator) for _ in range(parts))
