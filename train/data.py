@@ -1,9 +1,11 @@
 """What a training step reads: batches of sequences or of accumulated crops, and who reads which."""
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch.utils.data import DataLoader
 
 from datasets.clip import Clip
@@ -60,7 +62,16 @@ def loader(items: Items, batches: Sequence[list[int]], workers: int = 0) -> Data
 
 
 def in_parts(loader: DataLoader[Any], parts: int) -> Iterator[Iterator[Any]]:
-    """The batches of a loader, `parts` at a time, each loaded when it is asked for."""
-    iterator = iter(loader)
+    """The batches of a loader, `parts` at a time."""
+    batches = ahead(iter(loader))
     for _ in range(len(loader) // parts):
-        yield (next(iterator) for _ in range(parts))
+        yield (next(batches) for _ in range(parts))
+
+
+def ahead(batches: Iterator[Any]) -> Iterator[Any]:
+    """The same batches, each loaded by a thread while the one before it is worked on."""
+    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as thread:
+        loading = thread.submit(next, batches, None)
+        while (batch := loading.result()) is not None:
+            loading = thread.submit(next, batches, None)
+            yield batch

@@ -112,7 +112,7 @@ WSKP_BUDGETS = {
 }
 NTD_BUDGETS = {
     "tiny": {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
-    "quick": {"epochs": 100, "crop": 64},
+    "quick": {"epochs": 60, "crop": 128},
     "release": {"epochs": 100, "crop": 128},
     "paper": {},
 }
