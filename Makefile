@@ -11,7 +11,7 @@ SOURCES := onespp.py errors.py scenes render datasets models train eval tests
 LLVM := libllvm19
 
 .NOTPARALLEL:
-.PHONY: all setup dataset train eval bench test test-all lint clean
+.PHONY: all setup dataset train eval bench stress report test test-all lint clean
 
 all: dataset train eval
 
@@ -39,7 +39,14 @@ eval: $(READY)
 	$(BIN)/onespp eval --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
 
 bench: $(READY)
-	$(BIN)/onespp bench denoisers --runs $(RUNS)
+	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
+	$(BIN)/onespp bench scaling --runs $(RUNS)
+
+stress: $(READY)
+	$(BIN)/onespp stress --long --profile $(PROFILE) --runs $(RUNS)
+
+report: $(READY)
+	$(BIN)/onespp report --runs $(RUNS)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q

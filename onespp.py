@@ -1,6 +1,7 @@
 """The command line: one subcommand a step, each thin."""
 
 import errno
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -127,11 +128,23 @@ def train(
         train_network(task_for(name, data_folder(data, profile), runs, profile, seed, precision, at_once))
 
 
-def evaluate(names: Names = (), data: Data = None, runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
-    """Judge denoisers (all that can run, unless some are named) on the test clips: table, pictures, results.json."""
+def evaluate(
+    names: Names = (),
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    processes: int = os.cpu_count() or 1,
+) -> None:
+    """Judge denoisers (all that can run, unless some are named) on the test clips: table, pictures, results.json.
+
+    What has been judged before, of the same clips, weights and code, is kept.
+
+    Args:
+        processes: at most so many clips side by side; by default one on each processor.
+    """
     from eval.harness import evaluate as run
 
-    run(data_folder(data, profile), runs, profile, list(names) or None)
+    run(data_folder(data, profile), runs, profile, list(names) or None, processes)
 
 
 def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
@@ -179,35 +192,43 @@ def figure(
 
 
 def bench(
-    what: Annotated[Literal["denoisers", "fusion", "loading", "rendering", "training"], tyro.conf.Positional],
+    what: Annotated[
+        Literal["denoisers", "scaling", "fusion", "loading", "rendering", "training"], tyro.conf.Positional
+    ],
     names: Names = (),
     data: Data = None,
     runs: Runs = Path("runs"),
     profile: Profile = "quick",
-    size: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH...")] = ("1280x720",),
-    threads: int | None = None,
+    size: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH...")] = (),
+    threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (),
 ) -> None:
     """Measure this machine.
 
     denoisers: milliseconds and memory a frame, next to OIDN, of all denoisers unless some are named.
+    scaling: milliseconds against pixels, of all denoisers unless some are named; a plot.
     fusion: weight-shared kernel fusion, next to the straightforward way.
     loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
     rendering: seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
     training: milliseconds a step of rae, wskp6 and ntd, unless some are named, and where they go.
 
     Args:
-        size: of images, for the denoisers (one or several) and fusion (the first).
-        threads: for the denoisers and fusion; by default as many as PyTorch takes.
+        size: of images, by default 1280x720 (several for denoisers), and 320x180 to 1920x1080 for scaling.
+        threads: for denoisers (several; by default 1 and all that PyTorch takes), scaling and fusion (by default all).
     """
+    usual = ("1280x720",)
     if what == "denoisers":
         from eval.bench import bench_denoisers
 
-        print(bench_denoisers(runs, names, size, threads))
+        print(bench_denoisers(runs, names, size or usual, threads))
+    elif what == "scaling":
+        from eval.scaling import bench_scaling
+
+        print(bench_scaling(runs, names, size, threads))
     elif what == "fusion":
         from eval.bench import parse_size
         from eval.fusion_bench import bench_fusion
 
-        print(bench_fusion(runs, *parse_size(size[0]), threads))
+        print(bench_fusion(runs, *parse_size((size or usual)[0]), max(threads, default=None)))
     elif what == "rendering":
         from datasets.bench import bench_rendering
 
@@ -267,6 +288,37 @@ def ablate(
     print(run(what, data_folder(data, profile), runs, profile, seeds))
 
 
+def trade(
+    names: Names = (),
+    data: Data = None,
+    runs: Runs = Path("runs"),
+    profile: Profile = "quick",
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "1280x720",
+    threads: int | None = None,
+    spp: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 2, 4, 8, 16, 32, 64, 128, 256),
+) -> None:
+    """Weigh quality against milliseconds: denoisers, precisions, sizes of networks, samples a pixel; tables and plots.
+
+    Judges denoisers (all that can run, unless some are named) on the test clips, for RUNS/report/trade.json and the
+    report. Times are those that `onespp bench denoisers` has measured.
+
+    Args:
+        size: of images, for the times.
+        threads: for the times; by default the most that the bench has measured.
+        spp: samples a pixel to feed, rising.
+    """
+    from eval.trade import trade as run
+
+    print(run(data_folder(data, profile), runs, profile, names, size, threads, spp))
+
+
+def papers(runs: Runs = Path("runs")) -> None:
+    """Print what the papers measured on their scenes beside what was measured here, and which orders hold here too."""
+    from eval.against_papers import against_papers
+
+    print(against_papers(runs))
+
+
 def report(
     runs: Runs = Path("runs"),
     megabytes: Annotated[float, tyro.conf.arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
@@ -288,7 +340,7 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
 COMMANDS = {
     **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
     **{"show": show, "figure": figure, "exr": exr, "bench": bench, "stress": stress, "ablate": ablate},
-    **{"report": report},
+    **{"trade": trade, "papers": papers, "report": report},
 }
 
 

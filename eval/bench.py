@@ -19,8 +19,9 @@ from tqdm import tqdm
 from datasets.files import write_json
 from datasets.frame import Frame
 from errors import BadInput
+from eval.sizes import SIZES, WHOLE, create_any
 from eval.synthetic import synthetic_frame
-from models import DENOISERS, compiled, create, unavailable
+from models import DENOISERS, compiled, unavailable
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN
 from models.taa import unwrapped
@@ -41,34 +42,37 @@ class Variant(NamedTuple):
     name: str
     dtype: str = "float32"
     compiled: bool = True
+    device: str = "cpu"
 
     def build(self) -> Denoiser:
         """As it stands before `prepare`."""
         torch.manual_seed(0)
-        return OIDN("fast") if self.label == FAST else create(self.name)
+        return OIDN("fast") if self.label == FAST else create_any(self.name)
 
     def way(self) -> AbstractContextManager[None]:
         return nullcontext() if self.compiled else compiled.disabled()
 
 
-def variants(names: Sequence[str]) -> list[Variant]:
-    """All ways to run the named denoisers, or else all that can run here.
+def variants(names: Sequence[str], device: str = "cpu") -> list[Variant]:
+    """All ways to run the named denoisers, or else all that can run here, networks of other sizes too.
 
     Raises BadInput where a named one is unknown or cannot run.
     """
     found = []
     baseline = () if unavailable(BASELINE) else (BASELINE,)
-    for name in dict.fromkeys((*names, *baseline)) if names else DENOISERS:
-        if reason := unavailable(name):
+    everyone = (*DENOISERS, *(size for size in SIZES if size != WHOLE))
+    for name in dict.fromkeys((*names, *baseline)) if names else everyone:
+        if name not in SIZES and (reason := unavailable(name)):
             if names:
                 raise BadInput(reason)
             print(f"{name}: skipped, {reason}")
             continue
-        denoiser = create(name)
+        denoiser = create_any(name)
         dtypes = [dtype for dtype, precision in PRECISIONS.items() if precision not in denoiser.refuses]
-        found += [Variant(name, name, dtype) for dtype in dtypes]
-        found += [Variant(f"{name} (PyTorch)", name, compiled=False)] if name in COMPILED else []
-        found += [Variant(FAST, name)] if name == BASELINE else []
+        found += [Variant(name, name, dtype, device=device) for dtype in dtypes]
+        if name in COMPILED and device == "cpu":  # elsewhere PyTorch is the only way
+            found.append(Variant(f"{name} (PyTorch)", name, compiled=False))
+        found += [Variant(FAST, name, device=device)] if name == BASELINE else []
     return found
 
 
@@ -86,34 +90,47 @@ class Contender:
     def of(variant: Variant) -> "Contender":
         denoiser = variant.build()
         denoiser.prepare(PRECISIONS[variant.dtype])
+        denoiser.to(variant.device)
         contender = Contender(variant, denoiser)
         if network := network_of(denoiser):
-            network.register_forward_pre_hook(lambda *_: contender.in_network.append(-time.perf_counter()))
+            network.register_forward_pre_hook(lambda *_: contender.in_network.append(-contender.clock()))
             network.register_forward_hook(lambda *_: contender.leave_network())
         return contender
 
+    def clock(self) -> float:
+        """Seconds, once the device has done all that it was given."""
+        if self.variant.device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
     def leave_network(self) -> None:
-        self.in_network[-1] += time.perf_counter()
+        self.in_network[-1] += self.clock()
 
     def step(self, frame: Frame) -> None:
+        """Denoise the next frame, which is on the device already."""
         with self.variant.way():
-            start = time.perf_counter()
+            start = self.clock()
             _, self.state = self.denoiser(frame, self.state)
-            self.seconds.append(time.perf_counter() - start)
+            self.seconds.append(self.clock() - start)
 
     def play(self, frames: Iterable[Frame]) -> None:
         for frame in frames:
             self.step(frame)
 
-    def row(self, frames: Sequence[Frame], threads: int) -> dict[str, Any]:
-        """A row of results.json, in its form. `frames` are the sequence's first two."""
-        height, width = frames[0].size
+    def timing(self, size: Size) -> dict[str, Any]:
+        """What was measured, in the form of results.json."""
+        height, width = size
         p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds[WARM_UP:], (10, 50, 90)))
-        with multiprocessing.get_context("spawn").Pool(1) as process:
-            peak = process.apply(peak_memory, (self.variant, frames, threads))
         return {
             **{"denoiser": self.variant.label, "height": height, "width": width, "dtype": self.variant.dtype},
-            **{"ms_median": median, "ms_p10": p10, "ms_p90": p90, "peak_mb": peak},
+            **{"threads": torch.get_num_threads(), "ms_median": median, "ms_p10": p10, "ms_p90": p90},
+        }
+
+    def row(self, size: Size, peak: float | None) -> dict[str, Any]:
+        """A row of results.json. `peak` is the memory it takes, in MB."""
+        return {
+            **self.timing(size),
+            "peak_mb": peak,
             "parameters": None if isinstance(unwrapped(self.denoiser), OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
         }
@@ -164,16 +181,31 @@ def growth_mb(run: Callable[[], object]) -> float | None:
 
 @torch.inference_mode()
 def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> float | None:
-    """What two frames of a sequence add to resident memory, in MB, in a fresh process.
+    """What two frames of a sequence add to resident memory, or to the GPU's, in MB, in a fresh process.
 
     That is the state and everything in between, without the frame itself, the weights and the code.
     """
     torch.set_num_threads(threads)
     contender = Contender.of(variant)
-    contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE))  # loads and compiles
+    contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE).to(variant.device))  # loads and compiles
     contender.state = None
-    frames = [frame.map(torch.clone) for frame in frames]  # what comes from another process is resident once touched
+    # What comes from another process is resident once touched.
+    frames = [frame.map(torch.clone).to(variant.device) for frame in frames]
+    if variant.device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        contender.play(frames)
+        return (torch.cuda.max_memory_allocated() - before) / 1e6
     return growth_mb(lambda: contender.play(frames))
+
+
+def peaks(variants: Sequence[Variant], size: Size, threads: int) -> list[float | None]:
+    """The peak memory of each variant, in MB, each in a process of its own."""
+    frames, found = [synthetic_frame(index, *size) for index in range(2)], []
+    for variant in tqdm(variants, "memory", leave=False):
+        with multiprocessing.get_context("spawn").Pool(1) as process:
+            found.append(process.apply(peak_memory, (variant, frames, threads)))
+    return found
 
 
 def status_mb(field: str) -> float:
@@ -198,7 +230,7 @@ def race(variants: Sequence[Variant], size: Size) -> list[Contender]:
     contenders = [Contender.of(variant) for variant in variants]
     with tqdm(total=(WARM_UP + REPEATS) * len(contenders), desc=f"{size[1]}x{size[0]}", leave=False) as progress:
         for index in range(WARM_UP + REPEATS):
-            frame = synthetic_frame(index, *size)
+            frame = synthetic_frame(index, *size).to(variants[0].device)
             for contender in contenders:
                 progress.set_postfix_str(contender.variant.label)
                 contender.step(frame)
@@ -214,28 +246,56 @@ def parse_size(text: str) -> Size:
     return int(match[2]), int(match[1])
 
 
-def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], threads: int | None = None) -> str:
+def thread_counts(threads: Sequence[int]) -> list[int]:
+    """The numbers of threads to measure with, rising; by default one, and as many as PyTorch takes.
+
+    Raises BadInput for a number that cannot work.
+    """
+    for count in threads:
+        if count < 1:
+            raise BadInput(f"{count} threads cannot work: name at least 1")
+    return sorted({*threads} or {1, torch.get_num_threads()})
+
+
+def devices() -> list[str]:
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], threads: Sequence[int] = ()) -> str:
     """Measure the named denoisers, or all that can run here: a table, and RUNS/bench/results.json.
 
-    `threads` are by default as many as PyTorch has. Raises BadInput for unknown names, sizes and numbers of threads.
+    On the CPU with each number of `threads`; then, where there is one, on the GPU, into RUNS/bench/results-cuda.json.
+    Raises BadInput for unknown names, sizes and numbers of threads.
     """
-    if threads is not None and threads < 1:
-        raise BadInput(f"{threads} threads cannot work: name at least 1")
-    pixels, entrants = [parse_size(size) for size in sizes], variants(names)
-    threads = threads or torch.get_num_threads()
+    pixels, counts = [parse_size(size) for size in sizes], thread_counts(threads)
+    entrants = {device: variants(names, device) for device in devices()}
     folder = runs / "bench"
     folder.mkdir(parents=True, exist_ok=True)
+    tables = []
+    for device, ours in entrants.items():
+        rows, lines = measure(ours, pixels, counts if device == "cpu" else counts[-1:])
+        # The number at the top is of the last rows of each size.
+        facts = {"schema": 1, "device": device, "threads": counts[-1]}
+        write_json(folder / ("results.json" if device == "cpu" else f"results-{device}.json"), facts | {"rows": rows})
+        tables.append(f"{device}\n{tabulate(lines, 'keys', floatfmt='.3g', missingval='-')}")
+    return "\n\n".join(tables)
+
+
+def measure(
+    entrants: Sequence[Variant], sizes: Sequence[Size], counts: Sequence[int]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The rows of results.json and of the table: size by size, and in each by rising numbers of threads."""
     rows: list[dict[str, Any]] = []
     lines: list[dict[str, Any]] = []
-    with thread_count(threads):
-        for size in pixels:
-            contenders = race(entrants, size)
-            frames = [synthetic_frame(index, *size) for index in range(2)]
-            measured = [c.row(frames, threads) for c in tqdm(contenders, "memory", leave=False)]
+    for size in sizes:
+        memory = peaks(entrants, size, counts[-1])
+        for count in counts:
+            with thread_count(count):
+                contenders = race(entrants, size)
+                measured = [c.row(size, peak) for c, peak in zip(contenders, memory, strict=True)]
             lines += table_lines(contenders, measured)
             rows += measured
-    write_json(folder / "results.json", {"schema": 1, "device": "cpu", "threads": threads, "rows": rows})
-    return tabulate(lines, "keys", floatfmt=".3g", missingval="-")
+    return rows, lines
 
 
 def table_lines(contenders: Sequence[Contender], rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -245,6 +305,7 @@ def table_lines(contenders: Sequence[Contender], rows: Sequence[dict[str, Any]])
         share = contender.share_of_network()
         yield {
             **{"denoiser": row["denoiser"], "size": f"{row['width']}x{row['height']}", "dtype": row["dtype"]},
+            "threads": row["threads"],
             **{"ms": row["ms_median"], "p10": row["ms_p10"], "p90": row["ms_p90"]},
             "times oidn": row["ms_median"] / baseline if baseline else None,
             "prediction": f"{share:.0%}" if share is not None else None,

@@ -1,58 +1,52 @@
 """The evaluation harness: every denoiser over every test clip, one streaming pass a clip."""
 
+import math
+import multiprocessing
+import platform
+import re
+import shutil
+import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from signal import SIG_IGN, SIGINT
+from signal import signal as on_signal
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tabulate import tabulate
-from torch import Tensor
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.display import display, noise_of_halves, psnr
-from datasets.files import write_json
-from datasets.frame import Frame, Signal, read_frame, to_tensor
-from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics
+from datasets.display import display
+from datasets.frame import Signal, read_frame, to_tensor
+from eval.bench import thread_count
 from eval.pictures import save_strip
+from eval.results import (
+    SIGNALS,
+    ClipResults,
+    Result,
+    by_clip,
+    folder_of,
+    folders_of,
+    is_finished,
+    label,
+    load_picture,
+    load_result,
+    save_picture,
+    write_results,
+)
+from eval.table import table
+from eval.tracks import Track, Truth
 from models import DENOISERS, create, load, unavailable, without_taa
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser
+from models.operators import finite
 from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
 
 METRICS_CHANNELS = ("motion", "dual_motion")
 BASELINES = ("noisy", "accumulated")
-SIGNALS: tuple[Signal, ...] = ("total", "indirect")
-
-
-@dataclass
-class Track:
-    """One denoiser's way through one clip."""
-
-    name: str
-    denoiser: Denoiser
-    weights: str | None
-    state: State | None = None
-    temporal: TemporalMetrics = field(default_factory=TemporalMetrics)
-    per_frame: list[dict[str, float | None]] = field(default_factory=list)
-    nonfinite: int = 0
-
-    def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
-        """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
-        output, self.state = self.denoiser(frame, self.state)
-        self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
-        metrics = image_metrics(output, halves, exposure) | self.temporal.update(output, halves, exposure, still)
-        metrics["disocclusion_l1"] = disocclusion_l1(output, halves, exposure, frame.motion, frame.dual_motion)
-        self.per_frame.append(metrics)
-        return output
-
-    def means(self) -> dict[str, float | None]:
-        """Arithmetic means over the frames where a metric is defined, None where it never is."""
-        columns = {name: [row[name] for row in self.per_frame if row[name] is not None] for name in self.per_frame[0]}
-        return {name: float(np.mean(values)) if values else None for name, values in columns.items()}  # type: ignore[arg-type]
+PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
+SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
 
 
 def is_still(clip: Clip) -> bool:
@@ -63,28 +57,83 @@ def is_still(clip: Clip) -> bool:
 
 
 def signals_of(tracks: Sequence[Track]) -> list[Signal]:
-    present = {track.denoiser.signal for track in tracks}
+    present = {track.signal for track in tracks}
     return [signal for signal in SIGNALS if signal in present]
 
 
 @torch.no_grad()
-def evaluate_clip(clip: Clip, tracks: Sequence[Track], pictures: Mapping[Signal, Path]) -> None:
-    """Run all denoisers over a clip frame by frame, in memory that does not grow with its length.
+def play(clip: Clip, tracks: Sequence[Track | Truth], folders: Sequence[Path], quiet: bool = False) -> None:
+    """Run all tracks over a clip frame by frame, in memory that does not grow with its length; keep what they show.
 
-    Each is held to the reference of the signal that it returns; a picture of one frame is saved for each signal.
+    Each is held to the reference of the signal that it returns.
     """
-    channels = sorted({name for track in tracks for name in track.denoiser.reads} | set(METRICS_CHANNELS))
-    still, shown = is_still(clip), clip.frames * 3 // 4
-    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
+    reads = {name for track in tracks if isinstance(track, Track) for name in track.denoiser.reads}
+    channels, still = sorted(reads | set(METRICS_CHANNELS)), is_still(clip)
+    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
-        for signal in signals_of(tracks):
-            halves = to_tensor(clip.reference(index, signal), has_halves=True)[0]
-            ours = [track for track in tracks if track.denoiser.signal == signal]
-            outputs = {track.name: track.step(frame, halves, clip.exposure, still) for track in ours}
-            if index == shown:
-                errors = {track.name: track.per_frame[-1] for track in ours}
-                images = outputs | {"reference": halves.mean(dim=0, keepdim=True)}
-                save_strip(pictures[signal], images, errors, clip.exposure)
+        halves = {
+            signal: to_tensor(clip.reference(index, signal), has_halves=True)[0]
+            for signal in {track.signal for track in tracks}
+        }
+        for track, folder in zip(tracks, folders, strict=True):
+            output = track.step(frame, halves[track.signal], clip.exposure, still)
+            image = display(finite(output), clip.exposure)[0].permute(1, 2, 0)
+            save_picture(folder, index, image.numpy())
+
+
+def everyone_on(clip: Clip, tracks: Sequence[Track], runs: Path) -> list[tuple[Track | Truth, Path, bool]]:
+    """All tracks and their references, with their folders and whether their results are there."""
+    everyone: list[Track | Truth] = [*tracks, *(Truth(signal) for signal in signals_of(tracks))]
+    folders = [folder_of(runs, clip.scene, clip.name, track.name, track.signal) for track in everyone]
+    return [
+        (track, folder, is_finished(folder, track.key(clip))) for track, folder in zip(everyone, folders, strict=True)
+    ]
+
+
+def evaluate_clip(clip: Clip, tracks: Sequence[Track], runs: Path, quiet: bool = False) -> list[Result]:
+    """The results of all tracks and of their references: evaluated, where they are not there yet, and kept."""
+    everyone = everyone_on(clip, tracks, runs)
+    waiting = [(track, folder) for track, folder, finished in everyone if not finished]
+    for _, folder in waiting:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    if waiting:
+        threads = max(1, min(torch.get_num_threads(), clip.height * clip.width // PIXELS_A_THREAD))
+        with thread_count(threads):
+            play(clip, [track for track, _ in waiting], [folder for _, folder in waiting], quiet)
+    for track, _ in waiting:
+        track.result(clip).save(runs)
+    return [load_result(folder) for _, folder, _ in everyone]
+
+
+class Job(NamedTuple):
+    """A clip for a process of its own."""
+
+    path: Path
+    names: list[str]
+    runs: Path
+    profile: str
+    threads: int
+
+    def run(self) -> None:
+        torch.set_num_threads(self.threads)
+        denoisers = ready_denoisers(self.names, self.runs, self.profile)
+        evaluate_clip(Clip(self.path), tracks_of(denoisers), self.runs, quiet=True)
+
+
+def start_worker() -> None:
+    """An interrupt is the parent's to act on. Ended then, a worker must not leave behind a lock that bars share."""
+    on_signal(SIGINT, SIG_IGN)
+    tqdm.set_lock(threading.RLock())
+
+
+def evaluate_in_processes(clips: Sequence[Clip], names: list[str], runs: Path, profile: str, processes: int) -> None:
+    """Evaluate clips side by side."""
+    threads = max(1, torch.get_num_threads() // processes)
+    jobs = [Job(clip.path, names, runs, profile, threads) for clip in clips]
+    with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
+        for _ in tqdm(pool.imap_unordered(Job.run, jobs, chunksize=1), "clips", len(jobs), unit="clip"):
+            pass
 
 
 def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[str, tuple[Denoiser, str | None]]:
@@ -121,81 +170,43 @@ def tracks_of(denoisers: Mapping[str, tuple[Denoiser, str | None]]) -> list[Trac
     return tracks
 
 
-def evaluate(data: Path, runs: Path, profile: str, names: list[str] | None = None) -> dict[str, Any]:
-    """Evaluate over the test clips; writes `RUNS/eval/results.json` and a PNG strip a clip and signal.
+def device() -> str:
+    """What computes, in words."""
+    try:
+        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        model = None
+    return f"cpu, {model[1] if model else platform.machine()}, {torch.get_num_threads()} threads"
 
-    Returns the results. Strips of indirect light have names that end in `-indirect`.
+
+def save_strips(runs: Path, results: ClipResults) -> None:
+    """A PNG of a frame late in the clip as each denoiser shows it."""
+    index = len(results.reference.frames) * 3 // 4
+    images = {name: load_picture(folder, index) for name, folder in folders_of(runs, results).items()}
+    errors = {result.denoiser: result.frames[index] for result in results.tracks}
+    name = label(f"{results.scene}-{results.clip}", results.signal)
+    save_strip(runs / "eval" / f"{name}.png", images, errors)
+
+
+def evaluate(
+    data: Path, runs: Path, profile: str, names: list[str] | None = None, processes: int = 1
+) -> dict[str, Any]:
+    """Evaluate over the test clips; writes RUNS/eval: results.json, frames.csv, and a PNG strip a clip and signal.
+
+    What has been evaluated before, of the same clips, weights and code, is kept. Returns the results. Strips of
+    indirect light have names that end in `-indirect`.
     """
-    dataset = Dataset(data)
-    clips = dataset.clips("test")
+    clips = Dataset(data).clips("test")
     denoisers = ready_denoisers(names, runs, profile)
-    folder = runs / "eval"
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for clip in clips:
-        tracks, label = tracks_of(denoisers), f"{clip.scene}-{clip.name}"
-        evaluate_clip(clip, tracks, {"total": folder / f"{label}.png", "indirect": folder / f"{label}-indirect.png"})
-        rows += [
-            {
-                "denoiser": track.name,
-                "signal": track.denoiser.signal,
-                "weights": track.weights,
-                "scene": clip.scene,
-                "clip": clip.name,
-                "frames": clip.frames,
-                "metrics": track.means(),
-                "nonfinite": track.nonfinite,
-            }
-            for track in tracks
-        ]
-    results = {
-        "schema": 1,
-        "dataset": str(data),
-        "device": f"cpu, {torch.get_num_threads()} threads",
-        "versions": {package: version(package) for package in ("onespp", "torch", "torchmetrics")},
-        "rows": rows,
-    }
-    write_json(folder / "results.json", results)
-    print(table(results, clips))
-    return results
-
-
-COLUMNS = {
-    "rmse": ("RMSE", "{:.4f}"),
-    "psnr": ("PSNR dB", "{:.2f}"),
-    "ssim": ("SSIM", "{:.4f}"),
-    "flip": ("FLIP", "{:.4f}"),
-    "mse_unbiased": ("unbiased MSE", "{:.2e}"),
-    "temporal_error": ("temporal error", "{:.4f}"),
-    "disocclusion_l1": ("disocclusion L1", "{:.4f}"),
-}
-
-
-def noise_floor(clip: Clip, signal: Signal) -> float:
-    """Mean squared error as displayed of the reference itself, of all light or of indirect light alone."""
-    if signal == "total":
-        return float(clip.facts["floor_mse"])
-    halves = (display(clip.reference(index, signal), clip.exposure) for index in range(clip.frames))
-    return float(np.mean([noise_of_halves(a, b) for a, b in halves]))
-
-
-def cells(metrics: Mapping[str, float | None]) -> list[str]:
-    values = [(metrics.get(key), form) for key, (_, form) in COLUMNS.items()]
-    return [form.format(value) if value is not None else "-" for value, form in values]
-
-
-def table(results: dict[str, Any], clips: list[Clip]) -> str:
-    """Results for people: a row a clip, signal and denoiser, and the reference's own noise floor below each signal."""
-    lines = []
-    for clip in clips:
-        label = f"{clip.scene}/{clip.name}"
-        for signal in SIGNALS:
-            key = clip.scene, clip.name, signal
-            rows = [row for row in results["rows"] if (row["scene"], row["clip"], row["signal"]) == key]
-            lines += [[label, row["denoiser"], signal, *cells(row["metrics"]), row["nonfinite"]] for row in rows]
-            if rows:
-                mse, temporal = noise_floor(clip, signal), rows[0]["metrics"]["temporal_error_floor"]
-                floor = {"rmse": mse**0.5, "psnr": psnr(mse), "temporal_error": temporal}
-                lines.append([label, "(noise floor)", signal, *cells(floor), ""])
-    head = ["clip", "denoiser", "signal", *(title for title, _ in COLUMNS.values()), "non-finite"]
-    return tabulate(lines, head, disable_numparse=True)
+    (runs / "eval").mkdir(parents=True, exist_ok=True)
+    waiting = [c for c in clips if not all(done for _, _, done in everyone_on(c, tracks_of(denoisers), runs))]
+    pixels = sum(clip.frames * clip.height * clip.width for clip in waiting)
+    processes = min(processes, len(waiting), math.ceil(pixels / SMALLEST_SHARE))
+    if processes > 1:
+        evaluate_in_processes(waiting, list(denoisers), runs, profile, processes)
+    results = [result for clip in clips for result in evaluate_clip(clip, tracks_of(denoisers), runs)]
+    content = write_results(runs, data, device(), results, {name: weights for name, (_, weights) in denoisers.items()})
+    for group in by_clip(results):
+        save_strips(runs, group)
+    print(table(list(by_clip(results))))
+    return content

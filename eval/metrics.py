@@ -1,33 +1,55 @@
 """Metrics of one frame (design §7): display space, linear radiance, and change over time."""
 
 import math
+from typing import NamedTuple
 
 import flip_evaluator
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from datasets.display import display, psnr
 from datasets.frame import disoccluded
+from eval.ssim import ssim
 from models.operators import finite, luminance
 
 EPSILON = 0.01
-SSIM_WINDOW = 11
 
 
-def ssim(x: Tensor, reference: Tensor) -> float | None:
-    """Mean over valid 11 x 11 Gaussian windows and RGB (Wang et al. 2004); None for images smaller than a window."""
-    if min(x.shape[-2:]) < SSIM_WINDOW:
-        return None
-    _, full = structural_similarity_index_measure(x, reference, sigma=1.5, data_range=1.0, return_full_image=True)
-    margin = SSIM_WINDOW // 2  # torchmetrics averages over windows that reach into its padding too
-    return float(full[..., margin:-margin, margin:-margin].mean())
+class Metric(NamedTuple):
+    """How a metric is shown."""
+
+    title: str
+    form: str  # of its numbers
+    more_is_better: bool = False
+
+
+METRICS = {
+    "rmse": Metric("RMSE", "{:.4f}"),
+    "psnr": Metric("PSNR dB", "{:.2f}", more_is_better=True),
+    "ssim": Metric("SSIM", "{:.4f}", more_is_better=True),
+    "flip": Metric("FLIP", "{:.4f}"),
+    "mse_unbiased": Metric("unbiased MSE", "{:.2e}"),
+    "temporal_error": Metric("temporal error", "{:.4f}"),
+    "disocclusion_l1": Metric("disocclusion L1", "{:.4f}"),
+    "flicker": Metric("flicker", "{:.4f}"),
+    "l1": Metric("L1", "{:.4f}"),
+    "mse": Metric("MSE", "{:.2e}"),
+    "smape": Metric("SMAPE", "{:.4f}"),
+    "rel_mse": Metric("relative MSE", "{:.2e}"),
+}
+
+
+def flip_map(x: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float32]:
+    """LDR-FLIP (H, W) in [0, 1] (Andersson et al. 2020) of displayed images (H, W, 3), at its default distance."""
+    images = (np.ascontiguousarray(image, dtype=np.float32) for image in (reference, x))
+    errors: NDArray[np.float32] = flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0]
+    return errors.reshape(x.shape[:2])
 
 
 def flip(x: Tensor, reference: Tensor) -> float:
-    """Mean LDR-FLIP (Andersson et al. 2020) of displayed images (1, 3, H, W), at its default viewing distance."""
-    images = (image[0].permute(1, 2, 0).float().contiguous().numpy() for image in (reference, x))
-    _, mean, _ = flip_evaluator.evaluate(*images, "LDR")
-    return float(mean)
+    """Mean LDR-FLIP of displayed images (1, 3, H, W)."""
+    return float(flip_map(*(image[0].permute(1, 2, 0).numpy() for image in (x, reference))).mean(dtype=np.float64))
 
 
 def image_metrics(output: Tensor, halves: Tensor, exposure: float) -> dict[str, float | None]:

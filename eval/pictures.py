@@ -3,26 +3,25 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-from datasets.display import display
 from datasets.figure import DPI, plt, save_figure
-from models.operators import finite
 
 CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor
 
 
 def save_strip(
-    path: Path, images: Mapping[str, Tensor], errors: Mapping[str, Mapping[str, float | None]], exposure: float
+    path: Path, images: Mapping[str, NDArray[np.uint8]], errors: Mapping[str, Mapping[str, float | None]]
 ) -> None:
-    """A PNG of radiance images (1, 3, H, W) side by side as displayed, each captioned with its RMSE and SSIM."""
-    height, width = next(iter(images.values())).shape[-2:]
+    """A PNG of images (H, W, 3) side by side, each captioned with its RMSE and SSIM."""
+    height, width = next(iter(images.values())).shape[:2]
     zoom = max(1, -(-SMALLEST_PANEL // max(height, width))) / DPI
     size = (len(images) * width * zoom, height * zoom + CAPTION)
     figure, axes = plt.subplots(1, len(images), figsize=size, dpi=DPI, squeeze=False)
     for axis, (name, image) in zip(axes[0], images.items(), strict=True):
-        axis.imshow(display(finite(image), exposure)[0].permute(1, 2, 0).numpy(), interpolation="nearest")
+        axis.imshow(image, interpolation="nearest")
         axis.set_axis_off()
         measured = {key: errors.get(name, {}).get(key) for key in ("rmse", "ssim")}
         caption = [f"{key.upper()} {value:.3f}" for key, value in measured.items() if value is not None]

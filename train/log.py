@@ -4,7 +4,7 @@ import csv
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import matplotlib.image
 import numpy as np
@@ -50,15 +50,15 @@ class Log:
     def rewrite(self) -> None:
         if self.rows:
             with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
-                writer = csv.DictWriter(file, self.columns(self.rows[0]))
+                writer = self.writer(file, self.rows[0])
                 writer.writeheader()
-                writer.writerows(self.rows)
+                writer.writerows({**row, "step": int(row["step"])} for row in self.rows)
         else:
             self.path.unlink(missing_ok=True)
 
     @staticmethod
-    def columns(row: Mapping[str, float]) -> list[str]:
-        return [name for name in row if name != "val_loss"] + ["val_loss"]
+    def writer(file: TextIO, row: Row) -> "csv.DictWriter[str]":
+        return csv.DictWriter(file, [*(name for name in row if name != "val_loss"), "val_loss"], lineterminator="\n")
 
     def step(self, row: Row) -> None:
         self.pending.append(row)
@@ -72,7 +72,7 @@ class Log:
         self.pending = []
         new = not self.path.exists()
         with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, self.columns(row))
+            writer = self.writer(file, row)
             if new:
                 writer.writeheader()
             writer.writerow(row)

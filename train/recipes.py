@@ -100,7 +100,7 @@ PAPER = {
 # What a profile changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
 RAE_BUDGETS = {
     "tiny": {"epochs": 15, "crop": 32, "ramp": 1},
-    "quick": {"epochs": 60, "crop": 64, "ramp": 2},
+    "quick": {"epochs": 50, "crop": 64, "ramp": 2},
     "release": {"epochs": 100, "ramp": 4},
     "paper": {},
 }
@@ -112,7 +112,7 @@ WSKP_BUDGETS = {
 }
 NTD_BUDGETS = {
     "tiny": {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
-    "quick": {"epochs": 60, "crop": 128},
+    "quick": {"epochs": 40, "crop": 128},
     "release": {"epochs": 100, "crop": 128},
     "paper": {},
 }

@@ -5,11 +5,13 @@ import io
 import json
 import math
 
+import flip_evaluator
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import peak_signal_noise_ratio as torch_psnr
+from torchmetrics.functional.image import structural_similarity_index_measure as torch_ssim
 
 import models
 from datasets.clip import Dataset
@@ -54,6 +56,11 @@ def test_metrics_equal_independent_implementations():
     }
     _, full = structural_similarity(b, a, full=True, **options)
     assert metrics["ssim"] == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
+    both = (torch.from_numpy(image.transpose(2, 0, 1).copy())[None] for image in (a, b))
+    _, full = torch_ssim(*both, sigma=1.5, data_range=1.0, return_full_image=True)
+    assert metrics["ssim"] == pytest.approx(full[..., 5:-5, 5:-5].mean().item(), abs=1e-9)
+    _, mean, _ = flip_evaluator.evaluate(b.astype(np.float32), a.astype(np.float32), "LDR")
+    assert metrics["flip"] == pytest.approx(mean, abs=1e-6)
     x, r = exposure * output.double().numpy(), exposure * halves[:1].double().numpy()
     assert metrics["smape"] == pytest.approx((np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)).mean())
     assert metrics["rel_mse"] == pytest.approx(((x - r) ** 2 / (r**2 + 0.01)).mean())
@@ -70,6 +77,21 @@ def test_identical_constant_and_one_pixel_images():
     assert same["flip"] == 0 and opposite["flip"] > 0.9
     one = image_metrics(torch.full((1, 3, 1, 1), 0.5), torch.full((2, 3, 1, 1), 0.25), 1.0)
     assert one["ssim"] is None and one["mse_unbiased"] == pytest.approx(0.0625)
+    assert 0 < one["flip"] < 1 and one["rel_mse"] == pytest.approx(0.0625 / 0.0725)
+    assert one["smape"] == pytest.approx(0.25 / 0.76) and one["l1"] == pytest.approx(one["rmse"])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (10, 11), (11, 11), (13, 17)])
+@pytest.mark.parametrize(("level", "other"), [(0.0, 0.0), (0.0, 6e4), (6e4, 1e-7), (0.3, 0.5)])
+def test_metrics_are_finite_and_bounded_on_constant_images(size, level, other):
+    found = image_metrics(torch.full((1, 3, *size), level), torch.full((2, 3, *size), other), 1.0)
+    assert (found["ssim"] is None) == (min(size) < 11)
+    assert all(math.isfinite(value) for value in found.values() if value is not None)
+    for metric in ("mse", "rmse", "l1", "flip", "smape"):
+        assert 0 <= found[metric] <= 1
+    if found["ssim"] is not None:  # of constants, its first factor alone
+        a, b = (min(1.0, value) ** (1 / 2.2) for value in (level, other))
+        assert found["ssim"] == pytest.approx((2 * a * b + 1e-4) / (a**2 + b**2 + 1e-4), abs=1e-6)
 
 
 def test_non_finite_output_counts_as_zero():
@@ -189,7 +211,7 @@ def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
     assert row["metrics"]["rmse"] == pytest.approx(np.mean(rmse), rel=1e-4)
     lines = (line.split() for line in (runs / "table.txt").read_text().splitlines())
     (printed,) = (line for line in lines if line[:4] == [f"{clip.scene}/{clip.name}", "(noise", "floor)", signal])
-    assert float(printed[4]) == pytest.approx(np.sqrt(np.mean(floor)), abs=1e-4)
+    assert float(printed[4]) == pytest.approx(np.mean(np.sqrt(floor)), abs=1e-4)
 
 
 def test_pictures_show_every_denoiser_and_the_reference(runs):

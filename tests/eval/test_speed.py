@@ -8,13 +8,16 @@ import torch
 
 import eval.bench
 from errors import BadInput
-from eval.bench import Variant, bench_denoisers, macs_per_pixel, parse_size, variants
+from eval.bench import Variant, bench_denoisers, macs_per_pixel, parse_size, race, thread_counts, variants
+from eval.scaling import exponent, in_use
+from eval.sizes import SIZES
 from eval.synthetic import synthetic_frame
+from models import create, inference_precision
 from onespp import main
 
 KEYS = {
     *("denoiser", "height", "width", "dtype", "ms_median", "ms_p10", "ms_p90", "peak_mb"),
-    *("parameters", "macs_per_pixel"),
+    *("parameters", "macs_per_pixel", "threads"),
 }
 
 
@@ -36,6 +39,46 @@ def test_results_have_the_agreed_form(tmp_path, monkeypatch, capsys):
         counts = {"rae": 1_951_935, "oidn": None, "oidn (fast)": None}  # the baseline comes by itself
         assert row["parameters"] == counts.get(row["denoiser"], 0)
         assert (row["macs_per_pixel"] is None) == (row["denoiser"] != "rae")
+
+
+def test_every_number_of_threads_has_its_rows(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(eval.bench, "REPEATS", 1)
+    monkeypatch.setattr(eval.bench, "race", lambda ours, size: seen.append(torch.get_num_threads()) or race(ours, size))
+    monkeypatch.setattr(eval.bench, "peaks", lambda entrants, size, threads: [None] * len(entrants))
+    bench_denoisers(tmp_path, ["noisy"], ["8x8", "16x8"], threads=[2, 1])
+    results = json.loads((tmp_path / "bench" / "results.json").read_text())
+    noisy = [(row["width"], row["threads"]) for row in results["rows"] if row["denoiser"] == "noisy"]
+    assert noisy == [(8, 1), (8, 2), (16, 1), (16, 2)] and seen == [1, 2, 1, 2]
+    assert results["threads"] == 2  # that of the last rows of a size
+    assert thread_counts(()) == sorted({1, torch.get_num_threads()})
+
+
+def test_scaling(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(eval.bench, "REPEATS", 1)
+    main(["bench", "scaling", "noisy", "wskp3", "--size", "32x32", "16x16", "--threads", "1", "--runs", str(tmp_path)])
+    assert "16x16" in capsys.readouterr().out
+    rows = json.loads((tmp_path / "bench" / "scaling.json").read_text())["rows"]
+    names = ["noisy", "wskp3", *([] if eval.bench.unavailable("oidn") else ["oidn", "oidn (fast)"])]
+    assert [(row["denoiser"], row["width"]) for row in rows] == [(name, w) for w in (16, 32) for name in names]
+    used = str(inference_precision(create("wskp3"))).removeprefix("torch.")
+    assert [row["dtype"] for row in rows if row["denoiser"] == "wskp3"] == [used, used]
+    assert (tmp_path / "report" / "figures" / "scaling.png").exists()
+
+
+def test_exponent_of_known_laws():
+    pixels = [100, 400, 900, 1600]
+    assert exponent(pixels, [3.0 * n for n in pixels]) == pytest.approx(1)
+    assert exponent(pixels, [0.1 * n**1.5 for n in pixels]) == pytest.approx(1.5)
+    assert exponent(pixels[:1], [1.0]) is None
+
+
+def test_networks_of_other_sizes_are_measured_too():
+    names = {variant.name for variant in variants(())}
+    assert {"wskp6-1w", "wskp6-5w"} <= names and "wskp6-6w" not in names  # that is wskp6
+    assert macs_per_pixel(Variant("wskp6-1w", "wskp6-1w")) < macs_per_pixel(Variant("wskp6", "wskp6"))
+    assert not any(variant.name in SIZES for variant in in_use(()))
+    assert not [v for v in variants(["svgf"], "cuda") if not v.compiled]
 
 
 def test_multiply_accumulates_by_hand():
@@ -77,7 +120,7 @@ def test_what_is_measured(monkeypatch, capsys):
         with pytest.raises(BadInput, match="not a size"):
             bench_denoisers(None, ["noisy"], [text])
     with pytest.raises(BadInput, match="at least 1"):
-        bench_denoisers(None, ["noisy"], ["4x4"], threads=0)
+        bench_denoisers(None, ["noisy"], ["4x4"], threads=[0])
     assert parse_size("1280x720") == (720, 1280)
 
 

@@ -20,10 +20,10 @@ from datasets.clip import Dataset
 from datasets.display import display, psnr
 from datasets.frame import Cameras, Frame, read_frame
 from errors import BadInput
+from eval.trial import CONVEX, ROUNDING, range_violation
 
 NAMES = [name for name in (*models.DENOISERS, "noisy+taa", "wskp3+taa") if not models.unavailable(name)]
 THREADS = torch.get_num_threads()
-CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")
 ALL = tuple(models.channels_read())
 
 
@@ -127,15 +127,7 @@ def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channe
 @SETTINGS
 @given(frames=frames_strategy())
 def test_convex_filters_stay_in_range(denoisers, name, frames):
-    low, high = np.inf, 0.0
-    for frame, output in zip(frames, run(denoisers[name], frames), strict=True):
-        parts = [frame.irradiance("total")]
-        if name == "svgf":  # filters direct and indirect on their own, so their ranges add up
-            parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
-        low = min(low, sum(float(part.min()) for part in parts)) if name != "svgf" else 0.0
-        high = max(high, sum(float(part.max()) for part in parts))
-        filtered = (output - frame.emission) / frame.divisor
-        assert filtered.min() >= low * (1 - 1e-4) and filtered.max() <= high * (1 + 1e-4)
+    assert range_violation(name, frames, run(denoisers[name], frames)) <= ROUNDING
 
 
 # --- Long sequences ---------------------------------------------------------------------------------------------------

@@ -1,0 +1,165 @@
+"""`onespp papers`: measured values beside those that the papers print for their own scenes, and whose order holds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+from tabulate import tabulate
+
+from datasets.files import read_json
+from eval.ablation_results import Run, over_seeds
+from eval.metrics import METRICS, Metric
+from eval.papers import TABLES, PaperTable
+from train.recipes import TRAINABLE
+
+TITLES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {
+    "ms": Metric("ms", "{:.4g}"),
+    "prediction": Metric("prediction ms", "{:.4g}"),
+    "reconstruction": Metric("reconstruction ms", "{:.4g}"),
+}
+SIZE = (720, 1280)  # of WSKP's Table 3
+HEADER = """\
+The papers' values are of their own scenes and machines, mean over scenes; ours are means over the test clips here.
+Only orders can be compared. Plots are lost in the texts of the papers, so what is only drawn there is not here."""
+
+Value = Callable[[str, str], float | None]  # of a denoiser and a metric
+
+
+@dataclass
+class Measured:
+    """What one command left, and the command."""
+
+    value: Value
+    command: str
+
+
+def from_evaluation(runs: Path, signal: str) -> Measured:
+    """Means over the clips of RUNS/eval/results.json where a metric is defined."""
+    path = runs / "eval" / "results.json"
+    rows = read_json(path, ("rows",))["rows"] if path.exists() else []
+
+    def value(denoiser: str, metric: str) -> float | None:
+        values = [r["metrics"][metric] for r in rows if (r["denoiser"], r["signal"]) == (denoiser, signal)]
+        defined = [value for value in values if value is not None]
+        return fmean(defined) if defined else None
+
+    return Measured(value, f"onespp eval --runs {runs}")
+
+
+def from_bench(runs: Path) -> Measured:
+    """Medians of RUNS/bench/results.json at the paper's size, each denoiser's in its fastest precision."""
+    path = runs / "bench" / "results.json"
+    rows = read_json(path, ("rows",))["rows"] if path.exists() else []
+
+    def value(denoiser: str, metric: str) -> float | None:
+        ours = [r["ms_median"] for r in rows if (r["denoiser"], r["height"], r["width"]) == (denoiser, *SIZE)]
+        return min(ours, default=None) if metric == "ms" else None
+
+    return Measured(value, f"onespp bench denoisers --size {SIZE[1]}x{SIZE[0]} --runs {runs}")
+
+
+def from_ablation(runs: Path) -> Measured:
+    """Means over clips and seeds of RUNS/ablation/wskp-repvgg/results.json."""
+    path = runs / "ablation" / "wskp-repvgg" / "results.json"
+    rows = [Run(**row) for row in read_json(path, ("rows",))["rows"]] if path.exists() else []
+
+    def value(variant: str, metric: str) -> float | None:
+        found = over_seeds(rows, variant, metric)
+        return found[0] if found else None
+
+    return Measured(value, f"onespp ablate wskp-repvgg --runs {runs}")
+
+
+def measured(table: PaperTable, runs: Path) -> Measured:
+    """Raises BadInput where the file is damaged."""
+    if table.where == "bench":
+        return from_bench(runs)
+    return from_ablation(runs) if table.where == "ablation" else from_evaluation(runs, table.signal)
+
+
+def compared(table: PaperTable) -> list[str]:
+    """The metrics that ours can be compared by."""
+    return [metric for metric in table.metrics if metric not in table.incomparable]
+
+
+def is_better(metric: str, a: float, b: float) -> bool:
+    return a > b if TITLES[metric].more_is_better else a < b
+
+
+class Order(NamedTuple):
+    """A pair of methods that a paper orders by a metric, in the mean and in `scenes` of all its scenes."""
+
+    metric: str
+    better: str
+    worse: str
+    scenes: int
+
+
+def orders(table: PaperTable) -> list[Order]:
+    """The order of every two methods that are here too, by every metric that can be compared."""
+    found = []
+    for metric in compared(table):
+        for a, b in combinations(table.ours, 2):
+            better, worse = (a, b) if is_better(metric, table.mean(a, metric), table.mean(b, metric)) else (b, a)
+            pairs = zip(table.values[better][metric], table.values[worse][metric], strict=True)
+            scenes = sum(is_better(metric, x, y) for x, y in pairs)
+            if 2 * scenes > len(table.scenes):  # else the paper has them on a par
+                found.append(Order(metric, better, worse, scenes))
+    return found
+
+
+def verdict(table: PaperTable, order: Order, value: Value) -> str:
+    """Whether an order holds here, with the numbers."""
+    names = [table.ours[method] for method in (order.better, order.worse)]
+    ours = [value(name, order.metric) for name in names]
+    better, worse = ours
+    title, form = TITLES[order.metric].title, TITLES[order.metric].form
+    text = f"{title}: {names[0]} before {names[1]} (there in {order.scenes} of {len(table.scenes)})"
+    if better is None or worse is None:
+        return f"{text}: not measured"
+    here = f"{form.format(better)} against {form.format(worse)}"
+    return f"{text}: {'holds' if is_better(order.metric, better, worse) else 'DOES NOT HOLD'}, {here}"
+
+
+def line(table: PaperTable, method: str, value: Value) -> dict[str, str]:
+    """A method, and of each metric the paper's mean and, where they can be compared, ours."""
+    name = table.ours.get(method)
+    cells = {"there": method, "here": name or "-"}
+    for metric in table.metrics:
+        title, form = TITLES[metric].title, TITLES[metric].form
+        theirs = table.mean(method, metric) if metric in table.values[method] else None
+        cells[f"{title}, paper"] = "-" if theirs is None else form.format(theirs)
+        if metric in compared(table):
+            ours = value(name, metric) if name else None
+            cells[f"{title}, ours"] = "-" if ours is None else form.format(ours)
+    return cells
+
+
+def section(table: PaperTable, runs: Path) -> str:
+    """One table of a paper: methods, means there and here, notes, orders."""
+    here = measured(table, runs)
+    lines = [line(table, method, here.value) for method in table.values]
+    parts = [table.source, f"scenes: {', '.join(table.scenes)}", tabulate(lines, "keys", disable_numparse=True)]
+    parts += [f"  * {note}" for note in table.notes]
+    parts += [f"  - {verdict(table, order, here.value)}" for order in orders(table)]
+    if absent := missing(table, here.value):
+        untrained = [name for name in absent if name in TRAINABLE and table.where == "eval"]
+        first = f"`onespp train {' '.join(untrained)} --runs {runs}` and " if untrained else ""
+        parts.append(f"  not measured: {', '.join(absent)}; get them with {first}`{here.command}`")
+    return "\n".join(parts)
+
+
+def missing(table: PaperTable, value: Value) -> list[str]:
+    """Denoisers here without any number of the table."""
+    return [name for name in table.ours.values() if all(value(name, metric) is None for metric in compared(table))]
+
+
+def against_papers(runs: Path) -> str:
+    """All tables, as text. What has not been measured is "-", with the command to measure it.
+
+    Raises BadInput where a file of results is damaged.
+    """
+    return "\n\n".join([HEADER, *(section(table, runs) for table in TABLES)])

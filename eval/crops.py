@@ -1,0 +1,34 @@
+"""Where the most comes into view at once: the places to look at for what denoisers make of disocclusions."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+SMALLEST, SHARE = 16, 4  # px; a crop is a quarter of the image's shorter side, but no less than this
+
+
+class Window(NamedTuple):
+    """A square of an image, in pixels, and how many of them it is about."""
+
+    x: int
+    y: int
+    size: int
+    pixels: int
+
+
+def densest_window(mask: Tensor) -> Window | None:
+    """Of the windows that hold most pixels of a mask (H, W), one with them in its middle, as far as the border lets it.
+
+    None for an empty mask.
+    """
+    height, width = mask.shape
+    size = min(height, width, max(SMALLEST, min(height, width) // SHARE))
+    best = int(avg_pool2d(mask[None, None].double(), size, stride=1).argmax())
+    y, x = divmod(best, width - size + 1)
+    inside = mask[y : y + size, x : x + size].nonzero().double()
+    if not len(inside):
+        return None
+    dy, dx = (inside.mean(dim=0) - (size - 1) / 2).round().int().tolist()
+    y, x = min(max(0, y + dy), height - size), min(max(0, x + dx), width - size)
+    return Window(x, y, size, int(mask[y : y + size, x : x + size].sum()))

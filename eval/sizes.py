@@ -1,0 +1,30 @@
+"""Networks in other sizes than the named denoisers have: WSKP that fuses one window to six."""
+
+from collections.abc import Callable
+from functools import partial
+
+from eval.variants import label_of
+from models import create
+from models.denoiser import Denoiser
+from models.fusion import WINDOWS
+from models.wskp import WSKP
+
+# wskp6-2w fuses windows of 3 and 5 pixels, and so on. They are trained by `onespp ablate wskp-windows`.
+SIZES = {f"wskp6-{count}w": WINDOWS[:count] for count in range(1, len(WINDOWS) + 1)}
+WHOLE = f"wskp6-{len(WINDOWS)}w"  # is wskp6, in another training
+
+
+def create_any(name: str) -> Denoiser:
+    """A denoiser or one of SIZES, with fresh weights. Raises BadInput for an unknown name."""
+    makers: dict[str, Callable[[], Denoiser]] = {size: partial(WSKP, windows=SIZES[size]) for size in SIZES}
+    return makers[name]() if name in makers else create(name)
+
+
+def timed_as(name: str) -> str:
+    """What the bench calls a network of the same speed."""
+    return "wskp6" if name == WHOLE else name
+
+
+def trained_as(name: str) -> str:
+    """What the ablation calls one of SIZES, and its weights."""
+    return label_of(SIZES[name])

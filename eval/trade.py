@@ -1,0 +1,147 @@
+"""`onespp trade`: what quality costs in milliseconds, by denoiser, precision, size of network and samples a pixel."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tabulate import tabulate
+
+from datasets.clip import Clip, Dataset
+from datasets.figure import save_figure
+from datasets.files import write_json
+from errors import BadInput
+from eval.bench import parse_size
+from eval.candidates import Candidate, Times, candidates, ready
+from eval.harness import device, evaluate_clip, tracks_of
+from eval.metrics import METRICS
+from eval.pareto import Point, dominators
+from eval.results import Result, Values, mean_floor, means, versions
+from eval.spp import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table, shown
+from eval.table import LEGEND, NEAR, cell
+from eval.trade_plots import draw_front, draw_samples
+
+TRADED = ("psnr", "ssim", "rmse")
+
+Means = dict[tuple[str, str], Values]  # of (signal, label), over clips; of the reference the noise floors
+
+
+def clips_of(dataset: Dataset) -> list[Clip]:
+    """The test clips of one sample a pixel: those of more show the same frames again."""
+    clips = [clip for clip in dataset.clips("test") if clip.facts["noisy_spp"] == 1]
+    if not clips:
+        raise BadInput(f"{dataset.path} has no test clips of 1 spp: render another with `onespp dataset`")
+    return clips
+
+
+def over_clips(results: Sequence[Result]) -> Means:
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for result in results:
+        groups.setdefault((result.signal, result.denoiser), []).append(result)
+    return {
+        key: (mean_floor if group[0].floor else means)([result.metrics for result in group])
+        for key, group in groups.items()
+    }
+
+
+def rows_of(chosen: Sequence[Candidate], quality: Means, times: Times) -> list[dict[str, Any]]:
+    """A row a candidate and signal: milliseconds, metrics, and by whom it is beaten in each metric."""
+    by_label = {candidate.label: candidate for candidate in chosen}
+    rows: list[dict[str, Any]] = []
+    for (signal, label), metrics in quality.items():
+        if label in by_label:
+            candidate = by_label[label]
+            rows.append(
+                {
+                    **candidate.facts(),
+                    **{"signal": signal, "epochs": candidate.epochs(), "ms": times.of(candidate), "metrics": metrics},
+                }
+            )
+    for signal in {row["signal"] for row in rows}:
+        ours = [row for row in rows if row["signal"] == signal]
+        beaten = {metric: beaten_by(ours, metric) for metric in TRADED}
+        for row in ours:
+            row["dominated_by"] = {metric: by.get(row["label"]) for metric, by in beaten.items()}
+    return rows
+
+
+def beaten_by(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str, str | None]:
+    """For each label that has a time and a value: the best that is no slower and better, None on the front."""
+    points = {
+        row["label"]: Point(row["ms"], shown(metric, row["metrics"][metric]))
+        for row in rows
+        if row["ms"] is not None and row["metrics"][metric] is not None
+    }
+    return dominators(points, METRICS[metric].more_is_better)
+
+
+def front_table(rows: Sequence[Mapping[str, Any]], quality: Means) -> str:
+    """Fastest first. Who is on the front of a metric is marked so, who is not is told by whom it is beaten."""
+
+    def standing(row: Mapping[str, Any], metric: str) -> str:
+        if row["ms"] is None or row["metrics"][metric] is None:
+            return "-"
+        return row["dominated_by"][metric] or "front"
+
+    lines = []
+    for row in sorted(rows, key=lambda row: (row["ms"] is None, row["ms"])):
+        floors = quality.get((row["signal"], "reference"), {})
+        lines.append(
+            {
+                **{"denoiser": row["denoiser"], "dtype": row["dtype"], "epochs": row["epochs"] or "-"},
+                "ms": "-" if row["ms"] is None else f"{row['ms']:.4g}",
+                **{METRICS[m].title: cell(m, row["metrics"][m], floors.get(m)) for m in TRADED},
+                **{f"beaten in {METRICS[m].title.split()[0]} by": standing(row, m) for m in TRADED},
+            }
+        )
+    text = tabulate(lines, "keys", disable_numparse=True)
+    return f"{text}\n{LEGEND}" if NEAR in text else text
+
+
+def trade(
+    data: Path,
+    runs: Path,
+    profile: str,
+    names: Sequence[str] = (),
+    size: str = "1280x720",
+    threads: int | None = None,
+    levels: Sequence[int] = LEVELS,
+) -> str:
+    """Judge all that can be traded on the test clips: tables, RUNS/report/trade.json and figures beside it.
+
+    Times are those of RUNS/bench at `size` and `threads`. What was judged or rendered before is kept in RUNS/trade.
+    Raises BadInput where there are no times or clips, for a bad size or numbers of samples, and as `candidates` does.
+    """
+    check_levels(levels)
+    dataset, times = Dataset(data), Times(runs, parse_size(size), threads)
+    clips, chosen = clips_of(dataset), candidates(names, runs, profile)
+
+    entrants = ready(chosen)
+    results = [result for clip in clips for result in evaluate_clip(clip, tracks_of(entrants), runs / "trade")]
+    quality = over_clips(results)
+    rows = rows_of(chosen, quality, times)
+    few = sampled(chosen, bool(names))
+    samples = by_samples(few, clips, dataset, levels, times, runs / "trade")
+
+    figures = runs / "report" / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    title = f"{times.name}, {times.threads} threads; mean of {len(clips)} clips of {data}"
+    for metric in TRADED:
+        save_figure(figures / f"trade-{metric}.png", draw_front(rows, metric, title))
+    save_figure(figures / "trade-samples.png", draw_samples(samples["rows"], title))
+    facts = {"schema": 1, "dataset": str(data), "device": device(), "versions": versions(), "profile": profile}
+    facts |= {"clips": [f"{clip.scene}/{clip.name}" for clip in clips], "size": times.name, "threads": times.threads}
+    write_json(runs / "report" / "trade.json", facts | {"rows": rows, "samples": samples})
+    return tables(rows, quality, samples, title, times)
+
+
+def tables(
+    rows: Sequence[Mapping[str, Any]], quality: Means, samples: Mapping[str, Any], title: str, times: Times
+) -> str:
+    parts = [title]
+    for signal in dict.fromkeys(row["signal"] for row in rows):
+        parts.append(f"{signal} light\n{front_table([row for row in rows if row['signal'] == signal], quality)}")
+    if untimed := [row["label"] for row in rows if row["ms"] is None]:
+        parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command}`.")
+    parts.append(f"samples a pixel\n{samples_table(samples['rows'])}")
+    parts.append(f"trained on 1 spp, fed more (after RAE, Fig. 9 and 11)\n{generalisation(samples['rows'])}")
+    return "\n\n".join(parts)

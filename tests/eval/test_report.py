@@ -1,0 +1,204 @@
+"""The report: one page that needs nothing else, and animated pictures."""
+
+import base64
+import io
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from errors import BadInput
+from eval.crops import Window, densest_window
+from eval.metrics import METRICS, flip_map
+from eval.pareto import Point, dominators
+from eval.report import report
+from eval.results import folder_of, load_picture
+from onespp import main
+
+NAMES = ["noisy", "accumulated", "eaw", "ntd"]
+
+
+class Page(HTMLParser):
+    """Checks that tags match; collects their attributes, and the text of scripts and of the table's rows."""
+
+    VOID = ("meta", "link", "input", "img", "br")
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str | None]] = []
+        self.scripts: list[str] = []
+        self.rows: list[list[str]] = []
+        self.feed(path.read_text())
+        assert self.open == []
+        self.data = json.loads(self.scripts[0])
+
+    def handle_starttag(self, tag, attrs):
+        self.attributes += [(tag, name, value) for name, value in attrs]
+        self.open += [tag] if tag not in self.VOID else []
+        if tag == "script":
+            self.scripts.append("")
+        if tag == "tr":
+            self.rows.append([])
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "script":
+            self.scripts[-1] += data
+        elif self.open[-1:] in (["td"], ["th"]) or self.open[-2:] == ["th", "button"]:
+            self.rows[-1].append(data)
+
+
+@pytest.fixture(scope="session")
+def page(evaluated) -> Page:
+    return Page(evaluated / "report" / "index.html")
+
+
+def pixels(uri: str) -> np.ndarray:
+    head, body = uri.split(",")
+    assert head == "data:image/webp;base64"
+    return np.array(Image.open(io.BytesIO(base64.b64decode(body))).convert("RGB"))
+
+
+def test_the_page_loads_nothing(page, evaluated):
+    for tag, name, value in page.attributes:
+        if name in ("src", "href", "action", "poster", "srcset"):
+            assert value.startswith(("data:", "#")), (tag, name, value)
+    text = (evaluated / "report" / "index.html").read_text()
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", text)
+    assert set(re.findall(r"https?://[\w./]*", text)) == {"http://www.w3.org/2000/svg"}  # a namespace, never loaded
+
+
+def test_the_table_has_every_result_and_floor(page):
+    titles, *rows = page.rows
+    shown = [metric.title for key, metric in METRICS.items() if key != "flicker"]  # nothing stands still here
+    assert [title.removesuffix(" ↑") for title in titles] == ["clip", "denoiser", "signal", *shown, "non-finite"]
+    clips = ["mean of all clips", "cornell_box/000", "cornell_box_moving/000"]
+    assert [row[0] for row in rows if row[1] == "(noise floor)" and row[2] == "total"] == clips
+    assert {row[2] for row in rows if row[1] == "ntd"} == {"indirect"}
+    assert len(rows) == 3 * (len(NAMES) - 1 + 1) + 3 * (3 + 1)
+    assert all(len(row) == 3 + len(shown) + (row[1] != "(noise floor)") for row in rows)
+
+
+def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
+    clip = next(clip for clip in page.data["clips"] if clip["name"] == "cornell_box_moving/000 (indirect light)")
+    assert list(clip["images"]) == ["ntd", "noisy", "accumulated", "reference"] and clip["frames"] == list(range(8))
+    folders = {
+        name: folder_of(evaluated, "cornell_box_moving", "000", name, "indirect") for name in ("ntd", "reference")
+    }
+    for index in (0, 7):
+        images = {name: load_picture(folder, index) for name, folder in folders.items()}
+        for name, image in images.items():
+            assert np.array_equal(pixels(clip["images"][name][index]), image)
+        expected = flip_map(images["ntd"] / 255, images["reference"] / 255)
+        assert np.abs(pixels(clip["flips"]["ntd"][index])[..., 0] / 255 - expected).max() <= 0.51 / 255
+    assert set(clip["flips"]) == set(clip["images"]) - {"reference"}
+
+
+def test_curves_are_the_frames(page, evaluated):
+    clip = page.data["clips"][0]
+    assert clip["name"] == "cornell_box/000"
+    saved = json.loads((folder_of(evaluated, "cornell_box", "000", "eaw", "total") / "result.json").read_text())
+    for metric in ("rmse", "temporal_error"):
+        values = [
+            None if frame[metric] is None else pytest.approx(frame[metric], rel=1e-3) for frame in saved["frames"]
+        ]
+        assert clip["curves"][metric]["eaw"] == values
+        assert len(clip["curves"][metric]["reference"]) == 8
+
+
+def test_crops_lie_inside_and_in_frames_apart(page):
+    crops = page.data["clips"][-2]["crops"]
+    assert crops
+    for crop in crops:
+        assert 0 <= crop["x"] <= 64 - crop["size"] and 0 <= crop["y"] <= 64 - crop["size"] and crop["size"] == 16
+    assert len({crop["frame"] for crop in crops}) == len(crops)
+
+
+def test_quality_against_time(page):
+    plots = {(plot["signal"], plot["metric"]): plot for plot in page.data["trades"]}
+    total = plots["total", "flip"]
+    assert {point["name"]: point["ms"] for point in total["points"]} == {"noisy": 0.5, "accumulated": 1.0, "eaw": 2.5}
+    assert total["missing"] == [] and total["size"] == "1280 × 720"
+    indirect = {point["name"]: point["by"] for point in plots["indirect", "ssim"]["points"]}
+    assert indirect["noisy"] is None and "ntd" in indirect
+
+
+def test_a_page_of_few_megabytes_shows_fewer_frames(evaluated, tmp_path):
+    runs = shutil.copytree(evaluated, tmp_path / "runs")
+    whole = (runs / "report" / "index.html").stat().st_size
+    report(runs, megabytes=whole / 3e6)
+    small = Page(runs / "report" / "index.html")
+    frames = small.data["clips"][0]["frames"]
+    assert 1 < len(frames) < 8 and (runs / "report" / "index.html").stat().st_size < 0.6 * whole
+    assert all(crop["frame"] in frames for clip in small.data["clips"] for crop in clip["crops"])
+    assert len(small.data["clips"][0]["curves"]["rmse"]["noisy"]) == 8
+    report(runs, megabytes=1e-6)
+    assert Page(runs / "report" / "index.html").data["clips"][0]["frames"] == [0]
+
+
+def test_animations(evaluated):
+    for name in ("cornell_box-000", "cornell_box_moving-000", "cornell_box_moving-000-indirect"):
+        with Image.open(evaluated / "report" / f"{name}.webp") as image:
+            assert image.n_frames == 8 and image.width == 4 * 256 and image.info["loop"] == 0
+            first = np.array(image.convert("RGB"))
+            image.seek(7)
+            assert not np.array_equal(first, np.array(image.convert("RGB")))
+
+
+def test_figures_are_embedded(page):
+    assert ("img", "alt", "trade flip") in page.attributes
+
+
+def test_without_results_or_with_damaged_ones(evaluated, tmp_path, capsys):
+    with pytest.raises(BadInput, match="onespp eval"):
+        report(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(BadInput, match="more than 0"):
+        report(evaluated, megabytes=0)
+    runs = shutil.copytree(evaluated, tmp_path / "runs")
+    (runs / "eval" / "clips" / "cornell_box-000" / "eaw" / "0002.webp").write_bytes(b"RIFF")
+    with pytest.raises(SystemExit) as exit_:
+        main(["report", "--runs", str(runs)])
+    error = capsys.readouterr().err
+    assert exit_.value.code == 2 and "0002.webp is missing or damaged" in error and "onespp eval" in error
+    assert (runs / "report" / "index.html").read_bytes() == (evaluated / "report" / "index.html").read_bytes()
+    shutil.rmtree(runs / "eval" / "clips" / "cornell_box-000" / "eaw")
+    with pytest.raises(BadInput, match=r"eaw/result.json is missing"):
+        report(runs)
+
+
+def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
+    runs = shutil.copytree(evaluated, tmp_path / "runs")
+    shutil.rmtree(runs / "bench")
+    report(runs)
+    assert Page(runs / "report" / "index.html").data["trades"] == []
+    assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
+
+
+def test_densest_window():
+    mask = torch.zeros(100, 80, dtype=torch.bool)
+    assert densest_window(mask) is None
+    mask[40:44, 30:36] = True
+    window = densest_window(mask)
+    assert window.size == 20 and window.pixels == 24
+    assert abs(window.x + 9.5 - 32.5) <= 1 and abs(window.y + 9.5 - 41.5) <= 1
+    mask[:] = False
+    mask[0, 79] = True
+    assert densest_window(mask) == Window(60, 0, 20, 1)
+    assert densest_window(torch.ones(3, 50, dtype=torch.bool)).size == 3
+    assert densest_window(torch.ones(1, 1, dtype=torch.bool)) == Window(0, 0, 1, 1)
+
+
+def test_pareto_front():
+    points = {"a": Point(1, 0.5), "b": Point(2, 0.6), "c": Point(3, 0.2), "d": Point(3, 0.2), "e": Point(4, 0.3)}
+    assert dominators(points, more_is_better=False) == {"a": None, "b": "a", "c": None, "d": None, "e": "c"}
+    assert dominators(points, more_is_better=True) == {"a": None, "b": None, "c": "b", "d": "b", "e": "b"}

@@ -1,0 +1,166 @@
+"""Results frame by frame, and an evaluation that goes on where it was interrupted."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.clip import Dataset
+from eval import harness
+from eval.harness import evaluate
+from eval.metrics import METRICS
+from eval.results import FLOOR, folder_of, load_picture, read_results
+from models import create
+from models.weights import save_weights
+from train.loop import run_folder
+
+NAMES = ["noisy", "accumulated", "rae"]
+
+
+def save_fresh(runs: Path, seed: int) -> None:
+    torch.manual_seed(seed)
+    folder = run_folder(runs, "rae", "tiny")
+    folder.mkdir(parents=True, exist_ok=True)
+    save_weights(create("rae"), "rae", {}, folder / "weights.safetensors")
+
+
+def content(runs: Path) -> dict[str, bytes]:
+    """All that an evaluation writes, but strips of pictures; wherever `runs` is, which results.json names."""
+    files = [*runs.glob("eval/clips/*/*/*"), runs / "eval/results.json", runs / "eval/frames.csv"]
+    return {str(file.relative_to(runs)): file.read_bytes().replace(str(runs).encode(), b"RUNS") for file in files}
+
+
+@pytest.fixture(scope="module")
+def once(tiny, tmp_path_factory):
+    runs = tmp_path_factory.mktemp("once")
+    save_fresh(runs, 0)
+    evaluate(tiny, runs, "tiny", NAMES)
+    return runs
+
+
+@pytest.fixture
+def runs(once, tmp_path):
+    return shutil.copytree(once, tmp_path / "runs")
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The denoisers that were run, clip by clip."""
+    calls = []
+    play = harness.play
+
+    def watched(clip, tracks, folders, quiet=False):
+        calls.append((clip.scene, sorted(track.name for track in tracks)))
+        play(clip, tracks, folders, quiet)
+
+    monkeypatch.setattr(harness, "play", watched)
+    return calls
+
+
+def test_a_line_a_frame_whose_means_are_the_results(once, tiny):
+    with open(once / "eval" / "frames.csv") as file:
+        lines = list(csv.DictReader(file))
+    assert list(lines[0]) == ["denoiser", "signal", "scene", "clip", "frame", *METRICS]
+    assert len(lines) == 2 * 8 * (len(NAMES) + 1)
+    results = json.loads((once / "eval" / "results.json").read_text())
+    for row in results["rows"]:
+        ours = [line for line in lines if all(line[key] == row[key] for key in ("denoiser", "signal", "scene", "clip"))]
+        assert [int(line["frame"]) for line in ours] == list(range(8))
+        for metric in METRICS:
+            values = [float(line[metric]) for line in ours if line[metric]]
+            mean = row["metrics"][metric]
+            assert mean == pytest.approx(np.mean(values)) if values else mean is None
+    floors = [line for line in lines if line["denoiser"] == FLOOR and line["scene"] == "cornell_box"]
+    clip = Dataset(tiny).clips("test")[0]
+    stored = pytest.approx(clip.facts["floor_mse"], rel=1e-4)  # of what was rendered, before it became float16
+    assert np.mean([float(line["mse"]) for line in floors]) == stored
+    assert floors[0]["temporal_error"] == "" and float(floors[1]["temporal_error"]) > 0
+
+
+def test_pictures_are_what_is_shown(once, tiny):
+    clip = Dataset(tiny).clips("test")[0]
+    for name, radiance in (
+        ("noisy", sum(np.float32(clip.read(part, 5)) for part in ("direct", "indirect", "emission"))),
+        ("reference", clip.reference(5).mean(axis=0)),
+    ):
+        saved = load_picture(folder_of(once, clip.scene, clip.name, name, "total"), 5)
+        shown = 255 * np.clip(clip.exposure * radiance, 0, 1) ** (1 / 2.2)
+        assert np.abs(saved - shown).max() <= 0.51
+
+
+def test_what_is_there_is_kept(once, runs, tiny, played):
+    before = content(once)
+    evaluate(tiny, runs, "tiny", NAMES)
+    assert played == [] and content(runs) == before
+
+
+def test_only_what_changed_is_done_again(runs, tiny, played):
+    save_fresh(runs, 1)
+    evaluate(tiny, runs, "tiny", [*NAMES, "eaw"])
+    assert played == [("cornell_box", ["eaw", "rae"]), ("cornell_box_moving", ["eaw", "rae"])]
+    played.clear()
+    evaluate(tiny, runs, "tiny", ["noisy"])
+    rows = json.loads((runs / "eval" / "results.json").read_text())["rows"]
+    assert played == [] and {row["denoiser"] for row in rows} == {"noisy"}
+
+
+def test_another_clip_under_the_same_name_is_another_result(runs, tiny, tmp_path, played):
+    other = shutil.copytree(tiny, tmp_path / "other")
+    path = other / "test" / "cornell_box" / "000" / "clip.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"exposure": 1.0}))
+    evaluate(other, runs, "tiny", NAMES)
+    assert played == [("cornell_box", sorted([*NAMES, "reference"]))]
+
+
+@pytest.mark.parametrize("damage", ["missing result", "half a result", "missing picture"])
+def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
+    before = content(once)
+    folder = runs / "eval" / "clips" / "cornell_box-000" / "accumulated"
+    if damage == "missing picture":
+        (folder / "0003.webp").unlink()
+    elif damage == "missing result":
+        (folder / "result.json").unlink()
+    else:
+        (folder / "result.json").write_text('{"key": ')
+    evaluate(tiny, runs, "tiny", NAMES)
+    assert played == [("cornell_box", ["accumulated"])] and content(runs) == before
+
+
+@pytest.mark.parametrize("frame", [0, 5, 11])
+def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch, frame):
+    """`frame` of the 16 of both clips is the one in which it is killed."""
+    seen, save = [], harness.save_picture
+
+    def killed(folder, index, image):
+        seen.append(index)
+        if len(seen) > frame * (len(NAMES) + 1) + 1:
+            raise KeyboardInterrupt
+        save(folder, index, image)
+
+    runs = tmp_path / "runs"
+    shutil.copytree(once / "train", runs / "train")
+    monkeypatch.setattr(harness, "save_picture", killed)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(tiny, runs, "tiny", NAMES)
+    assert not (runs / "eval" / "results.json").exists()
+    assert len(list(runs.glob("eval/clips/*/*/result.json"))) == (len(NAMES) + 1) * (frame // 8)
+    monkeypatch.setattr(harness, "save_picture", save)
+    evaluate(tiny, runs, "tiny", NAMES)
+    assert content(runs) == content(once)
+
+
+@pytest.mark.slow
+def test_side_by_side_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(harness, "SMALLEST_SHARE", 1)
+    runs = tmp_path / "runs"
+    shutil.copytree(once / "train", runs / "train")
+    evaluate(tiny, runs, "tiny", NAMES, processes=2)
+    for a, b in zip(read_results(runs)[1], read_results(once)[1], strict=True):
+        for ours, theirs in zip([*a.tracks, a.reference], [*b.tracks, b.reference], strict=True):
+            assert ours.key == theirs.key and ours.frames == [
+                {k: v if v is None else pytest.approx(v, rel=1e-3) for k, v in frame.items()} for frame in theirs.frames
+            ]
