@@ -44,7 +44,7 @@ from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
 
 METRICS_CHANNELS = ("motion", "dual_motion")
-BASELINES = ("noisy", "accumulated")
+BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
 PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
 SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
 

@@ -245,6 +245,8 @@ def run(training: Training) -> None:
             if training.done % every == 0 or training.done == training.total:
                 training.validate()
         return
+    if not training.done:
+        training.save()  # so that a training killed at once keeps its precision
     label = f"{training.task.name} ({training.precision})"
     saved = time.monotonic()
     with (
