@@ -1,5 +1,9 @@
 """What the tests share: a tiny data set rendered once, and a loaded moving scene."""
 
+# isort: off - this one first: it sets MKL up, which must come before MKL's first use
+import train  # noqa: F401
+
+# isort: on
 from pathlib import Path
 
 import hypothesis

@@ -300,7 +300,10 @@ def test_every_recipe_has_a_loss_for_its_terms():
 STEPS, RATE = 40, 2e-3
 
 
-@pytest.mark.parametrize("name", TRAINABLE)
+SAME_NETWORK = [pytest.param(name, marks=pytest.mark.slow) for name in ("ntd-a", "ntd-b")]  # as ntd's
+
+
+@pytest.mark.parametrize("name", ["rae", "wskp3", "wskp6", "wskp-mr", "kp", "ntd", *SAME_NETWORK])
 def test_every_network_learns_one_batch(batch_of, name):
     """Forty steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.
 

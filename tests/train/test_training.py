@@ -63,7 +63,7 @@ def interrupt_after(monkeypatch, count: int) -> None:
     monkeypatch.setattr(Training, "steps", steps)
 
 
-@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+@pytest.mark.parametrize("name", ["wskp6", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rae", "ntd"))])
 def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, short, monkeypatch, name):
     """Interrupted in the middle of an epoch; the weights equal those of an undisturbed run bit for bit."""
     monkeypatch.setattr(loop, "SAVE_SECONDS", 0.0)
@@ -105,7 +105,7 @@ from train import loop
 from train.recipes import RECIPES
 loop.SAVE_SECONDS = 0.0
 name, data, runs, epochs = sys.argv[1:]
-RECIPES[name, "tiny"] = replace(RECIPES[name, "tiny"], epochs=int(epochs), crop=16)
+RECIPES[name, "tiny"] = replace(RECIPES[name, "tiny"], epochs=int(epochs), crop=32)
 loop.train_network(loop.task_for(name, Path(data), Path(runs), "tiny", precision="32-true"))
 """
 
@@ -131,7 +131,7 @@ def kill_once(name: str, data: Path, runs: Path, epochs: int, row: int) -> bool:
         ("ntd", 1, (4,)),
         *(
             pytest.param(name, epochs, range(3, 24, 2), marks=pytest.mark.slow)
-            for name, epochs in (("rae", 12), ("wskp6", 2), ("ntd", 3))
+            for name, epochs in (("rae", 15), ("wskp6", 2), ("ntd", 3))
         ),
     ],
 )
