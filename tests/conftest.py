@@ -1,9 +1,5 @@
 """What the tests share: a tiny data set rendered once, and a loaded moving scene."""
 
-# isort: off - this one first: it sets MKL up, which must come before MKL's first use
-import train  # noqa: F401
-
-# isort: on
 from pathlib import Path
 
 import hypothesis
@@ -11,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
 from datasets.job import generate
 from models import channels_read
 from render.stage import Stage
