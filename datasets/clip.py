@@ -2,6 +2,7 @@
 
 import math
 import resource
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -53,6 +54,11 @@ class Clip:
     @property
     def name(self) -> str:
         return self.path.name
+
+    @property
+    def fingerprint(self) -> str:
+        """The checksum (crc32, 8 hex digits) of clip.json, which has those of all channels."""
+        return f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
 
     @property
     def exposure(self) -> float:

@@ -74,7 +74,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     if spp % own:
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"
-    made_of = {"clip": str(clip.path.resolve()), "crc32": f"{zlib.crc32((clip.path / 'clip.json').read_bytes()):08x}"}
+    made_of = {"clip": str(clip.path.resolve()), "crc32": clip.fingerprint}
     made_of["how"] = how
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)

@@ -1,7 +1,7 @@
 """What can be traded: every denoiser, in each precision and size of network that there are weights for."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from datasets.files import read_json
 from errors import BadInput
 from eval.bench import PRECISIONS, Variant, variants
 from eval.sizes import SIZES, WHOLE, timed_as, trained_as
+from eval.trade_data import median_ms
 from models import without_taa
 from models.denoiser import Denoiser
 from models.taa import unwrapped
@@ -117,11 +118,7 @@ class Times:
             raise BadInput(f"there are no times at {path}: measure them with `{self.command}`")
         bench = read_json(path, ("device", "threads", "rows"))
         self.device, self.threads = bench["device"], threads or bench["threads"]
-        self.ms: Mapping[tuple[str, str], float] = {
-            (row["denoiser"], row["dtype"]): row["ms_median"]
-            for row in bench["rows"]
-            if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, self.threads)
-        }
+        self.ms = median_ms(bench, size, self.threads)
         if not self.ms:
             asked, command = f"{self.name} with {self.threads} threads", f"{self.command} --threads {self.threads}"
             raise BadInput(f"{path} has no times of {asked}: measure them with `{command}`")

@@ -13,6 +13,15 @@ from eval.rows import by_signal, mean_of
 TRADED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
 
 
+def median_ms(bench: dict[str, Any], size: tuple[int, int], threads: int) -> dict[tuple[str, str], float]:
+    """Milliseconds by (denoiser, dtype) in the bench's results, at a size (height, width) and a number of threads."""
+    return {
+        (row["denoiser"], row["dtype"]): row["ms_median"]
+        for row in bench["rows"]
+        if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, threads)
+    }
+
+
 def trades(runs: Path, clips: Sequence[ClipResults]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The bench's results, if there are any, and for each signal and metric the points of the plot."""
     path = runs / "bench" / "results.json"
@@ -22,11 +31,7 @@ def trades(runs: Path, clips: Sequence[ClipResults]) -> tuple[dict[str, Any], li
     if not bench["rows"]:
         return {}, []
     height, width = (bench["rows"][0][side] for side in ("height", "width"))
-    times = {  # of the first size, with as many threads as there are
-        (row["denoiser"], row["dtype"]): row["ms_median"]
-        for row in bench["rows"]
-        if (row["height"], row["width"], row.get("threads", bench["threads"])) == (height, width, bench["threads"])
-    }
+    times = median_ms(bench, (height, width), bench["threads"])  # of the first size, with as many threads as there are
     plots = [
         trade(signal, ours, metric, times) | {"size": f"{width} × {height}"}
         for signal, ours in by_signal(clips).items()

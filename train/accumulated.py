@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,22 +54,24 @@ def accumulate_clip(clip: Clip, denoiser: KernelPredictor, cache: Path) -> Path:
 
     It holds irradiance.npy (F, S, H, W, 3) and scale.npy (F, S, 2), logarithms of luminance and depth; float32.
     """
-    folder = cache / f"{zlib.crc32((clip.path / 'clip.json').read_bytes()):08x}"  # which has checksums of all channels
+    folder = cache / clip.fingerprint
     if folder.exists():
         return folder
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     temporary.mkdir(parents=True, exist_ok=True)
     try:
         shape = (clip.frames, clip.realisations, clip.height, clip.width, 3)
-        irradiance = np.lib.format.open_memmap(temporary / IRRADIANCE, mode="w+", dtype=np.float32, shape=shape)
         scale = np.zeros((*shape[:2], 2), np.float32)
-        for realisation in range(clip.realisations):
-            state: State | None = None
-            for index in range(clip.frames):
-                state = after = denoiser.accumulate(read_frame(clip, index, denoiser.reads, realisation), state)
-                irradiance[index, realisation] = after.history.irradiance[0].permute(1, 2, 0).numpy()
+        states: list[State | None] = [None] * clip.realisations
+        # Written, not mapped: on a full disk a map ends the process, and a write says why.
+        with (temporary / IRRADIANCE).open("wb") as file:
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(file, header)
+            for index, realisation in np.ndindex(shape[:2]):
+                frame = read_frame(clip, index, denoiser.reads, realisation)
+                states[realisation] = after = denoiser.accumulate(frame, states[realisation])
+                file.write(after.history.irradiance[0].permute(1, 2, 0).numpy().tobytes())
                 scale[index, realisation] = [mean.value.item() for mean in vars(after.scale).values()]
-        irradiance.flush()
         np.save(temporary / SCALE, scale)
         if not folder.exists():  # another process may have been as busy
             temporary.rename(folder)

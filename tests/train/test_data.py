@@ -1,5 +1,8 @@
 """Who reads which items, in what parts; and crops of accumulated frames."""
 
+import resource
+import signal
+
 import numpy as np
 import pytest
 import torch
@@ -91,6 +94,20 @@ def test_accumulating_is_done_once_and_whole(clips, cache, tmp_path, monkeypatch
     monkeypatch.setattr(type(wskp), "accumulate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         accumulate_clip(clips[0], wskp, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(clips, tmp_path):
+    """A limit on file size stands in for a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+        with pytest.raises(OSError, match="File too large"):
+            accumulate_clip(clips[0], create("wskp3"), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
     assert not list(tmp_path.iterdir())
 
 
