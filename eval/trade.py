@@ -15,7 +15,7 @@ from eval.candidates import Candidate, Times, candidates, ready
 from eval.harness import device, evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import Result, Values, mean_floor, means, versions
+from eval.results import REFERENCE, Result, Values, mean_floor, means, versions
 from eval.spp import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table, shown
 from eval.table import LEGEND, NEAR, cell
 from eval.trade_plots import draw_front, draw_samples
@@ -84,7 +84,7 @@ def front_table(rows: Sequence[Mapping[str, Any]], quality: Means) -> str:
 
     lines = []
     for row in sorted(rows, key=lambda row: (row["ms"] is None, row["ms"])):
-        floors = quality.get((row["signal"], "reference"), {})
+        floors = quality.get((row["signal"], REFERENCE), {})
         lines.append(
             {
                 **{"denoiser": row["denoiser"], "dtype": row["dtype"], "epochs": row["epochs"] or "-"},

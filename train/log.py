@@ -43,18 +43,19 @@ class Log:
     def __init__(self, folder: Path, done: int, total: int):
         self.path, self.every = folder / METRICS, max(1, total // ROWS)
         self.board = SummaryWriter(str(folder), purge_step=done)
-        self.rows = [row for row in read_metrics(self.path) if row["step"] <= done] if self.path.exists() else []
         self.pending: list[Row] = []
-        self.rewrite()
+        self.forget_after(done)
 
-    def rewrite(self) -> None:
-        if self.rows:
-            with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
-                writer = self.writer(file, self.rows[0])
-                writer.writeheader()
-                writer.writerows({**row, "step": int(row["step"])} for row in self.rows)
-        else:
+    def forget_after(self, done: int) -> None:
+        """Keep the rows of metrics.csv up to step `done`."""
+        rows = [row for row in read_metrics(self.path) if row["step"] <= done] if self.path.exists() else []
+        if not rows:
             self.path.unlink(missing_ok=True)
+            return
+        with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
+            writer = self.writer(file, rows[0])
+            writer.writeheader()
+            writer.writerows({**row, "step": int(row["step"])} for row in rows)
 
     @staticmethod
     def writer(file: TextIO, row: Row) -> "csv.DictWriter[str]":
