@@ -41,6 +41,7 @@ eval: $(READY)
 bench: $(READY)
 	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
 	$(BIN)/onespp bench scaling --runs $(RUNS)
+	$(BIN)/onespp bench rendering --runs $(RUNS)
 
 stress: $(READY)
 	$(BIN)/onespp stress --long --profile $(PROFILE) --runs $(RUNS)

@@ -3,6 +3,7 @@
 import errno
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -67,8 +68,9 @@ def dataset(
     regularise: Regularise = False,
 ) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.job import Options, Part, generate, render_here
+    from datasets.job import Part, generate, render_here
     from models import channels_read
+    from render.clip import Options
 
     if ray:
         from datasets.cluster import render_on_cluster
@@ -208,7 +210,7 @@ def bench(
     scaling: milliseconds against pixels, of all denoisers unless some are named; a plot.
     fusion: weight-shared kernel fusion, next to the straightforward way.
     loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
-    rendering: seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
+    rendering: samples a second and seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
     training: milliseconds a step of rae, wskp6 and ntd, unless some are named, and where they go.
 
     Args:
@@ -337,7 +339,7 @@ def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(m
     print(f"{out}: {export_clip(clip, out)} files")
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[..., None]] = {
     **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
     **{"show": show, "figure": figure, "exr": exr, "bench": bench, "stress": stress, "ablate": ablate},
     **{"trade": trade, "papers": papers, "report": report},

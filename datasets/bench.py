@@ -34,12 +34,12 @@ def with_ratios(rows: Iterator[Row]) -> Iterator[dict[str, Any]]:
 
 
 def bench_rendering(runs: Path) -> str:
-    """Seconds to a noise floor of 40 dB on a frame of each scene: a table, and RUNS/bench/rendering.json."""
+    """Samples a second and seconds to 40 dB on a frame of each scene: a table, and RUNS/bench/rendering.json."""
     rows = seconds_to_floor(tqdm(SCENES, "scenes", leave=False), 10 ** (-TARGET / 10), display_of)
     table = list(with_ratios(rows))
     folder = runs / "bench"
     folder.mkdir(parents=True, exist_ok=True)
     facts = {"variant": VARIANT, "size": SIZE, "frame": FRAME, "target_db": TARGET}
     write_json(folder / "rendering.json", {**facts, "rows": table})
-    heads = {"floor": "floor dB", "seconds": f"seconds to {TARGET:.0f} dB"}
-    return tabulate(table, heads, floatfmt=("", "", ".0f", ".1f", ".2f", "", ".3f"))
+    heads = {"samples_per_second": "samples/s", "floor": "floor dB", "seconds": f"seconds to {TARGET:.0f} dB"}
+    return tabulate(table, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f"))

@@ -30,6 +30,7 @@ BASELINE, FAST = "oidn", "oidn (fast)"
 COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 WARM_UP, REPEATS = 2, 10  # frames
+FEWEST, PATIENCE = 5, 240.0  # of frames measured, where all denoisers together take longer than these seconds
 COUNTING_SIZE = 128  # px; a side that no network needs to pad
 
 Size = tuple[int, int]  # height, width
@@ -123,7 +124,8 @@ class Contender:
         p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds[WARM_UP:], (10, 50, 90)))
         return {
             **{"denoiser": self.variant.label, "height": height, "width": width, "dtype": self.variant.dtype},
-            **{"threads": torch.get_num_threads(), "ms_median": median, "ms_p10": p10, "ms_p90": p90},
+            **{"threads": torch.get_num_threads(), "frames": len(self.seconds) - WARM_UP},
+            **{"ms_median": median, "ms_p10": p10, "ms_p90": p90},
         }
 
     def row(self, size: Size, peak: float | None) -> dict[str, Any]:
@@ -202,8 +204,10 @@ def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> floa
 def peaks(variants: Sequence[Variant], size: Size, threads: int) -> list[float | None]:
     """The peak memory of each variant, in MB, each in a process of its own."""
     frames, found = [synthetic_frame(index, *size) for index in range(2)], []
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])  # packages are imported once for all of them
     for variant in tqdm(variants, "memory", leave=False):
-        with multiprocessing.get_context("spawn").Pool(1) as process:
+        with context.Pool(1) as process:
             found.append(process.apply(peak_memory, (variant, frames, threads)))
     return found
 
@@ -226,8 +230,12 @@ def thread_count(threads: int) -> Iterator[None]:
 
 @torch.inference_mode()
 def race(variants: Sequence[Variant], size: Size) -> list[Contender]:
-    """Time all variants on one sequence: each frame by each of them in turn, so that drift of the machine hits all."""
+    """Time all variants on one sequence: each frame by each of them in turn, so that drift of the machine hits all.
+
+    After PATIENCE it ends with less than REPEATS frames, but at least FEWEST.
+    """
     contenders = [Contender.of(variant) for variant in variants]
+    end = time.perf_counter() + PATIENCE
     with tqdm(total=(WARM_UP + REPEATS) * len(contenders), desc=f"{size[1]}x{size[0]}", leave=False) as progress:
         for index in range(WARM_UP + REPEATS):
             frame = synthetic_frame(index, *size).to(variants[0].device)
@@ -235,6 +243,8 @@ def race(variants: Sequence[Variant], size: Size) -> list[Contender]:
                 progress.set_postfix_str(contender.variant.label)
                 contender.step(frame)
                 progress.update()
+            if index + 1 >= WARM_UP + FEWEST and time.perf_counter() > end:
+                break
     return contenders
 
 

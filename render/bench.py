@@ -27,6 +27,7 @@ class Row(NamedTuple):
     scene: str
     renderer: str
     spp: int
+    samples_per_second: float  # paths from the camera
     floor: float  # mean squared error of the mean of two halves, as displayed
     seconds: float  # to the target
     extrapolated: bool
@@ -90,6 +91,8 @@ def seconds_to_floor(names: Iterable[str], target: float, display_of: Callable[[
             for label, render in renderers.items():
                 spent[label].append(timed(render, 100 * repeat, reached[label][0]))
         for label, (spp, floor) in reached.items():
+            seconds = median(spent[label])
             # Where the target is passed, fewer samples would have done, by the same law.
-            yield Row(name, label, spp, floor, median(spent[label]) * floor / target, floor > target)
+            to_target = seconds * floor / target
+            yield Row(name, label, spp, SIZE * SIZE * spp / seconds, floor, to_target, floor > target)
         dr.flush_malloc_cache()

@@ -40,6 +40,9 @@ def test_bench_of_references(tmp_path, monkeypatch):
     assert theirs["ratio"] == 1 and mine["ratio"] == pytest.approx(mine["seconds"] / theirs["seconds"])
     assert all(row["floor"] >= 40 or row["extrapolated"] for row in facts["rows"])
     assert mine["spp"] < theirs["spp"]  # stratified
+    for row in facts["rows"]:
+        seconds = row["seconds"] * 10 ** ((row["floor"] - 40) / 10)  # of the samples that were timed
+        assert row["samples_per_second"] * seconds == pytest.approx(24 * 24 * row["spp"])
 
 
 def test_contact_sheet_shows_every_scene(tmp_path):
