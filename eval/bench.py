@@ -1,10 +1,8 @@
 """`onespp bench denoisers`: what a frame costs, from noisy Frame to radiance, next to OIDN in the same run."""
 
-import ctypes
-import multiprocessing
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,9 +14,11 @@ from tabulate import tabulate
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from datasets.files import write_json
+from datasets.files import read_json, write_json
 from datasets.frame import Frame
 from errors import BadInput
+from eval.memory import alone, growth_mb
+from eval.results import code, versions
 from eval.sizes import SIZES, WHOLE, create_any
 from eval.synthetic import synthetic_frame
 from models import DENOISERS, compiled, unavailable
@@ -135,6 +135,7 @@ class Contender:
             "peak_mb": peak,
             "parameters": None if isinstance(unwrapped(self.denoiser), OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
+            "prediction": self.share_of_network(),
         }
 
     def share_of_network(self) -> float | None:
@@ -169,18 +170,6 @@ def macs_per_pixel(variant: Variant) -> float | None:
     return macs / COUNTING_SIZE**2
 
 
-def growth_mb(run: Callable[[], object]) -> float | None:
-    """How far resident memory rises while `run` is called, in MB; Linux only, else None."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the rise would fit into that unseen
-        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    except (OSError, AttributeError):
-        return None
-    before = status_mb("VmRSS")
-    run()
-    return max(0.0, status_mb("VmHWM") - before)
-
-
 @torch.inference_mode()
 def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> float | None:
     """What two frames of a sequence add to resident memory, or to the GPU's, in MB, in a fresh process.
@@ -203,19 +192,8 @@ def peak_memory(variant: Variant, frames: Sequence[Frame], threads: int) -> floa
 
 def peaks(variants: Sequence[Variant], size: Size, threads: int) -> list[float | None]:
     """The peak memory of each variant, in MB, each in a process of its own."""
-    frames, found = [synthetic_frame(index, *size) for index in range(2)], []
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])  # packages are imported once for all of them
-    for variant in tqdm(variants, "memory", leave=False):
-        with context.Pool(1) as process:
-            found.append(process.apply(peak_memory, (variant, frames, threads)))
-    return found
-
-
-def status_mb(field: str) -> float:
-    match = re.search(rf"{field}:\s*(\d+) kB", Path("/proc/self/status").read_text())
-    assert match
-    return int(match[1]) / 1e3
+    frames = [synthetic_frame(index, *size) for index in range(2)]
+    return [alone(peak_memory, variant, frames, threads) for variant in tqdm(variants, "memory", leave=False)]
 
 
 @contextmanager
@@ -275,44 +253,50 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
     """Measure the named denoisers, or all that can run here: a table, and RUNS/bench/results.json.
 
     On the CPU with each number of `threads`; then, where there is one, on the GPU, into RUNS/bench/results-cuda.json.
-    Raises BadInput for unknown names, sizes and numbers of threads.
+    Goes on where the same call was interrupted. Raises BadInput for unknown names, sizes and numbers of threads.
     """
     pixels, counts = [parse_size(size) for size in sizes], thread_counts(threads)
     entrants = {device: variants(names, device) for device in devices()}
-    folder = runs / "bench"
-    folder.mkdir(parents=True, exist_ok=True)
+    (runs / "bench").mkdir(parents=True, exist_ok=True)
     tables = []
     for device, ours in entrants.items():
-        rows, lines = measure(ours, pixels, counts if device == "cpu" else counts[-1:])
+        path = runs / "bench" / ("results.json" if device == "cpu" else f"results-{device}.json")
+        unfinished = path.with_name(f"unfinished-{path.name}")
+        rows = measure(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished)
         # The number at the top is of the last rows of each size.
-        facts = {"schema": 1, "device": device, "threads": counts[-1]}
-        write_json(folder / ("results.json" if device == "cpu" else f"results-{device}.json"), facts | {"rows": rows})
-        tables.append(f"{device}\n{tabulate(lines, 'keys', floatfmt='.3g', missingval='-')}")
+        write_json(path, {"schema": 1, "device": device, "threads": counts[-1], "rows": rows})
+        unfinished.unlink()
+        tables.append(f"{device}\n{tabulate(table_lines(rows), 'keys', floatfmt='.3g', missingval='-')}")
     return "\n\n".join(tables)
 
 
 def measure(
-    entrants: Sequence[Variant], sizes: Sequence[Size], counts: Sequence[int]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The rows of results.json and of the table: size by size, and in each by rising numbers of threads."""
-    rows: list[dict[str, Any]] = []
-    lines: list[dict[str, Any]] = []
+    entrants: Sequence[Variant], sizes: Sequence[Size], counts: Sequence[int], unfinished: Path
+) -> list[dict[str, Any]]:
+    """The rows of results.json: size by size, and in each by rising numbers of threads.
+
+    Each race is kept in the file `unfinished`, and not run again where that is of the same denoisers and code.
+    """
+    call = {"entrants": [repr(variant) for variant in entrants], "code": code(), "versions": versions()}
+    before = read_json(unfinished, ("call", "rows")) if unfinished.exists() else {}
+    rows: list[dict[str, Any]] = before["rows"] if before.get("call") == call else []
+    done = {race_of(row) for row in rows}
     for size in sizes:
-        memory = peaks(entrants, size, counts[-1])
-        for count in counts:
+        left = [count for count in counts if (*size, count) not in done]
+        memory = peaks(entrants, size, counts[-1]) if left else []
+        for count in left:
             with thread_count(count):
-                contenders = race(entrants, size)
-                measured = [c.row(size, peak) for c, peak in zip(contenders, memory, strict=True)]
-            lines += table_lines(contenders, measured)
-            rows += measured
-    return rows, lines
+                rows += [c.row(size, peak) for c, peak in zip(race(entrants, size), memory, strict=True)]
+            write_json(unfinished, {"call": call, "rows": rows})
+    wanted = [(*size, count) for size in sizes for count in counts]
+    return [row for key in wanted for row in rows if race_of(row) == key]
 
 
-def table_lines(contenders: Sequence[Contender], rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def table_lines(rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """The rows for people: times next to OIDN's, and how they divide between the network and the rest."""
-    baseline = next((row["ms_median"] for row in rows if row["denoiser"] == BASELINE), None)
-    for contender, row in zip(contenders, rows, strict=True):
-        share = contender.share_of_network()
+    baselines = {race_of(row): row["ms_median"] for row in rows if row["denoiser"] == BASELINE}
+    for row in rows:
+        baseline, share = baselines.get(race_of(row)), row["prediction"]
         yield {
             **{"denoiser": row["denoiser"], "size": f"{row['width']}x{row['height']}", "dtype": row["dtype"]},
             "threads": row["threads"],
@@ -322,6 +306,10 @@ def table_lines(contenders: Sequence[Contender], rows: Sequence[dict[str, Any]])
             "reconstruction": f"{1 - share:.0%}" if share is not None else None,
             "peak MB": row["peak_mb"],
             "parameters": row["parameters"],
-            "as trained": contender.variant.build().parameter_count() if share is not None else None,
+            "as trained": create_any(row["denoiser"]).parameter_count() if share is not None else None,
             "MACs/pixel": row["macs_per_pixel"],
         }
+
+
+def race_of(row: dict[str, Any]) -> tuple[int, int, int]:
+    return row["height"], row["width"], row["threads"]

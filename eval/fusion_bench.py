@@ -1,6 +1,5 @@
 """`onespp bench fusion`: weight-shared kernel fusion next to the way the paper writes it, unfold and softmax."""
 
-import multiprocessing
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -15,7 +14,8 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from datasets.files import write_json
-from eval.bench import growth_mb, thread_count
+from eval.bench import thread_count
+from eval.memory import alone, growth_mb
 from models import compiled
 from models.fusion import WINDOWS, fuse
 
@@ -81,10 +81,7 @@ def bench_fusion(runs: Path, height: int, width: int, threads: int | None = None
                     start = time.perf_counter()
                     outputs[label] = method(label)(*arguments)
                     seconds[label] += [time.perf_counter() - start] if repeat >= 0 else []
-    peaks: dict[str, float | None] = {}
-    for label in tqdm(labels, "memory", leave=False):
-        with multiprocessing.get_context("spawn").Pool(1) as process:
-            peaks[label] = process.apply(peak_mb, (label, height, width, threads))
+    peaks = {label: alone(peak_mb, label, height, width, threads) for label in tqdm(labels, "memory", leave=False)}
     rows: list[dict[str, Any]] = []
     for label in labels:
         ms, peak, baseline = 1e3 * median(seconds[label]), peaks[label], peaks[UNFOLD]

@@ -17,7 +17,7 @@ from onespp import main
 
 KEYS = {
     *("denoiser", "height", "width", "dtype", "ms_median", "ms_p10", "ms_p90", "peak_mb"),
-    *("parameters", "macs_per_pixel", "threads"),
+    *("parameters", "macs_per_pixel", "threads", "frames", "prediction"),
 }
 
 
@@ -38,7 +38,9 @@ def test_results_have_the_agreed_form(tmp_path, monkeypatch, capsys):
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]
         counts = {"rae": 1_951_935, "oidn": None, "oidn (fast)": None}  # the baseline comes by itself
         assert row["parameters"] == counts.get(row["denoiser"], 0)
-        assert (row["macs_per_pixel"] is None) == (row["denoiser"] != "rae")
+        assert (row["macs_per_pixel"] is None) == (row["prediction"] is None) == (row["denoiser"] != "rae")
+        assert row["prediction"] is None or 0 < row["prediction"] < 1
+        assert row["frames"] == 2
 
 
 def test_every_number_of_threads_has_its_rows(tmp_path, monkeypatch):
@@ -52,6 +54,39 @@ def test_every_number_of_threads_has_its_rows(tmp_path, monkeypatch):
     assert noisy == [(8, 1), (8, 2), (16, 1), (16, 2)] and seen == [1, 2, 1, 2]
     assert results["threads"] == 2  # that of the last rows of a size
     assert thread_counts(()) == sorted({1, torch.get_num_threads()})
+
+
+def test_an_interrupted_bench_goes_on(tmp_path, monkeypatch):
+    seen = []
+
+    def racing(ours, size):
+        seen.append((*size, torch.get_num_threads()))
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return race(ours, size)
+
+    monkeypatch.setattr(eval.bench, "REPEATS", 1)
+    monkeypatch.setattr(eval.bench, "race", racing)
+    monkeypatch.setattr(eval.bench, "peaks", lambda entrants, size, threads: [None] * len(entrants))
+    with pytest.raises(KeyboardInterrupt):
+        bench_denoisers(tmp_path, ["noisy"], ["8x4"], [1, 2])
+    assert not (tmp_path / "bench" / "results.json").exists()
+    bench_denoisers(tmp_path, ["noisy"], ["8x4"], [1, 2])
+    assert seen == [(4, 8, 1), (4, 8, 2), (4, 8, 2)]
+    bench_denoisers(tmp_path, ["noisy"], ["8x4"], [1, 2])  # a new measurement
+    assert len(seen) == 5 and [file.name for file in (tmp_path / "bench").iterdir()] == ["results.json"]
+
+    seen.clear()
+    with pytest.raises(KeyboardInterrupt):
+        bench_denoisers(tmp_path, ["noisy"], ["8x4"], [1, 2])
+    bench_denoisers(tmp_path, ["noisy", "accumulated"], ["8x4"], [1])  # others: what is there is not theirs
+    assert len(seen) == 3
+
+
+def test_a_bench_that_takes_long_measures_fewer_frames(monkeypatch):
+    monkeypatch.setattr(eval.bench, "PATIENCE", 0)
+    (contender,) = race([Variant("noisy", "noisy")], (4, 8))
+    assert contender.timing((4, 8))["frames"] == eval.bench.FEWEST < eval.bench.REPEATS
 
 
 def test_scaling(tmp_path, monkeypatch, capsys):
