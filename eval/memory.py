@@ -1,0 +1,34 @@
+"""Peak memory, measured in processes of their own."""
+
+import ctypes
+import multiprocessing
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def growth_mb(run: Callable[[], object]) -> float | None:
+    """How far resident memory rises while `run` is called, in MB; Linux only, else None."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the rise would fit into that unseen
+        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+    except (OSError, AttributeError):
+        return None
+    before = status_mb("VmRSS")
+    run()
+    return max(0.0, status_mb("VmHWM") - before)
+
+
+def status_mb(field: str) -> float:
+    match = re.search(rf"{field}:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    assert match
+    return int(match[1]) / 1e3
+
+
+def alone(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What `function` returns in a process that has done nothing yet but import its module."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([function.__module__])  # imported once for all that follow
+    with context.Pool(1) as process:
+        return process.apply(function, arguments)
