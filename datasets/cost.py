@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend import dr
+from render.backend import VARIANT, dr
+from render.clip import Options
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Scene
 
+RENDERER = VARIANT.partition("_")[0].replace("llvm", "cpu")  # the device that renders: cpu or cuda
 SPP, REPEATS = (1, 2, 4, 8), 3
 
 
@@ -41,11 +43,11 @@ def line(spp: list[int], ms: list[float]) -> Cost:
     return Cost(max(0.0, float(frame_ms)), max(0.0, float(sample_ms)))
 
 
-def sample_cost(scene: Scene, height: int, width: int, threads: int) -> Cost:
+def sample_cost(scene: Scene, height: int, width: int, threads: int, options: Options) -> Cost:
     """Measured on the scene's first frame, without its G-buffer, which costs the same whatever the samples."""
     stage = Stage(scene, height, width)
     stage.pose(0)
-    ray, tracer = stage.rays(stage.view(0)), PathTracer(stage)
+    ray, tracer = stage.rays(stage.view(0)), PathTracer(stage, *options)
     spent: dict[int, list[float]] = {spp: [] for spp in SPP}
     with render_threads(threads):
         for repeat in range(-1, REPEATS):  # the first time compiles

@@ -17,6 +17,7 @@ from datasets.profiles import GENERATOR, ClipKind, clip_seed, profile_of
 from datasets.writer import to_storage
 from errors import BadInput
 from render.clip import Options, Sampling, render_clip
+from render.sampler import CYCLE
 from scenes import build_scene
 from scenes.animation import Scene
 
@@ -66,11 +67,16 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     """`clip` with `spp` samples a pixel as its noisy input, kept as a clip of one realisation below `root`.
 
     Every other channel is that of `clip`, in its place. What is there already is kept.
-    Raises BadInput where `spp` is no multiple of the clip's own, or another process is making it.
+    Raises BadInput where `spp` is no multiple of the clip's own, or more than its sampler has, or another process
+    is making it.
     """
     own = clip.facts["noisy_spp"]
     if spp == own:
         return clip
+    if how == "rendered" and Options(**dataset.facts["options"]).halton and spp > CYCLE:
+        raise BadInput(
+            f"{dataset.path} is of --halton, which has {CYCLE} different samples a pixel: {spp} are too many"
+        )
     if spp % own:
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"

@@ -4,15 +4,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from statistics import fmean
 from typing import NamedTuple
 
 from tabulate import tabulate
 
 from datasets.files import read_json
 from eval.ablation_results import Run, over_seeds
+from eval.floor import within_floor
 from eval.metrics import METRICS, Metric
 from eval.papers import TABLES, PaperTable
+from eval.results import mean_floor, read_results
+from eval.rows import mean_of, of, one_spp
+from eval.table import LEGEND, NEAR
 from train.recipes import TRAINABLE
 
 TITLES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {
@@ -34,19 +37,24 @@ class Measured:
 
     value: Value
     command: str
+    floor: Callable[[str], float | None] = lambda metric: None  # the noise floor of a metric
+
+    def near(self, denoiser: str, metric: str) -> bool:
+        """Whether the value says no more than that the image is as close to the truth as the reference."""
+        return within_floor(metric, self.value(denoiser, metric), self.floor(metric))
 
 
 def from_evaluation(runs: Path, signal: str) -> Measured:
-    """Means over the clips of RUNS/eval/results.json where a metric is defined."""
+    """Means over the clips of 1 spp of RUNS/eval/results.json where a metric is defined."""
     path = runs / "eval" / "results.json"
-    rows = read_json(path, ("rows",))["rows"] if path.exists() else []
+    clips = one_spp(read_results(runs)[1]) if path.exists() else []
+    ours = [clip for clip in clips if clip.signal == signal]
+    floors = mean_floor([clip.reference.metrics for clip in ours]) if ours else {}
 
     def value(denoiser: str, metric: str) -> float | None:
-        values = [r["metrics"][metric] for r in rows if (r["denoiser"], r["signal"]) == (denoiser, signal)]
-        defined = [value for value in values if value is not None]
-        return fmean(defined) if defined else None
+        return mean_of(ours, denoiser)[metric] if of(ours, denoiser) else None
 
-    return Measured(value, f"onespp eval --runs {runs}")
+    return Measured(value, f"onespp eval --runs {runs}", floors.get)
 
 
 def from_bench(runs: Path) -> Measured:
@@ -59,7 +67,7 @@ def from_bench(runs: Path) -> Measured:
         fastest = min(ours, key=lambda row: row["ms_median"], default=None)
         if fastest is None or metric == "ms":
             return fastest and fastest["ms_median"]
-        share = fastest["prediction"]
+        share = fastest.get("prediction")
         return share and fastest["ms_median"] * (share if metric == "prediction" else 1 - share)
 
     return Measured(value, f"onespp bench denoisers --size {SIZE[1]}x{SIZE[0]} --runs {runs}")
@@ -115,20 +123,22 @@ def orders(table: PaperTable) -> list[Order]:
     return found
 
 
-def verdict(table: PaperTable, order: Order, value: Value) -> str:
+def verdict(table: PaperTable, order: Order, here: Measured) -> str:
     """Whether an order holds here, with the numbers."""
     names = [table.ours[method] for method in (order.better, order.worse)]
-    ours = [value(name, order.metric) for name in names]
+    ours = [here.value(name, order.metric) for name in names]
     better, worse = ours
     title, form = TITLES[order.metric].title, TITLES[order.metric].form
     text = f"{title}: {names[0]} before {names[1]} (there in {order.scenes} of {len(table.scenes)})"
     if better is None or worse is None:
         return f"{text}: not measured"
-    here = f"{form.format(better)} against {form.format(worse)}"
-    return f"{text}: {'holds' if is_better(order.metric, better, worse) else 'DOES NOT HOLD'}, {here}"
+    numbers = f"{form.format(better)} against {form.format(worse)}"
+    if all(here.near(name, order.metric) for name in names):
+        return f"{text}: both within the noise floor, {numbers}"
+    return f"{text}: {'holds' if is_better(order.metric, better, worse) else 'DOES NOT HOLD'}, {numbers}"
 
 
-def line(table: PaperTable, method: str, value: Value) -> dict[str, str]:
+def line(table: PaperTable, method: str, here: Measured) -> dict[str, str]:
     """A method, and of each metric the paper's mean and, where they can be compared, ours."""
     name = table.ours.get(method)
     cells = {"there": method, "here": name or "-"}
@@ -137,18 +147,19 @@ def line(table: PaperTable, method: str, value: Value) -> dict[str, str]:
         theirs = table.mean(method, metric) if metric in table.values[method] else None
         cells[f"{title}, paper"] = "-" if theirs is None else form.format(theirs)
         if metric in compared(table):
-            ours = value(name, metric) if name else None
-            cells[f"{title}, ours"] = "-" if ours is None else form.format(ours)
+            ours = here.value(name, metric) if name else None
+            mark = NEAR if name and here.near(name, metric) else ""
+            cells[f"{title}, ours"] = "-" if ours is None else mark + form.format(ours)
     return cells
 
 
 def section(table: PaperTable, runs: Path) -> str:
     """One table of a paper: methods, means there and here, notes, orders."""
     here = measured(table, runs)
-    lines = [line(table, method, here.value) for method in table.values]
+    lines = [line(table, method, here) for method in table.values]
     parts = [table.source, f"scenes: {', '.join(table.scenes)}", tabulate(lines, "keys", disable_numparse=True)]
     parts += [f"  * {note}" for note in table.notes]
-    parts += [f"  - {verdict(table, order, here.value)}" for order in orders(table)]
+    parts += [f"  - {verdict(table, order, here)}" for order in orders(table)]
     if absent := missing(table, here.value):
         untrained = [name for name in absent if name in TRAINABLE and table.where == "eval"]
         first = f"`onespp train {' '.join(untrained)} --runs {runs}` and " if untrained else ""
@@ -166,4 +177,4 @@ def against_papers(runs: Path) -> str:
 
     Raises BadInput where a file of results is damaged.
     """
-    return "\n\n".join([HEADER, *(section(table, runs) for table in TABLES)])
+    return "\n\n".join([HEADER, *(section(table, runs) for table in TABLES), LEGEND])

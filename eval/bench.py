@@ -18,8 +18,10 @@ from datasets.files import read_json, write_json
 from datasets.frame import Frame
 from errors import BadInput
 from eval.memory import alone, growth_mb
-from eval.results import code, versions
-from eval.sizes import SIZES, WHOLE, create_any
+from eval.results import BASELINES, code, versions
+from eval.results import SOURCES as EVALUATED
+from eval.results import device as in_words
+from eval.sizes import SIZES, WHOLE, create_any, timed_as
 from eval.synthetic import synthetic_frame
 from models import DENOISERS, compiled, unavailable
 from models.denoiser import Denoiser, State
@@ -29,6 +31,7 @@ from models.taa import unwrapped
 BASELINE, FAST = "oidn", "oidn (fast)"
 COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+SOURCES = (*EVALUATED, "eval/bench.py", "eval/memory.py", "eval/synthetic.py")  # what times follow from
 WARM_UP, REPEATS = 2, 10  # frames
 FEWEST, PATIENCE = 5, 240.0  # of frames measured, where all denoisers together take longer than these seconds
 COUNTING_SIZE = 128  # px; a side that no network needs to pad
@@ -43,12 +46,16 @@ class Variant(NamedTuple):
     name: str
     dtype: str = "float32"
     compiled: bool = True
+    indirect: bool = False  # a baseline, on indirect light alone
     device: str = "cpu"
 
     def build(self) -> Denoiser:
         """As it stands before `prepare`."""
         torch.manual_seed(0)
-        return OIDN("fast") if self.label == FAST else create_any(self.name)
+        denoiser = OIDN("fast") if self.label == FAST else create_any(self.name)
+        if self.indirect:
+            denoiser.signal = "indirect"
+        return denoiser
 
     def way(self) -> AbstractContextManager[None]:
         return nullcontext() if self.compiled else compiled.disabled()
@@ -73,6 +80,8 @@ def variants(names: Sequence[str], device: str = "cpu") -> list[Variant]:
         found += [Variant(name, name, dtype, device=device) for dtype in dtypes]
         if name in COMPILED and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(Variant(f"{name} (PyTorch)", name, compiled=False))
+        if name in BASELINES:
+            found.append(Variant(timed_as(name, "indirect"), name, indirect=True, device=device))
         found += [Variant(FAST, name, device=device)] if name == BASELINE else []
     return found
 
@@ -255,7 +264,7 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
     On the CPU with each number of `threads`; then, where there is one, on the GPU, into RUNS/bench/results-cuda.json.
     Goes on where the same call was interrupted. Raises BadInput for unknown names, sizes and numbers of threads.
     """
-    pixels, counts = [parse_size(size) for size in sizes], thread_counts(threads)
+    pixels, counts = [parse_size(size) for size in dict.fromkeys(sizes)], thread_counts(threads)
     entrants = {device: variants(names, device) for device in devices()}
     (runs / "bench").mkdir(parents=True, exist_ok=True)
     tables = []
@@ -264,7 +273,7 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
         unfinished = path.with_name(f"unfinished-{path.name}")
         rows = measure(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished)
         # The number at the top is of the last rows of each size.
-        write_json(path, {"schema": 1, "device": device, "threads": counts[-1], "rows": rows})
+        write_json(path, {"schema": 1, "device": in_words(device, counts[-1]), "threads": counts[-1], "rows": rows})
         unfinished.unlink()
         tables.append(f"{device}\n{tabulate(table_lines(rows), 'keys', floatfmt='.3g', missingval='-')}")
     return "\n\n".join(tables)
@@ -275,9 +284,10 @@ def measure(
 ) -> list[dict[str, Any]]:
     """The rows of results.json: size by size, and in each by rising numbers of threads.
 
-    Each race is kept in the file `unfinished`, and not run again where that is of the same denoisers and code.
+    Each race is kept in the file `unfinished`, and not run again where that is of the same denoisers, code and device.
     """
-    call = {"entrants": [repr(variant) for variant in entrants], "code": code(), "versions": versions()}
+    facts = {"code": code(SOURCES), "versions": versions(), "device": in_words(entrants[0].device)}
+    call = {"entrants": [repr(variant) for variant in entrants], **facts}
     before = read_json(unfinished, ("call", "rows")) if unfinished.exists() else {}
     rows: list[dict[str, Any]] = before["rows"] if before.get("call") == call else []
     done = {race_of(row) for row in rows}

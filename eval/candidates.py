@@ -34,11 +34,6 @@ class Candidate:
         """Names the folder of its results: rae, rae-bfloat16."""
         return self.variant.label + ("" if self.variant.dtype == "float32" else f"-{self.variant.dtype}")
 
-    @property
-    def timed(self) -> tuple[str, str]:
-        """What the bench's row of the same speed says of denoiser and dtype."""
-        return timed_as(self.variant.label), self.variant.dtype
-
     def facts(self) -> dict[str, Any]:
         """In the form of trade.json."""
         return {"label": self.label, "denoiser": self.variant.label, "dtype": self.variant.dtype}
@@ -72,25 +67,31 @@ def weights_of(name: str, runs: Path, profile: str) -> tuple[Path, str]:
 def entrants(names: Sequence[str]) -> list[Variant]:
     """The named denoisers, or all, in each precision. Raises BadInput for an unknown name."""
     everyone = variants(names) if names else [*variants(()), *(v for v in variants([WHOLE]) if v.name == WHOLE)]
-    return [variant for variant in everyone if variant.compiled]  # or else it shows the same a second time
+    return [  # others show the same a second time, or were not asked for
+        v for v in everyone if v.compiled and not v.indirect and (v.name in names or not names)
+    ]
 
 
 def candidates(names: Sequence[str], runs: Path, profile: str) -> list[Candidate]:
     """The named denoisers, or all that can run and are trained.
 
-    Raises BadInput for an unknown name, one without weights, and an ablation of another profile.
+    Raises BadInput for an unknown name and one without weights.
     """
     found: list[Candidate] = []
     missing: dict[str, str] = {}
     ablation = runs / "ablation" / "wskp-windows" / "results.json"
-    if ablation.exists() and (other := read_json(ablation, ("profile",))["profile"]) != profile:
-        raise BadInput(f"{ablation} is of the profile {other}, not {profile}: name that, or another --runs")
+    other = read_json(ablation, ("profile",))["profile"] if ablation.exists() else None
     for variant in entrants(names):
         if not variant.build().parameter_count():
             found.append(Candidate(variant, None))
             continue
         path, command = weights_of(variant.name, runs, profile)
-        if path.exists():
+        if variant.name in SIZES and other != profile:
+            why = (
+                f"{ablation} is of the profile {other}: name another --runs" if other else f"`{command}` has not ended"
+            )
+            missing[variant.name] = f"{variant.name} has no weights of the profile {profile}, {why}"
+        elif path.exists():
             found.append(Candidate(variant, path))
         else:
             missing[variant.name] = f"{variant.name} has no weights at {path}: train them with `{command}`"
@@ -107,11 +108,12 @@ def ready(chosen: Sequence[Candidate]) -> Ready:
 class Times:
     """Milliseconds of a frame of `size` (height, width), from what `onespp bench denoisers` left.
 
-    `threads` are by default those at the top of the file. Raises BadInput where nothing was measured like that.
+    `threads` are by default those at the top of the file, `device` is "cpu" or "cuda".
+    Raises BadInput where nothing was measured like that.
     """
 
-    def __init__(self, runs: Path, size: tuple[int, int], threads: int | None = None):
-        path, self.size = runs / "bench" / "results.json", size
+    def __init__(self, runs: Path, size: tuple[int, int], threads: int | None = None, device: str = "cpu"):
+        path, self.size = runs / "bench" / ("results.json" if device == "cpu" else f"results-{device}.json"), size
         self.name = f"{size[1]}x{size[0]}"
         self.command = f"onespp bench denoisers --size {self.name} --runs {runs}"
         if not path.exists():
@@ -123,5 +125,5 @@ class Times:
             asked, command = f"{self.name} with {self.threads} threads", f"{self.command} --threads {self.threads}"
             raise BadInput(f"{path} has no times of {asked}: measure them with `{command}`")
 
-    def of(self, candidate: Candidate) -> float | None:
-        return self.ms.get(candidate.timed)
+    def of(self, candidate: Candidate, signal: str) -> float | None:
+        return self.ms.get((timed_as(candidate.variant.label, signal), candidate.variant.dtype))

@@ -57,10 +57,14 @@ def within_floor(metric: str, value: float | None, floor: float | None) -> bool:
     """
     if value is None or floor is None or metric not in METRICS:
         return False
+    limit = floor_limit(metric, floor)
+    return value >= limit if METRICS[metric].more_is_better else abs(value) <= limit
+
+
+def floor_limit(metric: str, floor: float) -> float:
+    """The value from which on `within_floor` holds; of the unbiased MSE its magnitude."""
     if metric == "psnr":
-        return value >= floor - 10 * math.log10(2)
+        return floor - 10 * math.log10(2)
     if metric == "ssim":
-        return 1 - value <= 2 * (1 - floor)
-    if metric == "mse_unbiased":
-        return abs(value) <= 2 * floor
-    return value <= floor * (2 if metric in SQUARED else math.sqrt(2))
+        return 1 - 2 * (1 - floor)
+    return floor * (2 if metric in (*SQUARED, "mse_unbiased") else math.sqrt(2))

@@ -2,8 +2,6 @@
 
 import math
 import multiprocessing
-import platform
-import re
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
@@ -22,10 +20,12 @@ from datasets.frame import Signal, read_frame, to_tensor
 from eval.bench import thread_count
 from eval.pictures import save_strip
 from eval.results import (
+    BASELINES,
     SIGNALS,
     ClipResults,
     Result,
     by_clip,
+    device,
     folder_of,
     folders_of,
     is_finished,
@@ -44,7 +44,6 @@ from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
 
 METRICS_CHANNELS = ("motion", "dual_motion")
-BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
 PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
 SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
 
@@ -168,15 +167,6 @@ def tracks_of(denoisers: Mapping[str, tuple[Denoiser, str | None]]) -> list[Trac
             baseline.signal = "indirect"
             tracks.append(Track(name, baseline, None))
     return tracks
-
-
-def device() -> str:
-    """What computes, in words."""
-    try:
-        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    except OSError:
-        model = None
-    return f"cpu, {model[1] if model else platform.machine()}, {torch.get_num_threads()} threads"
 
 
 def save_strips(runs: Path, results: ClipResults) -> None:

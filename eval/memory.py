@@ -23,7 +23,7 @@ def growth_mb(run: Callable[[], object]) -> float | None:
 def status_mb(field: str) -> float:
     match = re.search(rf"{field}:\s*(\d+) kB", Path("/proc/self/status").read_text())
     assert match
-    return int(match[1]) / 1e3
+    return int(match[1]) * 1024 / 1e6
 
 
 def alone(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -9,26 +9,32 @@ import csv
 import hashlib
 import io
 import json
+import platform
+import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from datasets.clip import Clip
 from datasets.files import read_json, write_file, write_json
 from datasets.frame import Signal
+from datasets.profiles import ClipKind
 from errors import BadInput
 from eval.metrics import METRICS
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 REFERENCE, FLOOR = "reference", "(noise floor)"
-PACKAGES = ("onespp", "torch", "numpy", "flip-evaluator")
+BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
+PACKAGES = ("onespp", "torch", "numpy", "numba", "flip-evaluator", "pyoidn")
 RESULT, RESULTS, FRAMES = "result.json", "results.json", "frames.csv"
 # What results follow from, besides packages, weights and clips.
 SOURCES = (
@@ -51,14 +57,30 @@ Values = dict[str, float | None]
 
 
 def versions() -> dict[str, str]:
-    return {package: version(package) for package in PACKAGES}
+    """Of the packages that results follow from, as far as they are installed."""
+    found = {}
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def device(kind: str = "cpu", threads: int | None = None) -> str:
+    """What computes, in words; with all threads that PyTorch takes, unless told."""
+    if kind == "cuda":
+        return f"cuda, {torch.cuda.get_device_name()}"
+    try:
+        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        model = None
+    return f"cpu, {model[1] if model else platform.machine()}, {threads or torch.get_num_threads()} threads"
 
 
 @cache
-def code() -> str:
+def code(sources: tuple[str, ...] = SOURCES) -> str:
     """A digest of the code that results follow from."""
     root = Path(__file__).parent.parent
-    files = [file for source in SOURCES for file in ((root / source).rglob("*.py"), [root / source])["." in source]]
+    files = [file for source in sources for file in ((root / source).rglob("*.py"), [root / source])["." in source]]
     return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(files))).hexdigest()
 
 
@@ -196,6 +218,10 @@ class ClipResults:
     signal: str
     tracks: list[Result]
     reference: Result
+
+    @property
+    def noisy_spp(self) -> int:
+        return ClipKind.of(self.clip).noisy_spp
 
     @property
     def name(self) -> str:

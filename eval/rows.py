@@ -7,7 +7,7 @@ from eval.floor import within_floor
 from eval.results import FLOOR, ClipResults, Result, Values, mean_floor, means
 from eval.table import cell, floor_cell
 
-ALL = "mean of all clips"
+ALL = "mean of clips of 1 spp"
 
 
 @dataclass
@@ -39,18 +39,23 @@ def rows_of(clip: str, tracks: Sequence[tuple[str, str, Values, int]], floors: V
 
 
 def table_rows(clips: Sequence[ClipResults]) -> list[Row]:
-    """Means over all clips, if there are several, and then clip by clip."""
+    """Means over the clips of one sample a pixel, if there are several, and then clip by clip."""
     rows = []
     for clip in clips:
         tracks = [(track.denoiser, track.signal, track.metrics, track.nonfinite) for track in clip.tracks]
         rows += rows_of(f"{clip.scene}/{clip.clip}", tracks, clip.reference.metrics)
     together = []
-    for signal, ours in by_signal(clips).items():
+    for signal, ours in by_signal(one_spp(clips)).items():
         if len(ours) > 1:
             names = [track.denoiser for track in ours[0].tracks]
             tracks = [(name, signal, mean_of(ours, name), nonfinite_of(ours, name)) for name in names]
             together += rows_of(ALL, tracks, mean_floor([clip.reference.metrics for clip in ours]))
     return together + rows
+
+
+def one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
+    """Without clips such as 000-4spp, which show the same frames again with other input: means do not mix them."""
+    return [clip for clip in clips if clip.noisy_spp == 1]
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[str, list[ClipResults]]:

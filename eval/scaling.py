@@ -11,6 +11,7 @@ from tabulate import tabulate
 from datasets.figure import DPI, plt, save_figure
 from datasets.files import write_json
 from eval.bench import PRECISIONS, Variant, parse_size, race, thread_count, thread_counts, variants
+from eval.results import device
 from eval.sizes import SIZES as OTHER_SIZES
 from models import inference_precision
 
@@ -19,7 +20,8 @@ SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
 
 def in_use(names: Sequence[str]) -> list[Variant]:
     """Of all ways to run the denoisers the one that evaluation takes. Raises BadInput for an unknown name."""
-    chosen = (v for v in variants(names) if v.compiled and (names or v.name not in OTHER_SIZES))
+    once = (v for v in variants(names) if v.compiled and not v.indirect)
+    chosen = (v for v in once if names or v.name not in OTHER_SIZES)
     return [v for v in chosen if PRECISIONS[v.dtype] == inference_precision(v.build())]
 
 
@@ -71,6 +73,8 @@ def bench_scaling(runs: Path, names: Sequence[str], sizes: Sequence[str] = (), t
     (runs / "bench").mkdir(parents=True, exist_ok=True)
     figures = runs / "report" / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    write_json(runs / "bench" / "scaling.json", {"schema": 1, "device": "cpu", "threads": count, "rows": rows})
+    write_json(
+        runs / "bench" / "scaling.json", {"schema": 1, "device": device(threads=count), "threads": count, "rows": rows}
+    )
     save_figure(figures / "scaling.png", draw(rows))
     return table(rows)

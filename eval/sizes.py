@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
+from eval.results import BASELINES
 from eval.variants import label_of
 from models import create
 from models.denoiser import Denoiser
@@ -20,9 +21,11 @@ def create_any(name: str) -> Denoiser:
     return makers[name]() if name in makers else create(name)
 
 
-def timed_as(name: str) -> str:
-    """What the bench calls a network of the same speed."""
-    return "wskp6" if name == WHOLE else name
+def timed_as(name: str, signal: str) -> str:
+    """What the bench calls whatever computes the same, in time: another training of a network, a baseline's signal."""
+    if signal == "indirect" and name in BASELINES:
+        return f"{name} (indirect)"
+    return {WHOLE: "wskp6", "ntd-b": "ntd"}.get(name, name)
 
 
 def trained_as(name: str) -> str:

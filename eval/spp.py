@@ -18,8 +18,10 @@ from eval.candidates import Candidate, Times, ready
 from eval.harness import evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import Result, Values, means
+from eval.results import REFERENCE, Result, Values, mean_floor, means
+from eval.table import cell, compared
 from models import inference_precision
+from render.clip import Options
 
 LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 SAMPLED = ("noisy", "accumulated", "svgf", "oidn", "rae", "wskp6", "ntd")
@@ -47,21 +49,27 @@ def sampled(chosen: Sequence[Candidate], named: bool) -> list[Candidate]:
 def judge(
     chosen: Sequence[Candidate], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
 ) -> dict[tuple[str, str, int], Values]:
-    """Means over clips of (signal, label, samples a pixel). What is rendered and judged is kept in `folder`."""
+    """Means over clips of (signal, label, samples a pixel). What is rendered and judged is kept in `folder`.
+
+    Noise floors are those of the label REFERENCE.
+    """
     entrants, found = ready(chosen), dict[tuple[str, str, int], list[Result]]()
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
         fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data")
         for result in evaluate_clip(fed, tracks_of(entrants), folder):
-            if not result.floor:
-                found.setdefault((result.signal, result.denoiser, spp), []).append(result)
-    return {key: means([result.metrics for result in results]) for key, results in found.items()}
+            found.setdefault((result.signal, result.denoiser, spp), []).append(result)
+    return {
+        key: (mean_floor if results[0].floor else means)([result.metrics for result in results])
+        for key, results in found.items()
+    }
 
 
 def costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[str, Cost]:
     """What samples of each clip's scene cost at the size and with the threads of the bench."""
+    options = Options(**dataset.facts["options"])
     return {
-        f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads)
+        f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads, options)
         for clip in tqdm(clips, f"rendering {times.name}", unit="scene", leave=False)
     }
 
@@ -80,14 +88,16 @@ def by_samples(
     by_label = {candidate.label: candidate for candidate in chosen}
     rows: list[Row] = []
     for (signal, label, spp), metrics in quality.items():
+        if label == REFERENCE:
+            continue
         candidate = by_label[label]
-        render_ms, filter_ms = float(np.mean([c.of(spp) for c in cost.values()])), times.of(candidate)
+        render_ms, filter_ms = float(np.mean([c.of(spp) for c in cost.values()])), times.of(candidate, signal)
         total = None if filter_ms is None else render_ms + filter_ms
         rows.append(
             {
                 **candidate.facts(),
                 **{"signal": signal, "spp": spp, "render_ms": render_ms, "filter_ms": filter_ms, "ms": total},
-                "metrics": metrics,
+                **{"metrics": metrics, "floors": quality[signal, REFERENCE, spp]},
             }
         )
     for signal in {row["signal"] for row in rows}:
@@ -100,9 +110,8 @@ def by_samples(
     }
 
 
-def shown(metric: str, value: float) -> float:
-    """A value in the digits that tables show: those behind them are no reason to spend milliseconds."""
-    return float(METRICS[metric].form.format(value))
+def shown(row: Mapping[str, Any], metric: str) -> str:
+    return cell(metric, row["metrics"][metric], row["floors"].get(metric))
 
 
 def name_of(row: Mapping[str, Any]) -> str:
@@ -112,7 +121,9 @@ def name_of(row: Mapping[str, Any]) -> str:
 def mark_beaten(rows: Sequence[Row]) -> None:
     """Say of each row which one has the higher PSNR in no more milliseconds; None on the front."""
     points = {
-        name_of(row): Point(row["ms"], shown("psnr", row["metrics"]["psnr"])) for row in rows if row["ms"] is not None
+        name_of(row): Point(row["ms"], compared("psnr", row["metrics"]["psnr"], row["floors"]["psnr"]))
+        for row in rows
+        if row["ms"] is not None
     }
     beaten = dominators(points, more_is_better=True)
     for row in rows:
@@ -124,12 +135,12 @@ def samples_table(rows: Sequence[Mapping[str, Any]]) -> str:
     groups: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         line = groups.setdefault((row["signal"], row["label"]), {"signal": row["signal"], "denoiser": row["label"]})
-        line[f"{row['spp']} spp"] = METRICS["psnr"].form.format(row["metrics"]["psnr"])
+        line[f"{row['spp']} spp"] = shown(row, "psnr")
     text = f"PSNR dB\n{tabulate([*groups.values()], 'keys', disable_numparse=True)}"
     for signal in dict.fromkeys(row["signal"] for row in rows):
         front = [r for r in rows if (r["signal"], r["dominated_by"]) == (signal, None) and r["ms"] is not None]
         front.sort(key=lambda row: row["ms"])
-        steps = (f"{name_of(row)} ({row['ms']:.4g} ms, {row['metrics']['psnr']:.2f} dB)" for row in front)
+        steps = (f"{name_of(row)} ({row['ms']:.4g} ms, {shown(row, 'psnr')} dB)" for row in front)
         text += f"\n\nWorth the time, {signal} light: {'; '.join(steps)}"
     return text
 
@@ -139,7 +150,7 @@ def generalisation(rows: Sequence[Mapping[str, Any]]) -> str:
     ours = [r for r in rows if r["signal"] == "total" and r["denoiser"] in GENERALISED and r["spp"] in FED]
     metrics = ("psnr", "ssim", "rmse")
     lines = [
-        [row["label"], row["spp"], *(METRICS[m].form.format(row["metrics"][m]) for m in metrics)]
+        [row["label"], row["spp"], *(shown(row, metric) for metric in metrics)]
         for row in sorted(ours, key=lambda row: (row["spp"], GENERALISED.index(row["denoiser"])))
     ]
     return tabulate(lines, ["denoiser", "spp", *(METRICS[m].title for m in metrics)], disable_numparse=True)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from tabulate import tabulate
 
-from eval.floor import within_floor
+from eval.floor import floor_limit, within_floor
 from eval.metrics import METRICS
 from eval.results import FLOOR, ClipResults, Values
 
@@ -19,6 +19,13 @@ def cell(metric: str, value: float | None, floor: float | None = None) -> str:
         return "-"
     mark = NEAR if within_floor(metric, value, floor) else ""
     return mark + METRICS[metric].form.format(value)
+
+
+def compared(metric: str, value: float, floor: float | None) -> float:
+    """What to compare by: the digits that are shown, and one and the same number for all that is within the floor."""
+    if floor is not None and within_floor(metric, value, floor):
+        value = floor_limit(metric, floor)
+    return float(METRICS[metric].form.format(value))
 
 
 def floor_cell(metric: str, value: float | None) -> str:

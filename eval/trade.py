@@ -7,17 +7,18 @@ from typing import Any
 from tabulate import tabulate
 
 from datasets.clip import Clip, Dataset
+from datasets.cost import RENDERER
 from datasets.figure import save_figure
 from datasets.files import write_json
 from errors import BadInput
 from eval.bench import parse_size
 from eval.candidates import Candidate, Times, candidates, ready
-from eval.harness import device, evaluate_clip, tracks_of
+from eval.harness import evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import REFERENCE, Result, Values, mean_floor, means, versions
-from eval.spp import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table, shown
-from eval.table import LEGEND, NEAR, cell
+from eval.results import REFERENCE, Result, Values, device, mean_floor, means, versions
+from eval.spp import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table
+from eval.table import LEGEND, NEAR, cell, compared
 from eval.trade_plots import draw_front, draw_samples
 
 TRADED = ("psnr", "ssim", "rmse")
@@ -53,21 +54,27 @@ def rows_of(chosen: Sequence[Candidate], quality: Means, times: Times) -> list[d
             rows.append(
                 {
                     **candidate.facts(),
-                    **{"signal": signal, "epochs": candidate.epochs(), "ms": times.of(candidate), "metrics": metrics},
+                    **{
+                        "signal": signal,
+                        "epochs": candidate.epochs(),
+                        "ms": times.of(candidate, signal),
+                        "metrics": metrics,
+                    },
                 }
             )
     for signal in {row["signal"] for row in rows}:
         ours = [row for row in rows if row["signal"] == signal]
-        beaten = {metric: beaten_by(ours, metric) for metric in TRADED}
+        floors = quality.get((signal, REFERENCE), {})
+        beaten = {metric: beaten_by(ours, metric, floors.get(metric)) for metric in TRADED}
         for row in ours:
             row["dominated_by"] = {metric: by.get(row["label"]) for metric, by in beaten.items()}
     return rows
 
 
-def beaten_by(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str, str | None]:
+def beaten_by(rows: Sequence[Mapping[str, Any]], metric: str, floor: float | None = None) -> dict[str, str | None]:
     """For each label that has a time and a value: the best that is no slower and better, None on the front."""
     points = {
-        row["label"]: Point(row["ms"], shown(metric, row["metrics"][metric]))
+        row["label"]: Point(row["ms"], compared(metric, row["metrics"][metric], floor))
         for row in rows
         if row["ms"] is not None and row["metrics"][metric] is not None
     }
@@ -112,7 +119,7 @@ def trade(
     Raises BadInput where there are no times or clips, for a bad size or numbers of samples, and as `candidates` does.
     """
     check_levels(levels)
-    dataset, times = Dataset(data), Times(runs, parse_size(size), threads)
+    dataset, times = Dataset(data), Times(runs, parse_size(size), threads, RENDERER)
     clips, chosen = clips_of(dataset), candidates(names, runs, profile)
 
     entrants = ready(chosen)
@@ -124,7 +131,7 @@ def trade(
 
     figures = runs / "report" / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    title = f"{times.name}, {times.threads} threads; mean of {len(clips)} clips of {data}"
+    title = f"{times.name}, {RENDERER}, {times.threads} threads; mean of {len(clips)} clips of {data}"
     for metric in TRADED:
         save_figure(figures / f"trade-{metric}.png", draw_front(rows, metric, title))
     save_figure(figures / "trade-samples.png", draw_samples(samples["rows"], title))

@@ -7,8 +7,10 @@ from typing import Any
 from datasets.files import read_json
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import ClipResults
-from eval.rows import by_signal, mean_of
+from eval.results import ClipResults, mean_floor
+from eval.rows import by_signal, mean_of, one_spp
+from eval.sizes import timed_as
+from eval.table import compared
 
 TRADED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
 
@@ -34,7 +36,7 @@ def trades(runs: Path, clips: Sequence[ClipResults]) -> tuple[dict[str, Any], li
     times = median_ms(bench, (height, width), bench["threads"])  # of the first size, with as many threads as there are
     plots = [
         trade(signal, ours, metric, times) | {"size": f"{width} × {height}"}
-        for signal, ours in by_signal(clips).items()
+        for signal, ours in by_signal(one_spp(clips)).items()
         for metric in TRADED
     ]
     return bench, [plot for plot in plots if plot["points"]]
@@ -44,12 +46,14 @@ def trade(
     signal: str, clips: Sequence[ClipResults], metric: str, times: dict[tuple[str, str], float]
 ) -> dict[str, Any]:
     """A point for each denoiser that was timed in the precision in which it was evaluated."""
-    points = {}
+    floor = mean_floor([clip.reference.metrics for clip in clips]).get(metric)
+    points, values = dict[str, Point](), dict[str, float]()
     for track in clips[0].tracks:
-        ms, quality = times.get((track.denoiser, track.precision)), mean_of(clips, track.denoiser)[metric]
+        ms = times.get((timed_as(track.denoiser, signal), track.precision))
+        quality = mean_of(clips, track.denoiser)[metric]
         if ms is not None and quality is not None:
-            points[track.denoiser] = Point(ms, quality)
+            points[track.denoiser], values[track.denoiser] = Point(ms, compared(metric, quality, floor)), quality
     by = dominators(points, METRICS[metric].more_is_better)
     missing = [track.denoiser for track in clips[0].tracks if track.denoiser not in points]
-    shown = [{"name": name, **point._asdict(), "by": by[name]} for name, point in points.items()]
+    shown = [{"name": name, "ms": points[name].ms, "quality": values[name], "by": by[name]} for name in points]
     return {"signal": signal, "metric": metric, "points": shown, "missing": missing}

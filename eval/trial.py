@@ -164,14 +164,15 @@ class Trial:
         expected = play(other, self.extreme.frames(unchanged))
         return differences(self.outputs, [self.extreme.gain * output for output in expected])
 
-    def spreads(self, pixel: Pixel, changed: Tensor) -> bool:
-        """Whether the spoiled frame has `changed` (H, W) where no ordinary value of the pixel changes anything."""
+    def spreads(self, pixel: Pixel) -> bool:
+        """Whether the spoiled frame differs where no ordinary value of the pixel changes anything."""
 
         def spoiled_frame(change: Callable[[Frame], Frame]) -> Tensor:
             return play(self.denoiser, list(self.extreme.frames(change))[: SPOILED + 1])[-1]
 
         clean = spoiled_frame(unchanged)
         seen = [(spoiled_frame(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY]
+        changed = (self.outputs[SPOILED] != clean).any(dim=0)  # NaN is a change, too
         return bool((changed & ~torch.stack(seen).any(dim=0)).any())
 
     def recovery(self, changed: Sequence[Tensor]) -> int | None:
@@ -193,7 +194,7 @@ class Trial:
             changed = [~(error <= limit).all(dim=0) for error in errors]  # NaN is a change, too
             recovery = self.recovery(changed)
             if poison := self.extreme.poison:
-                broken["spread"] = self.spreads(poison, changed[SPOILED])
+                broken["spread"] = self.spreads(poison)
                 broken["recovery"] = recovery is None
         nonfinite = sum(int(where.sum()) for where in bad)
         missed = tuple(name for name in REQUIREMENTS if broken.get(name))

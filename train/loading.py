@@ -131,4 +131,4 @@ def anonymous_memory(paths: list[Path], recipe: Recipe) -> tuple[float | str, fl
 def rss_anon() -> float | str:
     status = Path("/proc/self/status")
     match = re.search(r"RssAnon:\s*(\d+) kB", status.read_text()) if status.exists() else None
-    return int(match[1]) / 1e3 if match else "only on Linux"
+    return int(match[1]) * 1024 / 1e6 if match else "only on Linux"

@@ -63,7 +63,11 @@ function markBest() {
       const cells = group.map(row => row.cells[3 + index]).filter(cell => cell.dataset.value !== undefined);
       const size = cell => (more ? -cell.dataset.value : Math.abs(cell.dataset.value));
       const best = Math.min(...cells.map(size));
-      for (const cell of cells) cell.classList.toggle("best", size(cell) === best);
+      const bestIsNear = cells.some(cell => size(cell) === best && cell.classList.contains("near"));
+      for (const cell of cells) {
+        // Within the noise floor digits mean nothing: all are best alike.
+        cell.classList.toggle("best", size(cell) === best || (bestIsNear && cell.classList.contains("near")));
+      }
     }
   });
 }

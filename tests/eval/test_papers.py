@@ -1,6 +1,7 @@
 """What was transcribed agrees with what the papers say of it; orders are judged right; what is missing says so."""
 
 import math
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +19,7 @@ from eval.papers import (
     WSKP_TABLE_3,
     WSKP_TABLE_5,
 )
+from eval.results import REFERENCE, Result, folder_of, write_results
 from models import DENOISERS
 
 
@@ -111,14 +113,16 @@ def test_orders_are_those_of_most_scenes():
     }
 
 
-def evaluated(runs, **metrics) -> None:
-    rows = [
-        {"denoiser": name, "signal": "indirect" if name == "ntd" else "total", "metrics": values}
-        for name, clips in metrics.items()
-        for values in clips
-    ]
-    (runs / "eval").mkdir(parents=True)
-    write_json(runs / "eval" / "results.json", {"rows": rows})
+def evaluated(runs, floors=None, clips=("000", "001"), **metrics) -> None:
+    """Results as `onespp eval` leaves them, a value a clip."""
+    results = []
+    for name, values in ({REFERENCE: [{"mse_unbiased": 0.0} | (floors or {})] * len(clips)} | metrics).items():
+        for clip, value in zip(clips, values, strict=False):
+            for signal in ("total", "indirect") if name == REFERENCE else ("indirect" if name == "ntd" else "total",):
+                results.append(Result("", name, signal, "box", clip, value, []))
+                folder_of(runs, "box", clip, name, signal).mkdir(parents=True, exist_ok=True)
+                results[-1].save(runs)
+    write_results(runs, Path("data"), "cpu", results, dict.fromkeys(metrics))
 
 
 def test_verdicts(tmp_path):
@@ -127,18 +131,37 @@ def test_verdicts(tmp_path):
         rae=[{"rmse": 0.1, "ssim": 0.5}, {"rmse": 0.3, "ssim": None}],
         eaw=[{"rmse": 0.1, "ssim": 0.6}, {"rmse": 0.4, "ssim": 0.6}],
     )
-    value = measured(RAE_FIG_8, tmp_path).value
+    here = measured(RAE_FIG_8, tmp_path)
+    value = here.value
     assert value("rae", "rmse") == pytest.approx(0.2) and value("rae", "ssim") == 0.5  # where it is defined
     rmse, ssim = orders(RAE_FIG_8)
-    assert "rae before eaw (there in 5 of 5): holds, 0.2000 against 0.2500" in verdict(RAE_FIG_8, rmse, value)
-    assert "DOES NOT HOLD, 0.5000 against 0.6000" in verdict(RAE_FIG_8, ssim, value)
+    assert "rae before eaw (there in 5 of 5): holds, 0.2000 against 0.2500" in verdict(RAE_FIG_8, rmse, here)
+    assert "DOES NOT HOLD, 0.5000 against 0.6000" in verdict(RAE_FIG_8, ssim, here)
     order = orders(SVGF_TABLE_1)[0]
-    assert verdict(SVGF_TABLE_1, order, value).endswith("not measured")
+    assert verdict(SVGF_TABLE_1, order, measured(SVGF_TABLE_1, tmp_path / "other")).endswith("not measured")
+
+
+def test_orders_within_the_noise_floor_are_none(tmp_path):
+    both = {"rae": [{"rmse": 0.1, "ssim": 0.5}], "eaw": [{"rmse": 0.09, "ssim": 0.9}]}
+    evaluated(tmp_path, {"rmse": 0.08, "ssim": 0.2}, ("000",), **both)
+    here = measured(RAE_FIG_8, tmp_path)
+    assert all("both within the noise floor" in verdict(RAE_FIG_8, order, here) for order in orders(RAE_FIG_8))
+    assert "≈0.1000" in against_papers(tmp_path)
+    evaluated(tmp_path, {"rmse": 0.065, "ssim": 0.2}, ("000",), **both)
+    assert "DOES NOT HOLD" in verdict(RAE_FIG_8, orders(RAE_FIG_8)[0], measured(RAE_FIG_8, tmp_path))  # one is not
+
+
+def test_only_clips_of_one_sample_a_pixel_count(tmp_path):
+    evaluated(tmp_path, clips=("000", "000-4spp"), rae=[{"rmse": 0.3, "ssim": 0.5}, {"rmse": 0.1, "ssim": 0.9}])
+    assert measured(RAE_FIG_8, tmp_path).value("rae", "rmse") == 0.3
 
 
 def test_all_sources_are_read(tmp_path):
     evaluated(
-        tmp_path, ntd=[{"ssim": 0.9, "l1": 0.02, "mse": 0.001, "psnr": 30.0}], svgf=[{"ssim": 0.1, "l1": 1, "mse": 1}]
+        tmp_path,
+        clips=("000",),
+        ntd=[{"ssim": 0.9, "l1": 0.02, "mse": 0.001, "psnr": 30.0}],
+        svgf=[{"ssim": 0.1, "l1": 1.0, "mse": 1.0}],
     )
     assert measured(NTD_TABLE_2, tmp_path).value("ntd", "ssim") == 0.9
     assert measured(NTD_TABLE_2, tmp_path).value("svgf", "ssim") is None  # that was of total light

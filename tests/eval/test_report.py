@@ -81,7 +81,7 @@ def test_the_table_has_every_result_and_floor(page):
     titles, *rows = page.rows
     shown = [metric.title for key, metric in METRICS.items() if key != "flicker"]  # nothing stands still here
     assert [title.removesuffix(" ↑") for title in titles] == ["clip", "denoiser", "signal", *shown, "non-finite"]
-    clips = ["mean of all clips", "cornell_box/000", "cornell_box_moving/000"]
+    clips = ["mean of clips of 1 spp", "cornell_box/000", "cornell_box_moving/000"]
     assert [row[0] for row in rows if row[1] == "(noise floor)" and row[2] == "total"] == clips
     assert {row[2] for row in rows if row[1] == "ntd"} == {"indirect"}
     assert len(rows) == 3 * (len(NAMES) - 1 + 1) + 3 * (3 + 1)
@@ -128,8 +128,9 @@ def test_quality_against_time(page):
     total = plots["total", "flip"]
     assert {point["name"]: point["ms"] for point in total["points"]} == {"noisy": 0.5, "accumulated": 1.0, "eaw": 2.5}
     assert total["missing"] == [] and total["size"] == "1280 × 720"
-    indirect = {point["name"]: point["by"] for point in plots["indirect", "ssim"]["points"]}
-    assert indirect["noisy"] is None and "ntd" in indirect
+    indirect = {point["name"]: point for point in plots["indirect", "ssim"]["points"]}
+    assert indirect["noisy"]["by"] is None and "ntd" in indirect
+    assert (indirect["noisy"]["ms"], indirect["accumulated"]["ms"]) == (0.4, 0.6)  # not those of total light
 
 
 def test_a_page_of_few_megabytes_shows_fewer_frames(evaluated, tmp_path):

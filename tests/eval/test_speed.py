@@ -9,6 +9,7 @@ import torch
 import eval.bench
 from errors import BadInput
 from eval.bench import Variant, bench_denoisers, macs_per_pixel, parse_size, race, thread_counts, variants
+from eval.results import device
 from eval.scaling import exponent, in_use
 from eval.sizes import SIZES
 from eval.synthetic import synthetic_frame
@@ -28,11 +29,12 @@ def test_results_have_the_agreed_form(tmp_path, monkeypatch, capsys):
     table = capsys.readouterr().out
     assert "times oidn" in table and "reconstruction" in table and "accumulated (PyTorch)" in table
     results = json.loads((tmp_path / "bench" / "results.json").read_text())
-    assert (results["schema"], results["device"], results["threads"]) == (1, "cpu", 1)
+    assert (results["schema"], results["device"], results["threads"]) == (1, device(threads=1), 1)
     rows = results["rows"]
     assert all(row.keys() == KEYS and (row["width"], row["height"]) == (64, 32) for row in rows)
     labels = [(row["denoiser"], row["dtype"]) for row in rows]
-    assert labels[:2] == [("accumulated", "float32"), ("accumulated (PyTorch)", "float32")]
+    ways = ("accumulated", "accumulated (PyTorch)", "accumulated (indirect)")
+    assert labels[:3] == [(way, "float32") for way in ways]
     assert ("rae", "float32") in labels and ("rae", "bfloat16") in labels
     for row in rows:
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]

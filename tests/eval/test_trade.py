@@ -14,11 +14,12 @@ from datasets.samples import averaged, rendered, scene_of, source, with_samples
 from errors import BadInput
 from eval.bench import Variant
 from eval.candidates import Candidate, Times, candidates
-from eval.sizes import SIZES, WHOLE, create_any, trained_as
+from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 from eval.spp import check_levels, generalisation, mark_beaten
 from eval.trade import beaten_by, clips_of, trade
 from models.fusion import WINDOWS
 from models.weights import save_weights
+from render.clip import PLAIN
 from train.loop import WEIGHTS, run_folder
 
 SIZE = (32, 48)
@@ -73,9 +74,14 @@ def test_digits_that_nobody_sees_do_not_make_a_front():
     assert beaten_by(rows, "psnr") == {"fast": None, "slow": "fast", "better": None}
 
 
+def test_what_is_within_the_noise_floor_is_on_a_par():
+    rows = [{"label": str(psnr), "ms": psnr, "metrics": {"psnr": psnr}} for psnr in (30.0, 36.0, 38.0, 41.0)]
+    assert beaten_by(rows, "psnr", 40.0) == {"30.0": None, "36.0": None, "38.0": None, "41.0": "38.0"}  # from 36.99 on
+
+
 def test_samples_that_are_not_worth_their_time():
     rows = [
-        {"label": label, "spp": spp, "ms": ms, "metrics": {"psnr": psnr}}
+        {"label": label, "spp": spp, "ms": ms, "metrics": {"psnr": psnr}, "floors": {"psnr": None}}
         for label, spp, ms, psnr in (("noisy", 1, 1.0, 20.0), ("noisy", 4, 9.0, 26.0), ("rae", 1, 5.0, 30.0))
     ]
     mark_beaten(rows)
@@ -145,6 +151,9 @@ def test_clips_are_kept_until_what_they_are_made_of_changes(tiny, tmp_path):
 def test_samples_that_cannot_be_had(tiny, tmp_path):
     clip, dataset = a_clip(tiny), Dataset(tiny)
     four = with_samples(clip, dataset, 4, "rendered", tmp_path)
+    dataset.facts["options"] = {"halton": True, "regularise": False}
+    with pytest.raises(BadInput, match="16 different samples a pixel: 32 are too many"):
+        with_samples(clip, dataset, 32, "rendered", tmp_path)
     with pytest.raises(BadInput, match="has 4 samples a pixel: 6 are no multiple"):
         with_samples(four, dataset, 6, "rendered", tmp_path)
     dataset.facts["generator"] = 0
@@ -158,7 +167,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 def test_cost_of_samples(tiny):
     cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
-    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
 
 
@@ -169,8 +178,8 @@ def test_sizes_are_the_networks_of_the_ablation():
     assert [trained_as(name) for name in SIZES][:2] == ["3", "3+5"] and SIZES[WHOLE] == WINDOWS
     for name, windows in SIZES.items():
         assert create_any(name).windows == windows
-    assert Candidate(Variant(WHOLE, WHOLE, "bfloat16"), None).timed == ("wskp6", "bfloat16")
-    assert Candidate(Variant("wskp6-2w", "wskp6-2w"), None).timed == ("wskp6-2w", "float32")
+    assert [timed_as(name, "total") for name in (WHOLE, "wskp6-2w", "ntd-b")] == ["wskp6", "wskp6-2w", "ntd"]
+    assert timed_as("svgf", "indirect") == "svgf (indirect)" and timed_as("ntd", "indirect") == "ntd"
 
 
 def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
@@ -185,8 +194,13 @@ def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
     assert "skipped: wskp3 has no weights" in capsys.readouterr().out
     (tmp_path / "ablation" / "wskp-windows").mkdir(parents=True)
     write_json(tmp_path / "ablation" / "wskp-windows" / "results.json", {"profile": "quick"})
+    assert "svgf" in {candidate.label for candidate in candidates([], tmp_path, "tiny")}
     with pytest.raises(BadInput, match="is of the profile quick"):
-        candidates([], tmp_path, "tiny")
+        candidates(["wskp6-2w"], tmp_path, "tiny")
+
+
+def test_only_what_was_named_is_a_candidate(tmp_path):
+    assert [candidate.label for candidate in candidates(["svgf"], tmp_path, "tiny")] == ["svgf"]  # no baseline, no ways
 
 
 def test_times_come_from_the_bench(tmp_path):
@@ -194,8 +208,11 @@ def test_times_come_from_the_bench(tmp_path):
         Times(tmp_path, SIZE)
     bench_of(tmp_path, ["noisy", "rae"])
     rae = Candidate(Variant("rae", "rae", "bfloat16"), None)
-    assert Times(tmp_path, SIZE).of(rae) == 1.0 and Times(tmp_path, SIZE, threads=1).of(rae) == 2.0
-    assert Times(tmp_path, SIZE).of(Candidate(Variant("kp", "kp"), None)) is None
+    assert [Times(tmp_path, SIZE, threads=n).of(rae, "total") for n in (None, 1)] == [1.0, 2.0]
+    assert Times(tmp_path, SIZE).of(Candidate(Variant("kp", "kp"), None), "total") is None
+    assert Times(tmp_path, SIZE).of(Candidate(Variant("noisy", "noisy"), None), "indirect") is None  # of total light
+    with pytest.raises(BadInput, match=r"results-cuda.json"):
+        Times(tmp_path, SIZE, device="cuda")
     with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
         Times(tmp_path, SIZE, threads=3)
 
@@ -214,6 +231,7 @@ def traded(tiny, tmp_path_factory):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else trained_as(name)
         save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+    write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
     text = trade(tiny, runs, "tiny", names, "48x32", levels=(1, 4))
