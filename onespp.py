@@ -314,11 +314,11 @@ def trade(
     print(run(data_folder(data, profile), runs, profile, names, size, threads, spp))
 
 
-def papers(runs: Runs = Path("runs")) -> None:
+def papers(runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
     """Print what the papers measured on their scenes beside what was measured here, and which orders hold here too."""
     from eval.against_papers import against_papers
 
-    print(against_papers(runs))
+    print(against_papers(runs, profile))
 
 
 def report(

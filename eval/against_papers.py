@@ -44,7 +44,7 @@ class Measured:
         return within_floor(metric, self.value(denoiser, metric), self.floor(metric))
 
 
-def from_evaluation(runs: Path, signal: str) -> Measured:
+def from_evaluation(runs: Path, profile: str, signal: str) -> Measured:
     """Means over the clips of 1 spp of RUNS/eval/results.json where a metric is defined."""
     path = runs / "eval" / "results.json"
     clips = one_spp(read_results(runs)[1]) if path.exists() else []
@@ -54,7 +54,7 @@ def from_evaluation(runs: Path, signal: str) -> Measured:
     def value(denoiser: str, metric: str) -> float | None:
         return mean_of(ours, denoiser)[metric] if of(ours, denoiser) else None
 
-    return Measured(value, f"onespp eval --runs {runs}", floors.get)
+    return Measured(value, f"onespp eval --profile {profile} --runs {runs}", floors.get)
 
 
 def from_bench(runs: Path) -> Measured:
@@ -73,7 +73,7 @@ def from_bench(runs: Path) -> Measured:
     return Measured(value, f"onespp bench denoisers --size {SIZE[1]}x{SIZE[0]} --runs {runs}")
 
 
-def from_ablation(runs: Path) -> Measured:
+def from_ablation(runs: Path, profile: str) -> Measured:
     """Means over clips and seeds of RUNS/ablation/wskp-repvgg/results.json."""
     path = runs / "ablation" / "wskp-repvgg" / "results.json"
     rows = [Run(**row) for row in read_json(path, ("rows",))["rows"]] if path.exists() else []
@@ -82,14 +82,14 @@ def from_ablation(runs: Path) -> Measured:
         found = over_seeds(rows, variant, metric)
         return found[0] if found else None
 
-    return Measured(value, f"onespp ablate wskp-repvgg --runs {runs}")
+    return Measured(value, f"onespp ablate wskp-repvgg --profile {profile} --runs {runs}")
 
 
-def measured(table: PaperTable, runs: Path) -> Measured:
+def measured(table: PaperTable, runs: Path, profile: str = "quick") -> Measured:
     """Raises BadInput where the file is damaged."""
     if table.where == "bench":
         return from_bench(runs)
-    return from_ablation(runs) if table.where == "ablation" else from_evaluation(runs, table.signal)
+    return from_ablation(runs, profile) if table.where == "ablation" else from_evaluation(runs, profile, table.signal)
 
 
 def compared(table: PaperTable) -> list[str]:
@@ -153,16 +153,16 @@ def line(table: PaperTable, method: str, here: Measured) -> dict[str, str]:
     return cells
 
 
-def section(table: PaperTable, runs: Path) -> str:
+def section(table: PaperTable, runs: Path, profile: str) -> str:
     """One table of a paper: methods, means there and here, notes, orders."""
-    here = measured(table, runs)
+    here = measured(table, runs, profile)
     lines = [line(table, method, here) for method in table.values]
     parts = [table.source, f"scenes: {', '.join(table.scenes)}", tabulate(lines, "keys", disable_numparse=True)]
     parts += [f"  * {note}" for note in table.notes]
     parts += [f"  - {verdict(table, order, here)}" for order in orders(table)]
     if absent := missing(table, here.value):
         untrained = [name for name in absent if name in TRAINABLE and table.where == "eval"]
-        first = f"`onespp train {' '.join(untrained)} --runs {runs}` and " if untrained else ""
+        first = f"`onespp train {' '.join(untrained)} --profile {profile} --runs {runs}` and " if untrained else ""
         parts.append(f"  not measured: {', '.join(absent)}; get them with {first}`{here.command}`")
     return "\n".join(parts)
 
@@ -172,9 +172,9 @@ def missing(table: PaperTable, value: Value) -> list[str]:
     return [name for name in table.ours.values() if all(value(name, metric) is None for metric in compared(table))]
 
 
-def against_papers(runs: Path) -> str:
-    """All tables, as text. What has not been measured is "-", with the command to measure it.
+def against_papers(runs: Path, profile: str = "quick") -> str:
+    """All tables, as text. What has not been measured is "-", with the command to measure it in the profile.
 
     Raises BadInput where a file of results is damaged.
     """
-    return "\n\n".join([HEADER, *(section(table, runs) for table in TABLES), LEGEND])
+    return "\n\n".join([HEADER, *(section(table, runs, profile) for table in TABLES), LEGEND])

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from datasets.files import read_json, write_json
 from datasets.frame import Frame
 from errors import BadInput
-from eval.memory import alone, growth_mb
+from eval.memory import alone, growth_mb, release
 from eval.results import BASELINES, code, versions
 from eval.results import SOURCES as EVALUATED
 from eval.results import device as in_words
@@ -221,6 +221,7 @@ def race(variants: Sequence[Variant], size: Size) -> list[Contender]:
 
     After PATIENCE it ends with less than REPEATS frames, but at least FEWEST.
     """
+    release()  # what earlier races took: all these states of 1920 x 1080 fill most of 24 GB
     contenders = [Contender.of(variant) for variant in variants]
     end = time.perf_counter() + PATIENCE
     with tqdm(total=(WARM_UP + REPEATS) * len(contenders), desc=f"{size[1]}x{size[0]}", leave=False) as progress:

@@ -1,19 +1,28 @@
 """Peak memory, measured in processes of their own."""
 
 import ctypes
+import gc
 import multiprocessing
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 
+def release() -> None:
+    """Hand memory that nobody needs any more back to the system."""
+    gc.collect()
+    with suppress(OSError, AttributeError):  # glibc only
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def growth_mb(run: Callable[[], object]) -> float | None:
     """How far resident memory rises while `run` is called, in MB; Linux only, else None."""
+    release()  # or the rise would fit unseen into what was freed
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # hand back what was freed, or the rise would fit into that unseen
         Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    except (OSError, AttributeError):
+    except OSError:
         return None
     before = status_mb("VmRSS")
     run()

@@ -178,13 +178,13 @@ def test_all_sources_are_read(tmp_path):
 
 
 def test_what_is_missing_comes_with_its_command(tmp_path):
-    text = against_papers(tmp_path)
+    text = against_papers(tmp_path, "tiny")
     for table in TABLES:
         assert table.source in text and all(note in text for note in table.notes)
     for command in (
-        f"`onespp train rae --runs {tmp_path}` and `onespp eval --runs {tmp_path}`",
+        f"`onespp train rae --profile tiny --runs {tmp_path}` and `onespp eval --profile tiny --runs {tmp_path}`",
         f"`onespp bench denoisers --size 1280x720 --runs {tmp_path}`",
-        f"`onespp ablate wskp-repvgg --runs {tmp_path}`",
+        f"`onespp ablate wskp-repvgg --profile tiny --runs {tmp_path}`",
     ):
         assert command in text
     assert "holds" not in text and "HOLD" not in text
