@@ -13,9 +13,9 @@ from eval.ablation_results import Run, over_seeds
 from eval.floor import within_floor
 from eval.metrics import METRICS, Metric
 from eval.papers import TABLES, PaperTable
-from eval.results import mean_floor, read_results
+from eval.results import read_results
 from eval.rows import mean_of, of, one_spp
-from eval.table import LEGEND, NEAR
+from eval.table import LEGEND, NEAR, joint_floor
 from train.recipes import TRAINABLE
 
 TITLES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {
@@ -37,11 +37,11 @@ class Measured:
 
     value: Value
     command: str
-    floor: Callable[[str], float | None] = lambda metric: None  # the noise floor of a metric
+    floor: Value = lambda denoiser, metric: None  # noise floor
 
     def near(self, denoiser: str, metric: str) -> bool:
         """Whether the value says no more than that the image is as close to the truth as the reference."""
-        return within_floor(metric, self.value(denoiser, metric), self.floor(metric))
+        return within_floor(metric, self.value(denoiser, metric), self.floor(denoiser, metric))
 
 
 def from_evaluation(runs: Path, profile: str, signal: str) -> Measured:
@@ -49,12 +49,15 @@ def from_evaluation(runs: Path, profile: str, signal: str) -> Measured:
     path = runs / "eval" / "results.json"
     clips = one_spp(read_results(runs)[1]) if path.exists() else []
     ours = [clip for clip in clips if clip.signal == signal]
-    floors = mean_floor([clip.reference.metrics for clip in ours]) if ours else {}
+    floors = [clip.reference.metrics for clip in ours]
 
     def value(denoiser: str, metric: str) -> float | None:
         return mean_of(ours, denoiser)[metric] if of(ours, denoiser) else None
 
-    return Measured(value, f"onespp eval --profile {profile} --runs {runs}", floors.get)
+    def floor(denoiser: str, metric: str) -> float | None:
+        return joint_floor([r.metrics for r in of(ours, denoiser)], floors).get(metric) if of(ours, denoiser) else None
+
+    return Measured(value, f"onespp eval --profile {profile} --runs {runs}", floor)
 
 
 def from_bench(runs: Path) -> Measured:

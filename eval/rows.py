@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from eval.floor import within_floor
 from eval.results import FLOOR, ClipResults, Result, Values, mean_floor, means
-from eval.table import cell, floor_cell
+from eval.table import cell, floor_cell, joint_floor
 
 ALL = "mean of clips of 1 spp"
 
@@ -33,23 +33,29 @@ class Row:
         return not self.is_floor and within_floor(metric, self.values.get(metric), self.floors.get(metric))
 
 
-def rows_of(clip: str, tracks: Sequence[tuple[str, str, Values, int]], floors: Values) -> list[Row]:
-    rows = [Row(clip, name, signal, values, floors, nonfinite) for name, signal, values, nonfinite in tracks]
-    return [*rows, Row(clip, FLOOR, tracks[0][1], floors, floors)]
+def rows_of(clip: str, signal: str, tracks: Sequence[Result], floors: Values) -> list[Row]:
+    rows = [Row(clip, track.denoiser, signal, track.metrics, floors, track.nonfinite) for track in tracks]
+    return [*rows, Row(clip, FLOOR, signal, floors, floors)]
+
+
+def mean_rows(signal: str, clips: Sequence[ClipResults]) -> list[Row]:
+    floors, rows = [clip.reference.metrics for clip in clips], []
+    for name in (track.denoiser for track in clips[0].tracks):
+        metrics = [result.metrics for result in of(clips, name)]
+        rows.append(Row(ALL, name, signal, means(metrics), joint_floor(metrics, floors), nonfinite_of(clips, name)))
+    floor = mean_floor(floors)
+    return [*rows, Row(ALL, FLOOR, signal, floor, floor)]
 
 
 def table_rows(clips: Sequence[ClipResults]) -> list[Row]:
     """Means over the clips of one sample a pixel, if there are several, and then clip by clip."""
     rows = []
     for clip in clips:
-        tracks = [(track.denoiser, track.signal, track.metrics, track.nonfinite) for track in clip.tracks]
-        rows += rows_of(f"{clip.scene}/{clip.clip}", tracks, clip.reference.metrics)
+        rows += rows_of(f"{clip.scene}/{clip.clip}", clip.signal, clip.tracks, clip.reference.metrics)
     together = []
     for signal, ours in by_signal(one_spp(clips)).items():
         if len(ours) > 1:
-            names = [track.denoiser for track in ours[0].tracks]
-            tracks = [(name, signal, mean_of(ours, name), nonfinite_of(ours, name)) for name in names]
-            together += rows_of(ALL, tracks, mean_floor([clip.reference.metrics for clip in ours]))
+            together += mean_rows(signal, ours)
     return together + rows
 
 

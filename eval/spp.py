@@ -18,8 +18,8 @@ from eval.candidates import Candidate, Times, ready
 from eval.harness import evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import REFERENCE, Result, Values, mean_floor, means
-from eval.table import cell, compared
+from eval.results import REFERENCE, Values, means
+from eval.table import cell, compared, joint_floor
 from models import inference_precision
 from render.clip import Options
 
@@ -48,21 +48,18 @@ def sampled(chosen: Sequence[Candidate], named: bool) -> list[Candidate]:
 
 def judge(
     chosen: Sequence[Candidate], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
-) -> dict[tuple[str, str, int], Values]:
-    """Means over clips of (signal, label, samples a pixel). What is rendered and judged is kept in `folder`.
+) -> dict[tuple[str, str, int], list[Values]]:
+    """Metrics of (signal, label, samples a pixel), clip by clip. What is rendered and judged is kept in `folder`.
 
     Noise floors are those of the label REFERENCE.
     """
-    entrants, found = ready(chosen), dict[tuple[str, str, int], list[Result]]()
+    entrants, found = ready(chosen), dict[tuple[str, str, int], list[Values]]()
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
         fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data")
         for result in evaluate_clip(fed, tracks_of(entrants), folder):
-            found.setdefault((result.signal, result.denoiser, spp), []).append(result)
-    return {
-        key: (mean_floor if results[0].floor else means)([result.metrics for result in results])
-        for key, results in found.items()
-    }
+            found.setdefault((result.signal, result.denoiser, spp), []).append(result.metrics)
+    return found
 
 
 def costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[str, Cost]:
@@ -87,17 +84,18 @@ def by_samples(
     cost = costs(clips, dataset, times)
     by_label = {candidate.label: candidate for candidate in chosen}
     rows: list[Row] = []
-    for (signal, label, spp), metrics in quality.items():
+    for (signal, label, spp), judged in quality.items():
         if label == REFERENCE:
             continue
-        candidate = by_label[label]
+        candidate, floors = by_label[label], quality[signal, REFERENCE, spp]
         render_ms, filter_ms = float(np.mean([c.of(spp) for c in cost.values()])), times.of(candidate, signal)
         total = None if filter_ms is None else render_ms + filter_ms
         rows.append(
             {
                 **candidate.facts(),
                 **{"signal": signal, "spp": spp, "render_ms": render_ms, "filter_ms": filter_ms, "ms": total},
-                **{"metrics": metrics, "floors": quality[signal, REFERENCE, spp]},
+                **{"metrics": means(judged), "floors": joint_floor(judged, floors)},
+                "compared": {"psnr": compared("psnr", judged, floors)},
             }
         )
     for signal in {row["signal"] for row in rows}:
@@ -120,11 +118,7 @@ def name_of(row: Mapping[str, Any]) -> str:
 
 def mark_beaten(rows: Sequence[Row]) -> None:
     """Say of each row which one has the higher PSNR in no more milliseconds; None on the front."""
-    points = {
-        name_of(row): Point(row["ms"], compared("psnr", row["metrics"]["psnr"], row["floors"]["psnr"]))
-        for row in rows
-        if row["ms"] is not None
-    }
+    points = {name_of(row): Point(row["ms"], row["compared"]["psnr"]) for row in rows if row["ms"] is not None}
     beaten = dominators(points, more_is_better=True)
     for row in rows:
         row["dominated_by"] = beaten.get(name_of(row))

@@ -1,12 +1,13 @@
 """Results for people: numbers as text, marked where the reference's own noise decides them."""
 
 from collections.abc import Sequence
+from statistics import fmean
 
 from tabulate import tabulate
 
 from eval.floor import floor_limit, within_floor
 from eval.metrics import METRICS
-from eval.results import FLOOR, ClipResults, Values
+from eval.results import FLOOR, ClipResults, Values, mean_floor
 
 PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
 NEAR = "≈"
@@ -21,11 +22,24 @@ def cell(metric: str, value: float | None, floor: float | None = None) -> str:
     return mark + METRICS[metric].form.format(value)
 
 
-def compared(metric: str, value: float, floor: float | None) -> float:
-    """What to compare by: the digits that are shown, and one and the same number for all that is within the floor."""
-    if floor is not None and within_floor(metric, value, floor):
-        value = floor_limit(metric, floor)
-    return float(METRICS[metric].form.format(value))
+def joint_floor(clips: Sequence[Values], floors: Sequence[Values]) -> Values:
+    """Noise floors of means over clips, where every clip is within its own: no clip's floor hides another's error."""
+
+    def near(metric: str) -> bool:
+        pairs = [(clip.get(metric), floor.get(metric)) for clip, floor in zip(clips, floors, strict=True)]
+        return all(within_floor(metric, *pair) for pair in pairs if pair[0] is not None)
+
+    return {metric: floor if near(metric) else None for metric, floor in mean_floor(list(floors)).items()}
+
+
+def compared(metric: str, clips: Sequence[Values], floors: Sequence[Values]) -> float | None:
+    """What to compare means over clips by, in the digits shown: within its floor a clip counts as at its edge."""
+    values = []
+    for value, floor in ((c[metric], f.get(metric)) for c, f in zip(clips, floors, strict=True)):
+        if value is not None:
+            near = floor is not None and within_floor(metric, value, floor)
+            values.append(floor_limit(metric, floor) if near else value)  # type: ignore[arg-type]
+    return float(METRICS[metric].form.format(fmean(values))) if values else None
 
 
 def floor_cell(metric: str, value: float | None) -> str:

@@ -16,14 +16,14 @@ from eval.candidates import Candidate, Times, candidates, ready
 from eval.harness import evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import REFERENCE, Result, Values, device, mean_floor, means, versions
+from eval.results import REFERENCE, Result, Values, device, means, versions
 from eval.spp import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table
-from eval.table import LEGEND, NEAR, cell, compared
+from eval.table import LEGEND, NEAR, cell, compared, joint_floor
 from eval.trade_plots import draw_front, draw_samples
 
 TRADED = ("psnr", "ssim", "rmse")
 
-Means = dict[tuple[str, str], Values]  # of (signal, label), over clips; of the reference the noise floors
+Found = dict[tuple[str, str], list[Values]]  # of (signal, label), clip by clip; of the reference the noise floors
 
 
 def clips_of(dataset: Dataset) -> list[Clip]:
@@ -34,54 +34,47 @@ def clips_of(dataset: Dataset) -> list[Clip]:
     return clips
 
 
-def over_clips(results: Sequence[Result]) -> Means:
-    groups: dict[tuple[str, str], list[Result]] = {}
+def by_label(results: Sequence[Result]) -> Found:
+    found: Found = {}
     for result in results:
-        groups.setdefault((result.signal, result.denoiser), []).append(result)
-    return {
-        key: (mean_floor if group[0].floor else means)([result.metrics for result in group])
-        for key, group in groups.items()
-    }
+        found.setdefault((result.signal, result.denoiser), []).append(result.metrics)
+    return found
 
 
-def rows_of(chosen: Sequence[Candidate], quality: Means, times: Times) -> list[dict[str, Any]]:
+def rows_of(chosen: Sequence[Candidate], quality: Found, times: Times) -> list[dict[str, Any]]:
     """A row a candidate and signal: milliseconds, metrics, and by whom it is beaten in each metric."""
-    by_label = {candidate.label: candidate for candidate in chosen}
+    candidates_by_label = {candidate.label: candidate for candidate in chosen}
     rows: list[dict[str, Any]] = []
-    for (signal, label), metrics in quality.items():
-        if label in by_label:
-            candidate = by_label[label]
+    for (signal, label), clips in quality.items():
+        if label in candidates_by_label:
+            candidate, floors = candidates_by_label[label], quality[signal, REFERENCE]
             rows.append(
                 {
                     **candidate.facts(),
-                    **{
-                        "signal": signal,
-                        "epochs": candidate.epochs(),
-                        "ms": times.of(candidate, signal),
-                        "metrics": metrics,
-                    },
+                    **{"signal": signal, "epochs": candidate.epochs(), "ms": times.of(candidate, signal)},
+                    **{"metrics": means(clips), "floors": joint_floor(clips, floors)},
+                    "compared": {metric: compared(metric, clips, floors) for metric in TRADED},
                 }
             )
     for signal in {row["signal"] for row in rows}:
         ours = [row for row in rows if row["signal"] == signal]
-        floors = quality.get((signal, REFERENCE), {})
-        beaten = {metric: beaten_by(ours, metric, floors.get(metric)) for metric in TRADED}
+        beaten = {metric: beaten_by(ours, metric) for metric in TRADED}
         for row in ours:
             row["dominated_by"] = {metric: by.get(row["label"]) for metric, by in beaten.items()}
     return rows
 
 
-def beaten_by(rows: Sequence[Mapping[str, Any]], metric: str, floor: float | None = None) -> dict[str, str | None]:
+def beaten_by(rows: Sequence[Mapping[str, Any]], metric: str) -> dict[str, str | None]:
     """For each label that has a time and a value: the best that is no slower and better, None on the front."""
     points = {
-        row["label"]: Point(row["ms"], compared(metric, row["metrics"][metric], floor))
+        row["label"]: Point(row["ms"], row["compared"][metric])
         for row in rows
-        if row["ms"] is not None and row["metrics"][metric] is not None
+        if row["ms"] is not None and row["compared"][metric] is not None
     }
     return dominators(points, METRICS[metric].more_is_better)
 
 
-def front_table(rows: Sequence[Mapping[str, Any]], quality: Means) -> str:
+def front_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Fastest first. Who is on the front of a metric is marked so, who is not is told by whom it is beaten."""
 
     def standing(row: Mapping[str, Any], metric: str) -> str:
@@ -91,12 +84,11 @@ def front_table(rows: Sequence[Mapping[str, Any]], quality: Means) -> str:
 
     lines = []
     for row in sorted(rows, key=lambda row: (row["ms"] is None, row["ms"])):
-        floors = quality.get((row["signal"], REFERENCE), {})
         lines.append(
             {
                 **{"denoiser": row["denoiser"], "dtype": row["dtype"], "epochs": row["epochs"] or "-"},
                 "ms": "-" if row["ms"] is None else f"{row['ms']:.4g}",
-                **{METRICS[m].title: cell(m, row["metrics"][m], floors.get(m)) for m in TRADED},
+                **{METRICS[m].title: cell(m, row["metrics"][m], row["floors"].get(m)) for m in TRADED},
                 **{f"beaten in {METRICS[m].title.split()[0]} by": standing(row, m) for m in TRADED},
             }
         )
@@ -124,8 +116,7 @@ def trade(
 
     entrants = ready(chosen)
     results = [result for clip in clips for result in evaluate_clip(clip, tracks_of(entrants), runs / "trade")]
-    quality = over_clips(results)
-    rows = rows_of(chosen, quality, times)
+    rows = rows_of(chosen, by_label(results), times)
     few = sampled(chosen, bool(names))
     samples = by_samples(few, clips, dataset, levels, times, runs / "trade")
 
@@ -138,15 +129,13 @@ def trade(
     facts = {"schema": 1, "dataset": str(data), "device": device(), "versions": versions(), "profile": profile}
     facts |= {"clips": [f"{clip.scene}/{clip.name}" for clip in clips], "size": times.name, "threads": times.threads}
     write_json(runs / "report" / "trade.json", facts | {"rows": rows, "samples": samples})
-    return tables(rows, quality, samples, title, times)
+    return tables(rows, samples, title, times)
 
 
-def tables(
-    rows: Sequence[Mapping[str, Any]], quality: Means, samples: Mapping[str, Any], title: str, times: Times
-) -> str:
+def tables(rows: Sequence[Mapping[str, Any]], samples: Mapping[str, Any], title: str, times: Times) -> str:
     parts = [title]
     for signal in dict.fromkeys(row["signal"] for row in rows):
-        parts.append(f"{signal} light\n{front_table([row for row in rows if row['signal'] == signal], quality)}")
+        parts.append(f"{signal} light\n{front_table([row for row in rows if row['signal'] == signal])}")
     if untimed := [row["label"] for row in rows if row["ms"] is None]:
         parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command}`.")
     parts.append(f"samples a pixel\n{samples_table(samples['rows'])}")

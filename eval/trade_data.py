@@ -7,8 +7,8 @@ from typing import Any
 from datasets.files import read_json
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
-from eval.results import ClipResults, mean_floor
-from eval.rows import by_signal, mean_of, one_spp
+from eval.results import ClipResults
+from eval.rows import by_signal, mean_of, of, one_spp
 from eval.sizes import timed_as
 from eval.table import compared
 
@@ -46,13 +46,14 @@ def trade(
     signal: str, clips: Sequence[ClipResults], metric: str, times: dict[tuple[str, str], float]
 ) -> dict[str, Any]:
     """A point for each denoiser that was timed in the precision in which it was evaluated."""
-    floor = mean_floor([clip.reference.metrics for clip in clips]).get(metric)
+    floors = [clip.reference.metrics for clip in clips]
     points, values = dict[str, Point](), dict[str, float]()
     for track in clips[0].tracks:
         ms = times.get((timed_as(track.denoiser, signal), track.precision))
         quality = mean_of(clips, track.denoiser)[metric]
-        if ms is not None and quality is not None:
-            points[track.denoiser], values[track.denoiser] = Point(ms, compared(metric, quality, floor)), quality
+        seen = compared(metric, [result.metrics for result in of(clips, track.denoiser)], floors)
+        if ms is not None and quality is not None and seen is not None:
+            points[track.denoiser], values[track.denoiser] = Point(ms, seen), quality
     by = dominators(points, METRICS[metric].more_is_better)
     missing = [track.denoiser for track in clips[0].tracks if track.denoiser not in points]
     shown = [{"name": name, "ms": points[name].ms, "quality": values[name], "by": by[name]} for name in points]

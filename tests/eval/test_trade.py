@@ -16,6 +16,7 @@ from eval.bench import Variant
 from eval.candidates import Candidate, Times, candidates
 from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 from eval.spp import check_levels, generalisation, mark_beaten
+from eval.table import compared, joint_floor
 from eval.trade import beaten_by, clips_of, trade
 from models.fusion import WINDOWS
 from models.weights import save_weights
@@ -50,10 +51,10 @@ def test_fronts_by_brute_force(metric, sign):
     rng = np.random.default_rng(0)
     ms, values = rng.integers(1, 9, 40), rng.integers(20, 30, 40)  # with ties
     rows = [
-        {"label": str(i), "ms": float(a), "metrics": {metric: float(b)}}
+        {"label": str(i), "ms": float(a), "compared": {metric: float(b)}}
         for i, (a, b) in enumerate(zip(ms, values, strict=True))
     ]
-    found = beaten_by([*rows, {"label": "untimed", "ms": None, "metrics": {metric: 0.0}}], metric)
+    found = beaten_by([*rows, {"label": "untimed", "ms": None, "compared": {metric: 0.0}}], metric)
     assert "untimed" not in found and None in found.values() and len(set(found.values())) > 1
     for i, (a, b) in enumerate(zip(ms, values, strict=True)):
         better = {
@@ -66,22 +67,30 @@ def test_fronts_by_brute_force(metric, sign):
 
 
 def test_digits_that_nobody_sees_do_not_make_a_front():
-    rows = [
-        {"label": "fast", "ms": 1.0, "metrics": {"psnr": 30.001}},
-        {"label": "slow", "ms": 2.0, "metrics": {"psnr": 30.004}},
-        {"label": "better", "ms": 3.0, "metrics": {"psnr": 30.011}},
-    ]
-    assert beaten_by(rows, "psnr") == {"fast": None, "slow": "fast", "better": None}
+    seen = [compared("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    assert seen == [30.0, 30.0, 30.01]
 
 
 def test_what_is_within_the_noise_floor_is_on_a_par():
-    rows = [{"label": str(psnr), "ms": psnr, "metrics": {"psnr": psnr}} for psnr in (30.0, 36.0, 38.0, 41.0)]
-    assert beaten_by(rows, "psnr", 40.0) == {"30.0": None, "36.0": None, "38.0": None, "41.0": "38.0"}  # from 36.99 on
+    floor = [{"psnr": 40.0}]
+    assert [compared("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [30, 36, 36.99, 36.99]
+    assert compared("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
+    assert compared("ssim", [{"ssim": None}], floor) is None
+
+
+def test_a_hard_clips_floor_hides_no_error_of_another():
+    """Within the mean of the floors, 0.55, by far; but on the second clip 0.8 and 0.95 are apart."""
+    floors = [{"ssim": 0.1, "mse_unbiased": 1e-6}, {"ssim": 1.0, "mse_unbiased": 1e-6}]
+    a, b = ([{"ssim": 0.3, "mse_unbiased": 0.0}, {"ssim": s, "mse_unbiased": 0.0}] for s in (0.8, 0.95))
+    assert joint_floor(a, floors) == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
+    assert compared("ssim", a, floors) < compared("ssim", b, floors)
+    both = [{"ssim": 0.1, "mse_unbiased": 1e-6}] * 2
+    assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
 
 
 def test_samples_that_are_not_worth_their_time():
     rows = [
-        {"label": label, "spp": spp, "ms": ms, "metrics": {"psnr": psnr}, "floors": {"psnr": None}}
+        {"label": label, "spp": spp, "ms": ms, "compared": {"psnr": psnr}}
         for label, spp, ms, psnr in (("noisy", 1, 1.0, 20.0), ("noisy", 4, 9.0, 26.0), ("rae", 1, 5.0, 30.0))
     ]
     mark_beaten(rows)
