@@ -22,6 +22,9 @@ from eval.table import LEGEND, NEAR, cell, compared, joint_floor
 from eval.trade_plots import draw_front, draw_samples
 
 TRADED = ("psnr", "ssim", "rmse")
+FRONTS = (
+    "On fronts a clip within its noise floor counts as at its edge: so a mean can be beaten by one that looks worse."
+)
 
 Found = dict[tuple[str, str], list[Values]]  # of (signal, label), clip by clip; of the reference the noise floors
 
@@ -133,7 +136,7 @@ def trade(
 
 
 def tables(rows: Sequence[Mapping[str, Any]], samples: Mapping[str, Any], title: str, times: Times) -> str:
-    parts = [title]
+    parts = [title, FRONTS]
     for signal in dict.fromkeys(row["signal"] for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row['signal'] == signal])}")
     if untimed := [row["label"] for row in rows if row["ms"] is None]:
