@@ -18,7 +18,7 @@ from datasets.files import write_file, write_json
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.ablation_results import Run, draw, report, verdicts
-from eval.harness import evaluate_clip
+from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.results import device, versions
 from eval.tracks import Track
 from eval.variants import SHARE, Ablation, Variant, ablation_for
@@ -40,8 +40,7 @@ def meshes_move(clip: Clip) -> bool:
 
 def clips_to_judge(dataset: Dataset, ablation: Ablation) -> list[Clip]:
     """The test clips of 1 spp, or those of them where meshes move. Raises BadInput where there are none."""
-    usual = [clip for clip in dataset.clips("test") if clip.facts["noisy_spp"] == 1]
-    clips = [clip for clip in usual if not ablation.moving or meshes_move(clip)]
+    clips = [clip for clip in clips_of_one_spp(dataset) if not ablation.moving or meshes_move(clip)]
     if not clips:
         raise BadInput(f"nothing moves in the test clips of {dataset.path}: use a data set with moving scenes")
     return clips

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from datasets.clip import Clip, Dataset
 from datasets.display import display
 from datasets.frame import Signal, read_frame, to_tensor
+from errors import BadInput
 from eval.bench import thread_count
 from eval.pictures import save_strip
 from eval.results import (
@@ -46,6 +47,14 @@ from train.recipes import TRAINABLE
 METRICS_CHANNELS = ("motion", "dual_motion")
 PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
 SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
+
+
+def clips_of_one_spp(dataset: Dataset) -> list[Clip]:
+    """The test clips of one sample a pixel: those of more show the same frames again. Raises BadInput without any."""
+    clips = [clip for clip in dataset.clips("test") if clip.facts["noisy_spp"] == 1]
+    if not clips:
+        raise BadInput(f"{dataset.path} has no test clips of 1 spp: render another with `onespp dataset`")
+    return clips
 
 
 def is_still(clip: Clip) -> bool:

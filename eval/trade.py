@@ -6,14 +6,13 @@ from typing import Any
 
 from tabulate import tabulate
 
-from datasets.clip import Clip, Dataset
+from datasets.clip import Dataset
 from datasets.cost import RENDERER
 from datasets.figure import save_figure
 from datasets.files import write_json
-from errors import BadInput
 from eval.bench import parse_size
 from eval.candidates import Candidate, Times, candidates, ready
-from eval.harness import evaluate_clip, tracks_of
+from eval.harness import clips_of_one_spp, evaluate_clip, tracks_of
 from eval.metrics import METRICS
 from eval.pareto import Point, dominators
 from eval.results import REFERENCE, Result, Values, device, means, versions
@@ -27,14 +26,6 @@ FRONTS = (
 )
 
 Found = dict[tuple[str, str], list[Values]]  # of (signal, label), clip by clip; of the reference the noise floors
-
-
-def clips_of(dataset: Dataset) -> list[Clip]:
-    """The test clips of one sample a pixel: those of more show the same frames again."""
-    clips = [clip for clip in dataset.clips("test") if clip.facts["noisy_spp"] == 1]
-    if not clips:
-        raise BadInput(f"{dataset.path} has no test clips of 1 spp: render another with `onespp dataset`")
-    return clips
 
 
 def by_label(results: Sequence[Result]) -> Found:
@@ -115,7 +106,7 @@ def trade(
     """
     check_levels(levels)
     dataset, times = Dataset(data), Times(runs, parse_size(size), threads, RENDERER)
-    clips, chosen = clips_of(dataset), candidates(names, runs, profile)
+    clips, chosen = clips_of_one_spp(dataset), candidates(names, runs, profile)
 
     entrants = ready(chosen)
     results = [result for clip in clips for result in evaluate_clip(clip, tracks_of(entrants), runs / "trade")]

@@ -14,10 +14,11 @@ from datasets.samples import averaged, rendered, scene_of, source, with_samples
 from errors import BadInput
 from eval.bench import Variant
 from eval.candidates import Candidate, Times, candidates
+from eval.harness import clips_of_one_spp
 from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 from eval.spp import check_levels, generalisation, mark_beaten
 from eval.table import compared, joint_floor
-from eval.trade import beaten_by, clips_of, trade
+from eval.trade import beaten_by, trade
 from models.fusion import WINDOWS
 from models.weights import save_weights
 from render.clip import PLAIN
@@ -287,7 +288,7 @@ def test_clips_of_more_samples_are_left_out(tiny, tmp_path):
     copy = shutil.copytree(tiny, tmp_path / "data")
     paths = sorted((copy / "test").glob("*/*/clip.json"))
     write_json(paths[0], read_json(paths[0]) | {"noisy_spp": 4})
-    assert [clip.path for clip in clips_of(Dataset(copy))] == [path.parent for path in paths[1:]]
+    assert [clip.path for clip in clips_of_one_spp(Dataset(copy))] == [path.parent for path in paths[1:]]
     write_json(paths[1], read_json(paths[1]) | {"noisy_spp": 4})
     with pytest.raises(BadInput, match="no test clips of 1 spp"):
-        clips_of(Dataset(copy))
+        clips_of_one_spp(Dataset(copy))
