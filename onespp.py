@@ -68,8 +68,8 @@ def dataset(
     regularise: Regularise = False,
 ) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.job import Part, generate, render_here
-    from models import channels_read
+    from datasets.generate import Part, generate, render_here
+    from models.registry import channels_read
     from render.clip import Options
 
     if ray:
@@ -151,7 +151,7 @@ def evaluate(
 
 def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
     """Draw a contact sheet of scenes (16 rooms, unless some are named): the middle frame of each, its own exposure."""
-    from datasets.preview import contact_sheet
+    from eval.figures.contact_sheet import contact_sheet
 
     out.parent.mkdir(parents=True, exist_ok=True)
     contact_sheet(out, names or [f"room-{number}" for number in range(16)], seed, spp=spp)
@@ -169,7 +169,7 @@ def show(
 
     A contact sheet with errors, difference maps, and what each denoiser carries from frame to frame.
     """
-    from eval.show import show as draw
+    from eval.figures.show import show as draw
 
     for path in draw(clip, out, runs, profile, names):
         print(path)
@@ -186,9 +186,9 @@ def figure(
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     if what == "variance":
-        from eval.variance import variance_figure as draw
+        from eval.figures.variance import variance_figure as draw
     else:
-        from eval.unbiased import unbiased_figure as draw
+        from eval.figures.unbiased import unbiased_figure as draw
     draw(out)
     print(out)
 
@@ -219,28 +219,28 @@ def bench(
     """
     usual = ("1280x720",)
     if what == "denoisers":
-        from eval.bench import bench_denoisers
+        from eval.bench.denoisers import bench_denoisers
 
         print(bench_denoisers(runs, names, size or usual, threads))
     elif what == "scaling":
-        from eval.scaling import bench_scaling
+        from eval.bench.scaling import bench_scaling
 
         print(bench_scaling(runs, names, size, threads))
     elif what == "fusion":
-        from eval.bench import parse_size
-        from eval.fusion_bench import bench_fusion
+        from eval.bench.denoisers import parse_size
+        from eval.bench.fusion import bench_fusion
 
         print(bench_fusion(runs, *parse_size((size or usual)[0]), max(threads, default=None)))
     elif what == "rendering":
-        from datasets.bench import bench_rendering
+        from eval.bench.rendering import bench_rendering
 
         print(bench_rendering(runs))
     elif what == "training":
-        from train.speed import bench_training
+        from eval.bench.training import bench_training
 
         print(bench_training(data_folder(data, profile), runs, profile, names))
     else:
-        from train.loading import bench_loading
+        from eval.bench.loading import bench_loading
 
         print(bench_loading(data_folder(data, profile), runs, profile))
 
@@ -261,7 +261,7 @@ def stress(
     Args:
         long: play sequences of 10 000 frames as well (minutes).
     """
-    from eval.stress import stress as run
+    from eval.stress.run import stress as run
 
     if not run(runs, names, profile, long, precision):
         sys.exit(1)
@@ -285,7 +285,7 @@ def ablate(
     Args:
         seeds: trainings of each network, whose mean and spread are shown.
     """
-    from eval.ablation import ablate as run
+    from eval.ablation.run import ablate as run
 
     print(run(what, data_folder(data, profile), runs, profile, seeds))
 
@@ -309,14 +309,14 @@ def trade(
         threads: for the times; by default the most that the bench has measured.
         spp: samples a pixel to feed, rising.
     """
-    from eval.trade import trade as run
+    from eval.tradeoff.run import trade as run
 
     print(run(data_folder(data, profile), runs, profile, names, size, threads, spp))
 
 
 def papers(runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
     """Print what the papers measured on their scenes beside what was measured here, and which orders hold here too."""
-    from eval.against_papers import against_papers
+    from eval.papers.compare import against_papers
 
     print(against_papers(runs, profile))
 
@@ -326,7 +326,7 @@ def report(
     megabytes: Annotated[float, tyro.conf.arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
 ) -> None:
     """Make one page of all results, RUNS/report/index.html, which needs no network; and an animated picture a clip."""
-    from eval.report import report as make
+    from eval.report.page import report as make
 
     for path in make(runs, megabytes):
         print(path)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from datasets.clip import Dataset
-from datasets.job import ClipJob, Outcome, check_versions, render_clip_job
+from datasets.generate import ClipJob, Outcome, check_versions, render_clip_job
 from errors import BadInput
 from render.backend import VARIANT, dr
 

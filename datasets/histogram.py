@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.figure import plt, save_figure
+from datasets.plotting import plt, save_figure
 
 BINS = 16
 # In the order of datasets.inspect.Difficulty. What lies below the lowest is shown there.

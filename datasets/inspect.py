@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
-from datasets.display import luminance, psnr
 from datasets.files import read_json
+from datasets.tonemap import luminance, psnr
 from errors import BadInput
 
 CHUNK = 1 << 24

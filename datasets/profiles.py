@@ -1,6 +1,5 @@
 """Data profiles: which clips a data set has, and how well each is sampled."""
 
-import re
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -126,23 +125,6 @@ def plan(profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), option
         "channels": {"train": train, "val": train, "test": list(CHANNELS)},
         "splits": splits,
     }
-
-
-class ClipKind(NamedTuple):
-    """What a clip's name says: a number; `still`, in which nothing moves; 000-4spp, with 4 spp as noisy input."""
-
-    number: int
-    still: bool
-    noisy_spp: int
-
-    @staticmethod
-    def of(name: str) -> "ClipKind":
-        """Raises BadInput for a name that is none."""
-        match = re.fullmatch(r"(\d+|still)(?:-(\d+)spp)?", name)
-        if not match:
-            raise BadInput(f"'{name}' does not name a clip: clips are called 000, still or 000-4spp")
-        still = match[1] == "still"
-        return ClipKind(0 if still else int(match[1]), still, int(match[2] or 1))
 
 
 def clip_seed(seed: int, scene: str, split: str, number: int) -> int:

@@ -15,11 +15,11 @@ import torch
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.display import display
 from datasets.frame import Signal, read_frame, to_tensor
+from datasets.tonemap import display
 from errors import BadInput
-from eval.bench import thread_count
-from eval.pictures import save_strip
+from eval.bench.denoisers import thread_count
+from eval.clip_run import Track, Truth
 from eval.results import (
     BASELINES,
     SIGNALS,
@@ -36,11 +36,11 @@ from eval.results import (
     save_picture,
     write_results,
 )
-from eval.table import table
-from eval.tracks import Track, Truth
-from models import DENOISERS, create, load, unavailable, without_taa
+from eval.strip import save_strip
+from eval.text_table import table
 from models.denoiser import Denoiser
 from models.operators import finite
+from models.registry import DENOISERS, create, load, unavailable, without_taa
 from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datasets.display import display, psnr
 from datasets.frame import disoccluded
+from datasets.tonemap import display, psnr
 from eval.ssim import ssim
 from models.operators import finite, luminance
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from datasets.clip import Clip
+from datasets.clip_kind import ClipKind
 from datasets.files import read_json, write_file, write_json
 from datasets.frame import Signal
-from datasets.profiles import ClipKind
 from errors import BadInput
 from eval.metrics import METRICS
 
@@ -41,14 +41,14 @@ SOURCES = (
     "models",
     "datasets/channels.py",
     "datasets/clip.py",
-    "datasets/display.py",
+    "datasets/tonemap.py",
     "datasets/frame.py",
     "scenes/camera.py",
     "eval/metrics.py",
-    "eval/crops.py",
-    "eval/floor.py",
+    "eval/disocclusion_crops.py",
+    "eval/noise_floor.py",
     "eval/ssim.py",
-    "eval/tracks.py",
+    "eval/clip_run.py",
     "eval/harness.py",
 )
 KEYS = ("denoiser", "signal", "scene", "clip")

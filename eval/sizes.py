@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from functools import partial
 
+from eval.ablation.definitions import label_of
 from eval.results import BASELINES
-from eval.variants import label_of
-from models import create
 from models.denoiser import Denoiser
 from models.fusion import WINDOWS
+from models.registry import create
 from models.wskp import WSKP
 
 # wskp6-2w fuses windows of 3 and 5 pixels, and so on. They are trained by `onespp ablate wskp-windows`.

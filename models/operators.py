@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from datasets.display import LUMINANCE
 from datasets.frame import Cameras, Frame
+from datasets.tonemap import LUMINANCE
 from models import compiled
 
 BACKGROUND = 0  # mesh id

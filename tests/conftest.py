@@ -8,11 +8,11 @@ import pytest
 import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
-from datasets.job import generate
-from models import channels_read
+from datasets.generate import generate
+from models.registry import channels_read
 from render.stage import Stage
-from scenes import build_scene
 from scenes.animation import Camera, Scene, Shape, Track
+from scenes.registry import build_scene
 
 # Of tests that do not say themselves how many examples to try; `make test-all` takes the thorough ones.
 hypothesis.settings.register_profile("quick", max_examples=10)

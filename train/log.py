@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from datasets.clip import Clip
-from datasets.display import display
-from datasets.figure import DPI, plt, save_figure
 from datasets.files import replacing
 from datasets.frame import read_frame, to_tensor
+from datasets.plotting import DPI, plt, save_figure
+from datasets.tonemap import display
 from models.denoiser import Denoiser, State
 from models.operators import finite
 

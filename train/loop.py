@@ -19,8 +19,8 @@ from tqdm import tqdm
 from datasets.clip import Dataset
 from datasets.files import locked, write_file
 from errors import BadInput
-from models import create
 from models.denoiser import Denoiser
+from models.registry import create
 from models.weights import save_weights
 from train.data import in_parts, items, loader, micro_batches, most_at_once, split
 from train.log import Log, logging, loss_curve, sample_picture

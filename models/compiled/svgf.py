@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.display import LUMINANCE
+from datasets.tonemap import LUMINANCE
 from models.atrous import B3_SPLINE
 from models.compiled import array, jit, jit_parallel, threads
 from models.compiled.exponential import exp

@@ -11,9 +11,9 @@ import pytest
 from test_dataset import ONESPP, digest
 
 from datasets.cluster import render_on_cluster
-from datasets.job import ClipJob, Outcome, generate
+from datasets.generate import ClipJob, Outcome, generate
 from errors import BadInput
-from models import channels_read
+from models.registry import channels_read
 
 
 def holder(lock: Path) -> int | None:

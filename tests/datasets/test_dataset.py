@@ -16,17 +16,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import datasets.job
+import datasets.generate
 from datasets.clip import Clip, Dataset
 from datasets.files import locked
+from datasets.generate import Part
 from datasets.inspect import check_clip, difficulty, info, verify
-from datasets.job import Part
 from datasets.profiles import DATA_PROFILES, clip_seed, plan
 from datasets.writer import ClipWriter
 from errors import BadInput
-from models import channels_read
+from models.registry import channels_read
 from render.clip import Sampling, render_clip
-from scenes import build_scene
+from scenes.registry import build_scene
 
 ONESPP = [sys.executable, "-m", "onespp"]
 generate = partial(datasets.job.generate, reads=channels_read())  # as the command line does
@@ -302,7 +302,7 @@ def test_a_clip_that_fails_does_not_stop_the_others(copy, monkeypatch):
             raise RuntimeError("no such texture")
         return genuine(name, seed, frames)
 
-    monkeypatch.setattr(datasets.job, "build_scene", broken)
+    monkeypatch.setattr(datasets.generate, "build_scene", broken)
     with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
         generate(copy, "tiny", 0)
     assert (copy / "val" / "cornell_box_moving" / "000" / "clip.json").exists()
@@ -321,7 +321,7 @@ def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(copy, monkeyp
                 channels["indirect_reference"][1, 0, 0, 2] = np.inf
             yield channels, seconds
 
-    monkeypatch.setattr(datasets.job, "render_clip", faulty)
+    monkeypatch.setattr(datasets.generate, "render_clip", faulty)
     assert generate(copy, "tiny", 0) == 2
     box, moving = Dataset(copy).clips("val")
     assert {name: count for name, count in box.facts["nonfinite"].items() if count} == {

@@ -5,17 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets.adaptive_spp import noise_of_reference, reference_spp
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
+from datasets.clip_kind import ClipKind
+from datasets.generate import generate, render_to
 from datasets.inspect import info, size_in_full
-from datasets.job import generate, render_to
-from datasets.pilot import noise_of_reference, reference_spp
-from datasets.profiles import ClipKind, DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
+from datasets.profiles import DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
-from models import channels_read, create
+from models.registry import channels_read, create
 from render.clip import PLAIN
 from render.stage import Stage
-from scenes import build_scene
+from scenes.registry import build_scene
 
 AUXILIARY = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
 

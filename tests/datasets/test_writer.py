@@ -8,7 +8,7 @@ import pytest
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
-from datasets.display import clip_exposure, display
+from datasets.tonemap import clip_exposure, display
 from datasets.writer import ClipWriter
 
 HEIGHT, WIDTH, FRAMES, NOISES, MESHES = 3, 5, 4, 2, 2

@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 
 from eval.harness import evaluate
-from eval.report import report
-from models import create
+from eval.report.page import report
+from models.registry import create
 from models.weights import save_weights
 from train.loop import run_folder
 

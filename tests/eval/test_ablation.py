@@ -12,14 +12,14 @@ from torch import nn
 
 import onespp
 from datasets.clip import Dataset
-from datasets.figure import plt
 from datasets.frame import Frame, read_frame
+from datasets.plotting import plt
 from datasets.sequences import REFERENCES
 from errors import BadInput
-from eval import ablation, variants
-from eval.ablation import ablate, clips_to_judge, epoch_losses, meshes_move
-from eval.ablation_results import Run, cell, draw, report, verdict
-from eval.variants import ABLATIONS, Finding, TexturedRAE, ablation_for
+from eval.ablation import definitions, run
+from eval.ablation.definitions import ABLATIONS, Finding, TexturedRAE, ablation_for
+from eval.ablation.run import ablate, clips_to_judge, epoch_losses, meshes_move
+from eval.ablation.summary import Run, cell, draw, report, verdict
 from models.fusion import WINDOWS
 from models.ntd import NTD
 from models.rae import RAE
@@ -176,7 +176,7 @@ def test_ntd_is_judged_where_meshes_move(tiny, monkeypatch):
     }
     assert [clip.scene for clip in clips_to_judge(dataset, ablation_for("ntd"))] == ["cornell_box_moving"]
     assert len(clips_to_judge(dataset, ablation_for("rae-loss"))) == 2
-    monkeypatch.setattr(ablation, "meshes_move", lambda clip: False)
+    monkeypatch.setattr(run, "meshes_move", lambda clip: False)
     with pytest.raises(BadInput, match="nothing moves in the test clips of"):
         clips_to_judge(dataset, ablation_for("ntd"))
 
@@ -222,7 +222,7 @@ def test_an_ablation_from_training_to_plot(tiny, tmp_path, monkeypatch):
         small, variants=small.variants[:2], findings=(Finding("it helps", "psnr", (("wskp6", "wskp6-plain"),)),)
     )
     monkeypatch.setitem(ABLATIONS, "wskp-repvgg", lambda: small)
-    monkeypatch.setattr(variants, "recipe_for", small_recipe)
+    monkeypatch.setattr(definitions, "recipe_for", small_recipe)
     measured: list[str] = []
     monkeypatch.setattr(loop, "fastest_precision", lambda *_: measured.append("once") or "32-true")
     trained: list[str] = []
@@ -248,7 +248,7 @@ def test_an_ablation_from_training_to_plot(tiny, tmp_path, monkeypatch):
     load_weights(partial(WSKP, sizes=(5,))(), "wskp6-plain", folder / "wskp6-plain-0" / "weights.safetensors")
 
     trained.clear()
-    monkeypatch.setattr(ablation, "fusion_ms", lambda *_: {"wskp6": 1.0, "wskp6-plain": 1.0})
+    monkeypatch.setattr(run, "fusion_ms", lambda *_: {"wskp6": 1.0, "wskp6-plain": 1.0})
     ablate("wskp-repvgg", tiny, tmp_path, "tiny")
     again = json.loads((folder / "results.json").read_text())
     assert not trained and [row["clips"] for row in again["rows"]] == [row["clips"] for row in content["rows"]]

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from datasets.files import write_json
-from eval.ablation_results import Run
-from eval.against_papers import against_papers, is_better, measured, orders, verdict
-from eval.papers import (
+from eval.ablation.summary import Run
+from eval.papers.compare import against_papers, is_better, measured, orders, verdict
+from eval.papers.tables import (
     NTD_TABLE_2,
     RAE_FIG_8,
     SVGF_TABLE_1,
@@ -20,7 +20,7 @@ from eval.papers import (
     WSKP_TABLE_5,
 )
 from eval.results import REFERENCE, Result, folder_of, write_results
-from models import DENOISERS
+from models.registry import DENOISERS
 
 
 def test_tables_are_whole():

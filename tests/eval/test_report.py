@@ -14,11 +14,11 @@ import torch
 from PIL import Image
 
 from errors import BadInput
-from eval.crops import Window, densest_window
+from eval.disocclusion_crops import Window, densest_window
 from eval.metrics import METRICS, flip_map
-from eval.pareto import Point, dominators
-from eval.report import report
+from eval.report.page import report
 from eval.results import folder_of, load_picture
+from eval.tradeoff.pareto import Point, dominators
 from onespp import main
 
 NAMES = ["noisy", "accumulated", "eaw", "ntd"]

@@ -14,7 +14,7 @@ from eval import harness
 from eval.harness import evaluate
 from eval.metrics import METRICS
 from eval.results import FLOOR, folder_of, load_picture, read_results
-from models import create
+from models.registry import create
 from models.weights import save_weights
 from train.loop import run_folder
 

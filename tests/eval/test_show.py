@@ -10,9 +10,9 @@ from matplotlib import image
 
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.show import play, show
-from models import create
+from eval.figures.show import play, show
 from models.denoiser import Denoiser, State
+from models.registry import create
 from onespp import main
 
 

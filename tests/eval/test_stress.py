@@ -8,10 +8,10 @@ from itertools import pairwise
 import pytest
 import torch
 
-import eval.stress
-import models
-from eval.extremes import EXTREMES, LIGHT, LONG, PERIOD, RECOVERY_LIMIT, SPOILED, SURFACE, Extreme
-from eval.trial import FORGOTTEN, Range, Trial, heads, largest_logits
+import eval.stress.run
+from eval.stress.cases import EXTREMES, LIGHT, LONG, PERIOD, RECOVERY_LIMIT, SPOILED, SURFACE, Extreme
+from eval.stress.check import FORGOTTEN, Range, Trial, heads, largest_logits
+from models import registry
 from models.denoiser import Denoiser, State
 from models.weights import save_weights
 from onespp import main
@@ -121,7 +121,7 @@ def stress(tmp_path, monkeypatch, capsys):
     """Run the command on a class under a name: the exit code, what it breaks by extreme, and what it prints."""
 
     def run(kind, name="broken", *options):
-        monkeypatch.setitem(models.DENOISERS, name, kind)
+        monkeypatch.setitem(registry.DENOISERS, name, kind)
         code = 0
         try:
             main(["stress", name, "--runs", str(tmp_path), *options])
@@ -140,11 +140,11 @@ def stress(tmp_path, monkeypatch, capsys):
 def seldom_draw(request, monkeypatch):
     """The picture is drawn where it is looked at: it takes longer than all the rest."""
     if "passes" not in request.node.name:
-        monkeypatch.setattr(eval.stress, "heat_map", lambda *_: None)
+        monkeypatch.setattr(eval.stress.run, "heat_map", lambda *_: None)
 
 
 def test_a_sound_denoiser_passes(stress, tmp_path):
-    code, broken, printed = stress(models.DENOISERS["accumulated"], "accumulated")
+    code, broken, printed = stress(registry.DENOISERS["accumulated"], "accumulated")
     assert (code, broken) == (0, {}) and "All requirements are kept." in printed
     table = (tmp_path / "stress" / "table.md").read_text()
     assert all(f"| {name} " in table for name in NAMES if "float1" not in name and "logits" not in name)
@@ -200,7 +200,7 @@ def test_recovery_is_counted_in_frames():
 
 
 def test_long_sequences_show_drift(stress, monkeypatch):
-    monkeypatch.setattr(eval.stress, "LONG", replace(LONG, name="long", count=4 * PERIOD))
+    monkeypatch.setattr(eval.stress.run, "LONG", replace(LONG, name="long", count=4 * PERIOD))
     assert stress(Halves, "sound", "--long")[1].keys() == set()
     kept, drifted = (
         Trial("any", lambda _, kind=kind: kind(), eval.stress.LONG).outcome().error for kind in (Halves, GrowsBrighter)
@@ -224,7 +224,7 @@ def test_weights_are_named(tmp_path):
     assert file is None
     path = tmp_path / "train" / "wskp3-tiny" / "weights.safetensors"
     path.parent.mkdir(parents=True)
-    save_weights(models.create("wskp3"), "wskp3", {}, path)
+    save_weights(registry.create("wskp3"), "wskp3", {}, path)
     (entrant,) = eval.stress.contestants(["wskp3"], tmp_path, "tiny")
     assert entrant.origin == str(path)
 
@@ -275,7 +275,7 @@ def test_light_is_even_and_then_as_bright_on_average():
 @pytest.mark.parametrize("name", ["wskp3", "wskp-mr", "kp", "ntd"])
 def test_logits_are_scaled_and_left_as_they_were(name):
     torch.manual_seed(0)
-    denoiser = models.create(name)
+    denoiser = registry.create(name)
     denoiser.prepare()
     frame = next(EXTREMES[0].frames())
     seen = []

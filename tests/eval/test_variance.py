@@ -2,7 +2,7 @@
 
 import torch
 
-from eval.variance import alphas, pattern, reconstruct, sample, variance_figure
+from eval.figures.variance import alphas, pattern, reconstruct, sample, variance_figure
 
 
 def test_the_input_s_expectation_is_the_pattern_and_its_variance_grows():

@@ -7,20 +7,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_operators import flat_frame
 
-import models
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
+from models import registry
 from models.rae import RAE, RAEState
 from models.weights import load_weights, save_weights
 
-NAMES = list(models.DENOISERS)
+NAMES = list(registry.DENOISERS)
 
 
 @pytest.fixture(scope="module")
 def denoisers():
     torch.manual_seed(0)
-    return {name: models.create(name).eval() for name in NAMES}
+    return {name: registry.create(name).eval() for name in NAMES}
 
 
 def run(denoiser, frames):
@@ -203,7 +203,7 @@ def test_rae_inputs_are_the_seven_of_the_paper(tiny, denoisers, monkeypatch):
 def test_weights_round_trip(tmp_path, denoisers):
     path = tmp_path / "w.safetensors"
     save_weights(denoisers["rae"], "rae", {"epochs": 3}, path)
-    loaded = models.load("rae", path, torch.float32)
+    loaded = registry.load("rae", path, torch.float32)
     for a, b in zip(loaded.parameters(), denoisers["rae"].parameters(), strict=True):
         assert torch.equal(a, b)
     assert not loaded.training and list(tmp_path.iterdir()) == [path]
@@ -212,19 +212,19 @@ def test_weights_round_trip(tmp_path, denoisers):
 def test_unusable_weights_are_named(tmp_path, denoisers):
     path = tmp_path / "w.safetensors"
     with pytest.raises(BadInput, match="onespp train rae"):
-        models.load("rae", path)
+        registry.load("rae", path)
     with pytest.raises(BadInput, match="needs trained weights"):
-        models.load("rae", None)
+        registry.load("rae", None)
     path.write_bytes(b"not weights")
     with pytest.raises(BadInput, match="damaged"):
-        models.load("rae", path)
+        registry.load("rae", path)
     save_weights(denoisers["rae"], "wskp6", {}, path)
     with pytest.raises(BadInput, match="'wskp6', not of 'rae'"):
-        models.load("rae", path)
+        registry.load("rae", path)
     small = RAE()
     small.network = torch.nn.Conv2d(7, 3, 1)
     save_weights(small, "rae", {}, path)
     with pytest.raises(BadInput, match="another shape"):
         load_weights(RAE(), "rae", path)
     with pytest.raises(BadInput, match=r"unknown denoiser 'oidnn'.*accumulated"):
-        models.create("oidnn")
+        registry.create("oidnn")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from eval.fusion_bench import unfold_fuse
+from eval.bench.fusion import unfold_fuse
 from models import compiled
 from models.fusion import WINDOWS, box_sum, fuse, shared_kernel, windowed_sums
 
@@ -114,7 +114,7 @@ def test_a_poisoned_pixel_stays_within_its_windows():
 
 ON_GPU = """
 import torch
-from eval.fusion_bench import unfold_fuse
+from eval.bench.fusion import unfold_fuse
 from models.compiled.fusion_triton import fuse
 
 device = "cuda" if torch.cuda.is_available() else "cpu"

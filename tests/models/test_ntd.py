@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
-from models import create
-from models import ntd as ntd_module
 from models.convolution import ConvReLU
 from models.ntd import NTD, NTDState, combine, reconstruct, warp
+from models.registry import create
+from models.registry import ntd as ntd_module
 
 OUTPUTS = (26, 26, 51)
 

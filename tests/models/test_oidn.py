@@ -7,10 +7,10 @@ import pytest
 import torch
 from test_operators import flat_frame
 
-import models
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
+from models import registry
 from models.oidn import OIDN, OIDNAccumulated
 
 pytest.importorskip("pyoidn")
@@ -44,7 +44,7 @@ def noisy_wall(height: int, width: int, level: float = 1.0) -> Frame:
 
 def test_denoises_and_accumulation_helps(tiny):
     frames = frames_of(tiny, 6)
-    noisy, plain, accumulated = (last(models.create(n), frames) for n in ("noisy", "oidn", "oidn-accumulated"))
+    noisy, plain, accumulated = (last(registry.create(n), frames) for n in ("noisy", "oidn", "oidn-accumulated"))
     assert error(plain, frames[-1]) < 0.2 * error(noisy, frames[-1])
     assert error(accumulated, frames[-1]) < error(plain, frames[-1])
 
@@ -128,20 +128,20 @@ def test_native_objects_are_released(monkeypatch):
 
 
 def test_missing_or_broken_oidn_is_a_clear_error(monkeypatch):
-    assert models.unavailable("oidn") is None and models.unavailable("noisy") is None
+    assert registry.unavailable("oidn") is None and registry.unavailable("noisy") is None
     monkeypatch.setattr("pyoidn.Device.get_error", lambda self: "unsupported hardware")
-    assert "unsupported hardware" in models.unavailable("oidn")
+    assert "unsupported hardware" in registry.unavailable("oidn")
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     for name in ("oidn", "oidn-accumulated"):
-        assert "pip install 'onespp[oidn]'" in models.unavailable(name)
+        assert "pip install 'onespp[oidn]'" in registry.unavailable(name)
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
-            models.load(name, None)
+            registry.load(name, None)
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
-            models.create(name)(flat_frame(4, 4), None)
+            registry.create(name)(flat_frame(4, 4), None)
     assert models.channels_read(["oidn"])  # what it reads is known all the same
 
 
 def test_it_chooses_its_own_precision():
-    assert models.create("oidn").parameter_count() == 0
+    assert registry.create("oidn").parameter_count() == 0
     with pytest.raises(BadInput, match="chooses its own precision"):
-        models.create("oidn").prepare(torch.bfloat16)
+        registry.create("oidn").prepare(torch.bfloat16)

@@ -14,15 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_operators import chain, flat_frame
 
-import models
 from datasets.channels import REFERENCES
 from datasets.clip import Dataset
-from datasets.display import display, psnr
 from datasets.frame import Cameras, Frame, read_frame
+from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.trial import CONVEX, ROUNDING, range_violation
+from eval.stress.check import CONVEX, ROUNDING, range_violation
+from models import registry
 
-NAMES = [name for name in (*models.DENOISERS, "noisy+taa", "wskp3+taa") if not models.unavailable(name)]
+NAMES = [name for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa") if not registry.unavailable(name)]
 THREADS = torch.get_num_threads()
 ALL = tuple(models.channels_read())
 
@@ -31,7 +31,7 @@ ALL = tuple(models.channels_read())
 def denoisers():
     torch.set_num_threads(1)  # on images this small further threads only wait
     torch.manual_seed(0)
-    made = {name: models.create(name) for name in NAMES}
+    made = {name: registry.create(name) for name in NAMES}
     for denoiser in made.values():
         denoiser.prepare()
     yield made
@@ -177,13 +177,13 @@ def shown_psnr(images, others, exposure) -> float:
 @pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("name", NAMES)
 def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, name, precision):
-    half = models.create(name)
+    half = registry.create(name)
     if precision in half.refuses:
         with pytest.raises(BadInput, match=re.escape(half.refuses[precision])):
             half.prepare(precision)
         return
     torch.manual_seed(0)
-    full = models.create(name)
+    full = registry.create(name)
     half.load_state_dict(full.state_dict())
     full.prepare()
     half.prepare(precision)
@@ -238,7 +238,7 @@ def test_cameras_tell_a_cut(tiny):
 @pytest.mark.parametrize("name", NAMES)
 def test_preparing_twice_changes_nothing(name):
     torch.manual_seed(0)
-    denoiser = models.create(name)
+    denoiser = registry.create(name)
     frame = flat_frame(9, 7)
     denoiser.prepare()
     once = run(denoiser, [frame])[0]

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_operators import flat_frame
 
-from eval.synthetic import synthetic_frame
-from models import compiled, eaw, svgf
+from eval.bench.synthetic_frames import synthetic_frame
+from models import compiled
 from models.baselines import Accumulated
 from models.eaw import EAW
 from models.operators import Surfaces, running_scale
+from models.registry import eaw, svgf
 from models.svgf import SVGF, Integrated
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])

@@ -9,11 +9,10 @@ from test_denoisers import run
 from test_operators import flat_frame
 from torch.nn import functional as F
 
-import models
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
-from eval.fusion_bench import unfold_fuse
-from models import compiled
+from eval.bench.fusion import unfold_fuse
+from models import compiled, registry
 from models.compiled.exponential import exp, log
 from models.operators import accumulate, running_scale
 from models.repvgg import RepVGGBlock, merge, repvgg
@@ -45,7 +44,7 @@ def test_block_is_the_sum_of_its_branches():
 
 @pytest.mark.parametrize(("name", "outputs"), [("wskp3", 12), ("wskp6", 12), ("kp", 169)])
 def test_networks_have_the_papers_layers(name, outputs):
-    layers = [m for m in models.create(name).modules() if isinstance(m, RepVGGBlock)]
+    layers = [m for m in registry.create(name).modules() if isinstance(m, RepVGGBlock)]
     assert len(layers) == {"wskp3": 3, "wskp6": 6, "kp": 6}[name]
     assert layers[0].branches[0].in_channels == 10 and layers[-1].branches[0].out_channels == outputs
 
@@ -53,7 +52,7 @@ def test_networks_have_the_papers_layers(name, outputs):
 def test_wskp_is_accumulation_network_fusion(tiny):
     """The whole frame against its parts written out, with the fusion of the test in float64."""
     torch.manual_seed(3)
-    wskp = models.create("wskp3")
+    wskp = registry.create("wskp3")
     clip = Dataset(tiny).clips("test")[1]
     frames = [read_frame(clip, index, wskp.reads) for index in range(3)]
     outputs = run(wskp, frames)
@@ -86,13 +85,13 @@ def test_combination_of_resolutions_is_equation_7():
 @pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])
 def test_a_constant_image_stays_constant(name):
     frames = [flat_frame(21, 18, irradiance=torch.full((1, 3, 21, 18), 7.0)) for _ in range(2)]
-    for output in run(models.create(name), frames):
+    for output in run(registry.create(name), frames):
         torch.testing.assert_close(output, torch.full_like(output, 7.0), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["wskp3", "wskp6"])
 def test_kernel_choice_can_be_seen(name):
-    wskp = models.create(name)
+    wskp = registry.create(name)
     _, state = wskp(flat_frame(8, 9), None)
     shown = state.pictures()
     assert set(shown) == {"history length", "mean window (px)"}
@@ -100,7 +99,7 @@ def test_kernel_choice_can_be_seen(name):
 
 
 def test_compiled_features_equal_pytorch_s(tiny):
-    wskp = models.create("wskp3")
+    wskp = registry.create("wskp3")
     clip = Dataset(tiny).clips("test")[1]
     frame = Frame.stack([read_frame(clip, index, wskp.reads) for index in (2, 3)])
     frame = replace(frame, gain=torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 0.0]])[..., None, None])

@@ -6,8 +6,8 @@ import pytest
 from datasets.clip import Clip
 from datasets.writer import ClipWriter
 from render.clip import Sampling, render_clip
-from scenes import build_scene
 from scenes.extremes import EXTREMES, scaled
+from scenes.registry import build_scene
 
 SIZE, FRAMES = 24, 3
 SAMPLING = Sampling(2, 1, 32)

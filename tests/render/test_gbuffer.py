@@ -13,9 +13,9 @@ from errors import BadInput
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
-from scenes import build_scene
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
+from scenes.registry import build_scene
 
 
 def test_square_before_a_black_sky(square):
@@ -85,7 +85,7 @@ def test_posing_is_reversible(moving):
 COUNT_COMPILATIONS = """
 from render.backend import dr
 from render.clip import Sampling, render_clip
-from scenes import build_scene
+from scenes.registry import build_scene
 dr.set_flag(dr.JitFlag.KernelHistory, True)
 scene = build_scene("cornell_box_moving", 5, 10)
 for channels, _ in render_clip(scene, 10, 40, 40, Sampling(2, 1, 4), 0):

@@ -7,9 +7,9 @@ from render.backend import mi
 from render.gbuffer import render_gbuffer
 from render.motion import dual_motion
 from render.stage import Stage
-from scenes import build_scene
 from scenes.animation import Camera, Scene, Track
 from scenes.camera import FAR_OUTSIDE, View, intrinsics, look_at, motion_vectors, pixel_centres, project
+from scenes.registry import build_scene
 
 
 def homogeneous_projection(points: np.ndarray, view: View) -> np.ndarray:

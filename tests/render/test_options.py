@@ -10,8 +10,8 @@ from render.path import PathTracer
 from render.regularise import blurred
 from render.sampler import CYCLE
 from render.stage import Stage
-from scenes import build_scene
 from scenes.extremes import repaint
+from scenes.registry import build_scene
 
 
 @pytest.fixture(scope="module")

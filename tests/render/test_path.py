@@ -10,9 +10,9 @@ from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
-from scenes import build_scene
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
 from scenes.extremes import repaint
+from scenes.registry import build_scene
 
 BLOCK = 4  # px
 FRAME = 5

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets.display import clip_exposure, display, luminance
+from datasets.tonemap import clip_exposure, display, luminance
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
-from scenes import build_scene
 from scenes.animation import Scene, Shape
 from scenes.camera import motion_vectors, pixel_centres
+from scenes.registry import build_scene
 
 FRAMES = 24
 FEW, MANY = range(8), range(1000, 1100)

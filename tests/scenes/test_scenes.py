@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from errors import BadInput
-from scenes import SCENES, build_scene
 from scenes.animation import Track
 from scenes.camera import intrinsics, look_at, rigid_inverse
+from scenes.registry import SCENES, build_scene
 
 FRAMES = 24
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from models import create
+from models.registry import create
 from train.accumulated import AccumulatedCrops, accumulate_clip
 from train.data import in_parts, loader, micro_batches, split
 

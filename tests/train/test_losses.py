@@ -14,9 +14,9 @@ from torchmetrics.functional import symmetric_mean_absolute_percentage_error
 from datasets.clip import Dataset
 from datasets.frame import Frame
 from datasets.sequences import Batch
-from models import create
 from models.ntd import NTD
 from models.rae import RAE
+from models.registry import create
 from models.wskp import WSKP
 from train.accumulated import Crops
 from train.data import items, loader

@@ -6,7 +6,7 @@ import pytest
 
 from datasets.sequences import Augmentation
 from errors import BadInput
-from models import DENOISERS, create
+from models.registry import DENOISERS, create
 from train.recipes import DEFAULT, RECIPES, TRAINABLE, NTDTerms, RAETerms, SMAPETerms, recipe_for
 
 BUDGET = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}

@@ -1,0 +1,42 @@
+"""How many samples a reference needs: a few frames are rendered and their noise is measured."""
+
+import numpy as np
+
+from datasets.profiles import Quality
+from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
+from render.clip import PLAIN, Options
+from render.shot import Shot
+from render.stage import Stage
+from scenes.animation import Scene
+
+
+def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: Options) -> float:
+    """Mean squared error, as displayed, of a reference of `spp` samples: over the first, middle and last frame."""
+    halves, emissions = [], []
+    for frame in sorted({0, frames // 2, frames - 1}):
+        shot = Shot(stage, frame, options.regularise)
+        halves.append([shot.reflected(seed % 2**32 ^ half, spp // 2) for half in (0, 1)])
+        emissions.append(shot.emission)
+    exposure = clip_exposure(luminance(np.mean(halves, axis=1)))
+    shown = [display(pair + emission, exposure) for pair, emission in zip(np.array(halves), emissions, strict=True)]
+    return float(np.mean([noise_of_halves(a, b) for a, b in shown]))
+
+
+def reference_spp(
+    scene: Scene, frames: int, height: int, width: int, quality: Quality, seed: int, options: Options = PLAIN
+) -> int:
+    """Samples of both halves together, a power of two times quality.reference_spp and at most quality.most_spp.
+
+    The noise of independent samples falls as 1 / spp, so a measurement says how many would do. But few samples miss
+    paths that are rare and bright: it is measured again with as many, until it is down to the floor.
+    """
+    spp = quality.reference_spp
+    if quality.floor is None:
+        return spp
+    stage, target = Stage(scene, height, width), 10 ** (-quality.floor / 10)
+    while spp < quality.most_spp:
+        excess = noise_of_reference(stage, frames, spp, seed, options) / target
+        if excess <= 1:
+            break
+        spp <<= int(np.ceil(np.log2(excess)))
+    return min(spp, quality.most_spp)

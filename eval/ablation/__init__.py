@@ -1,0 +1,1 @@
+"""The ablations of the papers, trained and judged here."""

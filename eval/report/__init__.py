@@ -1,0 +1,1 @@
+"""One page of all results, and an animation of each clip."""

@@ -1,0 +1,80 @@
+"""`onespp report`: one page, in one file, of all that was measured."""
+
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from tqdm import tqdm
+
+from datasets.files import write_file
+from datasets.plotting import plt
+from errors import BadInput
+from eval.metrics import METRICS
+from eval.report.animation import save_animation
+from eval.report.page_data import clip_data, data_uri, step_for
+from eval.report.table_rows import table_rows
+from eval.report.trade_plot import trades
+from eval.results import ClipResults, read_results
+from eval.text_table import LEGEND
+
+
+def figures(runs: Path) -> list[dict[str, str]]:
+    """PNGs that other commands left in RUNS/report/figures."""
+    paths = sorted((runs / "report" / "figures").glob("*.png"))
+    return [{"name": path.stem.replace("-", " "), "uri": data_uri(path.read_bytes(), "png")} for path in paths]
+
+
+def page_file(name: str) -> str:
+    return resources.files("eval.report").joinpath("page", name).read_text()
+
+
+def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float) -> str:
+    """The page's HTML."""
+    bench, trade_plots = trades(runs, clips)
+    step = step_for(runs, clips, megabytes * 1e6)
+    pictures = [clip_data(runs, clip, step) for clip in tqdm(clips, "report", unit="clip")]
+    rows = table_rows(clips)
+    measured = [key for key in METRICS if any(row.values.get(key) is not None for row in rows)]
+    denoisers = list(dict.fromkeys(track.denoiser for clip in clips for track in clip.tracks))
+    data = {
+        "metrics": {key: {"title": METRICS[key].title, "more": METRICS[key].more_is_better} for key in measured},
+        "denoisers": denoisers,
+        "magma": (255 * plt.get_cmap("magma")(np.arange(256))[:, :3]).round().astype(int).tolist(),
+        "clips": pictures,
+        "trades": trade_plots,
+    }
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # metrics and denoisers keep their order
+    return environment.from_string(page_file("template.html")).render(
+        results=results,
+        clips=clips,
+        rows=rows,
+        metrics={key: METRICS[key] for key in measured},
+        legend=LEGEND,
+        bench=bench,
+        figures=figures(runs),
+        data=data,
+        style=Markup(page_file("style.css")),
+        script=Markup(page_file("script.js")),
+    )
+
+
+def report(runs: Path, megabytes: float = 24) -> list[Path]:
+    """Write RUNS/report/index.html, and an animated WebP a clip; returns their paths.
+
+    The page's pictures take about `megabytes` at most: where all frames do not fit, it shows every n-th.
+    Raises BadInput where nothing has been evaluated.
+    """
+    if megabytes <= 0:
+        raise BadInput(f"{megabytes} megabytes hold no page: name more than 0")
+    results, clips = read_results(runs)
+    if not clips:
+        raise BadInput(f"{runs / 'eval' / 'results.json'} has no rows: run `onespp eval` again")
+    page = runs / "report" / "index.html"
+    page.parent.mkdir(parents=True, exist_ok=True)
+    write_file(page, render(results, clips, runs, megabytes).encode())
+    return [page, *(save_animation(runs, clip) for clip in tqdm(clips, "animations", unit="clip"))]

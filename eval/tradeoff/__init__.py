@@ -1,0 +1,1 @@
+"""What quality costs: denoisers, precisions and samples a pixel against milliseconds."""

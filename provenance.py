@@ -1,0 +1,84 @@
+"""Where a result comes from: the packages, the device and the code that made it."""
+
+import ast
+import hashlib
+import platform
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).parent
+OURS = ("errors", "provenance", "timing", "scenes", "render", "datasets", "models", "train", "eval")
+
+# What decides the bytes of a data set, and the numbers of whatever denoises it.
+RENDERING = ("onespp", "mitsuba", "drjit", "numpy")
+DENOISING = ("onespp", "torch", "numpy", "numba", "flip-evaluator", "pyoidn")
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """The versions of those packages that are installed."""
+    found = {}
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def device_in_words(kind: str = "cpu", threads: int | None = None) -> str:
+    """What computes: the GPU's name, or the processor's and its threads, by default all that PyTorch takes."""
+    if kind == "cuda":
+        return f"cuda, {torch.cuda.get_device_name()}"
+    try:
+        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        model = None
+    return f"cpu, {model[1] if model else platform.machine()}, {threads or torch.get_num_threads()} threads"
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
+    with path.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+@cache
+def code_digest(*modules: str) -> str:
+    """SHA-256 of the sources of onespp's `modules` and of all modules that they import, directly or not."""
+    contents = (path.read_bytes() for _, path in sorted(sources(*modules).items()))
+    return hashlib.sha256(b"\0".join(contents)).hexdigest()
+
+
+def sources(*modules: str) -> dict[str, Path]:
+    """The files of onespp's `modules` and of all modules that they import, directly or not, by module name."""
+    found: dict[str, Path] = {}
+    waiting = list(modules)
+    while waiting:
+        module = waiting.pop()
+        path = source_of(module)
+        if path is not None and module not in found:
+            found[module] = path
+            waiting += imported_by(path)
+            waiting.append(module.rpartition(".")[0])  # importing a module runs its package first
+    return found
+
+
+def source_of(module: str) -> Path | None:
+    """The file of one of onespp's modules; None for whatever else has a name."""
+    path = ROOT.joinpath(*module.split("."))
+    files = (path / "__init__.py", path.with_suffix(".py"))
+    return next((file for file in files if module.split(".")[0] in OURS and file.is_file()), None)
+
+
+def imported_by(path: Path) -> Iterator[str]:
+    """Names that a source file imports: modules, and what may be a module or something in one."""
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)

@@ -1,0 +1,294 @@
+"""The trade: fronts by brute force, averaged and rendered samples, and one small run from end to end."""
+
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from datasets.clip import Clip, Dataset
+from datasets.files import read_json, write_json
+from datasets.frame import read_frame
+from errors import BadInput
+from eval.bench.denoisers import Variant
+from eval.harness import clips_of_one_spp
+from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
+from eval.text_table import compared, joint_floor
+from eval.tradeoff.candidates import Candidate, Times, candidates
+from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
+from eval.tradeoff.run import beaten_by, trade
+from eval.tradeoff.sample_cost import line, sample_cost
+from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
+from models.fusion import WINDOWS
+from models.weights import save_weights
+from render.clip import PLAIN
+from train.loop import WEIGHTS, run_folder
+
+SIZE = (32, 48)
+
+
+def a_clip(tiny, split: str = "test") -> Clip:
+    return Dataset(tiny).clips(split)[1]
+
+
+def bench_of(runs, labels, ms=lambda index: 1.0 + index, threads=(1, 2)) -> None:
+    """Times as `onespp bench denoisers` leaves them: with two threads half of those with one."""
+    height, width = SIZE
+    rows = [
+        {"denoiser": name, "dtype": dtype, "height": height, "width": width, "threads": n, "ms_median": ms(i) / n}
+        for i, name in enumerate(labels)
+        for dtype in ("float32", "bfloat16", "float16")
+        for n in threads
+    ]
+    (runs / "bench").mkdir(parents=True)
+    write_json(runs / "bench" / "results.json", {"schema": 1, "device": "cpu", "threads": max(threads), "rows": rows})
+
+
+# --- Fronts -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("metric, sign", [("psnr", 1), ("rmse", -1)])
+def test_fronts_by_brute_force(metric, sign):
+    rng = np.random.default_rng(0)
+    ms, values = rng.integers(1, 9, 40), rng.integers(20, 30, 40)  # with ties
+    rows = [
+        {"label": str(i), "ms": float(a), "compared": {metric: float(b)}}
+        for i, (a, b) in enumerate(zip(ms, values, strict=True))
+    ]
+    found = beaten_by([*rows, {"label": "untimed", "ms": None, "compared": {metric: 0.0}}], metric)
+    assert "untimed" not in found and None in found.values() and len(set(found.values())) > 1
+    for i, (a, b) in enumerate(zip(ms, values, strict=True)):
+        better = {
+            str(j)
+            for j in range(40)
+            if ms[j] <= a and sign * values[j] >= sign * b and (ms[j] < a or sign * values[j] > sign * b)
+        }
+        assert (found[str(i)] is None) == (not better)
+        assert found[str(i)] is None or found[str(i)] in better
+
+
+def test_digits_that_nobody_sees_do_not_make_a_front():
+    seen = [compared("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    assert seen == [30.0, 30.0, 30.01]
+
+
+def test_what_is_within_the_noise_floor_is_on_a_par():
+    floor = [{"psnr": 40.0}]
+    assert [compared("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [30, 36, 36.99, 36.99]
+    assert compared("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
+    assert compared("ssim", [{"ssim": None}], floor) is None
+
+
+def test_a_hard_clips_floor_hides_no_error_of_another():
+    """Within the mean of the floors, 0.55, by far; but on the second clip 0.8 and 0.95 are apart."""
+    floors = [{"ssim": 0.1, "mse_unbiased": 1e-6}, {"ssim": 1.0, "mse_unbiased": 1e-6}]
+    a, b = ([{"ssim": 0.3, "mse_unbiased": 0.0}, {"ssim": s, "mse_unbiased": 0.0}] for s in (0.8, 0.95))
+    assert joint_floor(a, floors) == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
+    assert compared("ssim", a, floors) < compared("ssim", b, floors)
+    both = [{"ssim": 0.1, "mse_unbiased": 1e-6}] * 2
+    assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
+
+
+def test_samples_that_are_not_worth_their_time():
+    rows = [
+        {"label": label, "spp": spp, "ms": ms, "compared": {"psnr": psnr}}
+        for label, spp, ms, psnr in (("noisy", 1, 1.0, 20.0), ("noisy", 4, 9.0, 26.0), ("rae", 1, 5.0, 30.0))
+    ]
+    mark_beaten(rows)
+    assert [row["dominated_by"] for row in rows] == [None, "rae, 1 spp", None]
+
+
+# --- Samples ----------------------------------------------------------------------------------------------------------
+
+
+def test_realisations_are_averaged(tiny, tmp_path):
+    clip = a_clip(tiny, "train")  # of two realisations
+    assert source(clip, 2) == "averaged" and source(clip, 4) == "rendered"
+    two = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path)
+    stored = np.load(clip.path / "indirect.npy").astype(np.float64)
+    assert stored.shape[1] == 2
+    np.testing.assert_allclose(np.load(two.path / "indirect.npy")[:, 0], stored.mean(axis=1), rtol=1e-6)
+    assert two.facts["noisy_spp"] == 2 and two.realisations == 1
+    assert len(list(averaged(clip, 1))) == clip.frames
+
+
+def test_everything_but_the_noise_is_the_clips_own(tiny, tmp_path):
+    clip = a_clip(tiny)
+    four = with_samples(clip, Dataset(tiny), 4, "rendered", tmp_path)
+    assert (four.scene, four.name) == (clip.scene, "000-4spp")
+    assert np.array_equal(four.reference(3), clip.reference(3)) and four.exposure == clip.exposure
+    channels = [name for name in clip.channels if name not in ("direct", "indirect", "direct_reference")]
+    ours, theirs = (read_frame(c, 3, [n for n in channels if n != "indirect_reference"]) for c in (four, clip))
+    assert all(np.array_equal(ours.channels[name], theirs.channels[name]) for name in theirs.channels)
+    assert not np.array_equal(four.read("direct", 3), clip.read("direct", 3))
+    assert with_samples(clip, Dataset(tiny), 1, "rendered", tmp_path) is clip
+
+
+def test_the_renderer_goes_on_where_the_clip_began(tiny):
+    """With as many samples as the clip has it makes the clip's own bytes: so scene, frames and seed are right."""
+    clip = a_clip(tiny)
+    frames = list(rendered(clip, Dataset(tiny), 1))
+    for frame in (0, clip.frames - 1):
+        half = frames[frame]["indirect"].astype(np.float16)
+        assert np.array_equal(half, clip.read("indirect", frame).astype(np.float16))
+
+
+def test_noise_falls_with_samples(tiny):
+    clip, errors = a_clip(tiny), []
+    for spp in (1, 4, 16):
+        frame = next(rendered(clip, Dataset(tiny), spp))
+        truth = clip.read("direct_reference", 0).astype(np.float64).mean(axis=0)
+        errors.append(float(((frame["direct"] - truth) ** 2).mean()))
+    assert errors[1] < 0.5 * errors[0] and errors[2] < 0.5 * errors[1]
+
+
+def test_clips_are_kept_until_what_they_are_made_of_changes(tiny, tmp_path):
+    copy = shutil.copytree(tiny, tmp_path / "data")
+    dataset, clip = Dataset(copy), a_clip(copy)
+    path = with_samples(clip, dataset, 2, "rendered", tmp_path / "more").path
+    kept = (path / "direct.npy").stat().st_mtime_ns
+    with_samples(clip, dataset, 2, "rendered", tmp_path / "more")
+    assert (path / "direct.npy").stat().st_mtime_ns == kept
+    (path / "clip.json").unlink()  # killed before it was whole
+    with_samples(clip, dataset, 2, "rendered", tmp_path / "more")
+    again = (path / "direct.npy").stat().st_mtime_ns
+    assert again != kept
+    write_json(clip.path / "clip.json", clip.facts | {"exposure": 2 * clip.exposure})
+    changed = with_samples(Clip(clip.path), dataset, 2, "rendered", tmp_path / "more")
+    assert changed.exposure == 2 * clip.exposure and (path / "direct.npy").stat().st_mtime_ns != again
+
+
+def test_samples_that_cannot_be_had(tiny, tmp_path):
+    clip, dataset = a_clip(tiny), Dataset(tiny)
+    four = with_samples(clip, dataset, 4, "rendered", tmp_path)
+    dataset.facts["options"] = {"halton": True, "regularise": False}
+    with pytest.raises(BadInput, match="16 different samples a pixel: 32 are too many"):
+        with_samples(clip, dataset, 32, "rendered", tmp_path)
+    with pytest.raises(BadInput, match="has 4 samples a pixel: 6 are no multiple"):
+        with_samples(four, dataset, 6, "rendered", tmp_path)
+    dataset.facts["generator"] = 0
+    with pytest.raises(BadInput, match=r"another version.*onespp dataset"):
+        scene_of(clip, dataset)
+    for levels in ((), (0, 1), (2, 1), (4, 4)):
+        with pytest.raises(BadInput, match="rising numbers"):
+            check_levels(levels)
+
+
+def test_cost_of_samples(tiny):
+    cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
+    assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
+    assert measured.sample_ms > 0 and measured.frame_ms >= 0
+
+
+# --- Candidates -------------------------------------------------------------------------------------------------------
+
+
+def test_sizes_are_the_networks_of_the_ablation():
+    assert [trained_as(name) for name in SIZES][:2] == ["3", "3+5"] and SIZES[WHOLE] == WINDOWS
+    for name, windows in SIZES.items():
+        assert create_any(name).windows == windows
+    assert [timed_as(name, "total") for name in (WHOLE, "wskp6-2w", "ntd-b")] == ["wskp6", "wskp6-2w", "ntd"]
+    assert timed_as("svgf", "indirect") == "svgf (indirect)" and timed_as("ntd", "indirect") == "ntd"
+
+
+def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
+    with pytest.raises(BadInput, match=r"rae has no weights.*`onespp train rae --profile tiny --runs"):
+        candidates(["rae"], tmp_path, "tiny")
+    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --profile tiny --runs"):
+        candidates(["wskp6-2w"], tmp_path, "tiny")
+    with pytest.raises(BadInput, match="unknown denoiser 'magic'"):
+        candidates(["magic"], tmp_path, "tiny")
+    labels = {candidate.label for candidate in candidates([], tmp_path, "tiny")}
+    assert {"noisy", "svgf"} <= labels and "rae" not in labels
+    assert "skipped: wskp3 has no weights" in capsys.readouterr().out
+    (tmp_path / "ablation" / "wskp-windows").mkdir(parents=True)
+    write_json(tmp_path / "ablation" / "wskp-windows" / "results.json", {"profile": "quick"})
+    assert "svgf" in {candidate.label for candidate in candidates([], tmp_path, "tiny")}
+    with pytest.raises(BadInput, match="is of the profile quick"):
+        candidates(["wskp6-2w"], tmp_path, "tiny")
+
+
+def test_only_what_was_named_is_a_candidate(tmp_path):
+    assert [candidate.label for candidate in candidates(["svgf"], tmp_path, "tiny")] == ["svgf"]  # no baseline, no ways
+
+
+def test_times_come_from_the_bench(tmp_path):
+    with pytest.raises(BadInput, match=r"no times at .*`onespp bench denoisers --size 48x32 --runs"):
+        Times(tmp_path, SIZE)
+    bench_of(tmp_path, ["noisy", "rae"])
+    rae = Candidate(Variant("rae", "rae", "bfloat16"), None)
+    assert [Times(tmp_path, SIZE, threads=n).of(rae, "total") for n in (None, 1)] == [1.0, 2.0]
+    assert Times(tmp_path, SIZE).of(Candidate(Variant("kp", "kp"), None), "total") is None
+    assert Times(tmp_path, SIZE).of(Candidate(Variant("noisy", "noisy"), None), "indirect") is None  # of total light
+    with pytest.raises(BadInput, match=r"results-cuda.json"):
+        Times(tmp_path, SIZE, device="cuda")
+    with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
+        Times(tmp_path, SIZE, threads=3)
+
+
+# --- From end to end --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def traded(tiny, tmp_path_factory):
+    """A trade of a few filters and an untrained wskp6, alone and with two windows; and what it printed."""
+    runs = tmp_path_factory.mktemp("runs")
+    for name, folder in (
+        ("wskp6", run_folder(runs, "wskp6", "tiny")),
+        ("wskp6-2w", runs / "ablation" / "wskp-windows" / "3+5-0"),
+    ):
+        folder.mkdir(parents=True)
+        label = "wskp6" if name == "wskp6" else trained_as(name)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+    write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
+    bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
+    names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
+    text = trade(tiny, runs, "tiny", names, "48x32", levels=(1, 4))
+    return runs, text
+
+
+def test_trade_holds_every_precision_and_size(traded):
+    runs, text = traded
+    content = read_json(runs / "report" / "trade.json")
+    assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
+    rows = {row["label"]: row for row in content["rows"]}
+    assert {"noisy", "wskp6", "wskp6-bfloat16", "wskp6-float16", "wskp6-2w-bfloat16"} <= rows.keys()
+    assert rows["wskp6"]["epochs"] == 7 and rows["noisy"]["epochs"] is None
+    assert rows["wskp6"]["ms"] == rows["wskp6-float16"]["ms"] == 2.0
+    assert rows["wskp6"]["metrics"]["psnr"] != rows["wskp6-bfloat16"]["metrics"]["psnr"]  # judged as it computes
+    assert rows["wskp6"]["metrics"]["psnr"] == pytest.approx(rows["wskp6-bfloat16"]["metrics"]["psnr"], abs=0.1)
+    assert rows["noisy"]["dominated_by"]["psnr"] is None  # the fastest
+    assert "beaten in PSNR by" in text and "trained on 1 spp" in text
+    assert {path.name for path in (runs / "report" / "figures").iterdir()} == {
+        *("trade-psnr.png", "trade-ssim.png", "trade-rmse.png", "trade-samples.png"),
+    }
+
+
+def test_more_samples_cost_more_and_show_more(traded):
+    samples = read_json(traded[0] / "report" / "trade.json")["samples"]
+    rows = {(row["denoiser"], row["spp"]): row for row in samples["rows"]}
+    assert samples["sources"] == {"cornell_box/000": "rendered", "cornell_box_moving/000": "rendered"}
+    for name in ("noisy", "accumulated", "svgf"):
+        one, four = rows[name, 1], rows[name, 4]
+        assert four["metrics"]["psnr"] > one["metrics"]["psnr"] and four["render_ms"] >= one["render_ms"]
+        assert four["ms"] == pytest.approx(four["render_ms"] + four["filter_ms"])
+    quality = {row["label"]: row["metrics"]["psnr"] for row in read_json(traded[0] / "report" / "trade.json")["rows"]}
+    assert rows["noisy", 1]["metrics"]["psnr"] == quality["noisy"]  # 1 spp is the clip itself
+    assert all(math.isfinite(row["metrics"]["psnr"]) for row in samples["rows"])
+
+
+def test_generalisation_shows_what_was_fed(traded):
+    rows = read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]
+    lines = [line.split()[:2] for line in generalisation(rows).splitlines()[2:]]
+    assert lines == [[name, spp] for spp in ("1", "4") for name in ("noisy", "accumulated", "svgf")]
+
+
+def test_clips_of_more_samples_are_left_out(tiny, tmp_path):
+    copy = shutil.copytree(tiny, tmp_path / "data")
+    paths = sorted((copy / "test").glob("*/*/clip.json"))
+    write_json(paths[0], read_json(paths[0]) | {"noisy_spp": 4})
+    assert [clip.path for clip in clips_of_one_spp(Dataset(copy))] == [path.parent for path in paths[1:]]
+    write_json(paths[1], read_json(paths[1]) | {"noisy_spp": 4})
+    with pytest.raises(BadInput, match="no test clips of 1 spp"):
+        clips_of_one_spp(Dataset(copy))
