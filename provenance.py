@@ -13,7 +13,19 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).parent
-OURS = ("errors", "provenance", "timing", "scenes", "render", "datasets", "models", "train", "eval")
+OURS = (
+    "errors",
+    "files",
+    "plotting",
+    "provenance",
+    "timing",
+    "scenes",
+    "render",
+    "datasets",
+    "models",
+    "train",
+    "eval",
+)
 
 # What decides the bytes of a data set, and the numbers of whatever denoises it.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")

@@ -1,4 +1,4 @@
-"""The channel table: what a clip holds, in which shape, precision and unit."""
+"""The channel table: what a clip holds, in which shape, precision and unit, and the constants of its light."""
 
 from typing import NamedTuple
 
@@ -26,6 +26,8 @@ class Channel(NamedTuple):
 
 
 RADIANCE = "W sr^-1 m^-2"
+LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue, Rec. 709
+ALBEDO_FLOOR = 0.01  # demodulation divides by no less
 
 CHANNELS: dict[str, Channel] = {
     "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE, radiance=True),

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS
-from datasets.files import read_json
 from errors import BadInput
+from files import read_json
 from scenes.camera import View, motion_vectors, pixel_centres
 
 SCHEMA = 1

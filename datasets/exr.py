@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
-from datasets.files import replacing
 from errors import BadInput
+from files import replacing
 from scenes.camera import View, rigid_inverse
 
 # Components of layers that are not colours. The halves of a reference are layers of their own, NAME_a and NAME_b.

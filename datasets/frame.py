@@ -8,14 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES
+from datasets.channels import ALBEDO_FLOOR, CAMERA_CHANNELS, CHANNELS, REFERENCES
 from datasets.clip import WHOLE, Clip, Window
 from errors import BadInput
 from scenes.camera import View
 
 Signal = Literal["total", "indirect"]
-
-ALBEDO_FLOOR = 0.01
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:

@@ -12,10 +12,10 @@ from datasets.adaptive_spp import reference_spp
 from datasets.channels import CHANNELS
 from datasets.clip import Dataset, is_clip
 from datasets.clip_kind import ClipKind
-from datasets.files import locked, read_json, write_json
 from datasets.profiles import DataProfile, clip_seed, plan, profile_of, versions
 from datasets.writer import ClipWriter
 from errors import BadInput
+from files import locked, read_json, write_json
 from render.clip import PLAIN, Clock, Options, Sampling, render_clip
 from scenes.registry import build_scene
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.plotting import plt, save_figure
+from plotting import plt, save_figure
 
 BINS = 16
 # In the order of datasets.inspect.Difficulty. What lies below the lowest is shown there.

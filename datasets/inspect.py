@@ -9,11 +9,11 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS
+from datasets.channels import ALBEDO_FLOOR, CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
-from datasets.files import read_json
 from datasets.tonemap import luminance, psnr
 from errors import BadInput
+from files import read_json
 
 CHUNK = 1 << 24
 
@@ -96,7 +96,7 @@ def difficulty(clip: Clip) -> Difficulty:
 
 
 def measure_frame(clip: Clip, frame: int) -> Difficulty:
-    albedo = np.maximum(clip.read("albedo", frame).astype(np.float64), 0.01)
+    albedo = np.maximum(clip.read("albedo", frame).astype(np.float64), ALBEDO_FLOOR)
     surface = clip.read("mesh_id", frame)[..., 0] > 0
     x, r = (
         luminance(sum(clip.read(name + kind, frame).astype(np.float64) for name in ("direct", "indirect")) / albedo)

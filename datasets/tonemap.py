@@ -6,14 +6,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Image = TypeVar("Image", bound=Any)
+from datasets.channels import LUMINANCE_WEIGHTS
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
+Image = TypeVar("Image", bound=Any)
 
 
 def luminance(radiance: NDArray[np.floating]) -> NDArray[np.float64]:
     """Rec. 709 luminance (...,) of linear RGB (..., 3)."""
-    return radiance @ LUMINANCE
+    return radiance @ np.array(LUMINANCE_WEIGHTS)
 
 
 def clip_exposure(y: NDArray[np.floating]) -> float:

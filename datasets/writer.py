@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS, REFERENCES, Channel
-from datasets.files import write_json
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
+from files import write_json
 
 HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in its normal range
 

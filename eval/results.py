@@ -26,10 +26,10 @@ from PIL import Image
 
 from datasets.clip import Clip
 from datasets.clip_kind import ClipKind
-from datasets.files import read_json, write_file, write_json
 from datasets.frame import Signal
 from errors import BadInput
 from eval.metrics import METRICS
+from files import read_json, write_file, write_json
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 REFERENCE, FLOOR = "reference", "(noise floor)"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.plotting import DPI, plt, save_figure
+from plotting import DPI, plt, save_figure
 
 CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.frame import Cameras, Frame
-from datasets.tonemap import LUMINANCE
 from models import compiled
 
 BACKGROUND = 0  # mesh id
@@ -21,7 +21,7 @@ def finite(x: Tensor) -> Tensor:
 
 def luminance(rgb: Tensor) -> Tensor:
     """Rec. 709 luminance (B, 1, H, W)."""
-    return (rgb * torch.tensor(LUMINANCE).to(rgb)[:, None, None]).sum(dim=1, keepdim=True)
+    return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64).to(rgb)[:, None, None]).sum(dim=1, keepdim=True)
 
 
 def pad(x: Tensor, multiple: int) -> Tensor:

@@ -7,8 +7,8 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from datasets.files import write_file
 from errors import BadInput
+from files import write_file
 from models.denoiser import Denoiser
 
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.frame import ALBEDO_FLOOR, Frame
+from datasets.channels import ALBEDO_FLOOR
+from datasets.frame import Frame
 from models import compiled
 from models.baselines import Accumulated, AccumulatedState
 from models.denoiser import Denoiser, State, carried

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from datasets.clip import Clip
-from datasets.files import replacing
 from datasets.frame import read_frame, to_tensor
-from datasets.plotting import DPI, plt, save_figure
 from datasets.tonemap import display
+from files import replacing
 from models.denoiser import Denoiser, State
 from models.operators import finite
+from plotting import DPI, plt, save_figure
 
 METRICS, CURVE, SAMPLE = "metrics.csv", "loss.png", "sample.png"
 ROWS = 2000  # of metrics.csv at most, whatever the number of steps

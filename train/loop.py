@@ -17,8 +17,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from datasets.clip import Dataset
-from datasets.files import locked, write_file
 from errors import BadInput
+from files import locked, write_file
 from models.denoiser import Denoiser
 from models.registry import create
 from models.weights import save_weights

@@ -13,18 +13,18 @@ import torch
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.files import write_file, write_json
 from datasets.frame import read_frame
-from datasets.plotting import save_figure
 from errors import BadInput
 from eval.ablation.definitions import SHARE, Ablation, Variant, ablation_for
 from eval.ablation.summary import Run, draw, report, verdicts
 from eval.clip_run import Track
 from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.results import device, versions
+from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.weights import load_weights
 from models.wskp import KernelPredictor
+from plotting import save_figure
 from train.log import METRICS, read_metrics
 from train.loop import CHECKPOINT, Task, load_checkpoint, train_network
 

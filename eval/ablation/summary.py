@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from datasets.plotting import DPI, plt
 from eval.ablation.definitions import CUMULATIVE, SINGLE, Ablation, Finding, label_of
 from eval.metrics import METRICS, Metric
+from plotting import DPI, plt
 
 MEASURED = METRICS | {
     "train_loss": Metric("training loss", "{:.4f}"),  # of the last epoch

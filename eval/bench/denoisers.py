@@ -14,7 +14,6 @@ from tabulate import tabulate
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from datasets.files import read_json, write_json
 from datasets.frame import Frame
 from errors import BadInput
 from eval.bench.memory import alone, growth_mb, release
@@ -23,6 +22,7 @@ from eval.results import BASELINES, code, versions
 from eval.results import SOURCES as EVALUATED
 from eval.results import device as in_words
 from eval.sizes import SIZES, WHOLE, create_any, timed_as
+from files import read_json, write_json
 from models import compiled
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN

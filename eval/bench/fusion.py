@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from datasets.files import write_json
 from eval.bench.denoisers import thread_count
 from eval.bench.memory import alone, growth_mb
+from files import write_json
 from models import compiled
 from models.fusion import WINDOWS, fuse
 

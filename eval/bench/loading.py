@@ -15,8 +15,8 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.files import write_json
 from datasets.inspect import size_of
+from files import write_json
 from models.registry import create
 from train.data import Items, items, loader, micro_batches
 from train.loop import Training, task_for

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.files import write_json
 from datasets.tonemap import clip_exposure, display, luminance, psnr
 from eval.bench.time_to_floor import FRAME, OURS, SIZE, Row, seconds_to_floor
+from files import write_json
 from render.backend import VARIANT
 
 SCENES = ("cornell_box", "cornell_box_moving", *(f"room-{number}" for number in range(6)))

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from datasets.files import write_json
-from datasets.plotting import DPI, plt, save_figure
 from eval.bench.denoisers import PRECISIONS, Variant, parse_size, race, thread_count, thread_counts, variants
 from eval.results import device
 from eval.sizes import SIZES as OTHER_SIZES
+from files import write_json
 from models.registry import inference_precision
+from plotting import DPI, plt, save_figure
 
 SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
 

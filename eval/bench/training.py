@@ -14,7 +14,7 @@ from tabulate import tabulate
 from torch.profiler import ProfilerActivity, profile, record_function
 from tqdm import tqdm
 
-from datasets.files import write_json
+from files import write_json
 from train.data import in_parts, loader, micro_batches
 from train.loop import Training, task_for
 from train.recipes import DEFAULT

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.plotting import DPI, plt, save_figure
 from datasets.tonemap import clip_exposure, display, luminance
+from plotting import DPI, plt, save_figure
 from render.shot import Shot
 from render.stage import Stage
 from scenes.registry import build_scene

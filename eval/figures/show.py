@@ -14,13 +14,13 @@ from tqdm import tqdm
 from datasets.channels import REFERENCES
 from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, Signal, read_frame
-from datasets.plotting import DPI, plt, save_figure
 from datasets.tonemap import display, psnr
 from errors import BadInput
 from eval.harness import ready_denoisers
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.registry import create
+from plotting import DPI, plt, save_figure
 
 SHOWN = 4  # frames of the clip, the first and the last among them
 SMALLEST_PANEL, LARGEST_PANEL = 192, 480  # px, the longer side

@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from datasets.frame import to_tensor
-from datasets.plotting import DPI, plt, save_figure
 from datasets.tonemap import clip_exposure, luminance
 from eval.figures.reference_halves import references
 from eval.metrics import METRICS, image_metrics
 from eval.noise_floor import noise_floor
+from plotting import DPI, plt, save_figure
 
 SCENE, SIZE = "cornell_box", (64, 64)
 REPEATS = {16: 128, 64: 64, 256: 32, 1024: 16}  # references by samples per pixel: the noisier, the more

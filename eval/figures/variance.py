@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Cameras, Frame
-from datasets.plotting import DPI, plt, save_figure
 from datasets.tonemap import display
 from models.svgf import SVGF
+from plotting import DPI, plt, save_figure
 
 TILE = 64  # px; every tile has the same structure, so that only the noise differs from left to right
 SIZE = 2 * TILE, 12 * TILE  # height, width

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from tabulate import tabulate
 
-from datasets.files import read_json
 from eval.ablation.summary import Run, over_seeds
 from eval.metrics import METRICS, Metric
 from eval.noise_floor import within_floor
@@ -16,6 +15,7 @@ from eval.papers.tables import TABLES, PaperTable
 from eval.report.table_rows import mean_of, of, one_spp
 from eval.results import read_results
 from eval.text_table import LEGEND, NEAR, joint_floor
+from files import read_json
 from train.recipes import TRAINABLE
 
 TITLES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {

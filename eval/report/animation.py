@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from datasets.files import replacing
 from eval.results import ClipResults, folders_of, label, load_picture
+from files import replacing
 
 BEST = 2  # denoisers that are shown
 FRAMES, MILLISECONDS = 240, 83  # at most so many frames, so long each

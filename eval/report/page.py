@@ -10,8 +10,6 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from tqdm import tqdm
 
-from datasets.files import write_file
-from datasets.plotting import plt
 from errors import BadInput
 from eval.metrics import METRICS
 from eval.report.animation import save_animation
@@ -20,6 +18,8 @@ from eval.report.table_rows import table_rows
 from eval.report.trade_plot import trades
 from eval.results import ClipResults, read_results
 from eval.text_table import LEGEND
+from files import write_file
+from plotting import plt
 
 
 def figures(runs: Path) -> list[dict[str, str]]:

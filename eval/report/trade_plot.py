@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from datasets.files import read_json
 from eval.metrics import METRICS
 from eval.report.table_rows import by_signal, mean_of, of, one_spp
 from eval.results import ClipResults
 from eval.sizes import timed_as
 from eval.text_table import compared
 from eval.tradeoff.pareto import Point, dominators
+from files import read_json
 
 TRADED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
 

@@ -12,14 +12,14 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.files import write_file, write_json
-from datasets.plotting import plt, save_figure
 from errors import BadInput
 from eval.bench.denoisers import PRECISIONS, thread_count
 from eval.stress.cases import EXTREMES, LONG, RECOVERY_LIMIT, Extreme
 from eval.stress.check import REQUIREMENTS, Outcome, Trial, heads
+from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS, create, load, unavailable, without_taa
+from plotting import plt, save_figure
 from train.loop import WEIGHTS, run_folder
 
 FRESH = "fresh"

@@ -8,11 +8,11 @@ from typing import Any
 
 from safetensors import safe_open
 
-from datasets.files import read_json
 from errors import BadInput
 from eval.bench.denoisers import PRECISIONS, Variant, variants
 from eval.report.trade_plot import median_ms
 from eval.sizes import SIZES, WHOLE, timed_as, trained_as
+from files import read_json
 from models.denoiser import Denoiser
 from models.registry import without_taa
 from models.taa import unwrapped

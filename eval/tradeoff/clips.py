@@ -12,11 +12,11 @@ from tqdm import tqdm
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_kind import ClipKind
-from datasets.files import locked, read_json, write_json
 from datasets.generate import check_versions
 from datasets.profiles import GENERATOR, clip_seed, profile_of
 from datasets.writer import to_storage
 from errors import BadInput
+from files import locked, read_json, write_json
 from render.clip import Options, Sampling, render_clip
 from render.sampler import CYCLE
 from scenes.animation import Scene

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from datasets.plotting import DPI, plt
 from eval.metrics import METRICS
+from plotting import DPI, plt
 
 MARKERS = {"float32": "o", "bfloat16": "s", "float16": "^"}
 

@@ -7,8 +7,6 @@ from typing import Any
 from tabulate import tabulate
 
 from datasets.clip import Dataset
-from datasets.files import write_json
-from datasets.plotting import save_figure
 from eval.bench.denoisers import parse_size
 from eval.harness import clips_of_one_spp, evaluate_clip, tracks_of
 from eval.metrics import METRICS
@@ -19,6 +17,8 @@ from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.sample_cost import RENDERER
 from eval.tradeoff.samples import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table
+from files import write_json
+from plotting import save_figure
 
 TRADED = ("psnr", "ssim", "rmse")
 FRONTS = (

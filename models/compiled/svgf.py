@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.tonemap import LUMINANCE
+from datasets.channels import LUMINANCE_WEIGHTS
 from models.atrous import B3_SPLINE
 from models.compiled import array, jit, jit_parallel, threads
 from models.compiled.exponential import exp
 
-RED, GREEN, BLUE = (np.float32(weight) for weight in LUMINANCE)
+RED, GREEN, BLUE = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
 SPLINE = np.array(B3_SPLINE, np.float32)
 NEGLIGIBLE = np.float32(30)  # e^-30 = 1e-13 counts as 0: denormal numbers are slow
 LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14

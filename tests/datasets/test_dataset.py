@@ -18,12 +18,12 @@ import pytest
 
 import datasets.generate
 from datasets.clip import Clip, Dataset
-from datasets.files import locked
 from datasets.generate import Part
 from datasets.inspect import check_clip, difficulty, info, verify
 from datasets.profiles import DATA_PROFILES, clip_seed, plan
 from datasets.writer import ClipWriter
 from errors import BadInput
+from files import locked
 from models.registry import channels_read
 from render.clip import Sampling, render_clip
 from scenes.registry import build_scene

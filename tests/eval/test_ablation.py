@@ -13,7 +13,6 @@ from torch import nn
 import onespp
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
-from datasets.plotting import plt
 from datasets.sequences import REFERENCES
 from errors import BadInput
 from eval.ablation import definitions, run
@@ -25,6 +24,7 @@ from models.ntd import NTD
 from models.rae import RAE
 from models.weights import load_weights
 from models.wskp import WSKP
+from plotting import plt
 from train import loop
 from train.loop import Training
 from train.losses import RAELoss, loss_for

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from datasets.files import write_json
 from eval.ablation.summary import Run
 from eval.papers.compare import against_papers, is_better, measured, orders, verdict
 from eval.papers.tables import (
@@ -20,6 +19,7 @@ from eval.papers.tables import (
     WSKP_TABLE_5,
 )
 from eval.results import REFERENCE, Result, folder_of, write_results
+from files import write_json
 from models.registry import DENOISERS
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from datasets.clip import Clip, Dataset
-from datasets.files import read_json, write_json
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.denoisers import Variant
@@ -19,6 +18,7 @@ from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_sampl
 from eval.tradeoff.run import beaten_by, trade
 from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
+from files import read_json, write_json
 from models.fusion import WINDOWS
 from models.weights import save_weights
 from render.clip import PLAIN

@@ -138,7 +138,7 @@ def test_missing_or_broken_oidn_is_a_clear_error(monkeypatch):
             registry.load(name, None)
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
             registry.create(name)(flat_frame(4, 4), None)
-    assert models.channels_read(["oidn"])  # what it reads is known all the same
+    assert registry.channels_read(["oidn"])  # what it reads is known all the same
 
 
 def test_it_chooses_its_own_precision():

@@ -24,7 +24,7 @@ from models import registry
 
 NAMES = [name for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa") if not registry.unavailable(name)]
 THREADS = torch.get_num_threads()
-ALL = tuple(models.channels_read())
+ALL = tuple(registry.channels_read())
 
 
 @pytest.fixture(scope="module")

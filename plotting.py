@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
-from datasets.files import replacing
+from files import replacing
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
