@@ -146,7 +146,7 @@ def evaluate(
     """
     from eval.harness import evaluate as run
 
-    run(data_folder(data, profile), runs, profile, list(names) or None, processes)
+    run(data_folder(data, profile), runs, profile, names, processes)
 
 
 def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
@@ -227,8 +227,8 @@ def bench(
 
         print(bench_scaling(runs, names, size, threads))
     elif what == "fusion":
-        from eval.bench.denoisers import parse_size
         from eval.bench.fusion import bench_fusion
+        from eval.bench.sizes import parse_size
 
         print(bench_fusion(runs, *parse_size((size or usual)[0]), max(threads, default=None)))
     elif what == "rendering":
