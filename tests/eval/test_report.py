@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from errors import BadInput
-from eval.disocclusion_crops import Window, densest_window
+from eval.disocclusion_crops import Crop, densest_crop
 from eval.metrics import METRICS, flip_map
 from eval.report.page import report
 from eval.results import folder_of, load_picture
@@ -185,18 +185,18 @@ def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
 
 
-def test_densest_window():
+def test_densest_crop():
     mask = torch.zeros(100, 80, dtype=torch.bool)
-    assert densest_window(mask) is None
+    assert densest_crop(mask) is None
     mask[40:44, 30:36] = True
-    window = densest_window(mask)
+    window = densest_crop(mask)
     assert window.size == 20 and window.pixels == 24
     assert abs(window.x + 9.5 - 32.5) <= 1 and abs(window.y + 9.5 - 41.5) <= 1
     mask[:] = False
     mask[0, 79] = True
-    assert densest_window(mask) == Window(60, 0, 20, 1)
-    assert densest_window(torch.ones(3, 50, dtype=torch.bool)).size == 3
-    assert densest_window(torch.ones(1, 1, dtype=torch.bool)) == Window(0, 0, 1, 1)
+    assert densest_crop(mask) == Crop(60, 0, 20, 1)
+    assert densest_crop(torch.ones(3, 50, dtype=torch.bool)).size == 3
+    assert densest_crop(torch.ones(1, 1, dtype=torch.bool)) == Crop(0, 0, 1, 1)
 
 
 def test_pareto_front():

@@ -5,19 +5,20 @@ import shutil
 
 import numpy as np
 import pytest
-from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.bench.denoisers import Variant
+from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import compared_mean, joint_floor
-from eval.tradeoff.candidates import Candidate, Times, candidates
+from eval.spec import DenoiserSpec, create
+from eval.tradeoff.candidates import candidates
 from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import beaten_by, trade
 from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
+from eval.tradeoff.times import Times, timed_as
 from files import read_json, write_json
 from models.fusion import WINDOWS
 from models.weights import save_weights
@@ -190,27 +191,28 @@ def test_cost_of_samples(tiny):
 
 
 def test_sizes_are_the_networks_of_the_ablation():
-    assert [trained_as(name) for name in SIZES][:2] == ["3", "3+5"] and SIZES[WHOLE] == WINDOWS
-    for name, windows in SIZES.items():
-        assert create_any(name).windows == windows
-    assert [timed_as(name, "total") for name in (WHOLE, "wskp6-2w", "ntd-b")] == ["wskp6", "wskp6-2w", "ntd"]
-    assert timed_as("svgf", "indirect") == "svgf (indirect)" and timed_as("ntd", "indirect") == "ntd"
+    assert [windows_label(windows) for windows in WINDOW_SETS.values()][:2] == ["3", "3+5"]
+    assert WINDOW_SETS[ALL_WINDOWS] == WINDOWS
+    for name, windows in WINDOW_SETS.items():
+        assert create(name).windows == windows
+    assert [timed_as(name, "total") for name in (ALL_WINDOWS, "wskp6-2w")] == ["wskp6", "wskp6-2w"]
+    assert [timed_as(name, "indirect") for name in ("svgf", "ntd", "ntd-b")] == ["svgf (indirect)", "ntd", "ntd"]
 
 
 def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
-    with pytest.raises(BadInput, match=r"rae has no weights.*`onespp train rae --profile tiny --runs"):
+    with pytest.raises(BadInput, match=r"rae: it has no weights.*`onespp train rae --budget tiny --runs"):
         candidates(["rae"], tmp_path, "tiny")
-    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --profile tiny --runs"):
+    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --budget tiny --runs"):
         candidates(["wskp6-2w"], tmp_path, "tiny")
     with pytest.raises(BadInput, match="unknown denoiser 'magic'"):
         candidates(["magic"], tmp_path, "tiny")
     labels = {candidate.label for candidate in candidates([], tmp_path, "tiny")}
     assert {"noisy", "svgf"} <= labels and "rae" not in labels
-    assert "skipped: wskp3 has no weights" in capsys.readouterr().out
+    assert "wskp3: skipped, it has no weights" in capsys.readouterr().out
     (tmp_path / "ablation" / "wskp-windows").mkdir(parents=True)
     write_json(tmp_path / "ablation" / "wskp-windows" / "results.json", {"profile": "quick"})
     assert "svgf" in {candidate.label for candidate in candidates([], tmp_path, "tiny")}
-    with pytest.raises(BadInput, match="is of the profile quick"):
+    with pytest.raises(BadInput, match="is of the budget quick"):
         candidates(["wskp6-2w"], tmp_path, "tiny")
 
 
@@ -222,10 +224,10 @@ def test_times_come_from_the_bench(tmp_path):
     with pytest.raises(BadInput, match=r"no times at .*`onespp bench denoisers --size 48x32 --runs"):
         Times(tmp_path, SIZE)
     bench_of(tmp_path, ["noisy", "rae"])
-    rae = Candidate(Variant("rae", "rae", "bfloat16"), None)
+    rae = DenoiserSpec("rae", precision="bfloat16")
     assert [Times(tmp_path, SIZE, threads=n).of(rae, "total") for n in (None, 1)] == [1.0, 2.0]
-    assert Times(tmp_path, SIZE).of(Candidate(Variant("kp", "kp"), None), "total") is None
-    assert Times(tmp_path, SIZE).of(Candidate(Variant("noisy", "noisy"), None), "indirect") is None  # of total light
+    assert Times(tmp_path, SIZE).of(DenoiserSpec("kp"), "total") is None
+    assert Times(tmp_path, SIZE).of(DenoiserSpec("noisy"), "indirect") is None  # of total light
     with pytest.raises(BadInput, match=r"results-cuda.json"):
         Times(tmp_path, SIZE, device="cuda")
     with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
@@ -244,8 +246,8 @@ def traded(tiny, tmp_path_factory):
         ("wskp6-2w", runs / "ablation" / "wskp-windows" / "3+5-0"),
     ):
         folder.mkdir(parents=True)
-        label = "wskp6" if name == "wskp6" else trained_as(name)
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+        label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
+        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
