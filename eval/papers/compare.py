@@ -9,11 +9,10 @@ from typing import NamedTuple
 from tabulate import tabulate
 
 from eval.ablation.summary import Run, over_seeds
-from eval.means import joint_floor
+from eval.means import scores_of
 from eval.metrics import METRICS, Quantity, within_floor
 from eval.papers.tables import TABLES, PaperTable
-from eval.report.table_rows import mean_of, of, one_spp
-from eval.results import read_results
+from eval.results import of_one_spp, read_results, results_of
 from eval.text_table import LEGEND, NEAR
 from files import read_json
 from train.recipes import TRAINABLE
@@ -47,15 +46,14 @@ class Measured:
 def from_evaluation(runs: Path, profile: str, signal: str) -> Measured:
     """Means over the clips of 1 spp of RUNS/eval/results.json where a metric is defined."""
     path = runs / "eval" / "results.json"
-    clips = one_spp(read_results(runs)[1]) if path.exists() else []
+    clips = of_one_spp(read_results(runs)[1]) if path.exists() else []
     ours = [clip for clip in clips if clip.signal == signal]
-    floors = [clip.reference.metrics for clip in ours]
 
     def value(denoiser: str, metric: str) -> float | None:
-        return mean_of(ours, denoiser)[metric] if of(ours, denoiser) else None
+        return scores_of(ours, denoiser).means[metric] if results_of(ours, denoiser) else None
 
     def floor(denoiser: str, metric: str) -> float | None:
-        return joint_floor([r.metrics for r in of(ours, denoiser)], floors).get(metric) if of(ours, denoiser) else None
+        return scores_of(ours, denoiser).joint_floor.get(metric) if results_of(ours, denoiser) else None
 
     return Measured(value, f"onespp eval --profile {profile} --runs {runs}", floor)
 
