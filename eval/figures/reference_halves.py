@@ -11,8 +11,10 @@ from render.stage import Stage
 from scenes.registry import build_scene
 
 
-def references(name: str, size: tuple[int, int], spps: Sequence[int], seed: int = 0) -> Iterator[NDArray[np.float64]]:
-    """Yields, for each of `spps`, two halves (2, H, W, 3) of the radiance of the first frame of a scene.
+def reference_halves(
+    name: str, size: tuple[int, int], spps: Sequence[int], seed: int = 0
+) -> Iterator[NDArray[np.float64]]:
+    """Yield, for each of `spps`, two halves (2, H, W, 3) of the reference radiance of a scene's first frame.
 
     Each half has spp/2 samples and a seed of its own, as in a data set; `size` is (height, width).
     Raises BadInput for an unknown scene.
