@@ -172,9 +172,7 @@ def tracks_of(denoisers: Mapping[str, tuple[Denoiser, str | None]]) -> list[Trac
     tracks = [Track(name, denoiser, weights) for name, (denoiser, weights) in denoisers.items()]
     if "indirect" in signals_of(tracks):
         for name in [name for name in BASELINES if name in denoisers]:
-            baseline = load(name, None)
-            baseline.signal = "indirect"
-            tracks.append(Track(name, baseline, None))
+            tracks.append(Track(name, load(name, None, signal="indirect"), None))
     return tracks
 
 

@@ -26,8 +26,8 @@ from files import read_json, write_json
 from models import compiled
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN
-from models.registry import DENOISERS, unavailable
-from models.taa import unwrapped
+from models.registry import DENOISERS, create, unavailable
+from models.taa import inner_denoiser
 
 BASELINE, FAST = "oidn", "oidn (fast)"
 COMPILED = ("accumulated", "eaw", "svgf")  # filters that are also measured the PyTorch way
@@ -58,10 +58,9 @@ class Variant(NamedTuple):
     def build(self) -> Denoiser:
         """As it stands before `prepare`."""
         torch.manual_seed(0)
-        denoiser = OIDN("fast") if self.label == FAST else create_any(self.name)
         if self.indirect:
-            denoiser.signal = "indirect"
-        return denoiser
+            return create(self.name, "indirect")
+        return OIDN("fast") if self.label == FAST else create_any(self.name)
 
     def way(self) -> AbstractContextManager[None]:
         return nullcontext() if self.compiled else compiled.disabled()
@@ -148,7 +147,7 @@ class Contender:
         return {
             **self.timing(size),
             "peak_mb": peak,
-            "parameters": None if isinstance(unwrapped(self.denoiser), OIDN) else self.denoiser.parameter_count(),
+            "parameters": None if isinstance(inner_denoiser(self.denoiser), OIDN) else self.denoiser.parameter_count(),
             "macs_per_pixel": macs_per_pixel(self.variant),
             "prediction": self.share_of_network(),
         }
@@ -160,7 +159,7 @@ class Contender:
 
 
 def network_of(denoiser: Denoiser) -> nn.Module | None:
-    network = getattr(unwrapped(denoiser), "network", None)
+    network = getattr(inner_denoiser(denoiser), "network", None)
     return network if isinstance(network, nn.Module) else None
 
 

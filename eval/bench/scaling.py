@@ -22,7 +22,7 @@ def in_use(names: Sequence[str]) -> list[Variant]:
     """Of all ways to run the denoisers the one that evaluation takes. Raises BadInput for an unknown name."""
     once = (v for v in variants(names) if v.compiled and not v.indirect)
     chosen = (v for v in once if names or v.name not in OTHER_SIZES)
-    return [v for v in chosen if PRECISIONS[v.dtype] == inference_precision(v.build())]
+    return [v for v in chosen if PRECISIONS[v.dtype] == inference_precision(type(v.build()))]
 
 
 def exponent(pixels: Sequence[int], ms: Sequence[float]) -> float | None:

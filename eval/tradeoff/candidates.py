@@ -15,7 +15,7 @@ from eval.sizes import SIZES, WHOLE, timed_as, trained_as
 from files import read_json
 from models.denoiser import Denoiser
 from models.registry import without_taa
-from models.taa import unwrapped
+from models.taa import inner_denoiser
 from models.weights import load_weights
 from train.loop import WEIGHTS, run_folder
 
@@ -42,7 +42,9 @@ class Candidate:
         """Raises BadInput where the weights are damaged or of another network."""
         name, denoiser = self.variant.name, self.variant.build()
         if self.weights:
-            load_weights(unwrapped(denoiser), trained_as(name) if name in SIZES else without_taa(name), self.weights)
+            load_weights(
+                inner_denoiser(denoiser), trained_as(name) if name in SIZES else without_taa(name), self.weights
+            )
         denoiser.prepare(PRECISIONS[self.variant.dtype])
         return denoiser
 

@@ -42,7 +42,7 @@ def sampled(chosen: Sequence[Candidate], named: bool) -> list[Candidate]:
         candidate
         for candidate in chosen
         if (named or candidate.variant.label in SAMPLED)
-        and PRECISIONS[candidate.variant.dtype] == inference_precision(candidate.variant.build())
+        and PRECISIONS[candidate.variant.dtype] == inference_precision(type(candidate.variant.build()))
     ]
 
 

@@ -13,7 +13,7 @@ from eval.bench.scaling import exponent, in_use
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.results import device
 from eval.sizes import SIZES
-from models.registry import create, inference_precision
+from models.registry import inference_precision
 from onespp import main
 
 KEYS = {
@@ -100,7 +100,7 @@ def test_scaling(tmp_path, monkeypatch, capsys):
     rows = json.loads((tmp_path / "bench" / "scaling.json").read_text())["rows"]
     names = ["noisy", "wskp3", *([] if eval.bench.denoisers.unavailable("oidn") else ["oidn", "oidn (fast)"])]
     assert [(row["denoiser"], row["width"]) for row in rows] == [(name, w) for w in (16, 32) for name in names]
-    used = str(inference_precision(create("wskp3"))).removeprefix("torch.")
+    used = str(inference_precision("wskp3")).removeprefix("torch.")
     assert [row["dtype"] for row in rows if row["denoiser"] == "wskp3"] == [used, used]
     assert (tmp_path / "report" / "figures" / "scaling.png").exists()
 
