@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 from datasets.frame import to_tensor
 from datasets.tonemap import clip_exposure, luminance
-from eval.figures.reference_halves import references
+from eval.figures.reference_halves import reference_halves
 from eval.metrics import METRICS, image_metrics
 from eval.noise_floor import noise_floor
 from plotting import DPI, plt, save_figure
@@ -43,7 +43,7 @@ def tensor(radiance: NDArray[np.float64]) -> Tensor:
 def measure(repeats: Mapping[int, int] = REPEATS, truth_spp: int = TRUTH_SPP) -> tuple[float, list[Measured]]:
     """The MSE of a fixed image to a reference of very many samples, and what noisy references say of it."""
     spps = [spp for spp, count in repeats.items() for _ in range(count)]
-    rendered = references(SCENE, SIZE, [truth_spp, *spps])
+    rendered = reference_halves(SCENE, SIZE, [truth_spp, *spps])
     truth = next(rendered).mean(axis=0)
     exposure, perfect, still = clip_exposure(luminance(truth)), tensor(truth), torch.zeros(1, 2, *SIZE)
     image = torch.lerp(perfect, avg_pool2d(perfect, 3, 1, 1, count_include_pad=False), BLUR)
