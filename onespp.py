@@ -68,14 +68,14 @@ def dataset(
     regularise: Regularise = False,
 ) -> None:
     """Render the clips of a profile that are not there yet."""
-    from datasets.generate import Part, generate, render_here
+    from datasets.generate import Share, generate, render_here
     from models.registry import channels_read
     from render.clip import Options
 
     if ray:
         from datasets.cluster import render_on_cluster
     folder = data_folder(data, profile)
-    share = Part.parse(part) if part else None
+    share = Share.parse(part or "1/1")
     channels = channels_read(reads)
     options = Options(halton, regularise)
     render = render_on_cluster if ray else render_here
@@ -85,7 +85,7 @@ def dataset(
 
 def verify(folder: Folder) -> None:
     """Check every file of a data set against its checksum and shape; names what is damaged."""
-    from datasets.inspect import verify as find_problems
+    from datasets.verify import find_problems
 
     problems = find_problems(folder)
     for problem in problems:
@@ -101,9 +101,9 @@ def info(folder: Folder, plot: Path | None = None) -> None:
     Args:
         plot: write a histogram of how hard the clips are to this PNG as well.
     """
-    from datasets.inspect import info as describe
+    from datasets.info import summarise
 
-    print(describe(folder, plot))
+    print(summarise(folder, plot))
 
 
 def train(
