@@ -11,19 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).parent
-OURS = (
-    "errors",
-    "files",
-    "plotting",
-    "provenance",
-    "timing",
-    "scenes",
-    "render",
-    "datasets",
-    "models",
-    "train",
-    "eval",
-)
+FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval")
+BESIDE_THEM = ("errors", "files", "plotting", "provenance", "timing")
 
 # What decides the bytes of a data set, and the numbers of whatever denoises it.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")
@@ -82,8 +71,9 @@ def sources(*modules: str) -> dict[str, Path]:
 def source_of(module: str) -> Path | None:
     """The file of one of onespp's modules; None for whatever else has a name."""
     path = ROOT.joinpath(*module.split("."))
+    is_ours = module.split(".")[0] in FOLDERS + BESIDE_THEM
     files = (path / "__init__.py", path.with_suffix(".py"))
-    return next((file for file in files if module.split(".")[0] in OURS and file.is_file()), None)
+    return next((file for file in files if is_ours and file.is_file()), None)
 
 
 def imported_by(path: Path) -> Iterator[str]:

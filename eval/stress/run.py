@@ -13,13 +13,14 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from errors import BadInput
-from eval.bench.denoisers import PRECISIONS, thread_count
+from eval.spec import PRECISIONS
 from eval.stress.cases import EXTREMES, LONG, RECOVERY_LIMIT, Extreme
 from eval.stress.check import REQUIREMENTS, Outcome, Trial, heads
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS, create, load, unavailable, without_taa
 from plotting import plt, save_figure
+from timing import thread_count
 from train.loop import WEIGHTS, run_folder
 
 FRESH = "fresh"

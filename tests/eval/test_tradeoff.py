@@ -5,14 +5,14 @@ import shutil
 
 import numpy as np
 import pytest
+from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.denoisers import Variant
 from eval.harness import clips_of_one_spp
-from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
-from eval.text_table import compared, joint_floor
+from eval.means import compared_mean, joint_floor
 from eval.tradeoff.candidates import Candidate, Times, candidates
 from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import beaten_by, trade
@@ -68,15 +68,20 @@ def test_fronts_by_brute_force(metric, sign):
 
 
 def test_digits_that_nobody_sees_do_not_make_a_front():
-    seen = [compared("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    seen = [compared_mean("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
     assert seen == [30.0, 30.0, 30.01]
 
 
 def test_what_is_within_the_noise_floor_is_on_a_par():
     floor = [{"psnr": 40.0}]
-    assert [compared("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [30, 36, 36.99, 36.99]
-    assert compared("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
-    assert compared("ssim", [{"ssim": None}], floor) is None
+    assert [compared_mean("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [
+        30,
+        36,
+        36.99,
+        36.99,
+    ]
+    assert compared_mean("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
+    assert compared_mean("ssim", [{"ssim": None}], floor) is None
 
 
 def test_a_hard_clips_floor_hides_no_error_of_another():
@@ -84,7 +89,7 @@ def test_a_hard_clips_floor_hides_no_error_of_another():
     floors = [{"ssim": 0.1, "mse_unbiased": 1e-6}, {"ssim": 1.0, "mse_unbiased": 1e-6}]
     a, b = ([{"ssim": 0.3, "mse_unbiased": 0.0}, {"ssim": s, "mse_unbiased": 0.0}] for s in (0.8, 0.95))
     assert joint_floor(a, floors) == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
-    assert compared("ssim", a, floors) < compared("ssim", b, floors)
+    assert compared_mean("ssim", a, floors) < compared_mean("ssim", b, floors)
     both = [{"ssim": 0.1, "mse_unbiased": 1e-6}] * 2
     assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
 
