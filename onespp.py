@@ -73,14 +73,14 @@ def dataset(
         halton: draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE).
         regularise: blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
     """
-    from datasets.generate import Part, generate, render_here
+    from datasets.generate import Share, generate, render_here
     from models.registry import channels_read
     from render.clip import Options
 
     if ray:
         from datasets.cluster import render_on_cluster
     folder = data_folder(data, profile)
-    share = Part.parse(part) if part else None
+    share = Share.parse(part or "1/1")
     options = Options(halton, regularise)
     render = render_on_cluster if ray else render_here
     rendered = generate(folder, profile, seed, share, channels_read(reads), options, render)
@@ -146,9 +146,9 @@ def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metav
         data: the data set.
         plot: draw a histogram of how hard the clips are as well.
     """
-    from datasets.inspect import info as describe
+    from datasets.info import summarise
 
-    print(describe(data, plot))
+    print(summarise(data, plot))
 
 
 def verify(data: Path = Path("data/quick")) -> None:
@@ -157,7 +157,7 @@ def verify(data: Path = Path("data/quick")) -> None:
     Args:
         data: the data set.
     """
-    from datasets.inspect import verify as find_problems
+    from datasets.verify import find_problems
 
     problems = find_problems(data)
     for problem in problems:

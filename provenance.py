@@ -10,8 +10,6 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import torch
-
 ROOT = Path(__file__).parent
 FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval")
 BESIDE_THEM = ("errors", "files", "plotting", "provenance", "timing")
@@ -32,6 +30,8 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 def device_in_words(kind: str = "cpu", threads: int | None = None) -> str:
     """What computes: the GPU's name, or the processor's and its threads, by default all that PyTorch takes."""
+    import torch  # takes a second, which rendering must not wait for
+
     if kind == "cuda":
         return f"cuda, {torch.cuda.get_device_name()}"
     try:

@@ -15,7 +15,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.inspect import size_of
+from datasets.info import size_of
 from files import write_json
 from models.registry import create
 from train.data import Items, items, loader, micro_batches
