@@ -16,7 +16,7 @@ from datasets.profiles import DataProfile, clip_seed, plan, profile_of, versions
 from datasets.writer import ClipWriter
 from errors import BadInput
 from files import locked, read_json, write_json
-from render.clip import PLAIN, Clock, Options, Sampling, render_clip
+from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
 from scenes.registry import build_scene
 
 
@@ -51,7 +51,7 @@ def check_versions(dataset: Dataset) -> None:
 
 
 def render_to(
-    destination: Path, profile: DataProfile, seed: int, channels: Sequence[str], options: Options = PLAIN
+    destination: Path, profile: DataProfile, seed: int, channels: Sequence[str], options: Options = NO_OPTIONS
 ) -> None:
     """Render the clip DATA/SPLIT/SCENE/CLIP, whole or not at all, with the named channels. `seed` is the data set's.
 
@@ -63,12 +63,12 @@ def render_to(
     scene = build_scene(scene_name, seed, profile.frames)
     scene = scene.still() if kind.still else scene
     size = profile.frames, profile.height, profile.width
-    clock = Clock()
+    timer = StepTimer()
     spp = reference_spp(scene, *size, quality, seed, options)
-    clock.lap("pilot")
+    timer.lap("pilot")
     frames = render_clip(scene, *size, Sampling(quality.realisations, kind.noisy_spp, spp, options), seed, channels)
     with ClipWriter(destination) as writer:
-        writer.timing = clock.read()
+        writer.timing = timer.read()
         for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{name}", profile.frames, leave=False, unit="frame"):
             writer.add(arrays, seconds)
         facts = {
@@ -143,7 +143,7 @@ def generate(
     seed: int,
     part: Part | None = None,
     reads: Sequence[str] = tuple(CHANNELS),
-    options: Options = PLAIN,
+    options: Options = NO_OPTIONS,
     render: Callable[[Sequence[ClipJob]], Iterator[Outcome]] = render_here,
 ) -> int:
     """Render what is missing of `profile`'s data set at `root`, or of one part of it. Returns how many clips were.

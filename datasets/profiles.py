@@ -11,7 +11,7 @@ import numpy as np
 from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES
 from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
-from render.clip import PLAIN, Options
+from render.clip import NO_OPTIONS, Options
 
 GENERATOR = 5  # raise it when the same seed renders different bytes
 
@@ -105,7 +105,9 @@ def rendered_channels(reads: Iterable[str]) -> list[str]:
     return [name for name in CHANNELS if name in wanted]
 
 
-def plan(profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), options: Options = PLAIN) -> dict[str, Any]:
+def plan(
+    profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), options: Options = NO_OPTIONS
+) -> dict[str, Any]:
     """The content of dataset.json: `reads` are the channels that training is going to read, `options` the renderer's.
 
     Test clips have every channel, for the metrics read them. Raises BadInput for an unknown profile or a bad seed.

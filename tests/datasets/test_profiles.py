@@ -14,7 +14,7 @@ from datasets.inspect import info, size_in_full
 from datasets.profiles import DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
 from models.registry import channels_read, create
-from render.clip import PLAIN
+from render.clip import NO_OPTIONS
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -102,10 +102,10 @@ def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
     scene = build_scene("room-5", 0, 2)  # in which few samples see little of the noise that many have
     quality = Quality(1, 16, floor=26.0, most_spp=1024)
     stage = Stage(scene, 24, 24)
-    few = noise_of_reference(stage, 2, 16, 1, PLAIN)
+    few = noise_of_reference(stage, 2, 16, 1, NO_OPTIONS)
     spp = reference_spp(scene, 2, 24, 24, quality, 1)
     assert spp > 16 * few / 10**-2.6
-    assert spp == 1024 or noise_of_reference(stage, 2, spp, 1, PLAIN) <= 10**-2.6
+    assert spp == 1024 or noise_of_reference(stage, 2, spp, 1, NO_OPTIONS) <= 10**-2.6
 
 
 def test_references_stop_at_the_most():
