@@ -122,7 +122,9 @@ class PathTracer:
         self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        self.freezes = not halton and not regularise  # Dr.Jit 1.5 refuses to freeze these
+        # Dr.Jit 1.5 refuses to freeze the rest: Halton points, regularised paths, and scenes without shapes (these only
+        # while another scene is loaded).
+        self.freezes = bool(stage.shapes) and not halton and not regularise
 
     def radiance(
         self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
