@@ -1,4 +1,4 @@
-"""Every extreme scene renders to finite numbers that can be stored, and scale does not matter."""
+"""Every extreme scene renders to finite numbers that can be stored, and the unit of length does not matter."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ from render.clip import Sampling, render_clip
 from scenes.extremes import EXTREMES, scaled
 from scenes.registry import build_scene
 
-SIZE, FRAMES = 24, 3
+SIZE = 24  # px
+FRAMES = 3
 SAMPLING = Sampling(2, 1, 32)
 
 
@@ -31,7 +32,7 @@ def test_extreme_scene_becomes_a_clip(name, tmp_path):
         assert clip.exposure == 1 and clip.reference(0).min() > 0
         assert np.abs(clip.motion_to(1, 0)).max() > 0.1  # the sky moves with its directions
     if name == "extremes-light":
-        assert clip.read("emission", 0).max() in (0, 1e5)  # not clamped to what float16 holds
+        assert np.isin(clip.read("emission", 0), (0, 1e5)).all()  # not clamped to what float16 holds
     if name == "extremes-mirrors":
         assert clip.read("roughness", 0).min() == 0
 
