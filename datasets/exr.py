@@ -13,7 +13,7 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
-from scenes.camera import View, rigid_inverse
+from scenes.camera import View, inverse_pose
 
 # Components of layers that are not colours. The halves of a reference are layers of their own, NAME_a and NAME_b.
 COMPONENTS = {"normal": "XYZ", "motion": "XY", "dual_motion": "XY", "depth": "Z", "roughness": "Y", "mesh_id": "I"}
@@ -49,7 +49,7 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "worldToCamera": np.ascontiguousarray(rigid_inverse(view.camera_to_world).T, np.float32),
+        "worldToCamera": np.ascontiguousarray(inverse_pose(view.camera_to_world).T, np.float32),
         ATTRIBUTE: json.dumps(facts),
     }
     try:
