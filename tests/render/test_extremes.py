@@ -6,7 +6,7 @@ import pytest
 from datasets.clip import Clip
 from datasets.writer import ClipWriter
 from render.clip import Sampling, render_clip
-from scenes.extremes import EXTREMES, scaled
+from scenes.extremes import EXTREME_SCENES, rescaled
 from scenes.registry import build_scene
 
 SIZE = 24  # px
@@ -14,7 +14,7 @@ FRAMES = 3
 SAMPLING = Sampling(2, 1, 32)
 
 
-@pytest.mark.parametrize("name", EXTREMES)
+@pytest.mark.parametrize("name", EXTREME_SCENES)
 def test_extreme_scene_becomes_a_clip(name, tmp_path):
     scene = build_scene(name, 5, FRAMES)
     with ClipWriter(tmp_path / "000") as writer:
@@ -42,7 +42,7 @@ def test_units_do_not_matter(factor):
     """The same samples in other units: the same picture and motion, depth times the factor."""
     scene = build_scene("cornell_box_moving", 5, FRAMES)
     one, other = (
-        list(render_clip(s, FRAMES, SIZE, SIZE, Sampling(1, 1, 64), 5))[2][0] for s in (scene, scaled(scene, factor))
+        list(render_clip(s, FRAMES, SIZE, SIZE, Sampling(1, 1, 64), 5))[2][0] for s in (scene, rescaled(scene, factor))
     )
     same = one["mesh_id"] == other["mesh_id"]
     assert same.mean() > 0.99
