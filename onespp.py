@@ -20,7 +20,7 @@ Profile = Annotated[
     ),
 ]
 Precision = Annotated[
-    Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
+    Literal["float32", "bfloat16"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
 ]
 Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
 PartArgument = Annotated[
@@ -113,7 +113,7 @@ def train(
     profile: Profile = "quick",
     seed: int = 0,
     precision: Precision = None,
-    at_once: int | None = None,
+    micro_batch: int | None = None,
 ) -> None:
     """Train denoisers (rae, wskp6 and ntd, unless some are named), or go on where a training was interrupted.
 
@@ -121,13 +121,14 @@ def train(
     so the steps stay the same.
 
     Args:
-        at_once: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
+        micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
     """
-    from train.loop import task_for, train_network
+    from train.loop import train_network
     from train.recipes import DEFAULT
+    from train.registry import task_for
 
     for name in names or DEFAULT:
-        train_network(task_for(name, data_folder(data, profile), runs, profile, seed, precision, at_once))
+        train_network(task_for(name, data_folder(data, profile), runs, profile, seed, precision, micro_batch))
 
 
 def evaluate(

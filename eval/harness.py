@@ -41,8 +41,8 @@ from eval.text_table import table
 from models.denoiser import Denoiser
 from models.operators import finite
 from models.registry import DENOISERS, create, load, unavailable, without_taa
-from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
+from train.task import WEIGHTS_FILE, run_folder
 
 METRICS_CHANNELS = ("motion", "dual_motion")
 PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
@@ -155,7 +155,7 @@ def ready_denoisers(names: list[str] | None, runs: Path, profile: str) -> dict[s
             print(f"{name}: skipped, {reason}")
             continue
         trained = create(name).parameter_count() > 0
-        weights = run_folder(runs, without_taa(name), profile) / WEIGHTS if trained else None
+        weights = run_folder(runs, without_taa(name), profile) / WEIGHTS_FILE if trained else None
         if weights and not weights.exists() and not names:
             remedy = f"; train them with `onespp train {name}`" if name in TRAINABLE else ""
             print(f"{name}: skipped, it has no weights at {weights}{remedy}")

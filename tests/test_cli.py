@@ -29,7 +29,7 @@ def test_help(capsys, command):
 def test_unknown_names(capsys, tiny, tmp_path):
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs")]
     assert "unknown profile 'fast'" in fails(capsys, "dataset", "--profile", "fast", "--data", str(tmp_path / "d"))
-    assert "unknown profile 'fast'" in fails(capsys, "train", "--profile", "fast", *there)
+    assert "unknown budget 'fast'" in fails(capsys, "train", "--profile", "fast", *there)
     assert "'oidn' is not a network" in fails(capsys, "train", "oidn", "--profile", "tiny", *there)
     assert "unknown denoiser 'magic'" in fails(capsys, "eval", "magic", "--profile", "tiny", *there)
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,7 @@ from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS, create, load, unavailable, without_taa
 from plotting import plt, save_figure
-from train.loop import WEIGHTS, run_folder
+from train.task import WEIGHTS_FILE, run_folder
 
 FRESH = "fresh"
 
@@ -61,7 +61,7 @@ def contestants(names: Sequence[str], runs: Path, profile: str) -> list[Contesta
                 raise BadInput(reason)
             print(f"{name}: skipped, {reason}")
             continue
-        file = run_folder(runs, without_taa(name), profile) / WEIGHTS
+        file = run_folder(runs, without_taa(name), profile) / WEIGHTS_FILE
         found.append(Contestant(name, file if create(name).parameter_count() and file.exists() else None))
     return found
 

@@ -17,7 +17,7 @@ from models.denoiser import Denoiser
 from models.registry import without_taa
 from models.taa import unwrapped
 from models.weights import load_weights
-from train.loop import WEIGHTS, run_folder
+from train.task import WEIGHTS_FILE, run_folder
 
 Ready = dict[str, tuple[Denoiser, str | None]]  # by label: denoisers ready to use, and the files of their weights
 
@@ -59,9 +59,9 @@ def weights_of(name: str, runs: Path, profile: str) -> tuple[Path, str]:
     """Where a network's weights belong, and the command that trains them."""
     if name in SIZES:
         folder = runs / "ablation" / "wskp-windows" / f"{trained_as(name)}-0"
-        return folder / WEIGHTS, f"onespp ablate wskp-windows --profile {profile} --runs {runs}"
+        return folder / WEIGHTS_FILE, f"onespp ablate wskp-windows --profile {profile} --runs {runs}"
     name = without_taa(name)
-    return run_folder(runs, name, profile) / WEIGHTS, f"onespp train {name} --profile {profile} --runs {runs}"
+    return run_folder(runs, name, profile) / WEIGHTS_FILE, f"onespp train {name} --profile {profile} --runs {runs}"
 
 
 def entrants(names: Sequence[str]) -> list[Variant]:

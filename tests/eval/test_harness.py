@@ -22,7 +22,7 @@ from eval.metrics import TemporalMetrics, disocclusion_l1, image_metrics, lumina
 from models import registry
 from models.registry import create
 from models.weights import save_weights
-from train.loop import run_folder
+from train.task import run_folder
 
 
 def pair(seed: int = 0, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
