@@ -105,8 +105,9 @@ def train(
         precision: by default the fastest on this machine.
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
     """
-    from train.loop import task_for, train_network
+    from train.loop import train_network
     from train.recipes import DEFAULT
+    from train.registry import task_for
 
     for name in names or DEFAULT:
         train_network(task_for(name, data_folder(data, budget), runs, budget, seed, precision, micro_batch))

@@ -25,8 +25,10 @@ from models.weights import load_weights
 from models.wskp import KernelPredictor
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions
-from train.log import METRICS, read_metrics
-from train.loop import CHECKPOINT, Task, load_checkpoint, train_network
+from train.checkpoint import CHECKPOINT_FILE, load_checkpoint
+from train.log import METRICS_CSV, read_metrics
+from train.loop import train_network
+from train.task import Task
 
 RESULTS, TABLE, PLOT = "results.json", "table.md", "plot.png"
 WARM_UP, REPEATS = 3, 30  # of a timing
@@ -102,9 +104,9 @@ def train_and_judge(ablation: Ablation, tasks: Mapping[tuple[str, int], Task], f
     precision: str | None = None
     for (label, seed), task in tqdm(tasks.items(), folder.name, unit="network"):
         weights = train_network(replace(task, precision=precision))
-        precision = load_checkpoint(task.folder / CHECKPOINT)["precision"]
+        precision = load_checkpoint(task.folder / CHECKPOINT_FILE)["precision"]
         denoiser = networks[label] = trained(variants[label], weights)
-        losses = epoch_losses(task.folder / METRICS, task.recipe.epochs)
+        losses = epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs)
         parameters = task.create().parameter_count()  # as trained
         runs.append(Run(label, seed, parameters, losses, judge(task.folder.name, denoiser, weights, clips, folder)))
     if ablation.timed:

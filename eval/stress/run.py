@@ -21,7 +21,7 @@ from models.denoiser import Denoiser
 from models.registry import DENOISERS, create, load, unavailable, without_taa
 from plotting import plt, save_figure
 from timing import thread_count
-from train.loop import WEIGHTS, run_folder
+from train.task import WEIGHTS_FILE, run_folder
 
 FRESH = "fresh"
 
@@ -62,7 +62,7 @@ def contestants(names: Sequence[str], runs: Path, profile: str) -> list[Contesta
                 raise BadInput(reason)
             print(f"{name}: skipped, {reason}")
             continue
-        file = run_folder(runs, without_taa(name), profile) / WEIGHTS
+        file = run_folder(runs, without_taa(name), profile) / WEIGHTS_FILE
         found.append(Contestant(name, file if create(name).parameter_count() and file.exists() else None))
     return found
 

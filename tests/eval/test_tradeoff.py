@@ -22,7 +22,7 @@ from files import read_json, write_json
 from models.fusion import WINDOWS
 from models.weights import save_weights
 from render.clip import NO_OPTIONS
-from train.loop import WEIGHTS, run_folder
+from train.task import WEIGHTS_FILE, run_folder
 
 SIZE = (32, 48)
 
@@ -245,7 +245,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else trained_as(name)
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
