@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from allocator import keep_freed_memory
 from errors import BadInput
 
 Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
@@ -348,6 +349,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one subcommand. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
+    keep_freed_memory()
     try:
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="onespp", args=arguments, description=__doc__)
     except BadInput as error:

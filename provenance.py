@@ -14,6 +14,7 @@ import torch
 
 ROOT = Path(__file__).parent
 OURS = (
+    "allocator",
     "errors",
     "files",
     "plotting",

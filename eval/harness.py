@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from allocator import keep_freed_memory
 from datasets.clip import Clip, Dataset
 from datasets.frame import Signal, read_frame, to_tensor
 from datasets.tonemap import display
@@ -132,6 +133,7 @@ class Job(NamedTuple):
 def start_worker() -> None:
     """An interrupt is the parent's to act on. Ended then, a worker must not leave behind a lock that bars share."""
     on_signal(SIGINT, SIG_IGN)
+    keep_freed_memory()
     tqdm.set_lock(threading.RLock())
 
 
