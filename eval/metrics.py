@@ -11,7 +11,7 @@ from torch import Tensor
 from datasets.frame import disoccluded
 from datasets.tonemap import display, psnr
 from eval.ssim import ssim
-from models.operators import finite, luminance
+from models.operators import finite, image_luminance
 
 EPSILON = 0.01
 
@@ -91,7 +91,7 @@ class TemporalMetrics:
         """
         halves = halves.double()
         images = (finite(output).double(), halves.mean(dim=0, keepdim=True), halves)
-        y, reference, ab = (luminance(display(image, exposure)) for image in images)
+        y, reference, ab = (image_luminance(display(image, exposure)) for image in images)
         before, self.before = self.before, (y, reference, ab)
         if before is None:
             return {"temporal_error": None, "temporal_error_floor": None, "flicker": None}

@@ -6,7 +6,7 @@ from functools import partial
 from eval.ablation.definitions import label_of
 from eval.results import BASELINES
 from models.denoiser import Denoiser
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.registry import create
 from models.wskp import WSKP
 

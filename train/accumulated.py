@@ -17,7 +17,7 @@ from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from datasets.sequences import check_fits, random_window
 from models.denoiser import State
-from models.operators import RunningMean, RunningScale
+from models.running_scale import RunningMean, RunningScale
 from models.wskp import KernelPredictor
 
 IRRADIANCE, SCALE = "irradiance.npy", "scale.npy"

@@ -17,7 +17,8 @@ from eval.bench.denoisers import thread_count
 from eval.bench.memory import alone, growth_mb
 from files import write_json
 from models import compiled
-from models.fusion import WINDOWS, fuse
+from models.fusion import fuse
+from models.parameters import WINDOWS
 
 UNFOLD, PYTORCH, COMPILED = "unfold and softmax", "onespp, PyTorch", "onespp, compiled"
 REPEATS = {UNFOLD: 3, PYTORCH: 15, COMPILED: 15}
