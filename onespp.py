@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from allocator import keep_freed_memory
 from errors import BadInput
 
 Data = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/PROFILE")]
@@ -379,6 +380,7 @@ SUMMARIES = {
 def main(arguments: list[str] | None = None) -> None:
     """Run one command. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
     words = sys.argv[1:] if arguments is None else arguments
+    keep_freed_memory()
     try:
         run(words)
     except BadInput as error:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from datasets.frame import Frame
+from models.accumulation import Accumulation, accumulate
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
-from models.operators import Accumulation, accumulate
 
 
 class Noisy(Denoiser):

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from datasets.frame import Frame, Moment, Signal
 from errors import BadInput
-from models.allocator import keep_freed_memory
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,6 @@ class Denoiser(torch.nn.Module):
         """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""
         if precision in self.refuses:
             raise BadInput(f"{type(self).__name__} does not compute in {precision}: {self.refuses[precision]}")
-        keep_freed_memory()
         self.eval()
         self.requires_grad_(False)
         self.to(precision)

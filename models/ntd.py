@@ -11,10 +11,11 @@ from torch.nn import functional as F
 from datasets.frame import Frame, Signal, disoccluded
 from models.convolution import ConvReLU
 from models.denoiser import Denoiser, State, matching_state
-from models.kernels import apply_kernels
-from models.operators import RunningScale, pad, running_scale
+from models.operators import pad_to_multiple
+from models.pixel_kernels import apply_kernels
+from models.running_scale import RunningScale, running_scale
 
-INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
+NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
 WIDTHS = (32, 48, 64, 80, 96)  # the paper's are lost
 TAPS = 25  # of a 5 x 5 kernel
 MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
@@ -28,7 +29,8 @@ class Decode(nn.Module):
 
     def __init__(self, below: int, skip: int):
         super().__init__()
-        self.skip, self.up = nn.Conv2d(skip, skip, 3, padding=1, bias=False), ConvReLU(below, skip)
+        self.skip = nn.Conv2d(skip, skip, 3, padding=1, bias=False)
+        self.up = ConvReLU(below, skip)
         self.second = ConvReLU(skip, skip)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
@@ -43,7 +45,7 @@ class KernelNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inputs = (INPUTS, *WIDTHS[:-1])
+        inputs = (NETWORK_INPUTS, *WIDTHS[:-1])
         self.encode = nn.ModuleList(
             nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
         )
@@ -82,7 +84,7 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
 
-def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+def combine_levels(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D takes the maximum of 2 x 2 pixels, U is bilinear.
 
     U is linear and so applied once. `fine` (B, C, H, W); `coarse`, and `alpha` (B, 1, ·, ·), have half the size,
@@ -93,7 +95,7 @@ def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return fine + F.interpolate(change, scale_factor=2.0, mode="bilinear")[..., :height, :width]
 
 
-def reconstruct(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def reconstruct_image(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
 
     Args:
@@ -103,11 +105,12 @@ def reconstruct(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) ->
     pyramid = [noisy]
     for _ in predictions[1:]:  # averages: maxima of noise would be biased
         pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
-    output, alpha = pyramid[-1], None
+    output = pyramid[-1]
+    alpha: Tensor | None = None
     for image, prediction in zip(pyramid[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
         filtered = apply_kernels(image, prediction[:, :TAPS])
-        output = filtered if alpha is None else combine(filtered, output, alpha)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
     return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS]), output, alpha), alpha
@@ -174,8 +177,8 @@ class NTD(Denoiser):
         colours = (self.compress(image, scale, frame) for image in (noisy, warped))
         x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
-        predictions = self.network(pad(x, MULTIPLE))
-        irradiance, alpha = reconstruct(noisy, warped, predictions)
+        predictions = self.network(pad_to_multiple(x, MULTIPLE))
+        irradiance, alpha = reconstruct_image(noisy, warped, predictions)
         dual = frame.dual_motion if self.vectors == "dual_motion" else None
         return irradiance, NTDState(frame.moment, irradiance, scale, warped, alpha, frame.motion, dual)
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from datasets.frame import Frame, Signal
 from errors import BadInput
+from models.accumulation import accumulate
 from models.baselines import Accumulated, AccumulatedState
 from models.denoiser import Denoiser, State, matching_state
-from models.operators import accumulate
 
 OIDNQuality = Literal["high", "balanced", "fast"]
 
@@ -51,7 +51,8 @@ class RayTracingFilter:
         device = open_device(threads)
         import pyoidn
 
-        self.device, self.filter = device, pyoidn.Filter(device)
+        self.device = device
+        self.filter = pyoidn.Filter(device)
         self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at exit at the latest
         with torch.inference_mode(False):  # else they could not be written to outside of it
             self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
@@ -117,7 +118,7 @@ class OIDN(Denoiser):
     def denoise(self, frame: Frame, radiance: Tensor) -> Tensor:
         """The denoised image of reflected `radiance` (B, 3, H, W), with emission for "total"."""
         denoise = self.filter_for(*frame.size)
-        inputs = radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1)
+        inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
         denoised = torch.stack([denoise(*item) for item in zip(*inputs, strict=True)])
         return denoised + frame.emission if self.signal == "total" else denoised
 

@@ -10,7 +10,9 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models.denoiser import Denoiser, State, matching_state
-from models.operators import RunningScale, Surfaces, reproject, running_scale
+from models.reprojection import reproject
+from models.running_scale import RunningScale, running_scale
+from models.surfaces import Surfaces
 
 NEWEST = 0.1  # weight of the current frame
 YCOCG = ((0.25, 0.5, 0.25), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25))  # from RGB
@@ -37,7 +39,7 @@ def expand(compressed: Tensor) -> Tensor:
     return recolour(compressed[:, :3] / compressed[:, 3:], RGB).clamp(min=0)
 
 
-def fetch(history: Tensor, motion: Tensor) -> Tensor:
+def fetch_bicubic(history: Tensor, motion: Tensor) -> Tensor:
     """`history` (B, 3, H, W) where this frame's pixels were, bicubic, not below 0."""
     height, width = history.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height).to(motion), torch.arange(width).to(motion), indexing="ij")
@@ -51,7 +53,8 @@ def fetch(history: Tensor, motion: Tensor) -> Tensor:
 def largest_around(image: Tensor) -> Tensor:
     """The largest value of the 3 × 3 pixels around each pixel; much faster than F.max_pool2d on a processor."""
     for dim, border in ((-1, (1, 1, 0, 0)), (-2, (0, 0, 1, 1))):
-        wide, length = F.pad(image, border, value=-torch.inf), image.shape[dim]
+        length = image.shape[dim]
+        wide = F.pad(image, border, value=-torch.inf)
         left, middle, right = (wide.narrow(dim, start, length) for start in range(3))
         image = torch.maximum(torch.maximum(left, middle), right)
     return image
@@ -59,7 +62,8 @@ def largest_around(image: Tensor) -> Tensor:
 
 def resolve(current: Tensor, history: Tensor, found: Tensor) -> Tensor:
     """Blend compressed images (B, 4, H, W), the history within the range of the 3 x 3 pixels around each pixel."""
-    low, high = -largest_around(-current), largest_around(current)
+    low = -largest_around(-current)
+    high = largest_around(current)
     return torch.lerp(torch.clamp(history, low, high), current, torch.where(found, NEWEST, 1))
 
 
@@ -111,7 +115,7 @@ class Antialiased(Denoiser):
         if before:
             exposure = scale.exposure()
             _, found = reproject(frame, before.surfaces.mesh_id, before.surfaces)
-            past = compress(fetch(before.output, frame.motion) * exposure)
+            past = compress(fetch_bicubic(before.output, frame.motion) * exposure)
             output = expand(resolve(compress(output * exposure), past, found)) / exposure
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
 

@@ -14,7 +14,7 @@ from datasets.channels import REFERENCES
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from datasets.sequences import check_fits, random_window
-from models.operators import RunningMean, RunningScale
+from models.running_scale import RunningMean, RunningScale
 from models.wskp import KernelPredictor
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from errors import BadInput
 from models.denoiser import Denoiser, State
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.rae import AUXILIARY, RAE, RAEState
 from models.registry import create
 from models.wskp import KP, WSKP

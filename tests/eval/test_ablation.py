@@ -19,8 +19,8 @@ from eval.ablation import definitions, run
 from eval.ablation.definitions import ABLATIONS, Finding, TexturedRAE, ablation_for
 from eval.ablation.run import ablate, clips_to_judge, epoch_losses, meshes_move
 from eval.ablation.summary import Run, cell, draw, report, verdict
-from models.fusion import WINDOWS
 from models.ntd import NTD
+from models.parameters import WINDOWS
 from models.rae import RAE
 from models.weights import load_weights
 from models.wskp import WSKP

@@ -19,7 +19,7 @@ from eval.tradeoff.run import beaten_by, trade
 from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
 from files import read_json, write_json
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.weights import save_weights
 from render.clip import NO_OPTIONS
 from train.task import WEIGHTS_FILE, run_folder

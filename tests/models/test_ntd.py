@@ -13,7 +13,7 @@ from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import ntd as ntd_module
 from models.convolution import ConvReLU
-from models.ntd import NTD, NTDState, NTDTraditional, combine, reconstruct, warp
+from models.ntd import NTD, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
 from models.registry import create
 from tests.helpers.frames import flat_frame, play, run
 
@@ -99,7 +99,7 @@ def test_combination_equals_eq_4(size):
     rng = np.random.default_rng(0)
     half = -(-size[0] // 2), -(-size[1] // 2)
     fine, coarse, alpha = rng.uniform(0, 5, (3, *size)), rng.uniform(0, 5, (3, *half)), rng.uniform(0, 1, (1, *half))
-    result = combine(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
+    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
     np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha), atol=1e-12)
 
 
@@ -121,7 +121,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     noisy, ones = torch.rand(1, 3, height, width), torch.ones(1, 3, height, width)
     seen: list[Tensor] = []
     monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
-    reconstruct(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
+    reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
     for image, block in zip(seen, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))
         for y in range(height // block):
@@ -130,7 +130,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
                 torch.testing.assert_close(image[0, :, y, x], part.mean(dim=(1, 2)))
         assert image.min() >= noisy.min() - 1e-6 and image.max() <= noisy.max() + 1e-6
     monkeypatch.undo()
-    flat, _ = reconstruct(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))
+    flat, _ = reconstruct_image(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))
     torch.testing.assert_close(flat, ones)
 
 
@@ -148,7 +148,7 @@ def test_reconstruction_equals_eq_4_at_both_levels():
     middle = naive_combine(half, quarter, np.full((1, 2, 3), a4))
     fine = naive_combine(noisy, middle, np.full((1, 4, 5), a2))
     maps = predictions(7, 10, (0.3, -0.6, 1.2), kernel=80.0)
-    result, alpha = reconstruct(*(torch.from_numpy(a).float()[None] for a in (noisy, warped)), maps)
+    result, alpha = reconstruct_image(*(torch.from_numpy(a).float()[None] for a in (noisy, warped)), maps)
     np.testing.assert_allclose(result[0], a_t * fine + (1 - a_t) * warped, atol=1e-5)
     assert alpha.shape == (1, 1, 7, 10) and alpha.flatten()[0].item() == pytest.approx(a_t)
 
@@ -157,10 +157,10 @@ def test_alpha_t_is_the_weight_of_the_current_frame():
     noisy, warped = torch.rand(1, 3, 9, 11), torch.rand(1, 3, 9, 11) + 10
     other = torch.rand(1, 3, 9, 11)
     now, then = (predictions(9, 11, (0, 0, logit)) for logit in (200.0, -200.0))
-    assert torch.equal(reconstruct(noisy, warped, now)[0], reconstruct(noisy, other, now)[0])
-    assert torch.equal(reconstruct(noisy, warped, then)[0], reconstruct(other, warped, then)[0])
+    assert torch.equal(reconstruct_image(noisy, warped, now)[0], reconstruct_image(noisy, other, now)[0])
+    assert torch.equal(reconstruct_image(noisy, warped, then)[0], reconstruct_image(other, warped, then)[0])
     mean = F.avg_pool2d(warped, 5, 1, 2, count_include_pad=False)  # what equal logits make of a window
-    torch.testing.assert_close(reconstruct(noisy, warped, then)[0], mean)
+    torch.testing.assert_close(reconstruct_image(noisy, warped, then)[0], mean)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

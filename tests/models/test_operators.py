@@ -9,7 +9,11 @@ from hypothesis import strategies as st
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
-from models.operators import Accumulation, Surfaces, accumulate, luminance, reproject, running_scale
+from models.accumulation import Accumulation, accumulate
+from models.operators import image_luminance
+from models.reprojection import reproject
+from models.running_scale import running_scale
+from models.surfaces import Surfaces
 from tests.helpers.frames import flat_frame
 
 
@@ -173,7 +177,7 @@ def test_running_scale_of_sparse_noise_is_near_that_of_its_mean():
 
 def test_luminance_weights():
     rgb = torch.eye(3)[None, :, :, None]
-    torch.testing.assert_close(luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
+    torch.testing.assert_close(image_luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
 
 
 def test_compiled_reprojection_equals_pytorch_s(tiny):

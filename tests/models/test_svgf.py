@@ -14,7 +14,8 @@ from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, eaw, svgf
 from models.baselines import Accumulated
 from models.eaw import EAW
-from models.operators import Surfaces, running_scale
+from models.running_scale import running_scale
+from models.surfaces import Surfaces
 from models.svgf import SVGF, Integrated
 from tests.helpers.frames import flat_frame, play, run
 
@@ -265,7 +266,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
     variance = torch.tensor([0.04, 0.01]).view(1, 1, 1, 1, 2)
     difference = 0.2126 * 2 + 0.0722 * 1
     sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
-    out, spread = svgf.filter_level(colour, variance, geometry, 1)
+    out, spread = svgf.svgf_level(colour, variance, geometry, 1)
     centre, side = 9 / 64, 3 / 32
     for x in range(2):
         w = side * math.exp(-difference / (4 * sigma[x]))
@@ -274,7 +275,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
         v = (centre**2 * variance[..., x] + w**2 * variance[..., 1 - x]) / (centre + w) ** 2
         assert spread[..., x].item() == pytest.approx(v.item(), rel=1e-5)
     # Without variance, nothing that differs mixes.
-    out, spread = svgf.filter_level(colour, torch.zeros_like(variance), geometry, 1)
+    out, spread = svgf.svgf_level(colour, torch.zeros_like(variance), geometry, 1)
     torch.testing.assert_close(out, colour)
     assert (spread == 0).all()
 
@@ -291,7 +292,7 @@ def test_a_level_is_the_paper_s(name, size, step, seed):
     colour, variance = np.float32(rng.random((2, 3, *size))), np.float32(rng.random((2, *size)) / 4)
     with WAYS[name]():
         images = to_torch(colour, 1, 2, 3, *size), to_torch(variance, 1, 2, 1, *size)
-        out, spread = svgf.filter_level(*images, packed(depth, normal, mesh), step)
+        out, spread = svgf.svgf_level(*images, packed(depth, normal, mesh), step)
     for s in range(2):
         expected = naive_level(colour[s].astype(float), variance[s].astype(float), depth, normal, mesh, step)
         np.testing.assert_allclose(out[0, s].numpy(), expected[0], rtol=1e-4)
@@ -302,15 +303,15 @@ def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
     """Far from the border and with all weights 1, a level multiplies the variance by (Σ h²)²."""
     geometry = packed(*plane(65, 65))
     colour, variance = torch.ones(1, 1, 3, 65, 65), torch.full((1, 1, 1, 65, 65), 0.5)
-    _, spread = svgf.filter_level(colour, variance, geometry, 4)
+    _, spread = svgf.svgf_level(colour, variance, geometry, 4)
     assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
 
 
 def test_five_levels_and_the_first_is_the_history(monkeypatch):
     frame = synthetic_frame(3, 24, 32)
-    seen, original = [], svgf.filter_level
+    seen, original = [], svgf.svgf_level
     monkeypatch.setattr(
-        svgf, "filter_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
+        svgf, "svgf_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
     )
     (output,), state = play(SVGF(), [frame])
     assert [step for step, _, _ in seen] == [1, 2, 4, 8, 16]
@@ -405,7 +406,7 @@ def test_a_level_of_eaw(name, size, step, seed):
     rng = np.random.default_rng(seed)
     colour, features = np.float32(rng.random((3, *size))), np.float32(rng.random((9, *size)))
     with WAYS[name]():
-        out = eaw.filter_level(to_torch(colour), to_torch(features), step)[0].numpy()
+        out = eaw.eaw_level(to_torch(colour), to_torch(features), step)[0].numpy()
     for p in np.ndindex(size):
         total, sums = 0.0, np.zeros(3)
         for q, j, i in window(p, size, 2, step):
@@ -418,7 +419,7 @@ def test_eaw_s_features(monkeypatch):
     """Exposed colour over σ_c, which halves from level to level; normal; position over the median depth."""
     frame = synthetic_frame(2, 20, 30)
     seen = []
-    monkeypatch.setattr(eaw, "filter_level", lambda colour, features, step: seen.append((features, step)) or colour)
+    monkeypatch.setattr(eaw, "eaw_level", lambda colour, features, step: seen.append((features, step)) or colour)
     run(EAW(), [frame])
     irradiance = frame.irradiance("total")
     exposure = running_scale(irradiance * frame.divisor, frame.depth, None).exposure()
@@ -435,4 +436,4 @@ def test_eaw_s_features(monkeypatch):
         y, x = torch.nonzero(hit, as_tuple=True)
         torch.testing.assert_close(pixel[0] / pixel[2], x + 0.5, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(pixel[1] / pixel[2], y + 0.5, rtol=1e-4, atol=1e-3)
-        assert (features[0, 6:, ~hit] == eaw.BACKGROUND).all()
+        assert (features[0, 6:, ~hit] == eaw.FAR_AWAY).all()
