@@ -2,6 +2,7 @@
 
 import inspect
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -26,9 +27,17 @@ from models.ntd import NTD
 from models.rae import RAE
 from models.wskp import WSKP
 from plotting import plt
+from timing import thread_count
 from train import loop
 from train.losses import RAELoss, loss_for
 from train.recipes import PAPER, RAETerms, Recipe, recipe_for
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """On images this small further threads only wait."""
+    with thread_count(1):
+        yield
 
 
 def frames_of(tiny, reads, count: int = 2) -> list[Frame]:
@@ -233,10 +242,10 @@ def test_the_fusion_of_all_is_timed(tiny):
 
 
 class SmallVariant(AblationVariant):
-    """Trained on one crop of each frame."""
+    """Trained in one step on one crop of each frame."""
 
     def recipe(self, budget: str) -> Recipe:
-        return replace(super().recipe(budget), crops=(1, 1))
+        return replace(super().recipe(budget), crops=(1, 1), batch=64)
 
 
 def modified(folder: Path) -> dict[str, int]:
