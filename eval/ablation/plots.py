@@ -12,8 +12,6 @@ from eval.ablation.variant_run import ABLATION_QUANTITIES, SeedMean, VariantRun,
 from eval.extra_denoisers import windows_label
 from plotting import DPI, plt
 
-Array = NDArray[np.float64]
-
 
 def ablation_figure(ablation: Ablation, runs: Sequence[VariantRun], title: str) -> Figure:
     figure = PLOTS[ablation.plot](ablation, runs)
@@ -33,7 +31,9 @@ def draw_curves(ablation: Ablation, runs: Sequence[VariantRun]) -> Figure:
     return figure
 
 
-def means_and_spreads(runs: Sequence[VariantRun], labels: Sequence[str], metric: str) -> tuple[Array, Array]:
+def means_and_spreads(
+    runs: Sequence[VariantRun], labels: Sequence[str], metric: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Of each label, over seeds; NaN and 0 where there are none."""
     found = [over_seeds(runs, label, metric) or SeedMean(math.nan, None) for label in labels]
     return np.array([one.mean for one in found]), np.array([one.spread or 0.0 for one in found])

@@ -20,7 +20,7 @@ from models.denoiser import Denoiser
 FORGOTTEN = 1e-3  # of the brightest pixel: what changes none by more has no effect any more
 ROUNDINGS = 10  # of half precision are no effect either: networks amplify them, RAE by its power of 5 alone
 ORDINARY_VALUES = (0.0, 1.0)  # that a pixel may well have: they tell which others see it
-BLACK = 1e-30  # radiance; an image without a brighter pixel
+BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
 REQUIREMENTS = {
     "finite": "what comes of finite pixels is finite",
     "range": f"{', '.join(CONVEX)} stay within the irradiance seen since the last reset; no other goes below 0",
@@ -48,7 +48,7 @@ def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
     """Absolute differences (3, H, W), each over the brightest pixel of the frame expected, unless that is black."""
     pairs = zip(outputs, expected, strict=True)
-    return [(a - b).abs() / (float(b.max()) if b.max() > BLACK else 1) for a, b in pairs]
+    return [(a - b).abs() / (float(b.max()) if b.max() > BLACK_BELOW else 1) for a, b in pairs]
 
 
 def largest_finite(errors: Iterable[Tensor]) -> float | None:
