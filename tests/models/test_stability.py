@@ -18,7 +18,7 @@ from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.stress.check import CONVEX, ROUNDING, range_violation
+from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
 from models import registry
 from tests.helpers.frames import chain, flat_frame, play, run
 
