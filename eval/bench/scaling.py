@@ -19,7 +19,7 @@ from plotting import DPI, plt, save_figure
 from provenance import device_in_words
 from timing import thread_count
 
-SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
+SCALING_SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
 
 
 def in_use(names: Sequence[str]) -> list[DenoiserSpec]:
@@ -41,7 +41,7 @@ def by_denoiser(rows: Sequence[Timing]) -> dict[str, list[Timing]]:
     return {row.denoiser: [other for other in rows if other.denoiser == row.denoiser] for row in rows}
 
 
-def draw(rows: Sequence[Timing]) -> Figure:
+def scaling_figure(rows: Sequence[Timing]) -> Figure:
     """Median milliseconds against pixels, both logarithmic, and how far they spread (p10 to p90)."""
     figure, axis = plt.subplots(figsize=(8, 5.5), dpi=DPI, layout="constrained")
     for index, (name, ours) in enumerate(by_denoiser(rows).items()):
@@ -56,7 +56,7 @@ def draw(rows: Sequence[Timing]) -> Figure:
     return figure
 
 
-def table(rows: Sequence[Timing]) -> str:
+def scaling_table(rows: Sequence[Timing]) -> str:
     """A row a denoiser: milliseconds at each size, and the exponent."""
     lines = []
     for name, ours in by_denoiser(rows).items():
@@ -71,7 +71,7 @@ def bench_scaling(runs: Path, names: Sequence[str], sizes: Sequence[str] = (), t
 
     With the largest number of `threads`, by default all. Raises BadInput for unknown names, sizes, numbers of threads.
     """
-    pixels = sorted({parse_size(size) for size in sizes or SIZES}, key=lambda size: size[0] * size[1])
+    pixels = sorted({parse_size(size) for size in sizes or SCALING_SIZES}, key=lambda size: size[0] * size[1])
     specs = in_use(names)
     count = thread_counts(threads)[-1]
     rows: list[Timing] = []
@@ -90,5 +90,5 @@ def bench_scaling(runs: Path, names: Sequence[str], sizes: Sequence[str] = (), t
             "rows": [asdict(row) for row in rows],
         },
     )
-    save_figure(figures / "scaling.png", draw(rows))
-    return table(rows)
+    save_figure(figures / "scaling.png", scaling_figure(rows))
+    return scaling_table(rows)
