@@ -228,9 +228,8 @@ def bench(
         print(bench_scaling(runs, names, size, threads))
     elif what == "fusion":
         from eval.bench.fusion import bench_fusion
-        from eval.bench.sizes import parse_size
 
-        print(bench_fusion(runs, *parse_size((size or usual)[0]), max(threads, default=None)))
+        print(bench_fusion(runs, (size or usual)[0], max(threads, default=None)))
     elif what == "rendering":
         from eval.bench.rendering import bench_rendering
 

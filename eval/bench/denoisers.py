@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from datasets.frame import Frame
 from eval.bench.memory import alone, growth_mb
+from eval.bench.output import bench_folder
 from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
@@ -159,11 +160,10 @@ def bench_denoisers(
     pixels = [parse_size(size) for size in dict.fromkeys(sizes)]
     counts = thread_counts(threads)
     specs = {device: ways(names, device) for device in devices()}
-    (runs / "bench").mkdir(parents=True, exist_ok=True)
     tables = []
     for device, ours in specs.items():
         path = results_file(runs, device)
-        unfinished = path.with_name(f"unfinished-{path.name}")
+        unfinished = bench_folder(runs) / f"unfinished-{path.name}"
         races = measure_races(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished, measured)
         rows = [*chain.from_iterable(races)]
         content = {
