@@ -7,6 +7,7 @@ from typing import Any
 from tabulate import tabulate
 
 from datasets.clip import Dataset
+from eval.bench.sample_cost import RENDERER
 from eval.bench.sizes import parse_size
 from eval.harness import clips_of_one_spp, entrant, evaluate_clip
 from eval.means import compared_mean, joint_floor, means
@@ -18,7 +19,6 @@ from eval.text_table import LEGEND, NEAR, cell
 from eval.tradeoff.candidates import candidates, trained_epochs
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.sample_cost import RENDERER
 from eval.tradeoff.samples import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table
 from eval.tradeoff.times import Times
 from files import write_json

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
 from errors import BadInput
+from eval.bench.sample_cost import Cost, sample_cost
 from eval.harness import entrant, evaluate_clip
 from eval.means import compared_mean, joint_floor, means
 from eval.metrics import METRICS, Values
@@ -20,7 +21,6 @@ from eval.spec import DenoiserSpec, precision_in_use
 from eval.text_table import cell
 from eval.tradeoff.clips import scene_of, source, with_samples
 from eval.tradeoff.pareto import Point, dominators
-from eval.tradeoff.sample_cost import Cost, sample_cost
 from eval.tradeoff.times import Times
 from render.clip import Options
 

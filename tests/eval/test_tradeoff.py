@@ -11,12 +11,12 @@ from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.denoisers import Variant
+from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.harness import clips_of_one_spp
 from eval.means import compared_mean, joint_floor
 from eval.tradeoff.candidates import Candidate, Times, candidates
 from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import beaten_by, trade
-from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
 from files import read_json, write_json
 from models.parameters import WINDOWS
@@ -180,7 +180,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 
 
 def test_cost_of_samples(tiny):
-    cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
+    cost = fit_cost([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
     measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
