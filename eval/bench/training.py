@@ -21,7 +21,7 @@ from eval.bench.output import bench_folder
 from files import write_json
 from timing import device_clock, take_turns
 from train.data import in_parts, loader, micro_batches
-from train.fabric import BFLOAT16, FLOAT32
+from train.precision import BFLOAT16, FLOAT32
 from train.recipes import DEFAULT
 from train.registry import task_for
 from train.training import Training
