@@ -4,7 +4,7 @@ import numpy as np
 
 from datasets.profiles import SamplingQuality
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
-from render.clip import PLAIN, Options
+from render.clip import NO_OPTIONS, Options
 from render.shot import Shot
 from render.stage import Stage
 from scenes.animation import Scene
@@ -24,7 +24,13 @@ def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: 
 
 
 def reference_spp(
-    scene: Scene, frames: int, height: int, width: int, quality: SamplingQuality, seed: int, options: Options = PLAIN
+    scene: Scene,
+    frames: int,
+    height: int,
+    width: int,
+    quality: SamplingQuality,
+    seed: int,
+    options: Options = NO_OPTIONS,
 ) -> int:
     """Samples a pixel of both halves together that bring a clip's references down to the noise floor of `quality`.
 

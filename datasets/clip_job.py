@@ -12,7 +12,7 @@ from datasets.clip_kind import ClipKind
 from datasets.profiles import DataProfile, clip_seed, profile_of
 from datasets.writer import ClipWriter
 from files import locked
-from render.clip import PLAIN, Clock, Options, Sampling, render_clip
+from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
 from scenes.registry import build_scene
 
 
@@ -53,7 +53,7 @@ def run_clip_job(job: ClipJob) -> ClipOutcome:
 
 
 def render_to_folder(
-    folder: Path, profile: DataProfile, dataset_seed: int, channels: Sequence[str], options: Options = PLAIN
+    folder: Path, profile: DataProfile, dataset_seed: int, channels: Sequence[str], options: Options = NO_OPTIONS
 ) -> None:
     """Render the named channels of the clip whose folder is DATA/SPLIT/SCENE/CLIP, whole or not at all.
 
@@ -66,7 +66,7 @@ def render_to_folder(
     scene = build_scene(scene_name, seed, profile.frames)
     if kind.still:
         scene = scene.still()
-    clock = Clock()
+    clock = StepTimer()
     spp = reference_spp(scene, profile.frames, profile.height, profile.width, quality, seed, options)
     clock.lap("pilot")
     sampling = Sampling(quality.realisations, kind.noisy_spp, spp, options)

@@ -13,7 +13,7 @@ from datasets.channels import CHANNELS, REFERENCES
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
-from scenes.camera import View, rigid_inverse
+from scenes.camera import View, inverse_pose
 
 # Components of layers that are not colours (RGB).
 COMPONENTS = {"normal": "XYZ", "motion": "XY", "dual_motion": "XY", "depth": "Z", "roughness": "Y", "mesh_id": "I"}
@@ -62,7 +62,7 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "worldToCamera": np.ascontiguousarray(rigid_inverse(view.camera_to_world).T, np.float32),
+        "worldToCamera": np.ascontiguousarray(inverse_pose(view.camera_to_world).T, np.float32),
         FACTS_ATTRIBUTE: json.dumps(facts),
     }
     try:

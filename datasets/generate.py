@@ -15,7 +15,7 @@ from datasets.profiles import plan
 from errors import BadInput
 from files import read_json, write_json
 from provenance import RENDERING, versions
-from render.clip import PLAIN, Options
+from render.clip import NO_OPTIONS, Options
 
 Item = TypeVar("Item")
 
@@ -54,7 +54,7 @@ def generate(
     seed: int,
     share: Share = WHOLE_DATA_SET,
     reads: Sequence[str] = tuple(CHANNELS),
-    options: Options = PLAIN,
+    options: Options = NO_OPTIONS,
     render: Callable[[Sequence[ClipJob]], Iterator[ClipOutcome]] = render_here,
 ) -> int:
     """Render the clips that are missing from the share of a data set at `root`. Returns how many were rendered.

@@ -11,7 +11,7 @@ from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES
 from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
 from provenance import RENDERING, versions
-from render.clip import PLAIN, Options
+from render.clip import NO_OPTIONS, Options
 
 GENERATOR = 5  # raise it when the same seed renders different bytes
 
@@ -127,7 +127,9 @@ def rendered_channels(reads: Iterable[str]) -> list[str]:
     return [name for name in CHANNELS if name in wanted]
 
 
-def plan(profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), options: Options = PLAIN) -> dict[str, Any]:
+def plan(
+    profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), options: Options = NO_OPTIONS
+) -> dict[str, Any]:
     """The content of dataset.json.
 
     Clips for training and validation get the channels that can be derived from nothing else and those in `reads`;

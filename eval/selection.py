@@ -6,9 +6,8 @@ from functools import partial
 from pathlib import Path
 
 from errors import BadInput
-from eval.extra_denoisers import FAST_OIDN, WINDOW_SETS, windows_label
+from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.spec import DenoiserSpec, denoiser_class, precision_in_use
-from models import registry
 from models.registry import DENOISERS, without_taa
 from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
@@ -37,9 +36,7 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
 
 def unavailable(name: str) -> str | None:
     """Why a denoiser cannot run on this machine. Raises BadInput for an unknown name."""
-    if name in WINDOW_SETS:
-        return None
-    return registry.unavailable("oidn" if name == FAST_OIDN else name)
+    return denoiser_class(name).unavailable()
 
 
 def weights_file(name: str, runs: Path, budget: str) -> Path | None:

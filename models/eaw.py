@@ -14,7 +14,7 @@ from models import compiled
 from models.atrous import CENTRE, LEVELS, RADIUS, WindowSum, b3_spline, taps
 from models.baselines import Accumulated, AccumulatedState
 from models.compiled import eaw as kernels
-from models.denoiser import CLASSICAL, Denoiser, State, carried
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.operators import RunningScale, accumulate, finite, rays, running_scale
 
 SIGMA_COLOUR = 4.0  # exposed irradiance, at the first level; halved from level to level
@@ -68,7 +68,7 @@ class EAW(Denoiser):
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, EAWState, frame)
+        before = matching_state(state, EAWState, frame)
         irradiance = finite(frame.irradiance(self.signal))
         history = accumulate(frame, irradiance, before.history if before else None)
         radiance = irradiance * frame.divisor

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
 from models.convolution import ConvReLU
-from models.denoiser import Denoiser, State, carried
+from models.denoiser import Denoiser, State, matching_state
 from models.kernels import apply_kernels
 from models.operators import RunningScale, pad, running_scale
 
@@ -138,19 +138,23 @@ class NTD(Denoiser):
     it does for all of the first frame (§5): so what comes into view, and all of the image where a cut moves the camera
     far away, starts anew. The paper leaves that to the network and tests no surfaces, and neither do we.
 
-    Args:
-        vectors: "dual_motion", or "motion" for the ablation A of the paper (§6.3).
-        signal: "indirect" as in the paper, or "total".
+    It denoises indirect light, as in the paper, unless it is built for "total".
+
+    Attributes:
+        vectors: the channel by which the previous output is fetched.
     """
 
+    vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
+    # The traditional vectors tell what is disoccluded, for the loss and for pictures.
+    reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
+    signal: Signal = "indirect"
     refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+    is_network = True
 
-    def __init__(self, vectors: Literal["motion", "dual_motion"] = "dual_motion", signal: Signal = "indirect") -> None:
-        super().__init__()
-        self.vectors, self.signal = vectors, signal
-        lights = ("indirect",) if signal == "indirect" else ("direct", "indirect", "emission")
-        # The traditional vectors tell what is disoccluded, for the loss and for pictures.
-        self.reads = (*lights, "albedo", "normal", "depth", *dict.fromkeys(("motion", vectors)))
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        if self.signal == "total":
+            self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
@@ -160,7 +164,7 @@ class NTD(Denoiser):
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
         """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state."""
-        before = carried(state, NTDState, frame)
+        before = matching_state(state, NTDState, frame)
         noisy = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None)
         warped = noisy
@@ -179,3 +183,10 @@ class NTD(Denoiser):
         irradiance, after = self.predict(frame, state)
         after = replace(after, irradiance=irradiance.clamp(min=0))
         return frame.remodulate(after.irradiance, self.signal), after
+
+
+class NTDTraditional(NTD):
+    """The paper's ablation A (§6.3): the previous output is fetched by traditional motion vectors."""
+
+    vectors = "motion"
+    reads = ("indirect", "albedo", "normal", "depth", "motion")

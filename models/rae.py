@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.frame import Frame
-from models.denoiser import Denoiser, State, carried
+from datasets.frame import Frame, Signal
+from models.denoiser import Denoiser, State, matching_state
 from models.operators import RunningScale, finite, pad, running_scale
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
@@ -101,9 +101,10 @@ class RAE(Denoiser):
     """
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+    is_network = True
 
-    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY)) -> None:
-        super().__init__()
+    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
+        super().__init__(signal=signal)
         self.auxiliary = tuple(auxiliary)
         needed = {*auxiliary, "depth"}  # depth has its running scale in any case
         self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
@@ -113,7 +114,7 @@ class RAE(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
         height, width = frame.size
-        before = carried(state, RAEState, frame)
+        before = matching_state(state, RAEState, frame)
         irradiance = finite(frame.irradiance(self.signal)).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
         colour = self.compress(irradiance, scale, frame)

@@ -22,7 +22,7 @@ from datasets.frame import Frame, Signal
 from models import compiled
 from models.atrous import CENTRE, LEVELS, RADIUS, WindowSum, b3_spline, taps
 from models.compiled import svgf as kernels
-from models.denoiser import CLASSICAL, Denoiser, State, carried
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.operators import Surfaces, finite, luminance, reproject
 
 ALPHA = 0.2  # §4.1: weight of the newest sample
@@ -185,7 +185,7 @@ class SVGF(Denoiser):
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, SVGFState, frame)
+        before = matching_state(state, SVGFState, frame)
         integrated = integrate(frame, irradiances(frame, self.signal), before.history if before else None)
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         estimated = estimate_variance(integrated, geometry)

@@ -1,13 +1,15 @@
 """Temporal antialiasing, for whatever denoiser (Karis 2014)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State, carried
+from models.denoiser import Denoiser, State, matching_state
 from models.operators import RunningScale, Surfaces, reproject, running_scale
 
 NEWEST = 0.1  # weight of the current frame
@@ -74,34 +76,36 @@ class AntialiasedState(State):
         return self.inner.pictures()
 
 
+def with_history(reads: Iterable[str]) -> tuple[str, ...]:
+    """The channels `reads` and those that the history is fetched and tested by."""
+    return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
+
+
 class Antialiased(Denoiser):
-    """Any denoiser with temporal antialiasing after it.
+    """A denoiser of `inner_class` with temporal antialiasing after it; `antialiased` makes the class.
 
     The history follows the motion vectors and is blended across edges, which is what smooths them; it is dropped where
     reprojection finds no trace of the pixel's surface: disoccluded, or off-screen. Tone mapping needs an exposure: the
     causal one of the outputs so far.
     """
 
-    def __init__(self, inner: Denoiser):
-        super().__init__()
-        self.inner = inner
-        self.reads = tuple(dict.fromkeys((*inner.reads, "normal", "depth", "mesh_id", "motion")))
-        self.refuses = inner.refuses  # type: ignore[misc]  # it is the wrapped instance's
+    inner_class: ClassVar[type[Denoiser]]
 
-    @property
-    def signal(self) -> Signal:
-        return self.inner.signal
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inner = self.inner_class(signal=signal)
+        self.reads = with_history(self.inner.reads)
 
-    @signal.setter
-    def signal(self, signal: Signal) -> None:
-        self.inner.signal = signal
+    @classmethod
+    def unavailable(cls) -> str | None:
+        return cls.inner_class.unavailable()
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         self.inner.prepare(precision)
         super().prepare(precision)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, AntialiasedState, frame)
+        before = matching_state(state, AntialiasedState, frame)
         output, inner = self.inner.forward(frame, before.inner if before else None)
         scale = running_scale(output, frame.depth, before.scale if before else None)
         if before:
@@ -112,6 +116,19 @@ class Antialiased(Denoiser):
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
 
 
-def unwrapped(denoiser: Denoiser) -> Denoiser:
+def antialiased(kind: type[Denoiser]) -> type[Antialiased]:
+    """The class of denoisers of `kind` with temporal antialiasing after them."""
+
+    class AntialiasedKind(Antialiased):
+        inner_class = kind
+        reads = with_history(kind.reads)
+        signal = kind.signal
+        refuses = kind.refuses
+        is_network = kind.is_network
+
+    return AntialiasedKind
+
+
+def inner_denoiser(denoiser: Denoiser) -> Denoiser:
     """The denoiser without antialiasing."""
     return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -10,10 +11,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
 from models import compiled
 from models.baselines import Accumulated, AccumulatedState
-from models.denoiser import Denoiser, State, carried
+from models.denoiser import Denoiser, State, matching_state
 from models.fusion import WINDOWS, fuse
 from models.kernels import apply_kernels
 from models.operators import RunningScale, accumulate, pad, running_scale
@@ -61,6 +62,7 @@ class KernelPredictor(Denoiser):
     """
 
     reads = Accumulated.reads
+    is_network = True
     filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
     network: nn.Module
 
@@ -79,7 +81,7 @@ class KernelPredictor(Denoiser):
 
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
         """The state after a frame, before any filter: accumulated irradiance and running scales."""
-        before = carried(state, WSKPState, frame)
+        before = matching_state(state, WSKPState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
@@ -102,17 +104,30 @@ class KernelPredictor(Denoiser):
         super().prepare(precision)
 
 
+def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
+    """`layers` RepVGG blocks from the inputs to `outputs` channels."""
+    return repvgg([INPUTS, *[WIDTH] * (layers - 1), outputs], sizes)
+
+
 class WSKP(KernelPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
-    def __init__(self, layers: int = 6, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = SIZES):
-        super().__init__()
+    layers: ClassVar[int] = 6
+
+    def __init__(self, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = SIZES, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
         self.windows = tuple(windows)
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)], sizes)
+        self.network = trunk(self.layers, 2 * len(windows), sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
         return fuse(irradiance, importance, mixture, self.windows), mixture
+
+
+class WSKP3(WSKP):
+    """The smaller of the paper's two networks."""
+
+    layers = 3
 
 
 class KP(KernelPredictor):
@@ -120,9 +135,9 @@ class KP(KernelPredictor):
 
     window = 13
 
-    def __init__(self, layers: int = 6, sizes: Sequence[int] = SIZES):
-        super().__init__()
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2], sizes)
+    def __init__(self, sizes: Sequence[int] = SIZES, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.network = trunk(WSKP.layers, self.window**2, sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         return apply_kernels(irradiance, predicted), None
@@ -173,8 +188,8 @@ class WSKPMR(KernelPredictor):
 
     windows = (3, 5)
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
         self.network = MultiResolutionNet(INPUTS, 2 * len(self.windows) + 1)
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:

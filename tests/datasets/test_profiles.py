@@ -15,7 +15,7 @@ from datasets.info import AUXILIARY_CHANNELS, size_in_full, stored_size, summari
 from datasets.profiles import DataProfile, SamplingQuality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
 from models.registry import channels_read, create
-from render.clip import PLAIN
+from render.clip import NO_OPTIONS
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -107,10 +107,10 @@ def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
     quality = SamplingQuality(realisations=1, reference_spp=16, floor=26.0, most_spp=1024)
     stage = Stage(scene, 24, 24)
     wanted = 10**-2.6
-    predicted = 16 * 2 ** np.ceil(np.log2(noise_of_reference(stage, 1, 16, 2, PLAIN) / wanted))
+    predicted = 16 * 2 ** np.ceil(np.log2(noise_of_reference(stage, 1, 16, 2, NO_OPTIONS) / wanted))
     spp = reference_spp(scene, 1, 24, 24, quality, 2)
     assert spp > predicted
-    assert spp == 1024 or noise_of_reference(stage, 1, spp, 2, PLAIN) <= wanted
+    assert spp == 1024 or noise_of_reference(stage, 1, spp, 2, NO_OPTIONS) <= wanted
 
 
 def test_references_stop_at_the_most():

@@ -21,7 +21,7 @@ from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
 from files import read_json, write_json
 from models.fusion import WINDOWS
 from models.weights import save_weights
-from render.clip import PLAIN
+from render.clip import NO_OPTIONS
 from train.loop import WEIGHTS, run_folder
 
 SIZE = (32, 48)
@@ -182,7 +182,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 def test_cost_of_samples(tiny):
     cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
-    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
 
 

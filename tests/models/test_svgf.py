@@ -9,15 +9,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_operators import flat_frame
 
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled
+from models import compiled, eaw, svgf
 from models.baselines import Accumulated
 from models.eaw import EAW
 from models.operators import Surfaces, running_scale
-from models.registry import eaw, svgf
 from models.svgf import SVGF, Integrated
+from tests.helpers.frames import flat_frame, play, run
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
@@ -37,15 +36,6 @@ def way(request):
     """The test runs with compiled kernels and the PyTorch way."""
     with WAYS[request.param]():
         yield request.param
-
-
-@torch.no_grad()
-def run(denoiser, frames):
-    state, outputs = None, []
-    for frame in frames:
-        output, state = denoiser(frame, state)
-        outputs.append(output)
-    return outputs, state
 
 
 def surfaces(rng, height, width):
@@ -322,7 +312,7 @@ def test_five_levels_and_the_first_is_the_history(monkeypatch):
     monkeypatch.setattr(
         svgf, "filter_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
     )
-    (output,), state = run(SVGF(), [frame])
+    (output,), state = play(SVGF(), [frame])
     assert [step for step, _, _ in seen] == [1, 2, 4, 8, 16]
     assert state.history.colour is seen[0][1]
     torch.testing.assert_close(output, frame.emission + seen[-1][1].sum(dim=1) * frame.albedo.clamp(min=0.01))
@@ -335,25 +325,24 @@ def test_five_levels_and_the_first_is_the_history(monkeypatch):
 @pytest.mark.parametrize("signal", ["total", "indirect"])
 def test_compiled_and_plain_agree(denoiser, signal):
     frames = [synthetic_frame(index, 41, 70) for index in range(6)]
-    made = denoiser()
-    made.signal = signal
+    made = denoiser(signal=signal)
     torch.set_num_threads(2)
-    fast = run(made, frames)[0]
+    fast = run(made, frames)
     torch.set_num_threads(1)
     with compiled.disabled():
-        slow = run(made, frames)[0]
+        slow = run(made, frames)
     for a, b in zip(fast, slow, strict=True):
         torch.testing.assert_close(a, b, rtol=2e-4, atol=1e-5)
 
 
 def test_indirect_alone_is_what_total_makes_of_it():
     frames = [synthetic_frame(index, 24, 32) for index in range(5)]
-    alone, total = SVGF(), SVGF()
-    alone.signal = "indirect"
-    a, state = run(alone, frames)
+    alone = SVGF(signal="indirect")
+    total = SVGF()
+    a, state = play(alone, frames)
     assert list(state.pictures()) == ["history length", "variance indirect"]
     dark = [replace(f, channels=f.channels | {"direct": 0 * f.direct, "emission": 0 * f.direct}) for f in frames]
-    for x, y in zip(a, run(total, dark)[0], strict=True):
+    for x, y in zip(a, run(total, dark), strict=True):
         torch.testing.assert_close(x, y)
 
 
@@ -364,8 +353,10 @@ def test_indirect_alone_is_what_total_makes_of_it():
 def test_the_output_stays_in_the_range_of_the_input(name, denoiser, size, seed, level):
     rng = np.random.default_rng(seed)
     depth, normal, mesh = surfaces(rng, *size)
-    low, high, state, made = np.inf, -np.inf, None, denoiser()
-    made.signal = "indirect"
+    low = np.inf
+    high = -np.inf
+    state = None
+    made = denoiser(signal="indirect")
     for _ in range(5):
         frame = flat_frame(*size, mesh_id=to_torch(mesh.astype(float)))
         light = level * to_torch(rng.choice([0.2, 0.9, 1.0], (3, *size)) * rng.random((3, *size)))
@@ -381,7 +372,7 @@ def test_a_thousand_times_the_light_is_a_thousand_times_the_output(denoiser):
     frames = [synthetic_frame(index, 30, 40) for index in range(5)]
     lights = ("direct", "indirect", "emission")
     bright = [replace(f, channels=f.channels | {name: 1000 * f.channels[name] for name in lights}) for f in frames]
-    for a, b in zip(run(denoiser(), frames)[0], run(denoiser(), bright)[0], strict=True):
+    for a, b in zip(run(denoiser(), frames), run(denoiser(), bright), strict=True):
         torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
 
 
@@ -398,7 +389,7 @@ def test_noise_on_a_wall_is_gone_and_the_sky_is_left_alone(denoiser):
         frame = flat_frame(48, 48, irradiance=light, mesh_id=mesh)
         frame.channels.update(depth=frame.depth * mesh, normal=frame.normal * mesh)
         frames.append(frame)
-    filtered, accumulated = (run(d, frames)[0][-1] for d in (denoiser(), Accumulated()))
+    filtered, accumulated = (run(d, frames)[-1] for d in (denoiser(), Accumulated()))
     torch.testing.assert_close(filtered[..., 30:], torch.full((1, 3, 48, 18), 100.0))
     errors = [(image[..., :30] - 1).square().mean() for image in (filtered, accumulated)]
     assert errors[0] < 0.3 * errors[1]

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_denoisers import run
-from test_operators import flat_frame
 from torch.nn import functional as F
 
 from datasets.clip import Dataset
@@ -17,6 +15,7 @@ from models.compiled.exponential import exp, log
 from models.operators import accumulate, running_scale
 from models.repvgg import RepVGGBlock, merge, repvgg
 from models.wskp import combine
+from tests.helpers.frames import flat_frame, run
 
 
 @pytest.mark.parametrize("widths", [(10, 24, 24, 12), (10, 24, 24, 24, 24, 24, 12), (3, 3)])
