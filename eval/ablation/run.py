@@ -1,35 +1,39 @@
 """`onespp ablate`: train the variants of a published ablation alike, judge them on the test clips, compare."""
 
 import math
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.ablation.definitions import SHARE, Ablation, Variant, ablation_for
-from eval.ablation.summary import Run, draw, report, verdicts
+from eval.ablation.definitions import SHARE_OF_EPOCHS, Ablation, AblationVariant, ablation_for
+from eval.ablation.plots import ablation_figure
+from eval.ablation.summary import ablation_table, judged_findings
+from eval.ablation.variant_run import VariantRun
 from eval.clip_run import Entrant
 from eval.harness import clips_of_one_spp, evaluate_clip
+from eval.metrics import Values
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.weights import load_weights
 from models.wskp import KernelPredictor
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions
-from train.log import METRICS, read_metrics
-from train.loop import CHECKPOINT, Task, load_checkpoint, train_network
+from timing import take_turns
+from train.checkpoint import load_checkpoint
+from train.log import METRICS_CSV, read_metrics
+from train.loop import train_network
+from train.task import Task
 
-RESULTS, TABLE, PLOT = "results.json", "table.md", "plot.png"
-WARM_UP, REPEATS = 3, 30  # of a timing
+Trainings = Sequence[tuple[AblationVariant, Task]]
 
 
 def meshes_move(clip: Clip) -> bool:
@@ -55,7 +59,7 @@ def epoch_losses(metrics: Path, epochs: int) -> list[float | None]:
     return [float(np.mean(finite)) if (finite := [x for x in epoch if math.isfinite(x)]) else None for epoch in losses]
 
 
-def trained(variant: Variant, weights: Path) -> Denoiser:
+def trained(variant: AblationVariant, weights: Path) -> Denoiser:
     """A variant ready to use, in float32 on every machine: networks are compared here, not precisions."""
     denoiser = variant.create()
     load_weights(denoiser, variant.label, weights)
@@ -63,94 +67,115 @@ def trained(variant: Variant, weights: Path) -> Denoiser:
     return denoiser
 
 
-@torch.inference_mode()
-def fusion_ms(denoisers: Mapping[str, Denoiser], clip: Clip) -> dict[str, float]:
-    """Median milliseconds of building and fusing the kernels of a frame of `clip`, without the network.
-
-    Each in turn, so that drift of the machine hits all.
-    """
-    work = {}
-    for label, denoiser in denoisers.items():
-        assert isinstance(denoiser, KernelPredictor)
-        frame = read_frame(clip, 0, denoiser.reads)
-        after = denoiser.accumulate(frame, None)
-        irradiance = after.history.irradiance
-        predicted = denoiser.network(denoiser.features(frame, irradiance, after.scale))
-        work[label] = partial(denoiser.reconstruct, irradiance, predicted)
-    seconds: dict[str, list[float]] = {label: [] for label in work}
-    for _ in tqdm(range(WARM_UP + REPEATS), "timing", leave=False):
-        for label, run in work.items():
-            start = time.perf_counter()
-            run()
-            seconds[label].append(time.perf_counter() - start)
-    return {label: 1e3 * float(np.median(times[WARM_UP:])) for label, times in seconds.items()}
+def entrant_of(variant: AblationVariant, task: Task, weights: Path) -> Entrant:
+    """A trained variant, to be evaluated under the name of its folder."""
+    fresh = variant.create()
+    return Entrant(
+        name=task.folder.name,
+        signal=fresh.signal,
+        precision="float32",
+        weights=weights,
+        modules=(type(fresh).__module__,),
+        build=partial(trained, variant, weights),
+    )
 
 
-def judge(name: str, denoiser: Denoiser, weights: Path, clips: Sequence[Clip], folder: Path) -> dict[str, Any]:
+def clip_means(entrant: Entrant, clips: Sequence[Clip], folder: Path) -> dict[str, Values]:
     """Means of the harness's metrics on each clip. What was judged before is kept, with pictures, in folder/eval."""
-    kind = type(denoiser)
-    entrant = Entrant(name, denoiser.signal, "float32", weights, (kind.__module__,), lambda: denoiser)
     results = [evaluate_clip(clip, [entrant], folder)[0] for clip in clips]
     return {f"{result.scene}/{result.clip}": result.metrics for result in results}
 
 
-def train_and_judge(ablation: Ablation, tasks: Mapping[tuple[str, int], Task], folder: Path) -> list[Run]:
+def fusion_of(denoiser: Denoiser, clip: Clip) -> Callable[[], tuple[Tensor, Tensor | None]]:
+    """What builds and fuses a kernel predictor's kernels for the first frame of `clip`, without the network."""
+    assert isinstance(denoiser, KernelPredictor)
+    frame = read_frame(clip, 0, denoiser.reads)
+    after = denoiser.accumulate(frame, None)
+    irradiance = after.history.irradiance
+    predicted = denoiser.network(denoiser.features(frame, irradiance, after.scale))
+    return partial(denoiser.reconstruct, irradiance, predicted)
+
+
+@torch.inference_mode()
+def fusion_ms(denoisers: Mapping[str, Denoiser], clip: Clip, measured: int = 30, warm_up: int = 3) -> dict[str, float]:
+    """Median milliseconds of building and fusing the kernels of a frame of `clip`, without the network."""
+    work = {label: fusion_of(denoiser, clip) for label, denoiser in denoisers.items()}
+    seconds = take_turns(work, measured, warm_up)
+    return {label: 1e3 * float(np.median(times)) for label, times in seconds.items()}
+
+
+def train_and_judge(ablation: Ablation, trainings: Trainings, clips: Sequence[Clip], folder: Path) -> list[VariantRun]:
     """Train what is not trained yet, all in the precision that the first one found the fastest, and judge it."""
-    variants = {variant.label: variant for variant in ablation.variants}
-    clips = clips_to_judge(next(iter(tasks.values())).data, ablation)
-    runs, networks = [], {}
+    runs = []
+    entrants: dict[str, Entrant] = {}
     precision: str | None = None
-    for (label, seed), task in tqdm(tasks.items(), folder.name, unit="network"):
+    for variant, task in tqdm(trainings, folder.name, unit="network"):
         weights = train_network(replace(task, precision=precision))
-        precision = load_checkpoint(task.folder / CHECKPOINT)["precision"]
-        denoiser = networks[label] = trained(variants[label], weights)
-        losses = epoch_losses(task.folder / METRICS, task.recipe.epochs)
-        parameters = task.create().parameter_count()  # as trained
-        runs.append(Run(label, seed, parameters, losses, judge(task.folder.name, denoiser, weights, clips, folder)))
-    if ablation.timed:
-        times = fusion_ms(networks, clips[0])
-        for run in runs:
-            run.fusion_ms = times[run.variant]
-    return runs
-
-
-def tasks_of(ablation: Ablation, data: Path, folder: Path, profile: str, seeds: int) -> dict[tuple[str, int], Task]:
-    """The trainings of an ablation by label and seed, each in folder/LABEL-SEED, with all accumulated frames shared."""
-    dataset, cache = Dataset(data), folder.parent.parent / "accumulated"
-    return {
-        (v.label, seed): Task(
-            *(v.label, v.create, v.recipe(profile), profile, dataset), folder / f"{v.label}-{seed}", cache, seed
+        precision = load_checkpoint(task.folder)["precision"]
+        entrants[variant.label] = entrant_of(variant, task, weights)
+        runs.append(
+            VariantRun(
+                variant=variant.label,
+                seed=task.seed,
+                parameters=variant.create().parameter_count(),  # as trained
+                losses=epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs),
+                clips=clip_means(entrants[variant.label], clips, folder),
+            )
         )
-        for seed in range(seeds)
-        for v in ablation.variants
-    }
+    if not ablation.timed:
+        return runs
+    times = fusion_ms({label: entrant.denoiser for label, entrant in entrants.items()}, clips[0])
+    return [replace(run, fusion_ms=times[run.variant]) for run in runs]
 
 
-def ablate(what: str, data: Path, runs: Path, profile: str, seeds: int = 1) -> str:
+def trainings_of(ablation: Ablation, dataset: Dataset, folder: Path, budget: str, seeds: int) -> Trainings:
+    """Each variant with each seed, each in folder/LABEL-SEED; all share accumulated frames with other trainings.
+
+    Raises BadInput for an unknown budget.
+    """
+    accumulated = folder.parent.parent / "accumulated"
+
+    def task(variant: AblationVariant, seed: int) -> Task:
+        own_folder = folder / f"{variant.label}-{seed}"
+        recipe = variant.recipe(budget)
+        return Task(variant.label, variant.create, recipe, budget, dataset, own_folder, accumulated, seed)
+
+    return [(variant, task(variant, seed)) for seed in range(seeds) for variant in ablation.variants]
+
+
+def ablate(what: str, data: Path, runs: Path, budget: str, seeds: int = 1) -> str:
     """Run an ablation, or go on with it: RUNS/ablation/WHAT/ gets results.json, table.md and plot.png.
 
-    Returns the table. Raises BadInput for an unknown ablation or profile, no seeds, or unusable data.
+    Returns the table. Raises BadInput for an unknown ablation or budget, no seeds, or unusable data.
     """
-    ablation, folder = ablation_for(what), runs / "ablation" / what
+    ablation = ablation_for(what)
     if seeds < 1:
         raise BadInput(f"{seeds} seeds train nothing: use 1 or more")
-    tasks = tasks_of(ablation, data, folder, profile, seeds)
+    folder = runs / "ablation" / what
+    dataset = Dataset(data)
+    trainings = trainings_of(ablation, dataset, folder, budget, seeds)
+    clips = clips_to_judge(dataset, ablation)
     folder.mkdir(parents=True, exist_ok=True)
-    results = train_and_judge(ablation, tasks, folder)
+    judged = train_and_judge(ablation, trainings, clips, folder)
 
-    epochs, clips = next(iter(tasks.values())).recipe.epochs, ", ".join(results[0].clips)
+    epochs = trainings[0][1].recipe.epochs
     title = f"{what}, after {ablation.source}\n"
-    title += f"profile {profile}, {epochs} epochs ({SHARE:.0%} of its own), seeds: {seeds}, judged on {clips}"
-    save_figure(folder / PLOT, draw(ablation, results, title))
-    write_file(folder / TABLE, f"{title}\n\n{report(ablation, results, 'github')}\n".encode())
-    facts = {
+    title += f"budget {budget}, {epochs} epochs ({SHARE_OF_EPOCHS:.0%} of its own), seeds: {seeds}, "
+    title += f"judged on {', '.join(judged[0].clips)}"
+    save_figure(folder / "plot.png", ablation_figure(ablation, judged, title))
+    write_file(folder / "table.md", f"{title}\n\n{ablation_table(ablation, judged, 'github')}\n".encode())
+    results = {
         "schema": 1,
         "what": what,
         "dataset": str(data),
         "device": device_in_words(),
         "versions": versions(DENOISING),
+        "profile": budget,
+        "epochs": epochs,
+        "share_of_epochs": SHARE_OF_EPOCHS,
+        "seeds": seeds,
+        "rows": [asdict(run) for run in judged],
+        "findings": [asdict(finding) for finding in judged_findings(ablation, judged)],
     }
-    budget = {"profile": profile, "epochs": epochs, "share_of_epochs": SHARE, "seeds": seeds}
-    found = {"rows": [vars(run) for run in results], "findings": verdicts(ablation, results)}
-    write_json(folder / RESULTS, facts | budget | found)
-    return f"{title}\n\n{report(ablation, results)}"
+    write_json(folder / "results.json", results)
+    return f"{title}\n\n{ablation_table(ablation, judged)}"

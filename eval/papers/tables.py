@@ -1,7 +1,7 @@
 """What the papers print, as data: each table with its number, for the scenes and machines of its authors.
 
-Transcribed from the papers' texts. Plots are not in them, so RAE's Fig. 12, SVGF's Fig. 8 and 10, WSKP's Fig. 6, 9 and
-10 and NTD's Fig. 8 are not here.
+Transcribed from the papers' texts. These have no plots, so RAE's Fig. 12, SVGF's Fig. 8 and 10, WSKP's Fig. 6, 9 and 10
+and NTD's Fig. 8 are not here.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,15 @@ Where = Literal["eval", "bench", "ablation"]
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table: `values` by method and metric, in the order of `scenes`; `ours`, the methods that are here too."""
+    """A table.
+
+    Attributes:
+        values: by method and metric, in the order of `scenes`.
+        ours: what the methods that are here too are called here.
+        where: the command whose results are compared with it.
+        signal: the light that it is of.
+        incomparable: metrics that are shown and never compared.
+    """
 
     source: str
     scenes: tuple[str, ...]
@@ -25,11 +33,16 @@ class PaperTable:
     where: Where = "eval"
     signal: Signal = "total"
     notes: tuple[str, ...] = ()
-    incomparable: tuple[str, ...] = ()  # metrics that are shown and never compared
+    incomparable: tuple[str, ...] = ()
 
     @property
     def metrics(self) -> tuple[str, ...]:
         return tuple(next(iter(self.values.values())))
+
+    @property
+    def comparable(self) -> tuple[str, ...]:
+        """The metrics that ours can be compared by."""
+        return tuple(metric for metric in self.metrics if metric not in self.incomparable)
 
     def mean(self, method: str, metric: str) -> float:
         """Over the scenes."""

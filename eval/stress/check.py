@@ -1,26 +1,26 @@
-"""One denoiser at one extreme: what comes of it, and which requirements it breaks."""
+"""One denoiser in one stress case: what comes of it, and which requirements it breaks."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.bench.race import network_of
-from eval.stress.cases import PERIOD, RECOVERY_LIMIT, SPOILED, Extreme, Pixel, unchanged
+from eval.spec import PRECISIONS
+from eval.stress.cases import RECOVERY_LIMIT, SPOILED_FRAME, StressCase
+from eval.stress.changes import FrameChange, PixelChange, unchanged
+from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
+from eval.stress.lit_frames import NOISE_PERIOD
+from eval.stress.logits import largest_logits
+from eval.stress.outcome import StressOutcome
 from models.denoiser import Denoiser
-from models.operators import finite
 
-CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")  # filters whose output is a mean of irradiance that they have seen
-ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 FORGOTTEN = 1e-3  # of the brightest pixel: what changes none by more has no effect any more
 ROUNDINGS = 10  # of half precision are no effect either: networks amplify them, RAE by its power of 5 alone
-ORDINARY = (0.0, 1.0)  # values that a pixel may well have: they tell which others see it
-SMALLEST = 1e-30
+ORDINARY_VALUES = (0.0, 1.0)  # that a pixel may well have: they tell which others see it
+BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
 REQUIREMENTS = {
     "finite": "what comes of finite pixels is finite",
     "range": f"{', '.join(CONVEX)} stay within the irradiance seen since the last reset; no other goes below 0",
@@ -30,172 +30,100 @@ REQUIREMENTS = {
 }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a denoiser at an extreme.
-
-    Attributes:
-        error: the largest, over the brightest pixel of what the answer is held to, absolute where that is black; None
-            where no pixel is finite.
-        nonfinite: output pixels, of all frames.
-        violation: how far the output leaves its range, over the range's end (convex filters), or below 0 (others).
-        recovery: frames until a bad pixel is forgotten, 0 where nothing shows it; None where that never happens, and
-            at extremes without one.
-        broken: the requirements that are not kept, of REQUIREMENTS.
-    """
-
-    error: float | None
-    nonfinite: int
-    violation: float
-    recovery: int | None
-    broken: tuple[str, ...]
-
-
-def heads(denoiser: Denoiser) -> list[nn.Module]:
-    """The last layers of a kernel predictor, whose outputs are its logits; none of other denoisers."""
-    network = network_of(denoiser)
-    if isinstance(network, nn.Sequential):
-        return [network[-1]]
-    return list(getattr(network, "heads", ()))
-
-
-@contextmanager
-def largest_logits(denoiser: Denoiser, size: float | None) -> Iterator[None]:
-    """Scale the logits so that the largest of each frame is `size`, unless that is None."""
-
-    def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
-        logits = output.float()  # the factor may overflow half precision
-        return (logits * ((size or 1) / logits.abs().max().clamp(min=SMALLEST))).to(output.dtype)
-
-    hooks = [layer.register_forward_hook(scale) for layer in heads(denoiser)] if size else []
-    try:
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()
-
-
-def play(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
+def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
     """Radiance (3, H, W) of every frame of a sequence."""
-    outputs, state = [], None
+    outputs = []
+    state = None
     for frame in tqdm(frames, "frames", leave=False, delay=2):
         output, state = denoiser(frame, state)
         outputs.append(output[0])
     return outputs
 
 
-class Range:
-    """The irradiance that a convex filter has seen since it began: what it must stay within, for each colour.
-
-    SVGF filters direct and indirect light by themselves, so that its limits are sums of two.
-    """
-
-    def __init__(self, name: str):
-        self.split = name == "svgf"
-        self.low, self.high = torch.tensor(torch.inf), torch.tensor(-torch.inf)
-
-    def see(self, frame: Frame) -> None:
-        parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
-        seen = torch.cat(parts if self.split else [frame.irradiance("total")]).double()
-        self.low, self.high = torch.minimum(self.low, seen.amin((2, 3))), torch.maximum(self.high, seen.amax((2, 3)))
-
-    def violation(self, frame: Frame, output: Tensor) -> float:
-        """How far radiance `output` (3, H, W) is outside, relative to the limit; at most 0 inside."""
-        irradiance = finite((output - frame.emission).double() / frame.divisor)[0].flatten(1)
-        low, high = self.low.sum(dim=0), self.high.sum(dim=0)
-        above = (irradiance.amax(dim=1) - high) / high.clamp(min=SMALLEST)
-        below = (low - irradiance.amin(dim=1)) / low.clamp(min=SMALLEST)
-        return float(torch.maximum(above, below).max())
-
-
-def range_violation(name: str, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
-    """The largest of a sequence, see Outcome; 0 where there is none. What is not finite counts as 0 on both sides."""
-    if name not in CONVEX:
-        return max(0.0, *(-float(finite(output).min()) for output in outputs))
-    largest, seen = 0.0, Range(name)
-    for frame, output in zip(frames, outputs, strict=True):
-        seen.see(frame.finite())
-        largest = max(largest, seen.violation(frame.finite(), output))
-    return largest
-
-
-def finite_pixels(frame: Frame, names: Iterable[str]) -> Tensor:
+def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
     """Where all the named channels are finite, (H, W)."""
-    return torch.stack([torch.isfinite(frame.channels[name]).all(dim=1)[0] for name in names]).all(dim=0)
+    return torch.stack([torch.isfinite(frame.channels[name]).all(dim=1)[0] for name in channels]).all(dim=0)
 
 
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
     """Absolute differences (3, H, W), each over the brightest pixel of the frame expected, unless that is black."""
     pairs = zip(outputs, expected, strict=True)
-    return [(a - b).abs() / (float(b.max()) if b.max() > SMALLEST else 1) for a, b in pairs]
-
-
-def forgotten(precision: torch.dtype) -> float:
-    """The largest change, over the brightest pixel, that counts as none."""
-    return max(FORGOTTEN, ROUNDINGS * torch.finfo(precision).eps)
+    return [(a - b).abs() / (float(b.max()) if b.max() > BLACK_BELOW else 1) for a, b in pairs]
 
 
 def largest_finite(errors: Iterable[Tensor]) -> float | None:
+    """The largest of all values that are finite; None where none is."""
     found = [error[torch.isfinite(error)] for error in errors]
     return max((float(error.max()) for error in found if len(error)), default=None)
 
 
-class Trial:
-    """The way of the denoiser called `name` through an extreme.
+def forgotten_below(precision: str) -> float:
+    """The largest change, over the brightest pixel, that counts as none in a precision, a key of PRECISIONS."""
+    return max(FORGOTTEN, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
 
-    `build` makes it in a given precision, always with the same weights; it must take the extreme's.
+
+class StressCheck:
+    """The way of the denoiser called `name` through a stress case.
+
+    `build` makes it in a given precision, a key of PRECISIONS, always with the same weights. It must compute in the
+    case's.
     """
 
-    def __init__(self, name: str, build: Callable[[torch.dtype], Denoiser], extreme: Extreme):
-        self.name, self.build, self.extreme = name, build, extreme
-        self.denoiser = build(extreme.precision)
-        self.frames = list(extreme.frames())
-        with largest_logits(self.denoiser, extreme.logits):
-            self.outputs = play(self.denoiser, self.frames)
+    def __init__(self, name: str, build: Callable[[str], Denoiser], case: StressCase):
+        self.name = name
+        self.build = build
+        self.case = case
+        self.denoiser = build(case.precision)
+        self.frames = list(case.frames())
+        with largest_logits(self.denoiser, case.logits):
+            self.outputs = denoise(self.denoiser, self.frames)
 
     def errors(self) -> list[Tensor]:
-        """Differences (3, H, W) from what the extreme holds the answer to, of the frames of which that is known."""
-        if self.extreme.held_to == "truth":
-            even = self.frames[: self.extreme.even]
+        """Differences (3, H, W) from what the case compares with, of the frames of which that is known."""
+        if self.case.compare_with == "truth":
+            even = self.frames[: self.case.even_frames]
             return differences(self.outputs[: len(even)], [frame.radiance(self.denoiser.signal)[0] for frame in even])
-        if self.extreme.held_to == "past":
-            return differences(self.outputs[-PERIOD:], self.outputs[PERIOD : 2 * PERIOD])
-        other = self.denoiser if self.extreme.held_to == "own" else self.build(torch.float32)
-        expected = play(other, self.extreme.frames(unchanged))
-        return differences(self.outputs, [self.extreme.gain * output for output in expected])
+        if self.case.compare_with == "past":
+            return differences(self.outputs[-NOISE_PERIOD:], self.outputs[NOISE_PERIOD : 2 * NOISE_PERIOD])
+        other = self.denoiser if self.case.compare_with == "own" else self.build("float32")
+        expected = denoise(other, self.case.frames(unchanged))
+        return differences(self.outputs, [self.case.gain * output for output in expected])
 
-    def spreads(self, pixel: Pixel) -> bool:
+    def spreads(self, pixel: PixelChange) -> bool:
         """Whether the spoiled frame differs where no ordinary value of the pixel changes anything."""
 
-        def spoiled_frame(change: Callable[[Frame], Frame]) -> Tensor:
-            return play(self.denoiser, list(self.extreme.frames(change))[: SPOILED + 1])[-1]
+        def spoiled_output(change: FrameChange) -> Tensor:
+            return denoise(self.denoiser, list(self.case.frames(change))[: SPOILED_FRAME + 1])[-1]
 
-        clean = spoiled_frame(unchanged)
-        seen = [(spoiled_frame(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY]
-        changed = (self.outputs[SPOILED] != clean).any(dim=0)  # NaN is a change, too
+        clean = spoiled_output(unchanged)
+        seen = [(spoiled_output(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY_VALUES]
+        changed = (self.outputs[SPOILED_FRAME] != clean).any(dim=0)  # NaN is a change, too
         return bool((changed & ~torch.stack(seen).any(dim=0)).any())
 
-    def recovery(self, changed: Sequence[Tensor]) -> int | None:
-        """Frames after the spoiled one until nothing is `changed` (H, W) any more; None if that is not reached."""
-        frames = max((index + 1 - SPOILED for index, where in enumerate(changed) if where.any()), default=0)
+    def recovery(self, errors: Sequence[Tensor]) -> int | None:
+        """Frames from the spoiled one until nothing shows it any more; None if that is not reached."""
+        limit = forgotten_below(self.case.precision)
+        changed = [index for index, error in enumerate(errors) if not (error <= limit).all()]  # NaN is a change, too
+        frames = changed[-1] + 1 - SPOILED_FRAME if changed else 0
         return frames if frames <= RECOVERY_LIMIT else None
 
-    def outcome(self) -> Outcome:
-        errors, recovery = self.errors(), None
+    def outcome(self) -> StressOutcome:
+        errors = self.errors()
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
         good_input = [finite_pixels(frame, self.denoiser.reads) for frame in self.frames]
         violation = range_violation(self.name, self.frames, self.outputs)
+        recovery = self.recovery(errors) if self.case.only is not None else None
+        poison = self.case.poison
         broken = {
             "finite": any((a & b).any() for a, b in zip(bad, good_input, strict=True)),
             "range": violation > (ROUNDING if self.name in CONVEX else 0),
+            "spread": poison is not None and self.spreads(poison),
+            "recovery": poison is not None and recovery is None,
         }
-        if self.extreme.only is not None:
-            limit = forgotten(self.extreme.precision)
-            changed = [~(error <= limit).all(dim=0) for error in errors]  # NaN is a change, too
-            recovery = self.recovery(changed)
-            if poison := self.extreme.poison:
-                broken["spread"] = self.spreads(poison)
-                broken["recovery"] = recovery is None
-        nonfinite = sum(int(where.sum()) for where in bad)
-        missed = tuple(name for name in REQUIREMENTS if broken.get(name))
-        return Outcome(largest_finite(errors), nonfinite, violation, recovery, missed)
+        return StressOutcome(
+            error=largest_finite(errors),
+            nonfinite=sum(int(where.sum()) for where in bad),
+            violation=violation,
+            recovery=recovery,
+            broken=tuple(name for name in REQUIREMENTS if broken[name]),
+        )

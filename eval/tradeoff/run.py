@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from datasets.clip import Dataset
+from eval.bench.sample_cost import RENDERER
 from eval.bench.sizes import parse_size
 from eval.harness import clips_of_one_spp, entrant, evaluate_clip
 from eval.results import by_clip
@@ -12,7 +13,6 @@ from eval.selection import with_indirect_baselines
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import TRADED, Trade, front_table, trades
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.sample_cost import RENDERER
 from eval.tradeoff.samples import (
     SPP_LEVELS,
     SampleTrades,

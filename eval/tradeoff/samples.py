@@ -12,6 +12,7 @@ from tqdm import tqdm
 from datasets.clip import Clip, Dataset
 from datasets.frame import Signal
 from errors import BadInput
+from eval.bench.sample_cost import Cost, sample_cost
 from eval.harness import entrant, evaluate_clip
 from eval.means import scores_of
 from eval.metrics import METRICS, Values
@@ -21,7 +22,6 @@ from eval.spec import DenoiserSpec, precision_in_use
 from eval.text_table import value_cell
 from eval.tradeoff.pareto import Offer, beaten_by
 from eval.tradeoff.resampled_clips import Source, scene_of, source, with_samples
-from eval.tradeoff.sample_cost import Cost, sample_cost
 from eval.tradeoff.times import Times
 from render.clip import Options
 

@@ -2,8 +2,9 @@
 
 import inspect
 import json
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -11,24 +12,33 @@ import torch
 from torch import nn
 
 import onespp
-from datasets.clip import Dataset
+from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
 from datasets.sequences import REFERENCES
 from errors import BadInput
-from eval.ablation import definitions, run
-from eval.ablation.definitions import ABLATIONS, Finding, TexturedRAE, ablation_for
-from eval.ablation.run import ablate, clips_to_judge, epoch_losses, meshes_move
-from eval.ablation.summary import Run, cell, draw, report, verdict
-from models.fusion import WINDOWS
+from eval.ablation.definitions import ABLATIONS, AblationVariant, Finding, ablation_for
+from eval.ablation.plots import ablation_figure
+from eval.ablation.run import ablate, clips_to_judge, epoch_losses, fusion_ms, meshes_move, trained
+from eval.ablation.summary import ablation_table, finding_verdict, seed_mean_text
+from eval.ablation.textured_rae import TexturedRAE
+from eval.ablation.variant_run import VariantRun
 from models.ntd import NTD
+from models.parameters import WINDOWS
 from models.rae import RAE
-from models.weights import load_weights
 from models.wskp import WSKP
 from plotting import plt
-from train import loop
-from train.loop import Training
-from train.losses import RAELoss, loss_for
-from train.recipes import PAPER, RAETerms, recipe_for
+from timing import thread_count
+from train import training
+from train.losses.rae import RAELoss, RAETerms
+from train.recipe import Recipe
+from train.recipes import recipe_for
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """On images this small further threads only wait."""
+    with thread_count(1):
+        yield
 
 
 def frames_of(tiny, reads, count: int = 2) -> list[Frame]:
@@ -36,14 +46,14 @@ def frames_of(tiny, reads, count: int = 2) -> list[Frame]:
     return [read_frame(clip, index, reads) for index in range(count)]
 
 
-def made_up(what: str, value, seeds: int = 2) -> list[Run]:
+def made_up(what: str, value, seeds: int = 2) -> list[VariantRun]:
     """Runs of all variants whose metrics are value(index of the variant, seed)."""
     runs = []
     for index, variant in enumerate(ablation_for(what).variants):
         for seed in range(seeds):
             x = value(index, seed)
             clips = {"scene/0": dict.fromkeys(("psnr", "ssim", "rmse", "temporal_error", "disocclusion_l1"), x)}
-            runs.append(Run(variant.label, seed, 7, [None, x], clips, x))
+            runs.append(VariantRun(variant.label, seed, 7, [None, x], clips, x))
     return runs
 
 
@@ -72,12 +82,14 @@ def test_every_ablation_can_be_trained_and_run(tiny, what):
     assert len(set(labels)) == len(labels)
     assert {label for finding in chosen.findings for pair in finding.pairs for label in pair} <= set(labels)
     for variant in chosen.variants:
-        recipe, whole = variant.recipe("quick"), recipe_for(variant.base, "quick")
+        recipe = variant.recipe("quick")
+        whole = recipe_for(variant.base, "quick")
         assert recipe == replace(whole, epochs=whole.epochs // 4, loss=recipe.loss)
         torch.manual_seed(0)
-        denoiser, state = variant.create(), None
-        assert loss_for(denoiser, recipe).terms == recipe.loss
+        denoiser = variant.create()
+        assert recipe.loss.around(denoiser).terms == recipe.loss
         denoiser.prepare()
+        state = None
         for frame in frames_of(tiny, denoiser.reads):
             output, state = denoiser(frame, state)
             assert torch.isfinite(output).all() and (output >= 0).all()
@@ -94,7 +106,8 @@ def test_inputs_of_rae_are_added_one_by_one():
 def test_the_default_rae_is_as_it_was(tiny):
     """Channels in the order that trained weights know; fewer are the same network with the others' weights at zero."""
     torch.manual_seed(0)
-    frame, whole = frames_of(tiny, RAE.reads, 1)[0], RAE()
+    (frame,) = frames_of(tiny, RAE.reads, 1)
+    whole = RAE()
     seen = []
     whole.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     _, state = whole.predict(frame, None)
@@ -119,7 +132,7 @@ def as_plain(textured: TexturedRAE) -> RAE:
 
 
 def test_textured_rae_denoises_radiance(tiny):
-    frame = frames_of(tiny, (*RAE.reads, *REFERENCES), 1)[0]
+    (frame,) = frames_of(tiny, (*RAE.reads, *REFERENCES), 1)
     textured = TexturedRAE(())
     textured.prepare()
     reference = (frame.direct_reference + frame.indirect_reference).mean(dim=1)
@@ -133,8 +146,8 @@ def test_textured_rae_denoises_radiance(tiny):
 def test_terms_of_raes_loss_are_added_one_by_one():
     terms = [variant.recipe("quick").loss for variant in ablation_for("rae-loss").variants]
     assert [(t.spatial, t.gradient, t.temporal) for t in terms] == [(0.8, 0, 0), (0.8, 0.1, 0), (0.8, 0.1, 0.1)]
-    assert isinstance(loss_for(RAE(), ablation_for("rae-loss").variants[0].recipe("quick")), RAELoss)
-    assert terms[2] == PAPER["rae"].loss == RAETerms()
+    assert isinstance(ablation_for("rae-loss").variants[0].recipe("quick").loss.around(RAE()), RAELoss)
+    assert terms[2] == recipe_for("rae", "paper").loss == RAETerms()
 
 
 def test_windows_stand_alone_and_together():
@@ -168,7 +181,12 @@ def test_ntd_differs_in_vectors_and_loss():
 # --- What comes out ---------------------------------------------------------------------------------------------------
 
 
-def test_ntd_is_judged_where_meshes_move(tiny, monkeypatch):
+class WithoutMotion(Dataset):
+    def clips(self, split: str) -> list[Clip]:
+        return [clip for clip in super().clips(split) if not meshes_move(clip)]
+
+
+def test_ntd_is_judged_where_meshes_move(tiny):
     dataset = Dataset(tiny)
     assert {clip.scene: meshes_move(clip) for clip in dataset.clips("test")} == {
         "cornell_box": False,
@@ -176,9 +194,8 @@ def test_ntd_is_judged_where_meshes_move(tiny, monkeypatch):
     }
     assert [clip.scene for clip in clips_to_judge(dataset, ablation_for("ntd"))] == ["cornell_box_moving"]
     assert len(clips_to_judge(dataset, ablation_for("rae-loss"))) == 2
-    monkeypatch.setattr(run, "meshes_move", lambda clip: False)
     with pytest.raises(BadInput, match="nothing moves in the test clips of"):
-        clips_to_judge(dataset, ablation_for("ntd"))
+        clips_to_judge(WithoutMotion(tiny), ablation_for("ntd"))
 
 
 def test_losses_are_means_of_epochs(tmp_path):
@@ -190,53 +207,73 @@ def test_losses_are_means_of_epochs(tmp_path):
 def test_findings_are_held_to_the_means_over_seeds():
     finding = Finding("B beats A", "psnr", (("wskp6", "wskp6-plain"),))
     runs = made_up("wskp-repvgg", lambda index, seed: 10.0 + index + 4 * seed * (index == 0))
-    assert cell(runs, "wskp6-plain", "psnr") == "12.00 ± 2.83"
+    assert seed_mean_text(runs, "wskp6-plain", "psnr") == "12.00 ± 2.83"
     wrong = "does not hold in 1 of 1: wskp6 11.00 ± 0.00 is no better than wskp6-plain 12.00 ± 2.83"
-    assert verdict(finding, runs) == f"{wrong} (seed by seed: in 1 of 2)"
-    assert verdict(finding, [run for run in runs if run.seed == 0]) == "holds"
-    assert verdict(replace(finding, metric="rmse"), runs) == "holds (seed by seed: in 1 of 2)"
+    assert finding_verdict(finding, runs) == f"{wrong} (seed by seed: in 1 of 2)"
+    assert finding_verdict(finding, [run for run in runs if run.seed == 0]) == "holds"
+    assert finding_verdict(replace(finding, metric="rmse"), runs) == "holds (seed by seed: in 1 of 2)"
     undefined = made_up("wskp-repvgg", lambda index, seed: None)
-    assert verdict(finding, undefined) == "not defined on these clips" and cell(undefined, "kp", "psnr") == "-"
+    assert (
+        finding_verdict(finding, undefined) == "not defined on these clips"
+        and seed_mean_text(undefined, "kp", "psnr") == "-"
+    )
 
 
 @pytest.mark.parametrize("what", ABLATIONS)
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_every_ablation_has_a_table_and_a_plot(what, seeds):
-    chosen, runs = ablation_for(what), made_up(what, lambda index, seed: 1.0 + index + seed / 8, seeds)
-    figure = draw(chosen, runs, "title")
+    ablation = ablation_for(what)
+    runs = made_up(what, lambda index, seed: 1.0 + index + seed / 8, seeds)
+    figure = ablation_figure(ablation, runs, "title")
     figure.canvas.draw()
     plt.close(figure)
-    text = report(chosen, runs, "github")
-    assert all(variant.label in text and variant.paper in text for variant in chosen.variants)
-    assert all(finding.text in text for finding in chosen.findings)
+    text = ablation_table(ablation, runs, "github")
+    assert all(variant.label in text and variant.paper in text for variant in ablation.variants)
+    assert all(finding.text in text for finding in ablation.findings)
 
 
-def small_recipe(name: str, profile: str):
-    return replace(recipe_for(name, profile), crops=(1, 1), epochs=4)
+def test_the_fusion_of_all_is_timed(tiny):
+    variants = ablation_for("wskp-repvgg").variants
+    torch.manual_seed(0)
+    denoisers = {variant.label: variant.create() for variant in variants}
+    for denoiser in denoisers.values():
+        denoiser.prepare()
+    times = fusion_ms(denoisers, Dataset(tiny).clips("test")[0], measured=1, warm_up=0)
+    assert times.keys() == denoisers.keys() and all(ms > 0 for ms in times.values())
+
+
+class SmallVariant(AblationVariant):
+    """Trained in one step on one crop of each frame."""
+
+    def recipe(self, budget: str) -> Recipe:
+        return replace(super().recipe(budget), crops=(1, 1), batch=64)
+
+
+def modified(folder: Path) -> dict[str, int]:
+    """When what a training writes was last written, by file."""
+    names = ("checkpoint.pt", "metrics.csv", "weights.safetensors")
+    return {str(path): path.stat().st_mtime_ns for name in names for path in sorted(folder.glob(f"*/{name}"))}
 
 
 def test_an_ablation_from_training_to_plot(tiny, tmp_path, monkeypatch):
     """A second call trains nothing, another seed only what is new, and all in one precision."""
-    small = replace(ablation_for("wskp-repvgg"), metrics=("psnr", "fusion_ms"))
+    whole = ablation_for("wskp-repvgg")
     small = replace(
-        small, variants=small.variants[:2], findings=(Finding("it helps", "psnr", (("wskp6", "wskp6-plain"),)),)
+        whole,
+        variants=tuple(SmallVariant(**vars(variant)) for variant in whole.variants[:2]),
+        metrics=("psnr", "fusion_ms"),
+        findings=(Finding("it helps", "psnr", (("wskp6", "wskp6-plain"),)),),
     )
     monkeypatch.setitem(ABLATIONS, "wskp-repvgg", lambda: small)
-    monkeypatch.setattr(definitions, "recipe_for", small_recipe)
     measured: list[str] = []
-    monkeypatch.setattr(loop, "fastest_precision", lambda *_: measured.append("once") or "32-true")
-    trained: list[str] = []
-    genuine = Training.step
-
-    def step(self, batch):
-        trained.append(self.task.folder.name)
-        return genuine(self, batch)
-
-    monkeypatch.setattr(Training, "step", step)
-    text = ablate("wskp-repvgg", tiny, tmp_path, "tiny")
+    monkeypatch.setattr(training, "fastest_precision", lambda *_: measured.append("once") or "float32")
     folder = tmp_path / "ablation" / "wskp-repvgg"
-    assert set(trained) == {"wskp6-plain-0", "wskp6-0"} and measured == ["once"]
-    assert "profile tiny, 1 epochs (25% of its own), seeds: 1" in text and "34.600 / 0.9830" in text
+
+    text = ablate("wskp-repvgg", tiny, tmp_path, "tiny")
+    first = modified(folder)
+    assert {Path(path).parent.name for path in first} == {"wskp6-plain-0", "wskp6-0"} and len(first) == 6
+    assert measured == ["once"]
+    assert "budget tiny, 1 epochs (25% of its own), seeds: 1" in text and "34.600 / 0.9830" in text
     assert (folder / "plot.png").read_bytes().startswith(b"\x89PNG") and "| wskp6 " in (folder / "table.md").read_text()
     assert (tmp_path / "accumulated").is_dir()
     content = json.loads((folder / "results.json").read_text())
@@ -245,15 +282,16 @@ def test_an_ablation_from_training_to_plot(tiny, tmp_path, monkeypatch):
         ("wskp6", 0, 1),
     ]
     assert all(row["fusion_ms"] > 0 and len(row["clips"]) == 2 for row in content["rows"])
-    load_weights(partial(WSKP, sizes=(5,))(), "wskp6-plain", folder / "wskp6-plain-0" / "weights.safetensors")
+    trained(small.variants[0], folder / "wskp6-plain-0" / "weights.safetensors")
 
-    trained.clear()
-    monkeypatch.setattr(run, "fusion_ms", lambda *_: {"wskp6": 1.0, "wskp6-plain": 1.0})
     ablate("wskp-repvgg", tiny, tmp_path, "tiny")
     again = json.loads((folder / "results.json").read_text())
-    assert not trained and [row["clips"] for row in again["rows"]] == [row["clips"] for row in content["rows"]]
+    assert modified(folder) == first
+    assert [row["clips"] for row in again["rows"]] == [row["clips"] for row in content["rows"]]
     assert "±" in ablate("wskp-repvgg", tiny, tmp_path, "tiny", seeds=2)
-    assert set(trained) == {"wskp6-plain-1", "wskp6-1"} and measured == ["once"]
+    second = modified(folder)
+    assert {Path(path).parent.name for path in second.keys() - first.keys()} == {"wskp6-plain-1", "wskp6-1"}
+    assert second.items() >= first.items() and measured == ["once"]
 
 
 def test_plain_is_without_identity():

@@ -1,12 +1,15 @@
 """What was transcribed agrees with what the papers say of it; orders are judged right; what is missing says so."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from eval.ablation.summary import Run
-from eval.papers.compare import against_papers, is_better, measured, orders, verdict
+from eval.ablation.variant_run import VariantRun
+from eval.metrics import Values
+from eval.papers.compare import against_papers, is_better, order_verdict, orders
+from eval.papers.measurements import measurements
 from eval.papers.tables import (
     NTD_TABLE_2,
     RAE_FIG_8,
@@ -59,39 +62,41 @@ def test_both_papers_ran_the_same_filters_on_the_same_scenes():
     shared = [s for s in SVGF_TABLE_1.scenes if s in RAE_FIG_8.scenes]
     assert shared == ["Sponza", "GlossySponza", "SanMiguel", "Classroom"]
     for scene in shared:
-        here, there = RAE_FIG_8.scenes.index(scene), SVGF_TABLE_1.scenes.index(scene)
+        in_rae = RAE_FIG_8.scenes.index(scene)
+        in_svgf = SVGF_TABLE_1.scenes.index(scene)
         for name in ("EAW", "SBF"):
             for metric in ("rmse", "ssim"):
-                a, b = RAE_FIG_8.values[name][metric][here], SVGF_TABLE_1.values[f"{name} alone"][metric][there]
-                assert a == pytest.approx(b, abs=0.005)
+                printed = SVGF_TABLE_1.values[f"{name} alone"][metric][in_svgf]
+                assert RAE_FIG_8.values[name][metric][in_rae] == pytest.approx(printed, abs=0.005)
 
 
 def test_wskp_averages_are_those_it_prints():
     """All but NBGD's PSNR, which the paper has wrong."""
-    for table, metric, digits in ((WSKP_TABLE_1, "psnr", 0.001), (WSKP_TABLE_2, "ssim", 0.001)):
+    for table, metric in ((WSKP_TABLE_1, "psnr"), (WSKP_TABLE_2, "ssim")):
         for method, printed in zip(table.values, WSKP_AVERAGES[metric], strict=True):
             if (method, metric) == ("NBGD", "psnr"):
                 assert table.mean(method, metric) == pytest.approx(29.301, abs=0.001)
             else:
-                assert table.mean(method, metric) == pytest.approx(printed, abs=digits)
+                assert table.mean(method, metric) == pytest.approx(printed, abs=0.001)
 
 
 def test_wskp_tables_agree_with_each_other_and_with_the_text():
     for scene in ("Living room", "Sponza"):
-        there, here = WSKP_TABLE_1.scenes.index(scene), WSKP_TABLE_5.scenes.index(scene)
-        for a, b in (("Ours (6-layer)", "Ours w/ RepVGG"), ("KP", "KP w/ RepVGG")):
-            assert WSKP_TABLE_1.values[a]["psnr"][there] == WSKP_TABLE_5.values[b]["psnr"][here]
-            assert WSKP_TABLE_2.values[a]["ssim"][there] == pytest.approx(
-                WSKP_TABLE_5.values[b]["ssim"][here],
-                abs=0.0011,  # KP's of Sponza is 0.982 in one and 0.9830 in the other
-            )
+        of_six = WSKP_TABLE_1.scenes.index(scene)
+        of_two = WSKP_TABLE_5.scenes.index(scene)
+        for method, with_repvgg in (("Ours (6-layer)", "Ours w/ RepVGG"), ("KP", "KP w/ RepVGG")):
+            scores = WSKP_TABLE_5.values[with_repvgg]
+            assert WSKP_TABLE_1.values[method]["psnr"][of_six] == scores["psnr"][of_two]
+            ssim = WSKP_TABLE_2.values[method]["ssim"][of_six]
+            # KP's of Sponza is 0.982 in one and 0.9830 in the other.
+            assert ssim == pytest.approx(scores["ssim"][of_two], abs=0.0011)
     for method, times in WSKP_TABLE_3.values.items():
         if "prediction" in times:
             parts = times["prediction"][0] + times["reconstruction"][0]
             assert times["ms"][0] == pytest.approx(parts + (0.41 if method == "KP" else 0), abs=0.005)
-    gains = [
-        b - a for a, b in zip(*(WSKP_TABLE_5.values[f"Ours {w} RepVGG"]["psnr"] for w in ("w/o", "w/")), strict=True)
-    ]
+    without = WSKP_TABLE_5.values["Ours w/o RepVGG"]["psnr"]
+    with_blocks = WSKP_TABLE_5.values["Ours w/ RepVGG"]["psnr"]
+    gains = [better - worse for better, worse in zip(with_blocks, without, strict=True)]
     assert all(0.5 < gain < 0.7 for gain in gains)  # "about 0.5 dB"
     assert WSKP_TABLE_3.mean("KP", "ms") > 2 * WSKP_TABLE_3.mean("Ours 6-layer", "ms")  # "roughly 2-times faster"
 
@@ -113,68 +118,73 @@ def test_orders_are_those_of_most_scenes():
     }
 
 
-def evaluated(runs, floors=None, clips=("000", "001"), **metrics) -> None:
-    """Results as `onespp eval` leaves them, a value a clip."""
+def write_evaluation(runs: Path, floors: Values | None = None, clips=("000", "001"), **metrics: list[Values]) -> None:
+    """Results as `onespp eval` leaves them, a value a clip: of indirect light for ntd, of all light for others."""
+    reference = {"mse_unbiased": 0.0} | (floors or {})
     results = []
-    for name, values in ({REFERENCE: [{"mse_unbiased": 0.0} | (floors or {})] * len(clips)} | metrics).items():
-        for clip, value in zip(clips, values, strict=False):
-            for signal in ("total", "indirect") if name == REFERENCE else ("indirect" if name == "ntd" else "total",):
-                results.append(Result("", name, signal, "box", clip, value, []))
-                folder_of(runs, "box", clip, name, signal).mkdir(parents=True, exist_ok=True)
-                results[-1].save(runs)
+    for signal in ("total", "indirect"):
+        results += [Result("", REFERENCE, signal, "box", clip, reference, []) for clip in clips]
+    for name, values in metrics.items():
+        signal = "indirect" if name == "ntd" else "total"
+        results += [Result("", name, signal, "box", clip, value, []) for clip, value in zip(clips, values, strict=True)]
+    for result in results:
+        folder_of(runs, result.scene, result.clip, result.denoiser, result.signal).mkdir(parents=True, exist_ok=True)
+        result.save(runs)
     write_results(runs, Path("data"), "cpu", results, dict.fromkeys(metrics))
 
 
 def test_verdicts(tmp_path):
-    evaluated(
+    write_evaluation(
         tmp_path,
         rae=[{"rmse": 0.1, "ssim": 0.5}, {"rmse": 0.3, "ssim": None}],
         eaw=[{"rmse": 0.1, "ssim": 0.6}, {"rmse": 0.4, "ssim": 0.6}],
     )
-    here = measured(RAE_FIG_8, tmp_path)
+    here = measurements(RAE_FIG_8, tmp_path)
     value = here.value
     assert value("rae", "rmse") == pytest.approx(0.2) and value("rae", "ssim") == 0.5  # where it is defined
     rmse, ssim = orders(RAE_FIG_8)
-    assert "rae before eaw (there in 5 of 5): holds, 0.2000 against 0.2500" in verdict(RAE_FIG_8, rmse, here)
-    assert "DOES NOT HOLD, 0.5000 against 0.6000" in verdict(RAE_FIG_8, ssim, here)
+    assert "rae before eaw (there in 5 of 5): holds, 0.2000 against 0.2500" in order_verdict(RAE_FIG_8, rmse, here)
+    assert "DOES NOT HOLD, 0.5000 against 0.6000" in order_verdict(RAE_FIG_8, ssim, here)
     order = orders(SVGF_TABLE_1)[0]
-    assert verdict(SVGF_TABLE_1, order, measured(SVGF_TABLE_1, tmp_path / "other")).endswith("not measured")
+    assert order_verdict(SVGF_TABLE_1, order, measurements(SVGF_TABLE_1, tmp_path / "other")).endswith("not measured")
 
 
 def test_orders_within_the_noise_floor_are_none(tmp_path):
     both = {"rae": [{"rmse": 0.1, "ssim": 0.5}], "eaw": [{"rmse": 0.09, "ssim": 0.9}]}
-    evaluated(tmp_path, {"rmse": 0.08, "ssim": 0.2}, ("000",), **both)
-    here = measured(RAE_FIG_8, tmp_path)
-    assert all("both within the noise floor" in verdict(RAE_FIG_8, order, here) for order in orders(RAE_FIG_8))
+    write_evaluation(tmp_path, {"rmse": 0.08, "ssim": 0.2}, ("000",), **both)
+    here = measurements(RAE_FIG_8, tmp_path)
+    assert all("both within the noise floor" in order_verdict(RAE_FIG_8, order, here) for order in orders(RAE_FIG_8))
     assert "≈0.1000" in against_papers(tmp_path)
-    evaluated(tmp_path, {"rmse": 0.065, "ssim": 0.2}, ("000",), **both)
-    assert "DOES NOT HOLD" in verdict(RAE_FIG_8, orders(RAE_FIG_8)[0], measured(RAE_FIG_8, tmp_path))  # one is not
+    write_evaluation(tmp_path, {"rmse": 0.065, "ssim": 0.2}, ("000",), **both)
+    assert "DOES NOT HOLD" in order_verdict(
+        RAE_FIG_8, orders(RAE_FIG_8)[0], measurements(RAE_FIG_8, tmp_path)
+    )  # one is not
 
 
 def test_only_clips_of_one_sample_a_pixel_count(tmp_path):
-    evaluated(tmp_path, clips=("000", "000-4spp"), rae=[{"rmse": 0.3, "ssim": 0.5}, {"rmse": 0.1, "ssim": 0.9}])
-    assert measured(RAE_FIG_8, tmp_path).value("rae", "rmse") == 0.3
+    write_evaluation(tmp_path, clips=("000", "000-4spp"), rae=[{"rmse": 0.3, "ssim": 0.5}, {"rmse": 0.1, "ssim": 0.9}])
+    assert measurements(RAE_FIG_8, tmp_path).value("rae", "rmse") == 0.3
 
 
 def test_all_sources_are_read(tmp_path):
-    evaluated(
+    write_evaluation(
         tmp_path,
         clips=("000",),
         ntd=[{"ssim": 0.9, "l1": 0.02, "mse": 0.001, "psnr": 30.0}],
         svgf=[{"ssim": 0.1, "l1": 1.0, "mse": 1.0}],
     )
-    assert measured(NTD_TABLE_2, tmp_path).value("ntd", "ssim") == 0.9
-    assert measured(NTD_TABLE_2, tmp_path).value("svgf", "ssim") is None  # that was of total light
+    assert measurements(NTD_TABLE_2, tmp_path).value("ntd", "ssim") == 0.9
+    assert measurements(NTD_TABLE_2, tmp_path).value("svgf", "ssim") is None  # that was of total light
     (tmp_path / "bench").mkdir()
     row = {"denoiser": "wskp3", "height": 720, "width": 1280, "ms_median": 30.0, "prediction": 0.9}
     rows = [row, row | {"ms_median": 20.0, "prediction": 0.25}, row | {"height": 1080, "width": 1920, "ms_median": 1.0}]
     write_json(tmp_path / "bench" / "results.json", {"rows": rows})
-    times = [measured(WSKP_TABLE_3, tmp_path).value("wskp3", m) for m in ("ms", "prediction", "reconstruction")]
+    times = [measurements(WSKP_TABLE_3, tmp_path).value("wskp3", m) for m in ("ms", "prediction", "reconstruction")]
     assert times == [20.0, 5.0, 15.0]  # of the fastest at that size
     (tmp_path / "ablation" / "wskp-repvgg").mkdir(parents=True)
-    runs = [vars(Run("kp", seed, 7, [None], {"a": {"psnr": 30.0 + seed, "ssim": 0.9}})) for seed in range(2)]
+    runs = [asdict(VariantRun("kp", seed, 7, [None], {"a": {"psnr": 30.0 + seed, "ssim": 0.9}})) for seed in range(2)]
     write_json(tmp_path / "ablation" / "wskp-repvgg" / "results.json", {"rows": runs})
-    assert measured(WSKP_TABLE_5, tmp_path).value("kp", "psnr") == 30.5
+    assert measurements(WSKP_TABLE_5, tmp_path).value("kp", "psnr") == 30.5
 
 
 def test_what_is_missing_comes_with_its_command(tmp_path):
@@ -182,9 +192,9 @@ def test_what_is_missing_comes_with_its_command(tmp_path):
     for table in TABLES:
         assert table.source in text and all(note in text for note in table.notes)
     for command in (
-        f"`onespp train rae --profile tiny --runs {tmp_path}` and `onespp eval --profile tiny --runs {tmp_path}`",
+        f"`onespp train rae --budget tiny --runs {tmp_path}` and `onespp eval --budget tiny --runs {tmp_path}`",
         f"`onespp bench denoisers --size 1280x720 --runs {tmp_path}`",
-        f"`onespp ablate wskp-repvgg --profile tiny --runs {tmp_path}`",
+        f"`onespp ablate wskp-repvgg --budget tiny --runs {tmp_path}`",
     ):
         assert command in text
     assert "holds" not in text and "HOLD" not in text

@@ -1,34 +1,52 @@
 """The stress bench reports exactly what a broken denoiser breaks, and lets a sound one pass."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-import eval.stress.run
-from eval.stress.cases import EXTREMES, LIGHT, LONG, PERIOD, RECOVERY_LIMIT, SPOILED, SURFACE, Extreme
-from eval.stress.check import FORGOTTEN, Range, Trial, heads, largest_logits
+from eval.spec import DenoiserSpec
+from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
+from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
+from eval.stress.check import FORGOTTEN, StressCheck
+from eval.stress.irradiance_range import IrradianceRange
+from eval.stress.lit_frames import NOISE_PERIOD
+from eval.stress.logits import largest_logits, last_layers
+from eval.stress.outcome import FRESH, StressOutcome, StressRow
+from eval.stress.run import applies, cases_in, check_all, stressed, weights_label
+from eval.stress.tables import heat_map, verdict_text
 from models import registry
 from models.denoiser import Denoiser, State
 from models.weights import save_weights
 from onespp import main
+from plotting import plt
 
-NAMES = [extreme.name for extreme in EXTREMES]
-IN_LIGHT = [extreme.name for extreme in EXTREMES if extreme.poison and extreme.poison.names == LIGHT]
+NAMES = [case.name for case in STRESS_CASES]
+CASES = {case.name: case for case in STRESS_CASES}
+IN_LIGHT = [case.name for case in STRESS_CASES if case.poison and case.poison.channels == LIGHT_CHANNELS]
 KEYS = {"denoiser", "weights", "extreme", "error", "nonfinite", "violation", "recovery", "broken"}
 
+Check = Callable[..., list[StressRow]]
 
-def all_break(extremes: Iterable[str], *requirements: str) -> dict[str, list[str]]:
-    return {extreme: list(requirements) for extreme in extremes}
+
+def all_break(cases: Iterable[str], *requirements: str) -> dict[str, tuple[str, ...]]:
+    return {case: requirements for case in cases}
+
+
+def broken_in(rows: Iterable[StressRow]) -> dict[str, tuple[str, ...]]:
+    """The requirements that are broken, by case."""
+    return {row.extreme: row.outcome.broken for row in rows if row.outcome.broken}
 
 
 class Simple(Denoiser):
     """The noisy frame, with bad pixels as they come."""
 
-    reads = LIGHT
+    reads = LIGHT_CHANNELS
     mended = False
 
     def __call__(self, frame, state):
@@ -92,7 +110,7 @@ class Mean(State):
 class Remembers(Denoiser):
     """An exponential mean that gives the newest frame a weight of `alpha`."""
 
-    reads = LIGHT
+    reads = LIGHT_CHANNELS
     alpha = 0.01
 
     def forward(self, frame, state):
@@ -109,7 +127,7 @@ class Halves(Remembers):
 class GrowsBrighter(Denoiser):
     """By 1 % from frame to frame."""
 
-    reads = LIGHT
+    reads = LIGHT_CHANNELS
 
     def forward(self, frame, state):
         factor = 1.01 * state.radiance if isinstance(state, Mean) else torch.ones(1)
@@ -117,95 +135,41 @@ class GrowsBrighter(Denoiser):
 
 
 @pytest.fixture
-def stress(tmp_path, monkeypatch, capsys):
-    """Run the command on a class under a name: the exit code, what it breaks by extreme, and what it prints."""
+def check(monkeypatch) -> Check:
+    """Take a class through cases, by default all, as a denoiser of that name."""
 
-    def run(kind, name="broken", *options):
+    def run(kind: type[Denoiser], name: str = "broken", cases: Sequence[StressCase] = STRESS_CASES) -> list[StressRow]:
         monkeypatch.setitem(registry.DENOISERS, name, kind)
-        code = 0
-        try:
-            main(["stress", name, "--runs", str(tmp_path), *options])
-        except SystemExit as end:
-            code = end.code
-        results = json.loads((tmp_path / "stress" / "results.json").read_text())
-        rows = results["rows"]
-        assert (results["schema"], results["device"]) == (1, "cpu, 1 thread")
-        assert all(row.keys() == KEYS for row in rows)
-        return code, {row["extreme"]: row["broken"] for row in rows if row["broken"]}, capsys.readouterr().out
+        return check_all([DenoiserSpec(name)], cases)
 
     return run
 
 
-@pytest.fixture(autouse=True)
-def seldom_draw(request, monkeypatch):
-    """The picture is drawn where it is looked at: it takes longer than all the rest."""
-    if "passes" not in request.node.name:
-        monkeypatch.setattr(eval.stress.run, "heat_map", lambda *_: None)
+# --- The command ------------------------------------------------------------------------------------------------------
 
 
-def test_a_sound_denoiser_passes(stress, tmp_path):
-    code, broken, printed = stress(registry.DENOISERS["accumulated"], "accumulated")
-    assert (code, broken) == (0, {}) and "All requirements are kept." in printed
+@pytest.mark.parametrize(
+    ("name", "code", "printed"),
+    [("accumulated", 0, "All requirements are kept."), ("broken", 1, "Broken requirements:")],
+)
+def test_the_exit_code_says_whether_all_is_kept(tmp_path, monkeypatch, capsys, name, code, printed):
+    monkeypatch.setitem(registry.DENOISERS, "broken", GoesNegative)
+    try:
+        main(["stress", name, "--runs", str(tmp_path)])
+        ended = 0
+    except SystemExit as end:
+        ended = end.code
+    assert ended == code and printed in capsys.readouterr().out
+    results = json.loads((tmp_path / "stress" / "results.json").read_text())
+    assert (results["schema"], results["device"], results["precision"]) == (1, "cpu, 1 thread", "float32")
+    assert results["versions"]["torch"] == torch.__version__
+    rows = results["rows"]
+    assert all(row.keys() == KEYS and row["denoiser"] == name for row in rows)
+    assert any(row["broken"] for row in rows) == bool(code)
     table = (tmp_path / "stress" / "table.md").read_text()
-    assert all(f"| {name} " in table for name in NAMES if "float1" not in name and "logits" not in name)
-    assert (tmp_path / "stress" / "errors.png").stat().st_size > 10_000
-
-
-def test_nan_is_found(stress):
-    code, broken, printed = stress(Overflows)
-    bright = ["a firefly of 65504", "radiance 6e4", "radiance 1e-7 to 6e4"]
-    assert (code, broken) == (1, all_break(bright, "finite"))
-    assert "finite: what comes of finite pixels is finite" in printed and "recovery: " not in printed
-
-
-def test_spreading_is_found(stress):
-    assert stress(Spreads)[:2] == (1, all_break(IN_LIGHT, "spread"))
-
-
-def test_spreading_nan_is_found(stress):
-    assert stress(SpreadsNaN)[:2] == (1, all_break(IN_LIGHT, "finite", "spread"))
-
-
-def test_a_bad_pixel_may_stay_bad_for_a_frame(stress):
-    assert stress(KeepsBadPixels)[:2] == (0, {})
-
-
-def test_leaving_the_range_is_found_where_it_is_promised(stress):
-    lit = [name for name in NAMES if name not in ("all black", "logits to ±1e4")]
-    assert stress(Brightens, "eaw")[:2] == (1, all_break(lit, "range"))
-    assert stress(Brightens)[:2] == (0, {})
-
-
-def test_negative_light_is_found(stress):
-    code, broken, printed = stress(GoesNegative)
-    assert code == 1 and set(map(tuple, broken.values())) == {("range",)} and "all black" in broken
-    assert "no other goes below 0" in printed
-
-
-def test_a_state_that_does_not_recover_is_found(stress):
-    code, broken, printed = stress(Remembers)
-    assert (code, broken) == (1, all_break(IN_LIGHT, "recovery"))
-    assert f"> {RECOVERY_LIMIT}" in printed
-
-
-def test_recovery_is_counted_in_frames():
-    """The mean's error halves from frame to frame."""
-    extreme = next(extreme for extreme in EXTREMES if extreme.name == IN_LIGHT[0])
-    outcome = Trial("halves", lambda _: Halves(), extreme).outcome()
-    frames = list(extreme.frames())
-    whole = frames[0].radiance("total")
-    lost = float((whole - frames[SPOILED].finite().radiance("total")).abs().max() / whole.max())
-    expected = next(n for n in range(100) if lost * 0.5 ** (n + 1) <= FORGOTTEN)
-    assert outcome.recovery == expected and outcome.error == pytest.approx(lost / 2)
-
-
-def test_long_sequences_show_drift(stress, monkeypatch):
-    monkeypatch.setattr(eval.stress.run, "LONG", replace(LONG, name="long", count=4 * PERIOD))
-    assert stress(Halves, "sound", "--long")[1].keys() == set()
-    kept, drifted = (
-        Trial("any", lambda _, kind=kind: kind(), eval.stress.LONG).outcome().error for kind in (Halves, GrowsBrighter)
-    )
-    assert kept < 1e-6 and drifted == pytest.approx(1.01 ** (2 * PERIOD) - 1, rel=1e-3)
+    assert all(f"| {row['extreme']} " in table for row in rows)
+    with Image.open(tmp_path / "stress" / "errors.png") as picture:
+        picture.verify()
 
 
 def test_what_cannot_be_stressed(capsys, tmp_path):
@@ -220,34 +184,126 @@ def test_what_cannot_be_stressed(capsys, tmp_path):
 
 def test_weights_are_named(tmp_path):
     """Fresh ones where there are no trained ones."""
-    (file,) = (entrant.weights for entrant in eval.stress.contestants(["wskp3"], tmp_path, "tiny"))
-    assert file is None
+    network, classical = stressed(["wskp3", "accumulated"], tmp_path, "tiny")
+    assert (weights_label(network), weights_label(classical)) == (FRESH, None)
     path = tmp_path / "train" / "wskp3-tiny" / "weights.safetensors"
     path.parent.mkdir(parents=True)
     save_weights(registry.create("wskp3"), "wskp3", {}, path)
-    (entrant,) = eval.stress.contestants(["wskp3"], tmp_path, "tiny")
-    assert entrant.origin == str(path)
+    (network,) = stressed(["wskp3"], tmp_path, "tiny")
+    assert weights_label(network) == str(path)
 
 
-# --- The extremes are what they say -----------------------------------------------------------------------------------
+def test_cases_apply_to_precisions_and_logits_that_a_denoiser_has():
+    def taken_by(name: str) -> set[str]:
+        spec = DenoiserSpec(name)
+        return {case for case in ("logits to ±1e4", "bfloat16", "float16") if applies(CASES[case], spec)}
+
+    assert taken_by("wskp3") == taken_by("wskp-mr") == taken_by("kp") == {"logits to ±1e4", "bfloat16", "float16"}
+    assert taken_by("ntd") == {"logits to ±1e4", "bfloat16"}
+    assert taken_by("rae") == {"bfloat16", "float16"}
+    assert taken_by("svgf") == set()
 
 
-@pytest.mark.parametrize("extreme", (*EXTREMES, replace(LONG, count=3)), ids=lambda extreme: extreme.name)
-def test_frames_continue_their_sequence(extreme: Extreme):
+def test_half_precision_and_the_long_sequence_are_asked_for():
+    assert cases_in("float32", long=False) == list(STRESS_CASES)
+    assert cases_in("float32", long=True) == [*STRESS_CASES, LONG_CASE]
+    half = cases_in("bfloat16", long=True)
+    assert {case.precision for case in half} == {"bfloat16"}
+    assert [case.name for case in half] == [*(name for name in NAMES if "float1" not in name), LONG_CASE.name]
+
+
+def test_the_picture_shows_errors_and_what_is_broken():
+    cases = STRESS_CASES[:2]
+    outcomes = (StressOutcome(0.01, 0, 0.0, None, ()), StressOutcome(None, 3, 0.0, None, ("finite",)))
+    rows = [StressRow("noisy", None, case.name, outcome) for case, outcome in zip(cases, outcomes, strict=True)]
+    figure = heat_map(rows, cases)
+    axes = figure.axes[0]
+    errors = np.ma.filled(axes.images[0].get_array(), np.nan)
+    np.testing.assert_allclose(errors, [[-2, np.nan]])
+    assert [(*line.get_xdata(), *line.get_ydata()) for line in axes.lines] == [(1, 0)]
+    assert [label.get_text() for label in axes.get_xticklabels()] == [case.name for case in cases]
+    plt.close(figure)
+
+
+# --- What is found ----------------------------------------------------------------------------------------------------
+
+
+def test_nan_is_found(check):
+    rows = check(Overflows)
+    bright = ["a firefly of 65504", "radiance 6e4", "radiance 1e-7 to 6e4"]
+    assert broken_in(rows) == all_break(bright, "finite")
+    text = verdict_text(rows, STRESS_CASES)
+    assert "finite: what comes of finite pixels is finite" in text and "recovery: " not in text
+
+
+def test_spreading_is_found(check):
+    assert broken_in(check(Spreads)) == all_break(IN_LIGHT, "spread")
+
+
+def test_spreading_nan_is_found(check):
+    assert broken_in(check(SpreadsNaN)) == all_break(IN_LIGHT, "finite", "spread")
+
+
+def test_a_bad_pixel_may_stay_bad_for_a_frame(check):
+    assert broken_in(check(KeepsBadPixels)) == {}
+
+
+def test_leaving_the_range_is_found_where_it_is_promised(check):
+    lit = [name for name in NAMES if name not in ("all black", "logits to ±1e4")]
+    assert broken_in(check(Brightens, "eaw")) == all_break(lit, "range")
+    assert broken_in(check(Brightens)) == {}
+
+
+def test_negative_light_is_found(check):
+    rows = check(GoesNegative)
+    broken = broken_in(rows)
+    assert set(broken.values()) == {("range",)} and "all black" in broken
+    assert "no other goes below 0" in verdict_text(rows, STRESS_CASES)
+
+
+def test_a_state_that_does_not_recover_is_found(check):
+    rows = check(Remembers)
+    assert broken_in(rows) == all_break(IN_LIGHT, "recovery")
+    assert f"> {RECOVERY_LIMIT}" in verdict_text(rows, STRESS_CASES)
+
+
+def test_recovery_is_counted_in_frames():
+    """The mean's error halves from frame to frame."""
+    case = CASES[IN_LIGHT[0]]
+    outcome = StressCheck("halves", lambda _: Halves(), case).outcome()
+    frames = list(case.frames())
+    whole = frames[0].radiance("total")
+    lost = float((whole - frames[SPOILED_FRAME].finite().radiance("total")).abs().max() / whole.max())
+    expected = next(n for n in range(100) if lost * 0.5 ** (n + 1) <= FORGOTTEN)
+    assert outcome.recovery == expected and outcome.error == pytest.approx(lost / 2)
+
+
+def test_long_sequences_show_drift(check):
+    long = replace(LONG_CASE, frame_count=4 * NOISE_PERIOD)
+    (kept,) = check(Halves, cases=[long])
+    assert kept.outcome.error < 1e-6 and kept.outcome.broken == ()
+    (drifted,) = check(GrowsBrighter, cases=[long])
+    assert drifted.outcome.error == pytest.approx(1.01 ** (2 * NOISE_PERIOD) - 1, rel=1e-3)
+
+
+# --- The cases are what they say --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", (*STRESS_CASES, replace(LONG_CASE, frame_count=3)), ids=lambda case: case.name)
+def test_frames_continue_their_sequence(case: StressCase):
     """So that all states are carried; and only the frames meant to be are not finite."""
-    frames = list(extreme.frames())
-    assert len(frames) == extreme.count and {frame.size for frame in frames} == {extreme.size}
+    frames = list(case.frames())
+    assert len(frames) == case.frame_count and {frame.size for frame in frames} == {case.size}
     for before, frame in pairwise(frames):
         assert frame.follows(before.moment)
     for index, frame in enumerate(frames):
         bad = sum((~torch.isfinite(tensor)).any(dim=1).sum() for tensor in frame.channels.values())
-        assert bad == (len(extreme.poison.names) if extreme.poison and index == SPOILED else 0)
+        assert bad == (len(case.poison.channels) if case.poison and index == SPOILED_FRAME else 0)
 
 
-def test_extremes_reach_their_values():
+def test_cases_reach_their_values():
     def values(name: str, channel: str, index: int = 0) -> torch.Tensor:
-        extreme = next(extreme for extreme in EXTREMES if extreme.name == name)
-        return list(extreme.frames())[index].channels[channel]
+        return list(CASES[name].frames())[index].channels[channel]
 
     def spans(tensor: torch.Tensor) -> Iterator[float]:
         return (float(value) for value in torch.aminmax(tensor[tensor > 0]))
@@ -256,19 +312,20 @@ def test_extremes_reach_their_values():
     assert low < 1e-3 and high > 1e5
     low, high = spans(values("radiance 1e-7 to 6e4", "direct"))
     assert low < 1e-7 and high > 1e4
-    assert values("a firefly of 65504", "direct", SPOILED).max() == 65504
+    assert values("a firefly of 65504", "direct", SPOILED_FRAME).max() == 65504
     assert (values("albedo 0", "albedo") == 0).all() and (values("no surface at all", "mesh_id") == 0).all()
     assert not values("all black", "direct").any() and not values("all black", "emission").any()
     low, high = spans(values("depth around 1e-4", "depth"))
     assert 2e-5 < low < high < 3e-4
-    assert {name for extreme in EXTREMES if extreme.poison for name in extreme.poison.names} == {*LIGHT, *SURFACE}
+    poisoned = {name for case in STRESS_CASES if case.poison for name in case.poison.channels}
+    assert poisoned == {*LIGHT_CHANNELS, *SURFACE_CHANNELS}
 
 
 def test_light_is_even_and_then_as_bright_on_average():
-    extreme = replace(EXTREMES[0], count=60)
-    frames = list(extreme.frames())
-    assert all((frame.irradiance("total") - 1).abs().max() < 1e-6 for frame in frames[: extreme.even])
-    noisy = torch.cat([frame.irradiance("total") for frame in frames[extreme.even :]])
+    case = replace(STRESS_CASES[0], frame_count=60)
+    frames = list(case.frames())
+    assert all((frame.irradiance("total") - 1).abs().max() < 1e-6 for frame in frames[: case.even_frames])
+    noisy = torch.cat([frame.irradiance("total") for frame in frames[case.even_frames :]])
     assert noisy.mean() == pytest.approx(1, abs=0.05) and (noisy == 0).float().mean() > 0.3
 
 
@@ -277,26 +334,30 @@ def test_logits_are_scaled_and_left_as_they_were(name):
     torch.manual_seed(0)
     denoiser = registry.create(name)
     denoiser.prepare()
-    frame = next(EXTREMES[0].frames())
+    layers = last_layers(denoiser)
+    frame = next(STRESS_CASES[0].frames())
     seen = []
     with largest_logits(denoiser, 1e4):
-        hooks = [head.register_forward_hook(lambda *args: seen.append(args[2].abs().max())) for head in heads(denoiser)]
+        hooks = [layer.register_forward_hook(lambda *args: seen.append(args[2].abs().max())) for layer in layers]
         denoiser(frame, None)
     assert seen and all(float(top) == pytest.approx(1e4) for top in seen)
     for hook in hooks:
         hook.remove()
-    assert not any(head._forward_hooks for head in heads(denoiser))
+    assert not any(layer._forward_hooks for layer in layers)
 
 
 def test_the_range_is_of_every_colour_and_of_what_svgf_adds_up():
     """Hand-made: direct light of 1 to 3, indirect of 0 to 2, in other pixels."""
-    frame = next(EXTREMES[0].frames())
-    albedo, zero = torch.ones(1, 3, 1, 2), torch.zeros(1, 3, 1, 2)
-    direct, indirect = (torch.tensor(row).expand(1, 3, 1, 2) for row in ([1.0, 3.0], [2.0, 0.0]))
-    tensors = {"direct": direct, "indirect": indirect, "albedo": albedo, "emission": zero}
+    frame = next(STRESS_CASES[0].frames())
+    tensors = {
+        "direct": torch.tensor([1.0, 3.0]).expand(1, 3, 1, 2),
+        "indirect": torch.tensor([2.0, 0.0]).expand(1, 3, 1, 2),
+        "albedo": torch.ones(1, 3, 1, 2),
+        "emission": torch.zeros(1, 3, 1, 2),
+    }
     frame = replace(frame, channels=tensors)
     for name, low, high in (("eaw", 3.0, 3.0), ("svgf", 1.0, 5.0)):
-        seen = Range(name)
+        seen = IrradianceRange(name)
         seen.see(frame)
         for level, outside in ((low, 0), (high, 0), (high * 1.01, 0.01), (low * 0.99, 0.01)):
             assert max(0, seen.violation(frame, torch.full((3, 1, 2), level))) == pytest.approx(outside, abs=1e-6)

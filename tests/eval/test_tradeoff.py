@@ -9,6 +9,7 @@ import pytest
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
+from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
@@ -18,14 +19,13 @@ from eval.tradeoff.candidates import candidates
 from eval.tradeoff.pareto import Offer, beaten_by
 from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import trade
-from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import SampleTrade, check_levels, generalisation, sample_trades
 from eval.tradeoff.times import Times, timed_as
 from files import read_json, write_json
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.weights import save_weights
-from render.clip import PLAIN
-from train.loop import WEIGHTS, run_folder
+from render.clip import NO_OPTIONS
+from train.task import WEIGHTS_FILE, run_folder
 
 SIZE = (32, 48)
 
@@ -199,9 +199,9 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 
 
 def test_cost_of_samples(tiny):
-    cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
+    cost = fit_cost([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
-    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
 
 
@@ -267,7 +267,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
-        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS)
+        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")

@@ -1,0 +1,85 @@
+"""Ways to change a frame: its light, its surfaces, its units, or one pixel of it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from datasets.frame import Cameras, Frame
+
+FrameChange = Callable[[Frame], Frame]
+
+LIGHT_CHANNELS = ("direct", "indirect", "emission")
+SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+
+
+def unchanged(frame: Frame) -> Frame:
+    return frame
+
+
+def light_times(factor: float) -> FrameChange:
+    """All light times `factor`."""
+    return lambda frame: replace(
+        frame, channels=frame.channels | {name: factor * frame.channels[name] for name in LIGHT_CHANNELS}
+    )
+
+
+def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
+    """The named channels at the same value in all pixels; a tuple gives each component its own."""
+
+    def change(frame: Frame) -> Frame:
+        tensors = {name: torch.zeros_like(frame.channels[name]) for name in values}
+        for name, value in values.items():
+            tensors[name] += torch.tensor(value).view(-1, 1, 1)
+        return replace(frame, channels=frame.channels | tensors)
+
+    return change
+
+
+def ramp(frame: Frame, low: float, high: float) -> Tensor:
+    """From `low` at the left to `high` at the right, evenly in the logarithm, (W,)."""
+    return torch.logspace(math.log10(low), math.log10(high), frame.size[1])
+
+
+def dim_to_bright(frame: Frame) -> Frame:
+    """Irradiance from 1e-7 to 6e4 across the image."""
+    factors = ramp(frame, 1e-7, 6e4)
+    return replace(frame, channels=frame.channels | {name: frame.channels[name] * factors for name in LIGHT_CHANNELS})
+
+
+def near_to_far(frame: Frame) -> Frame:
+    """Depth from 1e-4 to 1e6 across the image. The cameras stay, so what moves is not where they expect it."""
+    depth = torch.where(frame.depth > 0, ramp(frame, 1e-4, 1e6), 0)
+    return replace(frame, channels=frame.channels | {"depth": depth})
+
+
+def lengths_times(factor: float) -> FrameChange:
+    """The same scene in other units: depth and the positions of cameras and meshes times `factor`."""
+
+    def cameras(at: Cameras) -> Cameras:
+        factors = torch.ones(4, 4, dtype=torch.float64)
+        factors[:3, 3] = factor
+        return Cameras(at.K, at.camera_to_world * factors, at.object_to_world * factors)
+
+    def change(frame: Frame) -> Frame:
+        channels = frame.channels | {"depth": factor * frame.depth}
+        return replace(frame, channels=channels, now=cameras(frame.now), previous=cameras(frame.previous))
+
+    return change
+
+
+@dataclass(frozen=True)
+class PixelChange:
+    """The pixel in the middle of the image at `value`, in all components of the named channels."""
+
+    value: float
+    channels: tuple[str, ...]
+
+    def __call__(self, frame: Frame) -> Frame:
+        height, width = frame.size
+        tensors = {name: frame.channels[name].clone() for name in self.channels}
+        for tensor in tensors.values():
+            tensor[..., height // 2, width // 2] = self.value
+        return replace(frame, channels=frame.channels | tensors)

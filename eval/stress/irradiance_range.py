@@ -1,0 +1,56 @@
+"""The range that a denoiser's output must stay within: of convex filters, the irradiance that they have seen."""
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from datasets.frame import Frame
+from models.operators import finite
+
+CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")  # filters whose output is a mean of irradiance that they have seen
+ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
+DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
+
+
+class IrradianceRange:
+    """The irradiance that a convex filter has seen since it began: what it must stay within, for each colour.
+
+    SVGF filters direct and indirect light separately, so its limits are sums of two.
+    """
+
+    def __init__(self, name: str):
+        self.separate = name == "svgf"
+        self.low = torch.tensor(torch.inf)
+        self.high = torch.tensor(-torch.inf)
+
+    def see(self, frame: Frame) -> None:
+        parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
+        seen = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
+        self.low = torch.minimum(self.low, seen.amin((2, 3)))
+        self.high = torch.maximum(self.high, seen.amax((2, 3)))
+
+    def violation(self, frame: Frame, output: Tensor) -> float:
+        """How far radiance `output` (3, H, W) is outside, relative to the limit; at most 0 inside."""
+        irradiance = finite((output - frame.emission).double() / frame.divisor)[0].flatten(1)
+        low = self.low.sum(dim=0)
+        high = self.high.sum(dim=0)
+        above = (irradiance.amax(dim=1) - high) / high.clamp(min=DARKEST_LIMIT)
+        below = (low - irradiance.amin(dim=1)) / low.clamp(min=DARKEST_LIMIT)
+        return float(torch.maximum(above, below).max())
+
+
+def range_violation(name: str, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
+    """How far a sequence leaves the range at most, 0 where it does not.
+
+    Relative to the range's end for a convex filter, absolute below 0 for any other denoiser. What is not finite counts
+    as 0, in frames and in `outputs` (3, H, W) alike.
+    """
+    if name not in CONVEX:
+        return max(0.0, *(-float(finite(output).min()) for output in outputs))
+    seen = IrradianceRange(name)
+    largest = 0.0
+    for frame, output in zip(frames, outputs, strict=True):
+        seen.see(frame.finite())
+        largest = max(largest, seen.violation(frame.finite(), output))
+    return largest

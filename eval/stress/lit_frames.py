@@ -1,0 +1,31 @@
+"""The frames that stress cases change: a moving scene under light of irradiance 1."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from datasets.frame import Frame, to_tensor
+from eval.bench.sizes import Size
+from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, synthetic_frame
+from eval.stress.changes import FrameChange
+
+LIGHT_SHARES = {"direct": 0.7, "indirect": 0.3}  # of the irradiance
+HIT_SHARES = {"direct": HIT_DIRECT, "indirect": HIT_INDIRECT}  # of the pixels whose one sample finds light
+NOISE_PERIOD = 100  # frames until the noise of a long sequence repeats
+
+
+def lit(frame: Frame, seed: int | None) -> Frame:
+    """The frame under light of irradiance 1 everywhere: as one sample a pixel finds it, or even without a seed."""
+    divisor = frame.divisor[0].permute(1, 2, 0).double().numpy()
+    light = {name: share * divisor for name, share in LIGHT_SHARES.items()}
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
+    return replace(frame, channels=frame.channels | {name: to_tensor(array) for name, array in light.items()})
+
+
+@lru_cache(maxsize=4 * NOISE_PERIOD)
+def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -> Frame:
+    """Frame `index` of the synthetic sequence, its surfaces changed by `surfaces` before light falls on them."""
+    return lit(surfaces(synthetic_frame(index, *size)), seed)

@@ -1,0 +1,108 @@
+"""What the stress bench found, for people: tables, a picture, and the requirements that are broken."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from tabulate import tabulate
+
+from eval.stress.cases import RECOVERY_LIMIT, StressCase
+from eval.stress.check import REQUIREMENTS
+from eval.stress.outcome import FRESH, StressRow
+from plotting import plt
+
+
+def short(value: float | None) -> str:
+    """A number in few digits."""
+    if value is None:
+        return "-"
+    return "0" if value == 0 else f"{value:.1e}"
+
+
+def recovery_time(row: StressRow, case: StressCase) -> str:
+    """Frames until the case's bad pixel is forgotten."""
+    if case.only is None:
+        return "-"
+    return f"> {RECOVERY_LIMIT}" if row.outcome.recovery is None else str(row.outcome.recovery)
+
+
+def error_cell(row: StressRow | None) -> str:
+    """The worst error, with a ! where a requirement is broken; nothing where the case does not apply."""
+    if row is None:
+        return ""
+    return short(row.outcome.error) + (" !" if row.outcome.broken else "")
+
+
+def weights_cell(weights: str | None) -> str:
+    if weights is None:
+        return "-"
+    return FRESH if weights == FRESH else "trained"
+
+
+def overview(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
+    """A column a denoiser: its error in each case, and the rest in few lines."""
+    weights = {row.denoiser: row.weights for row in rows}
+    found = {(row.denoiser, row.extreme): row for row in rows}
+    outcomes = {name: [row.outcome for row in rows if row.denoiser == name] for name in weights}
+
+    lines = [["weights", *(weights_cell(file) for file in weights.values())]]
+    lines += [[case.name, *(error_cell(found.get((name, case.name))) for name in weights)] for case in cases]
+    for case in cases:
+        if case.only is not None:
+            times = [recovery_time(found[name, case.name], case) for name in weights]
+            lines.append([f"frames until forgotten: {case.name}", *times])
+    nonfinite = [sum(outcome.nonfinite for outcome in of) for of in outcomes.values()]
+    lines.append(["pixels that are not finite", *map(str, nonfinite)])
+    violations = [max(outcome.violation for outcome in of) for of in outcomes.values()]
+    lines.append(["largest range violation", *map(short, violations)])
+    return tabulate(lines, ["worst error", *weights], disable_numparse=True, maxheadercolwidths=11)
+
+
+def details(rows: Sequence[StressRow], cases: Sequence[StressCase], form: str = "simple") -> str:
+    """A line a row, with all that was measured. `form` is one of tabulate's."""
+    by_name = {case.name: case for case in cases}
+    lines = [
+        {
+            "denoiser": row.denoiser,
+            "weights": row.weights or "-",
+            "extreme": row.extreme,
+            "worst error": short(row.outcome.error),
+            "non-finite": row.outcome.nonfinite,
+            "range violation": short(row.outcome.violation),
+            "recovery": recovery_time(row, by_name[row.extreme]),
+            "broken": ", ".join(row.outcome.broken),
+        }
+        for row in rows
+    ]
+    return tabulate(lines, "keys", tablefmt=form, disable_numparse=True)
+
+
+def verdict_text(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
+    """Which requirements are broken, and where; or that all are kept."""
+    broken = [row for row in rows if row.outcome.broken]
+    if not broken:
+        return "All requirements are kept."
+    missed = {name for row in broken for name in row.outcome.broken}
+    explained = [f"{name}: {text}" for name, text in REQUIREMENTS.items() if name in missed]
+    return "\n".join(["Broken requirements:", "", details(broken, cases), "", *explained])
+
+
+def heat_map(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> Figure:
+    """The worst errors, a row a denoiser and a column a case, with a cross where a requirement is broken."""
+    names = list(dict.fromkeys(row.denoiser for row in rows))
+    columns = [case.name for case in cases]
+    errors = np.full((len(names), len(columns)), np.nan)
+    figure, axes = plt.subplots(figsize=(3 + 0.45 * len(columns), 2.6 + 0.35 * len(names)), layout="constrained")
+    for row in rows:
+        y = names.index(row.denoiser)
+        x = columns.index(row.extreme)
+        errors[y, x] = np.nan if row.outcome.error is None else np.log10(max(row.outcome.error, 1e-8))
+        if row.outcome.broken:
+            axes.plot(x, y, "x", color="red", markersize=12, markeredgewidth=3)
+    image = axes.imshow(errors, cmap="viridis", vmin=-8, vmax=2)
+    axes.set_facecolor("lightgrey")  # where there is no error to show
+    axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_title("Worst error at the extremes; red crosses: a requirement is broken")
+    figure.colorbar(image, label="log₁₀ of the error over the brightest pixel")
+    return figure
