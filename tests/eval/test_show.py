@@ -50,16 +50,17 @@ def test_panels_stand_where_they_belong(tmp_path):
     save_figure(tmp_path / "grid.png", figure)
     drawn = png.imread(tmp_path / "grid.png")[..., :3]
     colours |= {(2, 0): colormaps["viridis"](0.0)[:3], (2, 1): colormaps["viridis"](1.0)[:3]}
-    corners = {}
+    left = {}
+    top = {}
     for place, colour in colours.items():
-        rows, shown = np.nonzero(np.abs(drawn - colour).max(axis=2) < 1 / 255)
-        # A colour bar, to the right of its panel, ends in the same colours.
-        inside = shown < np.median(shown) + 110
-        height, width = np.ptp(rows[inside]) + 1, np.ptp(shown[inside]) + 1
-        assert width >= 192 and height == pytest.approx(0.75 * width, abs=2), place
-        corners[place] = shown.min(), rows.min()
-    assert corners[0, 0][0] < corners[1, 0][0] - 192 and corners[1, 0][0] < corners[2, 0][0] - 192
-    assert all(corners[column, 0][1] < corners[column, 1][1] - 140 for column in range(3))
+        y, x = np.nonzero(np.abs(drawn - colour).max(axis=2) < 1 / 255)
+        panel = x < np.median(x) + 110  # without the colour bar to the right of it, which ends in the same colour
+        width = np.ptp(x[panel]) + 1
+        assert width >= 192 and np.ptp(y[panel]) + 1 == pytest.approx(0.75 * width, abs=2), place
+        left[place] = x.min()
+        top[place] = y.min()
+    assert all(left[column, frame] + 192 < left[column + 1, frame] for column in (0, 1) for frame in (0, 1))
+    assert all(top[column, 0] + 0.75 * 192 < top[column, 1] for column in (0, 1, 2))
 
 
 def test_what_the_panels_hold(tiny):

@@ -24,7 +24,8 @@ def test_temporal_variance_keeps_what_spatial_variance_blurs():
     images = filtered_pattern((64, 256), frames=16)
     reference = pattern(64, 256)
     error = {name: (image - reference).square().mean(dim=0).sqrt() for name, image in images.items()}
-    spatial, temporal = error["spatial variance estimate"], error["temporal variance estimate"]
+    spatial = error["spatial variance estimate"]
+    temporal = error["temporal variance estimate"]
     assert temporal[:128].mean() < 0.4 * spatial[:128].mean()
     assert temporal[128:].mean() < spatial[128:].mean()
     assert temporal[:64].mean() < temporal[64:128].mean() < temporal[128:].mean()
