@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -89,17 +90,8 @@ class ClipRun:
         return output
 
     def result(self, clip: Clip) -> Result:
-        return Result(
-            key=self.key(clip),
-            denoiser=self.name,
-            signal=self.signal,
-            scene=clip.scene,
-            clip=clip.name,
-            metrics=means(self.frames),
-            frames=self.frames,
-            nonfinite=self.nonfinite,
-            precision=self.entrant.precision,
-        )
+        precision = self.entrant.precision
+        return result_of(self, clip, means(self.frames), nonfinite=self.nonfinite, precision=precision)
 
 
 @dataclass
@@ -128,19 +120,15 @@ class ReferenceRun:
         return reference
 
     def result(self, clip: Clip) -> Result:
-        return Result(
-            key=self.key(clip),
-            denoiser=self.name,
-            signal=self.signal,
-            scene=clip.scene,
-            clip=clip.name,
-            metrics=mean_floor(self.frames),
-            frames=self.frames,
-            crops=self.crops,
-        )
+        return result_of(self, clip, mean_floor(self.frames), crops=self.crops)
 
 
 Run = ClipRun | ReferenceRun
+
+
+def result_of(run: Run, clip: Clip, metrics: Values, **facts: Any) -> Result:
+    """What a run through a clip ended with: its mean `metrics`, and `facts` by the names of Result's fields."""
+    return Result(run.key(clip), run.name, run.signal, clip.scene, clip.name, metrics, run.frames, **facts)
 
 
 def hidden(frame: Frame) -> Tensor:

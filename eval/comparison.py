@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from datasets.tonemap import display
-from models.operators import luminance
+from models.operators import image_luminance
 
 
 class Luminances(NamedTuple):
@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def luminances(self) -> Luminances:
-        return Luminances(*(luminance(image) for image in (self.shown, self.shown_reference, self.shown_halves)))
+        return Luminances(*(image_luminance(image) for image in (self.shown, self.shown_reference, self.shown_halves)))
 
     @cached_property
     def change(self) -> Luminances | None:

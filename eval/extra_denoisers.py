@@ -3,8 +3,8 @@
 from typing import Any, NamedTuple
 
 from models.denoiser import Denoiser
-from models.fusion import WINDOWS
 from models.oidn import OIDN
+from models.parameters import WINDOWS
 from models.wskp import WSKP
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from tqdm import tqdm
 
+from allocator import keep_freed_memory
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.clip_run import ClipRun, Entrant, ReferenceRun, Run, play
@@ -109,6 +110,7 @@ class ClipJob(NamedTuple):
 def start_worker() -> None:
     """An interrupt is the parent's to act on. Ended then, a worker must not leave behind a lock that bars share."""
     on_signal(SIGINT, SIG_IGN)
+    keep_freed_memory()
     tqdm.set_lock(threading.RLock())
 
 

@@ -6,12 +6,11 @@ from functools import partial
 from pathlib import Path
 
 from errors import BadInput
-from eval.extra_denoisers import FAST_OIDN, WINDOW_SETS, windows_label
+from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.spec import DenoiserSpec, denoiser_class, precision_in_use
-from models import registry
 from models.registry import DENOISERS, without_taa
-from train.loop import WEIGHTS, run_folder
 from train.recipes import TRAINABLE
+from train.task import WEIGHTS_FILE, run_folder
 
 BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
 
@@ -37,9 +36,7 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
 
 def unavailable(name: str) -> str | None:
     """Why a denoiser cannot run on this machine. Raises BadInput for an unknown name."""
-    if name in WINDOW_SETS:
-        return None
-    return registry.unavailable("oidn" if name == FAST_OIDN else name)
+    return denoiser_class(name).unavailable()
 
 
 def weights_file(name: str, runs: Path, budget: str) -> Path | None:
@@ -47,8 +44,8 @@ def weights_file(name: str, runs: Path, budget: str) -> Path | None:
     if not denoiser_class(name).is_network:
         return None
     if name in WINDOW_SETS:
-        return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS
-    return run_folder(runs, without_taa(name), budget) / WEIGHTS
+        return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS_FILE
+    return run_folder(runs, without_taa(name), budget) / WEIGHTS_FILE
 
 
 def untrained(runs: Path, budget: str, name: str) -> str | None:

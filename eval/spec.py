@@ -10,7 +10,7 @@ from datasets.frame import Signal
 from eval.extra_denoisers import EXTRA, WINDOW_SETS, windows_label
 from models import compiled, registry
 from models.denoiser import Denoiser
-from models.taa import unwrapped
+from models.taa import inner_denoiser
 from models.weights import load_weights
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -24,7 +24,7 @@ def denoiser_class(name: str) -> type[Denoiser]:
 def create(name: str, signal: Signal | None = None) -> Denoiser:
     """A denoiser of the registry or of EXTRA, with fresh weights. Raises BadInput for an unknown name."""
     if name in EXTRA:
-        return EXTRA[name].kind(**EXTRA[name].arguments)
+        return EXTRA[name].kind(signal=signal, **EXTRA[name].arguments)
     return registry.create(name, signal)
 
 
@@ -91,7 +91,7 @@ class DenoiserSpec:
         denoiser = create(self.name, self.signal)
         if self.weights:
             name = windows_label(WINDOW_SETS[self.name]) if self.name in WINDOW_SETS else self.name
-            load_weights(unwrapped(denoiser), registry.without_taa(name), self.weights)
+            load_weights(inner_denoiser(denoiser), registry.without_taa(name), self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         return denoiser.to(self.device)
 

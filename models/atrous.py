@@ -10,11 +10,12 @@ from types import EllipsisType
 
 from torch import Tensor
 
-LEVELS = 5
+from models.operators import STRIP_ROWS
+
+ATROUS_LEVELS = 5
 B3_SPLINE = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)  # h, separable
 RADIUS = len(B3_SPLINE) // 2
 CENTRE = B3_SPLINE[RADIUS] ** 2
-STRIP = 64  # rows; few enough for temporaries to stay in the cache, enough for two threads
 
 Region = tuple[EllipsisType, slice, slice]
 
@@ -29,14 +30,16 @@ class Tap:
     q: Region
 
 
-def taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]:
+def strip_taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]:
     """A window of (2 radius + 1)² places `step` pixels apart, without its centre, strip by strip of an image (H, W)."""
     height, width = size
     offsets = range(-radius * step, radius * step + 1, step)
-    for start in range(0, height, STRIP):
+    for start in range(0, height, STRIP_ROWS):
         for dy, dx in itertools.product(offsets, offsets):
-            top, bottom = max(start, -dy), min(start + STRIP, height, height - dy)
-            left, right = max(0, -dx), min(width, width - dx)
+            top = max(start, -dy)
+            bottom = min(start + STRIP_ROWS, height, height - dy)
+            left = max(0, -dx)
+            right = min(width, width - dx)
             if (dx or dy) and top < bottom and left < right:
                 p = (..., slice(top, bottom), slice(left, right))
                 q = (..., slice(top + dy, bottom + dy), slice(left + dx, right + dx))
@@ -47,7 +50,8 @@ class WindowSum:
     """The sum of an image's values over every pixel's window, weighted; begun with the pixel itself."""
 
     def __init__(self, image: Tensor, centre: float):
-        self.image, self.sum = image, centre * image
+        self.image = image
+        self.sum = centre * image
 
     def add(self, tap: Tap, weight: Tensor) -> None:
         self.sum[tap.p].addcmul_(weight, self.image[tap.q])

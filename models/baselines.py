@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from datasets.frame import Frame
-from models.denoiser import CLASSICAL, Denoiser, State, carried
-from models.operators import Accumulation, accumulate
+from models.accumulation import Accumulation, accumulate
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 
 
 class Noisy(Denoiser):
@@ -34,6 +34,6 @@ class Accumulated(Denoiser):
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, AccumulatedState, frame)
+        before = matching_state(state, AccumulatedState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
         return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.moment, history)

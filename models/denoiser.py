@@ -8,7 +8,6 @@ from torch import Tensor
 
 from datasets.frame import Frame, Moment, Signal
 from errors import BadInput
-from models.allocator import keep_freed_memory
 
 
 @dataclass(frozen=True)
@@ -22,31 +21,46 @@ class State:
         return {}
 
 
-# Filters without a network compute in float32 whatever the hardware: sums over windows and moments need its digits.
+# Why filters without a network compute in float32 alone, whatever the hardware.
 CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
 S = TypeVar("S", bound=State)
 
 
-def carried(state: State | None, kind: type[S], frame: Frame) -> S | None:
-    """The state as one's own kind, or None where the frame does not follow it: another size, or a cut."""
+def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None:
+    """The state as one of `kind`; None where it is another, or the frame does not follow it: another size, or a cut."""
     return state if isinstance(state, kind) and frame.follows(state.moment) else None
 
 
 class Denoiser(torch.nn.Module):
     """One frame in, linear HDR radiance out.
 
+    What a denoiser needs and returns are facts of its class: nothing has to be built to ask for them.
+
     Attributes:
-        reads: channels it needs; nothing else is loaded, rendered or stored for it.
-        signal: what it returns; "total" denoises direct + indirect and adds emission back untouched.
+        reads: channels it needs; nothing else is loaded, rendered or stored for it. An instance may have its own.
+        signal: what it returns; "total" denoises direct + indirect and adds emission back untouched. The class's is the
+            default for instances.
         refuses: precisions that it does not compute in, with the reason.
+        is_network: whether it needs trained weights.
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
     """
 
     reads: tuple[str, ...]
     signal: Signal = "total"
     refuses: ClassVar[dict[torch.dtype, str]] = {}
+    is_network: ClassVar[bool] = False
     precision: torch.dtype = torch.float32
+
+    def __init__(self, *, signal: Signal | None = None):
+        """`signal` is the class's unless another one is named."""
+        super().__init__()
+        self.signal = signal or type(self).signal
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """Why it cannot run on this machine, with what to install; None where it can."""
+        return None
 
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """What `forward` makes of the frame's finite part: pixels that are NaN or infinite count as 0."""
@@ -64,7 +78,6 @@ class Denoiser(torch.nn.Module):
         """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""
         if precision in self.refuses:
             raise BadInput(f"{type(self).__name__} does not compute in {precision}: {self.refuses[precision]}")
-        keep_freed_memory()
         self.eval()
         self.requires_grad_(False)
         self.to(precision)

@@ -13,12 +13,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models import compiled
-
-WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3
-STRIP = 64  # rows; the temporaries of a strip stay in the cache
-SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither overflows nor vanishes in float32
-LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35
-OUTSIDE = -1e30  # logit of a tap outside the image
+from models.compiled import fusion as kernels
+from models.operators import STRIP_ROWS
+from models.parameters import LEAST_EXPONENT, OUTSIDE, SAFE_RANGE, WINDOWS
 
 
 def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
@@ -27,7 +24,9 @@ def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
     Powers of two of entries are added up, nothing is ever subtracted: running sums would cancel.
     """
     length = x.shape[dim] - window + 1
-    total, start, size = None, 0, 1
+    total: Tensor | None = None
+    start = 0
+    size = 1
     while True:
         if window & size:
             part = x.narrow(dim, start, length)
@@ -54,12 +53,15 @@ def along(dim: int, margin: int) -> tuple[int, ...]:
 
 def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Box sums relative to the largest logit of every window: first of columns, then of rows of these."""
-    top, total = logits, values
+    margin = window // 2
+    top = logits
+    total = values
     for dim in (-2, -1):
-        size, margin = top.shape[dim], window // 2
+        size = top.shape[dim]
         entries = F.pad(top, along(dim, margin), value=OUTSIDE)
         parts = F.pad(total, along(dim, margin))
-        top, total = windowed_max(entries, window, dim), torch.zeros_like(total)
+        top = windowed_max(entries, window, dim)
+        total = torch.zeros_like(total)
         for tap in range(window):
             entry = entries.narrow(dim, tap, size)
             weight = torch.exp((entry - top).clamp(min=LEAST_EXPONENT)) * (entry > OUTSIDE)
@@ -94,7 +96,8 @@ class SharedKernel(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, logits: Tensor, window: int) -> Tensor:
         top, total = windowed_sums(logits, with_ones(image), window)
-        filtered, weight = total[:, :-1] / total[:, -1:], total[:, -1:]
+        weight = total[:, -1:]
+        filtered = total[:, :-1] / weight
         ctx.window = window
         ctx.save_for_backward(image, logits, filtered, top + torch.log(weight))
         return filtered
@@ -118,9 +121,10 @@ def shared_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:
 
 def strips(height: int, margin: int) -> Iterator[tuple[slice, slice, slice]]:
     """Rows to compute, rows that they depend on, and the former within the latter."""
-    for start in range(0, height, STRIP):
-        stop = min(start + STRIP, height)
-        low, high = max(start - margin, 0), min(stop + margin, height)
+    for start in range(0, height, STRIP_ROWS):
+        stop = min(start + STRIP_ROWS, height)
+        low = max(start - margin, 0)
+        high = min(stop + margin, height)
         yield slice(start, stop), slice(low, high), slice(start - low, stop - low)
 
 
@@ -130,25 +134,17 @@ def fuse_whole(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequ
     return torch.stack(parts).sum(dim=0)
 
 
+@compiled.by(kernels.fuse, gpu=kernels.fuse_on_gpu if find_spec("triton") else None)
 def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
     """Filter an image with shared kernels of several window sizes and mix the results (Eq. 5).
 
     Args:
-        image: (B, C, H, W), finite. importance: I, (B, M, H, W), one map a window; any finite numbers.
+        image: (B, 3, H, W), finite. importance: I, (B, M, H, W), one map a window; any finite numbers.
         mixture: logits (B, M, H, W) whose softmax over M are the shares alpha. windows: M odd sizes.
-    Returns (B, C, H, W): a convex combination of the image's pixels within the largest window, taps outside the image
+    Returns (B, 3, H, W): a convex combination of the image's pixels within the largest window, taps outside the image
     left out. Differentiable in the first three.
     """
     training = torch.is_grad_enabled() and any(t.requires_grad for t in (image, importance, mixture))
-    colour = image.shape[1] == 3
-    if colour and compiled.usable(image, importance, mixture):
-        from models.compiled.fusion import fuse as fuse_on_processor
-
-        return fuse_on_processor(image, importance, mixture, windows)
-    if colour and not training and image.is_cuda and compiled.enabled and find_spec("triton"):
-        from models.compiled.fusion_triton import fuse as fuse_on_gpu
-
-        return fuse_on_gpu(image, importance, mixture, windows)
     if training or image.device.type != "cpu":
         return fuse_whole(image, importance, mixture, windows)
     fused = torch.empty_like(image)

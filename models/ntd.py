@@ -10,11 +10,12 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
 from models.convolution import ConvReLU
-from models.denoiser import Denoiser, State, carried
-from models.kernels import apply_kernels
-from models.operators import RunningScale, pad, running_scale
+from models.denoiser import Denoiser, State, matching_state
+from models.operators import pad_to_multiple
+from models.pixel_kernels import apply_kernels
+from models.running_scale import RunningScale, running_scale
 
-INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
+NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
 WIDTHS = (32, 48, 64, 80, 96)  # the paper's are lost
 TAPS = 25  # of a 5 x 5 kernel
 MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
@@ -28,7 +29,8 @@ class Decode(nn.Module):
 
     def __init__(self, below: int, skip: int):
         super().__init__()
-        self.skip, self.up = nn.Conv2d(skip, skip, 3, padding=1, bias=False), ConvReLU(below, skip)
+        self.skip = nn.Conv2d(skip, skip, 3, padding=1, bias=False)
+        self.up = ConvReLU(below, skip)
         self.second = ConvReLU(skip, skip)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
@@ -43,7 +45,7 @@ class KernelNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inputs = (INPUTS, *WIDTHS[:-1])
+        inputs = (NETWORK_INPUTS, *WIDTHS[:-1])
         self.encode = nn.ModuleList(
             nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
         )
@@ -82,7 +84,7 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
 
-def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+def combine_levels(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D takes the maximum of 2 x 2 pixels, U is bilinear.
 
     U is linear and so applied once. `fine` (B, C, H, W); `coarse`, and `alpha` (B, 1, ·, ·), have half the size,
@@ -93,7 +95,7 @@ def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return fine + F.interpolate(change, scale_factor=2.0, mode="bilinear")[..., :height, :width]
 
 
-def reconstruct(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def reconstruct_image(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
 
     Args:
@@ -103,11 +105,12 @@ def reconstruct(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) ->
     pyramid = [noisy]
     for _ in predictions[1:]:  # averages: maxima of noise would be biased
         pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
-    output, alpha = pyramid[-1], None
+    output = pyramid[-1]
+    alpha: Tensor | None = None
     for image, prediction in zip(pyramid[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
         filtered = apply_kernels(image, prediction[:, :TAPS])
-        output = filtered if alpha is None else combine(filtered, output, alpha)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
     return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS]), output, alpha), alpha
@@ -138,19 +141,23 @@ class NTD(Denoiser):
     it does for all of the first frame (§5): so what comes into view, and all of the image where a cut moves the camera
     far away, starts anew. The paper leaves that to the network and tests no surfaces, and neither do we.
 
-    Args:
-        vectors: "dual_motion", or "motion" for the ablation A of the paper (§6.3).
-        signal: "indirect" as in the paper, or "total".
+    It denoises indirect light, as in the paper, unless it is built for "total".
+
+    Attributes:
+        vectors: the channel by which the previous output is fetched.
     """
 
+    vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
+    # The traditional vectors tell what is disoccluded, for the loss and for pictures.
+    reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
+    signal: Signal = "indirect"
     refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+    is_network = True
 
-    def __init__(self, vectors: Literal["motion", "dual_motion"] = "dual_motion", signal: Signal = "indirect") -> None:
-        super().__init__()
-        self.vectors, self.signal = vectors, signal
-        lights = ("indirect",) if signal == "indirect" else ("direct", "indirect", "emission")
-        # The traditional vectors tell what is disoccluded, for the loss and for pictures.
-        self.reads = (*lights, "albedo", "normal", "depth", *dict.fromkeys(("motion", vectors)))
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        if self.signal == "total":
+            self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
@@ -160,7 +167,7 @@ class NTD(Denoiser):
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
         """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state."""
-        before = carried(state, NTDState, frame)
+        before = matching_state(state, NTDState, frame)
         noisy = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None)
         warped = noisy
@@ -170,8 +177,8 @@ class NTD(Denoiser):
         colours = (self.compress(image, scale, frame) for image in (noisy, warped))
         x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
-        predictions = self.network(pad(x, MULTIPLE))
-        irradiance, alpha = reconstruct(noisy, warped, predictions)
+        predictions = self.network(pad_to_multiple(x, MULTIPLE))
+        irradiance, alpha = reconstruct_image(noisy, warped, predictions)
         dual = frame.dual_motion if self.vectors == "dual_motion" else None
         return irradiance, NTDState(frame.moment, irradiance, scale, warped, alpha, frame.motion, dual)
 
@@ -179,3 +186,10 @@ class NTD(Denoiser):
         irradiance, after = self.predict(frame, state)
         after = replace(after, irradiance=irradiance.clamp(min=0))
         return frame.remodulate(after.irradiance, self.signal), after
+
+
+class NTDTraditional(NTD):
+    """The paper's ablation A (§6.3): the previous output is fetched by traditional motion vectors."""
+
+    vectors = "motion"
+    reads = ("indirect", "albedo", "normal", "depth", "motion")

@@ -6,13 +6,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
 from errors import BadInput
+from models.accumulation import accumulate
 from models.baselines import Accumulated, AccumulatedState
-from models.denoiser import Denoiser, State, carried
-from models.operators import accumulate
+from models.denoiser import Denoiser, State, matching_state
 
-Quality = Literal["high", "balanced", "fast"]
+OIDNQuality = Literal["high", "balanced", "fast"]
 
 IMAGES = ("color", "albedo", "normal", "output")
 
@@ -35,16 +35,7 @@ def open_device(threads: int) -> Any:
     return device
 
 
-def unavailable() -> str | None:
-    """Why OIDN cannot run here, with what to install; None where it can."""
-    try:
-        open_device(threads=1).release()
-    except BadInput as error:
-        return str(error)
-    return None
-
-
-def release(device: Any, filter_: Any) -> None:
+def release_native(device: Any, filter_: Any) -> None:
     filter_.release()
     device.release()
 
@@ -56,12 +47,13 @@ class RayTracingFilter:
     images, here free of noise and said to be so (`cleanAux`); the exposure left to OIDN (`inputScale` not set).
     """
 
-    def __init__(self, height: int, width: int, threads: int, quality: Quality):
+    def __init__(self, height: int, width: int, threads: int, quality: OIDNQuality):
         device = open_device(threads)
         import pyoidn
 
-        self.device, self.filter = device, pyoidn.Filter(device)
-        self.close = weakref.finalize(self, release, self.device, self.filter)  # at exit at the latest
+        self.device = device
+        self.filter = pyoidn.Filter(device)
+        self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at exit at the latest
         with torch.inference_mode(False):  # else they could not be written to outside of it
             self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
         for name, image in self.images.items():
@@ -98,10 +90,18 @@ class OIDN(Denoiser):
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
 
-    def __init__(self, quality: Quality = "high"):
-        super().__init__()
+    def __init__(self, quality: OIDNQuality = "high", *, signal: Signal | None = None):
+        super().__init__(signal=signal)
         self.quality = quality
         self.key: tuple[int, int, int] | None = None  # (H, W, threads) that the filter was made for
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        try:
+            open_device(threads=1).release()
+        except BadInput as error:
+            return str(error)
+        return None
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         super().prepare(precision)
@@ -118,7 +118,7 @@ class OIDN(Denoiser):
     def denoise(self, frame: Frame, radiance: Tensor) -> Tensor:
         """The denoised image of reflected `radiance` (B, 3, H, W), with emission for "total"."""
         denoise = self.filter_for(*frame.size)
-        inputs = radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1)
+        inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
         denoised = torch.stack([denoise(*item) for item in zip(*inputs, strict=True)])
         return denoised + frame.emission if self.signal == "total" else denoised
 
@@ -133,6 +133,6 @@ class OIDNAccumulated(OIDN):
     reads = Accumulated.reads
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, AccumulatedState, frame)
+        before = matching_state(state, AccumulatedState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
         return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.moment, history)

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.frame import Frame
-from models.denoiser import Denoiser, State, carried
-from models.operators import RunningScale, finite, pad, running_scale
+from datasets.frame import Frame, Signal
+from models.denoiser import Denoiser, State, matching_state
+from models.operators import pad_to_multiple
+from models.running_scale import RunningScale, running_scale
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
@@ -41,7 +42,9 @@ class RecurrentBlock(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.input, self.merge, self.output = conv(width, width), conv(2 * width, width), conv(width, width)
+        self.input = conv(width, width)
+        self.merge = conv(2 * width, width)
+        self.output = conv(width, width)
 
     def forward(self, x: Tensor, hidden: Tensor | None) -> Tensor:
         x = activate(self.input(x))
@@ -62,7 +65,8 @@ class RecurrentAutoencoder(nn.Module):
         self.first = conv(inputs, encoder[0])
         self.encoder = nn.ModuleList(conv(a, b) for a, b in zip(encoder, widths, strict=False))
         self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
-        below, stages = widths[-1], []
+        below = widths[-1]
+        stages = []
         for skip, (middle, out) in zip(widths[-2::-1], decoder, strict=True):
             stages.append(
                 nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE, inplace=True), conv(middle, out))
@@ -101,9 +105,10 @@ class RAE(Denoiser):
     """
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+    is_network = True
 
-    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY)) -> None:
-        super().__init__()
+    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
+        super().__init__(signal=signal)
         self.auxiliary = tuple(auxiliary)
         needed = {*auxiliary, "depth"}  # depth has its running scale in any case
         self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
@@ -113,12 +118,12 @@ class RAE(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
         height, width = frame.size
-        before = carried(state, RAEState, frame)
-        irradiance = finite(frame.irradiance(self.signal)).clamp(min=0)
+        before = matching_state(state, RAEState, frame)
+        irradiance = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
         colour = self.compress(irradiance, scale, frame)
         auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.auxiliary)
-        x = pad(torch.cat([colour, *auxiliary], dim=1), 32)
+        x = pad_to_multiple(torch.cat([colour, *auxiliary], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)

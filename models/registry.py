@@ -1,27 +1,25 @@
 """The denoisers that have names."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from datasets.frame import Signal
 from errors import BadInput
-from models import oidn
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
-from models.ntd import NTD
+from models.ntd import NTD, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.rae import RAE
 from models.svgf import SVGF
-from models.taa import Antialiased, unwrapped
+from models.taa import antialiased, inner_denoiser
 from models.weights import load_weights
-from models.wskp import KP, WSKP, WSKPMR
+from models.wskp import KP, WSKP, WSKP3, WSKPMR
 
 TAA = "+taa"
-DENOISERS: dict[str, Callable[[], Denoiser]] = {
+DENOISERS: dict[str, type[Denoiser]] = {
     "noisy": Noisy,
     "accumulated": Accumulated,
     "eaw": EAW,
@@ -29,48 +27,14 @@ DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
-    "wskp3": partial(WSKP, layers=3),
-    "wskp6": partial(WSKP, layers=6),
+    "wskp3": WSKP3,
+    "wskp6": WSKP,
     "wskp-mr": WSKPMR,
     "kp": KP,
-    "ntd-a": partial(NTD, vectors="motion"),
-    "ntd-b": NTD,
+    "ntd-a": NTDTraditional,
+    "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,
 }
-
-
-# STAND-IN until the facts are the classes' own.
-Denoiser.is_network = False  # type: ignore[attr-defined]
-for _kind in (RAE, WSKP, WSKPMR, KP, NTD):
-    _kind.is_network = True
-NTD.signal = "indirect"
-
-
-def denoiser_class(name: str) -> type[Denoiser]:
-    plain = without_taa(name)
-    if plain not in DENOISERS:
-        create(plain)
-    maker = DENOISERS[plain]
-    return maker.func if isinstance(maker, partial) else maker  # type: ignore
-
-
-def create(name: str, signal: Signal | None = None) -> Denoiser:
-    denoiser = _create(name)
-    if signal:
-        denoiser.signal = signal
-    return denoiser
-
-
-def _create(name: str) -> Denoiser:
-    """A denoiser by its name, with fresh weights where it has any. Raises BadInput for an unknown name.
-
-    A name that ends in "+taa" means that denoiser with temporal antialiasing after it.
-    """
-    if name.endswith(TAA):
-        return Antialiased(_create(without_taa(name)))
-    if name not in DENOISERS:
-        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}")
-    return DENOISERS[name]()
 
 
 def without_taa(name: str) -> str:
@@ -78,33 +42,59 @@ def without_taa(name: str) -> str:
     return name.removesuffix(TAA)
 
 
+def denoiser_class(name: str) -> type[Denoiser]:
+    """The class of a denoiser, which tells what it reads and refuses. Raises BadInput for an unknown name.
+
+    A name that ends in "+taa" means that denoiser with temporal antialiasing after it.
+    """
+    if name.endswith(TAA):
+        return antialiased(denoiser_class(without_taa(name)))
+    if name not in DENOISERS:
+        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}")
+    return DENOISERS[name]
+
+
+def create(name: str, signal: Signal | None = None) -> Denoiser:
+    """A denoiser by its name, with fresh weights if it is a network. Raises BadInput for an unknown name.
+
+    `signal` is what it returns, by default that of its class.
+    """
+    return denoiser_class(name)(signal=signal)
+
+
 def unavailable(name: str) -> str | None:
     """Why a denoiser cannot run on this machine, with what to install; None where it can."""
-    return oidn.unavailable() if isinstance(create(without_taa(name)), OIDN) else None
+    return denoiser_class(name).unavailable()
 
 
 def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
     """The channels that the named denoisers read, or all denoisers. Raises BadInput for an unknown name."""
-    return tuple(sorted({channel for name in names or DENOISERS for channel in create(name).reads}))
+    return tuple(sorted({channel for name in names or DENOISERS for channel in denoiser_class(name).reads}))
 
 
-def load(name: str, weights: Path | None, precision: torch.dtype | None = None) -> Denoiser:
-    """A denoiser ready to use: with the weights of the file if it has any, in the form for inference.
+def load(
+    name: str, weights: Path | None, precision: torch.dtype | None = None, signal: Signal | None = None
+) -> Denoiser:
+    """A denoiser ready to use: with the weights of the file if it is a network, in the form for inference.
 
-    `precision` is by default the fastest here of those that it does not refuse.
+    `precision` is by default the fastest here of those that it does not refuse, `signal` that of its class.
     Raises BadInput where the file is missing, damaged or of another network, and for a precision it refuses.
     """
-    denoiser = create(name)
-    if denoiser.parameter_count():
+    denoiser = create(name, signal)
+    if denoiser.is_network:
         if weights is None:
             raise BadInput(f"'{name}' needs trained weights")
-        load_weights(unwrapped(denoiser), without_taa(name), weights)
-    denoiser.prepare(precision or inference_precision(denoiser))
+        load_weights(inner_denoiser(denoiser), without_taa(name), weights)
+    denoiser.prepare(precision or inference_precision(name))
     return denoiser
 
 
-def inference_precision(denoiser: type[Denoiser] | Denoiser) -> torch.dtype:
-    """bfloat16 for networks that take it, where this processor has instructions for it, else float32."""
-    takes = denoiser.is_network and torch.bfloat16 not in denoiser.refuses  # type: ignore[union-attr]
+def inference_precision(denoiser: type[Denoiser] | str) -> torch.dtype:
+    """bfloat16 for networks that take it, where this processor has instructions for it, else float32.
+
+    `denoiser` is a class or a name. Raises BadInput for an unknown name.
+    """
+    kind = denoiser_class(denoiser) if isinstance(denoiser, str) else denoiser
+    takes = kind.is_network and torch.bfloat16 not in kind.refuses
     has = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
     return torch.bfloat16 if takes and has else torch.float32

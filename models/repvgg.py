@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-SIZES = (1, 3, 5)
+BRANCH_SIZES = (1, 3, 5)
 
 
 class RepVGGBlock(nn.Module):
@@ -18,9 +18,10 @@ class RepVGGBlock(nn.Module):
     One size alone, without identity, is a plain convolution.
     """
 
-    def __init__(self, inputs: int, outputs: int, relu: bool, sizes: Sequence[int] = SIZES):
+    def __init__(self, inputs: int, outputs: int, relu: bool, sizes: Sequence[int] = BRANCH_SIZES):
         super().__init__()
-        self.relu, self.has_identity = relu, inputs == outputs and len(sizes) > 1
+        self.relu = relu
+        self.has_identity = inputs == outputs and len(sizes) > 1
         self.branches: Sequence[nn.Conv2d] = nn.ModuleList(  # type: ignore[assignment]
             nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in sizes
         )
@@ -29,7 +30,8 @@ class RepVGGBlock(nn.Module):
     def kernel(self) -> tuple[Tensor, Tensor]:
         """Weight (outputs, inputs, k, k), k the largest size, and bias (outputs,) of the branches' sum."""
         size = max(branch.kernel_size[0] for branch in self.branches)
-        weights, biases = [], []
+        weights = []
+        biases = []
         for branch in self.branches:
             margin = (size - branch.kernel_size[0]) // 2
             weights.append(F.pad(branch.weight, (margin,) * 4))
@@ -47,8 +49,10 @@ class RepVGGBlock(nn.Module):
         weight, bias = self.kernel()
         outputs, inputs, size = weight.shape[:3]
         merged = nn.Conv2d(inputs, outputs, size, padding=size // 2)
-        merged.weight, merged.bias = nn.Parameter(weight, False), nn.Parameter(bias, False)
-        self.merged, self.branches = merged, nn.ModuleList()  # type: ignore[assignment]
+        merged.weight = nn.Parameter(weight, False)
+        merged.bias = nn.Parameter(bias, False)
+        self.merged = merged
+        self.branches = nn.ModuleList()  # type: ignore[assignment]
 
     def forward(self, x: Tensor) -> Tensor:
         if self.merged is not None:
@@ -59,7 +63,7 @@ class RepVGGBlock(nn.Module):
         return F.relu(y, inplace=True) if self.relu else y
 
 
-def repvgg(widths: Sequence[int], sizes: Sequence[int] = SIZES) -> nn.Sequential:
+def repvgg(widths: Sequence[int], sizes: Sequence[int] = BRANCH_SIZES) -> nn.Sequential:
     """Blocks from widths[0] channels to widths[-1], the last one linear."""
     pairs = list(pairwise(widths))
     return nn.Sequential(*(RepVGGBlock(a, b, i + 1 < len(pairs), sizes) for i, (a, b) in enumerate(pairs)))

@@ -20,20 +20,17 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models import compiled
-from models.atrous import CENTRE, LEVELS, RADIUS, WindowSum, b3_spline, taps
+from models.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
 from models.compiled import svgf as kernels
-from models.denoiser import CLASSICAL, Denoiser, State, carried
-from models.operators import Surfaces, finite, luminance, reproject
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
+from models.operators import image_luminance
+from models.parameters import EPSILON_L, EPSILON_Z, LEAST_DIVISOR, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
+from models.reprojection import reproject
+from models.surfaces import Surfaces
 
 ALPHA = 0.2  # §4.1: weight of the newest sample
 RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
-SPATIAL_RADIUS = 3  # §4.2: 7 x 7
-SIGMA_Z, SIGMA_L = 1.0, 4.0  # §4.4
-SQUARINGS = 7  # σ_n = 128 = 2^7
-EPSILON_Z = 1e-3  # of the depth
-EPSILON_L = 1e-20  # luminance²
-SMALLEST = 1e-30
-BRIGHTEST = 1e16  # luminance; its square must stay finite
+LARGEST_LUMINANCE = 1e16  # its square must stay finite
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,11 @@ class Integrated:
 
 def integrate(frame: Frame, colour: Tensor, history: Integrated | None) -> Integrated:
     """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1)."""
-    y = luminance(colour.flatten(0, 1)).clamp(-BRIGHTEST, BRIGHTEST).unflatten(0, colour.shape[:2])
+    y = (
+        image_luminance(colour.flatten(0, 1))
+        .clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+        .unflatten(0, colour.shape[:2])
+    )
     moments = torch.cat([y, y.square()], dim=2)
     length = torch.ones_like(frame.depth)
     if history is not None:
@@ -67,23 +68,24 @@ def integrate(frame: Frame, colour: Tensor, history: Integrated | None) -> Integ
 
 def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
     """Change of depth per pixel along `dim`, from the nearer in depth of the two neighbours on the same mesh."""
-    depth, mesh_id = depth.movedim(dim, -1), mesh_id.movedim(dim, -1)
+    depth = depth.movedim(dim, -1)
+    mesh_id = mesh_id.movedim(dim, -1)
     step = torch.where(mesh_id[..., 1:] == mesh_id[..., :-1], depth.diff(dim=-1), torch.inf)
-    ahead, behind = F.pad(step, (0, 1), value=torch.inf), F.pad(step, (1, 0), value=torch.inf)
+    ahead = F.pad(step, (0, 1), value=torch.inf)
+    behind = F.pad(step, (1, 0), value=torch.inf)
     smaller = torch.where(ahead.abs() < behind.abs(), ahead, behind)
     return torch.where(smaller.isinf(), 0, smaller).movedim(-1, dim)
 
 
+@compiled.by(kernels.pack_geometry)
 def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
     """What stops the filters at the edges of surfaces, (B, 1, 7, H, W).
 
     Unit normal (3; 0 for background), depth, σ_z ∇z (2: along x and y, per pixel), ε of Eq. 3.
     """
-    if compiled.usable(depth, normal, mesh_id):
-        return kernels.pack_geometry(depth, normal, mesh_id, SIGMA_Z, EPSILON_Z, SMALLEST)
-    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=SMALLEST), 0)
+    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=LEAST_DIVISOR), 0)
     gradient = [SIGMA_Z * slope(depth, mesh_id, dim) for dim in (-1, -2)]
-    epsilon = EPSILON_Z * depth.abs() + SMALLEST
+    epsilon = EPSILON_Z * depth.abs() + LEAST_DIVISOR
     return torch.cat([unit, depth, *gradient, epsilon], dim=1)[:, None]
 
 
@@ -98,6 +100,7 @@ def geometry_weight(p: Tensor, q: Tensor, dx: int, dy: int) -> Tensor:
     return w_n.mul_((depth - to_depth).abs_().div_(expected.add_(epsilon)).neg_().exp_())
 
 
+@compiled.by(kernels.spatial_variance)
 def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
     """Variance (B, S, 1, H, W) of luminance, replaced `where` (B, 1, H, W) by a 7 x 7 bilateral estimate (§4.2).
 
@@ -105,11 +108,11 @@ def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Te
     the variance of the means about the window's centre: the number that the averaged moments give, without their
     cancellation.
     """
-    if compiled.usable(variance, mean, geometry):
-        return kernels.spatial_variance(variance, mean, geometry, where, SPATIAL_RADIUS)
-    total, spread = WindowSum(torch.ones_like(geometry[:, :, :1]), 1), WindowSum(variance, 1)
-    first, second = torch.zeros_like(mean), torch.zeros_like(mean)
-    for tap in taps(mean.shape[-2:], SPATIAL_RADIUS):
+    total = WindowSum(torch.ones_like(geometry[:, :, :1]), 1)
+    spread = WindowSum(variance, 1)
+    first = torch.zeros_like(mean)
+    second = torch.zeros_like(mean)
+    for tap in strip_taps(mean.shape[-2:], SPATIAL_RADIUS):
         weight = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
         off = mean[tap.q] - mean[tap.p]
         total.add(tap, weight)
@@ -130,23 +133,27 @@ def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
 
 def edge_scale(variance: Tensor) -> Tensor:
     """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W)."""
-    total, mean = WindowSum(torch.ones_like(variance), 1 / 4), WindowSum(variance, 1 / 4)
-    for tap in taps(variance.shape[-2:], 1):
+    total = WindowSum(torch.ones_like(variance), 1 / 4)
+    mean = WindowSum(variance, 1 / 4)
+    for tap in strip_taps(variance.shape[-2:], 1):
         weight = variance.new_tensor(1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy)))
         total.add(tap, weight)
         mean.add(tap, weight)
     return 1 / (SIGMA_L * (mean.sum / total.sum + EPSILON_L).sqrt())
 
 
-def filter_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
-    """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered."""
-    if compiled.usable(colour, variance, geometry):
-        return kernels.filter_level(colour, variance, geometry, step, SIGMA_L, EPSILON_L)
-    y = luminance(colour.flatten(0, 1)).view_as(variance)
+@compiled.by(kernels.svgf_level)
+def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
+    """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered.
+
+    Taps are `step` pixels apart.
+    """
+    y = image_luminance(colour.flatten(0, 1)).view_as(variance)
     scale = edge_scale(variance)
     total = WindowSum(torch.ones_like(variance), CENTRE)
-    mean, spread = WindowSum(colour, CENTRE), WindowSum(variance, CENTRE**2)
-    for tap in taps(variance.shape[-2:], RADIUS, step):
+    mean = WindowSum(colour, CENTRE)
+    spread = WindowSum(variance, CENTRE**2)
+    for tap in strip_taps(variance.shape[-2:], RADIUS, step):
         w_l = (y[tap.p] - y[tap.q]).abs_().mul_(scale[tap.p]).neg_().exp_()
         w_zn = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
         weight = w_l.mul_(w_zn.mul_(b3_spline(tap, step)))
@@ -172,7 +179,7 @@ class SVGFState(State):
 def irradiances(frame: Frame, signal: Signal) -> Tensor:
     """Noisy demodulated direct and indirect, (B, 2, 3, H, W), or indirect alone, (B, 1, 3, H, W)."""
     parts = [frame.direct, frame.indirect] if signal == "total" else [frame.indirect]
-    return finite(torch.stack([part / frame.divisor for part in parts], dim=1))
+    return torch.stack([part / frame.divisor for part in parts], dim=1)
 
 
 class SVGF(Denoiser):
@@ -185,12 +192,12 @@ class SVGF(Denoiser):
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, SVGFState, frame)
+        before = matching_state(state, SVGFState, frame)
         integrated = integrate(frame, irradiances(frame, self.signal), before.history if before else None)
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         estimated = estimate_variance(integrated, geometry)
-        colour, variance = filter_level(integrated.colour, estimated, geometry, 1)
+        colour, variance = svgf_level(integrated.colour, estimated, geometry, 1)
         history = replace(integrated, colour=colour)  # §4.3: the first level's output
-        for level in range(1, LEVELS):
-            colour, variance = filter_level(colour, variance, geometry, 2**level)
+        for level in range(1, ATROUS_LEVELS):
+            colour, variance = svgf_level(colour, variance, geometry, 2**level)
         return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)

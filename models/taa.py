@@ -1,14 +1,18 @@
 """Temporal antialiasing, for whatever denoiser (Karis 2014)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State, carried
-from models.operators import RunningScale, Surfaces, reproject, running_scale
+from models.denoiser import Denoiser, State, matching_state
+from models.reprojection import reproject
+from models.running_scale import RunningScale, running_scale
+from models.surfaces import Surfaces
 
 NEWEST = 0.1  # weight of the current frame
 YCOCG = ((0.25, 0.5, 0.25), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25))  # from RGB
@@ -35,7 +39,7 @@ def expand(compressed: Tensor) -> Tensor:
     return recolour(compressed[:, :3] / compressed[:, 3:], RGB).clamp(min=0)
 
 
-def fetch(history: Tensor, motion: Tensor) -> Tensor:
+def fetch_bicubic(history: Tensor, motion: Tensor) -> Tensor:
     """`history` (B, 3, H, W) where this frame's pixels were, bicubic, not below 0."""
     height, width = history.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height).to(motion), torch.arange(width).to(motion), indexing="ij")
@@ -49,7 +53,8 @@ def fetch(history: Tensor, motion: Tensor) -> Tensor:
 def largest_around(image: Tensor) -> Tensor:
     """The largest value of the 3 × 3 pixels around each pixel; much faster than F.max_pool2d on a processor."""
     for dim, border in ((-1, (1, 1, 0, 0)), (-2, (0, 0, 1, 1))):
-        wide, length = F.pad(image, border, value=-torch.inf), image.shape[dim]
+        length = image.shape[dim]
+        wide = F.pad(image, border, value=-torch.inf)
         left, middle, right = (wide.narrow(dim, start, length) for start in range(3))
         image = torch.maximum(torch.maximum(left, middle), right)
     return image
@@ -57,7 +62,8 @@ def largest_around(image: Tensor) -> Tensor:
 
 def resolve(current: Tensor, history: Tensor, found: Tensor) -> Tensor:
     """Blend compressed images (B, 4, H, W), the history within the range of the 3 x 3 pixels around each pixel."""
-    low, high = -largest_around(-current), largest_around(current)
+    low = -largest_around(-current)
+    high = largest_around(current)
     return torch.lerp(torch.clamp(history, low, high), current, torch.where(found, NEWEST, 1))
 
 
@@ -74,44 +80,59 @@ class AntialiasedState(State):
         return self.inner.pictures()
 
 
+def with_history(reads: Iterable[str]) -> tuple[str, ...]:
+    """The channels `reads` and those that the history is fetched and tested by."""
+    return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
+
+
 class Antialiased(Denoiser):
-    """Any denoiser with temporal antialiasing after it.
+    """A denoiser of `inner_class` with temporal antialiasing after it; `antialiased` makes the class.
 
     The history follows the motion vectors and is blended across edges, which is what smooths them; it is dropped where
     reprojection finds no trace of the pixel's surface: disoccluded, or off-screen. Tone mapping needs an exposure: the
     causal one of the outputs so far.
     """
 
-    def __init__(self, inner: Denoiser):
-        super().__init__()
-        self.inner = inner
-        self.reads = tuple(dict.fromkeys((*inner.reads, "normal", "depth", "mesh_id", "motion")))
-        self.refuses = inner.refuses  # type: ignore[misc]  # it is the wrapped instance's
+    inner_class: ClassVar[type[Denoiser]]
 
-    @property
-    def signal(self) -> Signal:
-        return self.inner.signal
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inner = self.inner_class(signal=signal)
+        self.reads = with_history(self.inner.reads)
 
-    @signal.setter
-    def signal(self, signal: Signal) -> None:
-        self.inner.signal = signal
+    @classmethod
+    def unavailable(cls) -> str | None:
+        return cls.inner_class.unavailable()
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         self.inner.prepare(precision)
         super().prepare(precision)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = carried(state, AntialiasedState, frame)
+        before = matching_state(state, AntialiasedState, frame)
         output, inner = self.inner.forward(frame, before.inner if before else None)
         scale = running_scale(output, frame.depth, before.scale if before else None)
         if before:
             exposure = scale.exposure()
             _, found = reproject(frame, before.surfaces.mesh_id, before.surfaces)
-            past = compress(fetch(before.output, frame.motion) * exposure)
+            past = compress(fetch_bicubic(before.output, frame.motion) * exposure)
             output = expand(resolve(compress(output * exposure), past, found)) / exposure
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
 
 
-def unwrapped(denoiser: Denoiser) -> Denoiser:
+def antialiased(kind: type[Denoiser]) -> type[Antialiased]:
+    """The class of denoisers of `kind` with temporal antialiasing after them."""
+
+    class AntialiasedKind(Antialiased):
+        inner_class = kind
+        reads = with_history(kind.reads)
+        signal = kind.signal
+        refuses = kind.refuses
+        is_network = kind.is_network
+
+    return AntialiasedKind
+
+
+def inner_denoiser(denoiser: Denoiser) -> Denoiser:
     """The denoiser without antialiasing."""
     return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser

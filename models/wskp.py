@@ -2,26 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import Frame
-from models import compiled
+from datasets.frame import Frame, Signal
+from models.accumulation import accumulate
 from models.baselines import Accumulated, AccumulatedState
-from models.denoiser import Denoiser, State, carried
-from models.fusion import WINDOWS, fuse
-from models.kernels import apply_kernels
-from models.operators import RunningScale, accumulate, pad, running_scale
-from models.repvgg import SIZES, merge, repvgg
+from models.denoiser import Denoiser, State, matching_state
+from models.features import network_features
+from models.fusion import fuse
+from models.operators import pad_to_multiple
+from models.parameters import FEATURES, WINDOWS
+from models.pixel_kernels import apply_kernels
+from models.repvgg import BRANCH_SIZES, merge, repvgg
+from models.running_scale import RunningScale, running_scale
 
-INPUTS = 10  # §5.1: displayed colour, albedo, normal, depth
 WIDTH = 24  # ours: the drawn widths are lost
-GAMMA = 2.2
 
 
 @dataclass(frozen=True)
@@ -40,38 +39,17 @@ class WSKPState(AccumulatedState):
         return shown
 
 
-def features_compiled(frame: Frame, irradiance: Tensor, exposure: Tensor, scale: RunningScale) -> Tensor:
-    from models.compiled.features import features
-
-    def constants(item: int) -> NDArray[np.float64]:
-        return np.array([scale.log_depth.value[item].exp(), ALBEDO_FLOOR, 1 / GAMMA])
-
-    items = [
-        features([t[item] for t in (irradiance, frame.albedo, frame.normal, frame.depth)], gain, constants(item))
-        for item, gain in enumerate(exposure.expand(-1, 3, 1, 1).flatten(1).numpy())
-    ]
-    return torch.stack([item.permute(1, 2, 0) for item in items]).permute(0, 3, 1, 2) if items[1:] else items[0][None]
-
-
 class KernelPredictor(Denoiser):
-    """Temporal accumulation, a network that predicts how to filter, the filter on HDR irradiance, re-modulation (§4).
-
-    The network sees the accumulated radiance as displayed (causal exposure, clipped, gamma 2.2), the albedo, the
-    world-space normal scaled to [0, 1] and the depth d / (d + s) (§5.1).
-    """
+    """Temporal accumulation, a network that predicts how to filter, the filter on irradiance, re-modulation (§4)."""
 
     reads = Accumulated.reads
+    is_network = True
     filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
     network: nn.Module
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
-        """The network's input (B, 10, H, W) in [0, 1]."""
-        exposure = scale.exposure() * frame.gain
-        if compiled.usable(irradiance, frame.albedo, frame.normal, frame.depth):
-            return features_compiled(frame, irradiance, exposure, scale)
-        colour = (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA)
-        depth = scale.normalised_depth(frame.depth)
-        return torch.cat([colour, frame.albedo, frame.normal / 2 + 0.5, depth], dim=1)
+        """The network's input, see network_features."""
+        return network_features(frame, irradiance, scale)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any."""
@@ -79,7 +57,7 @@ class KernelPredictor(Denoiser):
 
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
         """The state after a frame, before any filter: accumulated irradiance and running scales."""
-        before = carried(state, WSKPState, frame)
+        before = matching_state(state, WSKPState, frame)
         history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
@@ -102,17 +80,32 @@ class KernelPredictor(Denoiser):
         super().prepare(precision)
 
 
+def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
+    """`layers` RepVGG blocks from the inputs to `outputs` channels."""
+    return repvgg([FEATURES, *[WIDTH] * (layers - 1), outputs], sizes)
+
+
 class WSKP(KernelPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
-    def __init__(self, layers: int = 6, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = SIZES):
-        super().__init__()
+    layers: ClassVar[int] = 6
+
+    def __init__(
+        self, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None
+    ):
+        super().__init__(signal=signal)
         self.windows = tuple(windows)
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), 2 * len(windows)], sizes)
+        self.network = trunk(self.layers, 2 * len(windows), sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
         return fuse(irradiance, importance, mixture, self.windows), mixture
+
+
+class WSKP3(WSKP):
+    """The smaller of the paper's two networks."""
+
+    layers = 3
 
 
 class KP(KernelPredictor):
@@ -120,9 +113,9 @@ class KP(KernelPredictor):
 
     window = 13
 
-    def __init__(self, layers: int = 6, sizes: Sequence[int] = SIZES):
-        super().__init__()
-        self.network = repvgg([INPUTS, *[WIDTH] * (layers - 1), self.window**2], sizes)
+    def __init__(self, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.network = trunk(WSKP.layers, self.window**2, sizes)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
         return apply_kernels(irradiance, predicted), None
@@ -160,7 +153,7 @@ class MultiResolutionNet(nn.Module):
         return predictions
 
 
-def combine(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W)."""
     return fine + alpha * F.interpolate(coarse - F.avg_pool2d(fine, 2), scale_factor=2.0)
 
@@ -173,23 +166,24 @@ class WSKPMR(KernelPredictor):
 
     windows = (3, 5)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.network = MultiResolutionNet(INPUTS, 2 * len(self.windows) + 1)
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.network = MultiResolutionNet(FEATURES, 2 * len(self.windows) + 1)
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
-        return pad(super().features(frame, irradiance, scale), 4)
+        return pad_to_multiple(super().features(frame, irradiance, scale), 4)
 
     def reconstruct(self, irradiance: Tensor, predicted: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:  # type: ignore[override]
         height, width = irradiance.shape[-2:]
-        images = [pad(irradiance, 4)]
+        images = [pad_to_multiple(irradiance, 4)]
         for _ in predicted[1:]:
             images.append(F.avg_pool2d(images[-1], 2))
-        output, mixture = images[-1], None
+        output = images[-1]
+        mixture: Tensor | None = None
         for level, (image, maps) in enumerate(zip(images[::-1], predicted, strict=True)):
             maps = maps.to(image.dtype)
-            importance, mixture = maps[:, :2], maps[:, 2:4]
-            filtered = fuse(image, importance, mixture, self.windows)
-            output = combine(filtered, output, torch.sigmoid(maps[:, 4:])) if level else filtered
+            mixture = maps[:, 2:4]
+            filtered = fuse(image, maps[:, :2], mixture, self.windows)
+            output = combine_resolutions(filtered, output, torch.sigmoid(maps[:, 4:])) if level else filtered
         assert mixture is not None
         return output[..., :height, :width].clamp(min=0), mixture[..., :height, :width]

@@ -11,11 +11,13 @@ from eval.ablation.textured_rae import TexturedRAE
 from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.papers.tables import WSKP_TABLE_5
 from models.denoiser import Denoiser
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.rae import AUXILIARY, RAE
 from models.registry import create
 from models.wskp import KP, WSKP
-from train.recipes import RAETerms, Recipe, recipe_for
+from train.losses.rae import RAETerms
+from train.recipe import Recipe
+from train.recipes import recipe_for
 
 SHARE_OF_EPOCHS = 1 / 4  # of a budget's; an ablation trains up to eleven networks
 SINGLE_WINDOWS = [(window,) for window in WINDOWS]

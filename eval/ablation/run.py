@@ -28,8 +28,10 @@ from models.wskp import KernelPredictor
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions
 from timing import take_turns
-from train.log import METRICS, read_metrics
-from train.loop import CHECKPOINT, Task, load_checkpoint, train_network
+from train.checkpoint import load_checkpoint
+from train.log import METRICS_CSV, read_metrics
+from train.loop import train_network
+from train.task import Task
 
 Trainings = Sequence[tuple[AblationVariant, Task]]
 
@@ -109,14 +111,14 @@ def train_and_judge(ablation: Ablation, trainings: Trainings, clips: Sequence[Cl
     precision: str | None = None
     for variant, task in tqdm(trainings, folder.name, unit="network"):
         weights = train_network(replace(task, precision=precision))
-        precision = load_checkpoint(task.folder / CHECKPOINT)["precision"]
+        precision = load_checkpoint(task.folder)["precision"]
         entrants[variant.label] = entrant_of(variant, task, weights)
         runs.append(
             VariantRun(
                 variant=variant.label,
                 seed=task.seed,
                 parameters=variant.create().parameter_count(),  # as trained
-                losses=epoch_losses(task.folder / METRICS, task.recipe.epochs),
+                losses=epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs),
                 clips=clip_means(entrants[variant.label], clips, folder),
             )
         )

@@ -16,7 +16,8 @@ from tqdm import tqdm
 from eval.bench.memory import alone, growth_mb
 from files import write_json
 from models import compiled
-from models.fusion import WINDOWS, fuse
+from models.fusion import fuse
+from models.parameters import WINDOWS
 from timing import thread_count
 
 UNFOLD, PYTORCH, COMPILED = "unfold and softmax", "onespp, PyTorch", "onespp, compiled"

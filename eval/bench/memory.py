@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from allocator import keep_freed_memory
+
 
 def release() -> None:
     """Hand memory that nobody needs any more back to the system."""
@@ -39,5 +41,5 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
     """What `function` returns in a process that has done nothing yet but import its module."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([function.__module__])  # imported once for all that follow
-    with context.Pool(1) as process:
+    with context.Pool(1, keep_freed_memory) as process:
         return process.apply(function, arguments)

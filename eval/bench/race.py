@@ -15,7 +15,7 @@ from eval.bench.sizes import Size, size_name
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.spec import DenoiserSpec
 from models.denoiser import Denoiser, State
-from models.taa import unwrapped
+from models.taa import inner_denoiser
 from timing import take_turns
 
 WARM_UP_FRAMES = 2
@@ -95,7 +95,7 @@ class Contender:
 
 
 def network_of(denoiser: Denoiser) -> nn.Module | None:
-    network = getattr(unwrapped(denoiser), "network", None)
+    network = getattr(inner_denoiser(denoiser), "network", None)
     return network if isinstance(network, nn.Module) else None
 
 

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d
 from datasets.frame import to_tensor
 from datasets.tonemap import clip_exposure, luminance
 from eval.comparison import Comparison
-from eval.figures.reference_halves import references
+from eval.figures.reference_halves import reference_halves
 from eval.metrics import METRICS, noise_floors
 from eval.metrics import measure as measure_frame
 from plotting import DPI, plt, save_figure
@@ -44,7 +44,7 @@ def tensor(radiance: NDArray[np.float64]) -> Tensor:
 def measure(repeats: Mapping[int, int] = REPEATS, truth_spp: int = TRUTH_SPP) -> tuple[float, list[Measured]]:
     """The MSE of a fixed image to a reference of very many samples, and what noisy references say of it."""
     spps = [spp for spp, count in repeats.items() for _ in range(count)]
-    rendered = references(SCENE, SIZE, [truth_spp, *spps])
+    rendered = reference_halves(SCENE, SIZE, [truth_spp, *spps])
     truth = next(rendered).mean(axis=0)
     exposure = clip_exposure(luminance(truth))
     perfect = tensor(truth)

@@ -1,65 +1,68 @@
-"""Kernels that Numba compiles for the processor at first use: the fast way of what models/ also says in PyTorch.
+"""Kernels compiled at first use: the fast way of what models/ also says in PyTorch.
 
-They need no compiler, are kept on disk from run to run, and serve inference on CPUs. Everything else (gradients, half
-precision, and GPUs but for fusion_triton.py) takes the PyTorch way, which the tests hold them to.
+`by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba makes the
+kernels for the processor without a compiler and keeps them on disk from run to run; it notices when the file of a
+kernel changes, but not when another does that the kernel takes functions or numbers from. Whatever has no kernel
+(gradients, half precision, most of all on GPUs) takes the PyTorch way, which the tests hold the kernels to.
 """
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import ParamSpec, TypeVar
 
-import numba
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-enabled = True
+from models.compiled.jit import match_threads
 
-# Inputs are finite, and sums may be taken in any order.
-jit = numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"}, error_model="numpy", boundscheck=False)
-# Numba counts rows of a prange without a sign: np.int64(row), before anything is subtracted from it.
-jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+enabled = True
 
 
 @contextlib.contextmanager
 def disabled() -> Iterator[None]:
     """Take the PyTorch way within the context: for tests and benches."""
     global enabled
-    before, enabled = enabled, False
+    before = enabled
+    enabled = False
     try:
         yield
     finally:
         enabled = before
 
 
-def usable(*tensors: Tensor) -> bool:
-    """Whether compiled kernels can work on the tensors: float32 on a CPU, without gradients."""
-    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
-    return enabled and plain and not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+def kernel_device(tensors: Sequence[Tensor]) -> str | None:
+    """The type of device whose kernels can work on the tensors ("cpu", "cuda"); None where PyTorch must.
+
+    Kernels know no gradients and take images in float32, of which the first tensor is one.
+    """
+    differentiates = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    if not enabled or differentiates or tensors[0].dtype != torch.float32:
+        return None
+    types = {tensor.device.type for tensor in tensors}
+    return types.pop() if len(types) == 1 else None
 
 
-def array(tensor: Tensor) -> NDArray[np.float32]:
-    """A tensor's values as a contiguous numpy array, without a copy where it is contiguous."""
-    return tensor.detach().contiguous().numpy()
+def by(processor: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Let kernels do the work of the PyTorch function that this decorates, wherever they can: see `kernel_device`.
 
+    `processor` and `gpu` have the function's signature and return what it returns, but for rounding.
+    """
 
-@numba.njit(parallel=True, cache=True)
-def nothing() -> None:
-    for _ in numba.prange(2):
-        pass
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def choose(*args: P.args, **kwargs: P.kwargs) -> R:
+            device = kernel_device([value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)])
+            if device == "cpu":
+                match_threads()
+                return processor(*args, **kwargs)
+            if device == "cuda" and gpu is not None:
+                return gpu(*args, **kwargs)
+            return function(*args, **kwargs)
 
+        return choose
 
-@functools.cache
-def start() -> None:
-    """Start Numba's threads. They share PyTorch's OpenMP, which that sets to all cores: set it back."""
-    count = torch.get_num_threads()
-    numba.set_num_threads(1)
-    nothing()
-    torch.set_num_threads(count)
-
-
-def threads() -> None:
-    """Let Numba use as many threads as PyTorch. Call it before a parallel kernel."""
-    start()
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    return decorate

@@ -1,5 +1,10 @@
-"""models.fusion for the processor: strips of rows, each within a core's cache, every loop along a row vectorised."""
+"""models.fusion for the processor: strips of rows, each within a core's cache, every loop along a row vectorised.
 
+Loops run over rows that are sliced off as wholes: indices that are sums might be negative, which NumPy takes from the
+end, and slices of several dimensions might have any stride. Neither is vectorised.
+"""
+
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,19 +14,18 @@ import torch
 from numba.np.ufunc.parallel import get_thread_id
 from torch import Tensor
 
-from models.compiled import array, jit, threads
+from models import parameters
 from models.compiled.exponential import exp
+from models.compiled.jit import array, jit_in_any_order
+from models.parameters import WINDOWS
 
-STRIP = 32  # rows
-SAFE_RANGE = np.float32(80)  # see models.fusion
-LEAST_EXPONENT = np.float32(-80)
-OUTSIDE = np.float32(-1e30)
-
-# Loops run over rows that are sliced off as wholes: indices that are sums might be negative, which NumPy takes from the
-# end, and slices of several dimensions might have any stride. Neither is vectorised.
+STRIP = 32  # rows that a thread fuses at once
+SAFE_RANGE = np.float32(parameters.SAFE_RANGE)
+LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
+OUTSIDE = np.float32(parameters.OUTSIDE)
 
 
-@jit
+@jit_in_any_order
 def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -> None:
     """columns (4, W + 2 margin), within its margins, = sum of rows first to last - 1 of source (4, rows, W)."""
     width = source.shape[2]
@@ -34,11 +38,12 @@ def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -
                 row[x] += line[x]
 
 
-@jit
+@jit_in_any_order
 def row_sums(total: Any, columns: Any, radius: int) -> None:
     """total (4, W) = sums of 2 radius + 1 neighbours in columns (4, W + 2 radius)."""
     for c in range(4):
-        row, line = total[c], columns[c]
+        row = total[c]
+        line = columns[c]
         width = row.size
         row[:] = line[:width]
         for tap in range(1, 2 * radius + 1):
@@ -47,30 +52,32 @@ def row_sums(total: Any, columns: Any, radius: int) -> None:
                 row[x] += shifted[x]
 
 
-@jit
+@jit_in_any_order
 def mix(fused: Any, y: int, total: Any, share: Any) -> None:
     """Row y of fused (3, H, W) += share (W) times the ratio of sums in total (4, W)."""
     weight = total[3]
     for c in range(3):
-        row, sums = fused[c, y], total[c]
+        row = fused[c, y]
+        sums = total[c]
         for x in range(share.size):
             row[x] += share[x] * sums[x] / weight[x]
 
 
-@jit
-def unpack(planes: Any, maps: Any) -> None:
-    """planes (rows, W) = maps (rows, W), of any strides."""
-    for y in range(planes.shape[0]):
-        line = planes[y]
+@jit_in_any_order
+def copy_rows(rows: Any, source: Any) -> None:
+    """rows (n, W) = source (n, W), of any strides."""
+    for y in range(rows.shape[0]):
+        line = rows[y]
         for x in range(line.size):
-            line[x] = maps[y, x]
+            line[x] = source[y, x]
 
 
-@jit
+@jit_in_any_order
 def softmax(shares: Any, y: int) -> None:
     """Row y of shares (M, rows, W) becomes its softmax over M."""
     count, _, width = shares.shape
-    top, total = shares[0, y].copy(), np.zeros(width, np.float32)
+    top = shares[0, y].copy()
+    total = np.zeros(width, np.float32)
     for i in range(1, count):
         share = shares[i, y]
         for x in range(width):
@@ -87,7 +94,7 @@ def softmax(shares: Any, y: int) -> None:
             share[x] /= total[x]
 
 
-@jit
+@jit_in_any_order
 def filter_strip(
     fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
 ) -> None:
@@ -97,14 +104,16 @@ def filter_strip(
     and lie within SAFE_RANGE; `shares` (strip, W); `weighted` (5, rows or more, W) is scratch.
     """
     height, width = image.shape[1:]
-    rows, stop = len(logits), start + len(shares)
+    stop = start + len(shares)
     shift = (logits.min() + logits.max()) / np.float32(2)
-    for y in range(rows):
-        line, entry = weighted[3, y], logits[y]
+    for y in range(len(logits)):
+        line = weighted[3, y]
+        entry = logits[y]
         for x in range(width):
             line[x] = exp(entry[x] - shift)
         for c in range(3):
-            product, pixel = weighted[c, y], image[c, low + y]
+            product = weighted[c, y]
+            pixel = image[c, low + y]
             for x in range(width):
                 product[x] = pixel[x] * line[x]
     columns = np.zeros((4, width + 2 * radius), np.float32)
@@ -115,14 +124,15 @@ def filter_strip(
         mix(fused, y, total, shares[y - start])
 
 
-@jit
+@jit_in_any_order
 def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: Any, taps: int) -> None:
     """Largest entry (taps, W), and sums of exp(entry - largest) * value (4, taps, W), into tops and totals.
 
     These have `margin` entries more on both sides: tops (W + 2 margin), totals (4, W + 2 margin).
     """
     width = entries.shape[1]
-    top, weight = tops[margin : margin + width], np.empty(width, np.float32)
+    top = tops[margin : margin + width]
+    weight = np.empty(width, np.float32)
     top[:] = entries[0]
     for tap in range(1, taps):
         entry = entries[tap]
@@ -136,22 +146,26 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
             exponent = exponent if exponent > LEAST_EXPONENT else LEAST_EXPONENT
             weight[x] = exp(exponent) if entry[x] > OUTSIDE else np.float32(0)
         for c in range(4):
-            total, value = totals[c][margin : margin + width], values[c, tap]
+            total = totals[c][margin : margin + width]
+            value = values[c, tap]
             for x in range(width):
                 total[x] += weight[x] * value[x]
 
 
-@jit
+@jit_in_any_order
 def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
     """The same for any finite logits: relative to the largest of every window, columns first, then rows."""
     height, width = image.shape[1:]
     taps = 2 * radius + 1
     entries = np.empty((taps, width), np.float32)
     values = np.zeros((4, taps, width), np.float32)
-    top, tops = np.empty(width, np.float32), np.full(width + 2 * radius, OUTSIDE)
-    total, totals = np.empty((4, width), np.float32), np.zeros((4, width + 2 * radius), np.float32)
+    top = np.empty(width, np.float32)
+    tops = np.full(width + 2 * radius, OUTSIDE)
+    total = np.empty((4, width), np.float32)
+    totals = np.zeros((4, width + 2 * radius), np.float32)
     for y in range(start, start + len(shares)):
-        first, last = max(y - radius, 0), min(y + radius + 1, height)
+        first = max(y - radius, 0)
+        last = min(y + radius + 1, height)
         for tap in range(last - first):
             entries[tap] = logits[first + tap - low]
             values[:3, tap] = image[:, first + tap]
@@ -164,46 +178,61 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
         mix(fused, y, total, shares[y - start])
 
 
-IMAGE, MAPS = numba.float32[:, :, ::1], numba.float32[:, :, :]
+def fuse_strips(
+    fused: Any, image: Any, importance: Any, mixture: Any, windows: Any, weighted: Any, shares: Any
+) -> None:
+    """fused (3, H, W) += image (3, H, W) filtered, strips in parallel.
 
-
-@numba.njit(
-    numba.void(IMAGE, IMAGE, MAPS, MAPS, numba.int64[::1], numba.float32[:, :, :, ::1], numba.float32[:, :, :, ::1]),
-    cache=True,
-    parallel=True,
-    error_model="numpy",
-)
-def fuse_image(fused: Any, image: Any, importance: Any, mixture: Any, windows: Any, sums: Any, mixtures: Any) -> None:
+    weighted (threads, 5, rows, W) and shares (threads, M, STRIP, W) are scratch of the threads' own: memory that is
+    allocated within the loop would be cleared anew for every strip.
+    """
     height = image.shape[1]
     for strip in numba.prange((height + STRIP - 1) // STRIP):
-        start, stop = strip * STRIP, min((strip + 1) * STRIP, height)
-        # Each thread has scratch of its own: memory that is allocated here would be cleared anew for every strip.
-        weighted, shares = sums[get_thread_id()], mixtures[get_thread_id()]
+        start = strip * STRIP
+        stop = min((strip + 1) * STRIP, height)
+        my_weighted = weighted[get_thread_id()]
+        my_shares = shares[get_thread_id()]
         for i in range(windows.size):
-            unpack(shares[i, : stop - start], mixture[i, start:stop])
+            copy_rows(my_shares[i, : stop - start], mixture[i, start:stop])
         for y in range(stop - start):
-            softmax(shares, y)
+            softmax(my_shares, y)
         for i in range(windows.size):
             radius = windows[i] // 2
-            low, high = max(start - radius, 0), min(stop + radius, height)
-            logits = weighted[4, : high - low]
-            unpack(logits, importance[i, low:high])
+            low = max(start - radius, 0)
+            high = min(stop + radius, height)
+            logits = my_weighted[4, : high - low]
+            copy_rows(logits, importance[i, low:high])
             if logits.max() - logits.min() <= SAFE_RANGE:
-                filter_strip(fused, image, logits, shares[i, : stop - start], radius, start, low, weighted)
+                filter_strip(fused, image, logits, my_shares[i, : stop - start], radius, start, low, my_weighted)
             else:
-                filter_strip_in_steps(fused, image, logits, shares[i, : stop - start], radius, start, low)
+                filter_strip_in_steps(fused, image, logits, my_shares[i, : stop - start], radius, start, low)
 
 
-def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int]) -> Tensor:
-    """See models.fusion.fuse; the image has three channels. The maps may have any strides."""
-    threads()
+@functools.cache
+def compiled_fuse_strips() -> Any:
+    """`fuse_strips`, compiled once for maps of any strides. That takes seconds even from disk: not at import."""
+    image = numba.float32[:, :, ::1]
+    maps = numba.float32[:, :, :]
+    scratch = numba.float32[:, :, :, ::1]
+    signature = numba.void(image, image, maps, maps, numba.int64[::1], scratch, scratch)
+    return numba.njit(signature, cache=True, parallel=True, error_model="numpy")(fuse_strips)
+
+
+def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
+    """See models.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
-    count, width = numba.get_num_threads(), image.shape[-1]
-    scratch = (
-        np.empty((count, 5, STRIP + max(windows), width), np.float32),
-        np.empty((count, len(windows), STRIP, width), np.float32),
-    )
+    threads = numba.get_num_threads()
+    width = image.shape[-1]
+    weighted = np.empty((threads, 5, STRIP + max(windows), width), np.float32)
+    shares = np.empty((threads, len(windows), STRIP, width), np.float32)
     for item in range(len(image)):
-        maps = importance[item].detach().numpy(), mixture[item].detach().numpy()
-        fuse_image(fused[item].numpy(), array(image[item]), *maps, np.array(windows), *scratch)
+        maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
+        compiled_fuse_strips()(fused[item].numpy(), array(image[item]), *maps, np.array(windows), weighted, shares)
     return fused
+
+
+def fuse_on_gpu(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
+    """The same for CUDA devices, by Triton, which is imported here because it takes long and is not everywhere."""
+    from models.compiled.fusion_triton import fuse
+
+    return fuse(image, importance, mixture, windows)

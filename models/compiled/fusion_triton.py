@@ -9,17 +9,27 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-BLOCK = 128  # pixels of a row, a program
+PROGRAM_WIDTH = 128  # pixels of a row that one program filters
 
 
 @triton.jit  # type: ignore[untyped-decorator]
 def fuse_rows(
-    fused: Any, image: Any, importance: Any, mixture: Any, radii: Any, height: Any, width: Any,
-    COUNT: tl.constexpr, BLOCK: tl.constexpr,
-) -> None:  # fmt: skip
+    fused: Any,
+    image: Any,
+    importance: Any,
+    mixture: Any,
+    radii: Any,
+    height: Any,
+    width: Any,
+    COUNT: tl.constexpr,
+    BLOCK: tl.constexpr,
+) -> None:
     """Every window relative to its largest logit: one way over its taps for that, one for the sums."""
-    x, y, item = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1), tl.program_id(2).to(tl.int64)
-    plane, within = height * width, x < width
+    x = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    y = tl.program_id(1)
+    item = tl.program_id(2).to(tl.int64)
+    plane = height * width
+    within = x < width
     at = y * width + x
     image += item * 3 * plane
     fused += item * 3 * plane
@@ -29,16 +39,21 @@ def fuse_rows(
     for i in range(COUNT):
         top = tl.maximum(top, tl.load(mixture + i * plane + at, within, 0))
     total = tl.zeros((BLOCK,), tl.float32)
-    red, green, blue = total, total, total
+    red = total
+    green = total
+    blue = total
     for i in range(COUNT):
-        logits, radius = importance + i * plane, tl.load(radii + i)
+        logits = importance + i * plane
+        radius = tl.load(radii + i)
         largest = tl.full((BLOCK,), -float("inf"), tl.float32)
         for v in range(tl.maximum(y - radius, 0), tl.minimum(y + radius + 1, height)):
             for dx in range(-radius, radius + 1):
                 inside = (x + dx >= 0) & (x + dx < width)
                 largest = tl.maximum(largest, tl.load(logits + v * width + x + dx, inside, -float("inf")))
         weight = tl.zeros((BLOCK,), tl.float32)
-        r, g, b = weight, weight, weight
+        r = weight
+        g = weight
+        b = weight
         for v in range(tl.maximum(y - radius, 0), tl.minimum(y + radius + 1, height)):
             for dx in range(-radius, radius + 1):
                 inside = (x + dx >= 0) & (x + dx < width)
@@ -59,12 +74,12 @@ def fuse_rows(
 
 
 def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int]) -> Tensor:
-    """See models.fusion.fuse; the image has three channels."""
+    """See models.fusion.fuse."""
     batch, _, height, width = image.shape
     fused = torch.empty_like(image, memory_format=torch.contiguous_format)
     radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)
     tensors = (tensor.float().contiguous() for tensor in (image, importance, mixture))
-    grid = (triton.cdiv(width, BLOCK), height, batch)
+    grid = (triton.cdiv(width, PROGRAM_WIDTH), height, batch)
     with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
-        fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), BLOCK)
+        fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), PROGRAM_WIDTH)
     return fused

@@ -16,7 +16,7 @@ from eval.spec import DenoiserSpec
 from models import registry
 from models.registry import create
 from models.weights import save_weights
-from train.loop import run_folder
+from train.task import run_folder
 
 METRICS = {
     *("mse", "rmse", "l1", "psnr", "ssim", "flip", "mse_unbiased", "smape", "rel_mse"),

@@ -16,7 +16,7 @@ from eval.metrics import METRICS
 from eval.results import FLOOR, folder_of, load_picture, read_results
 from models.registry import create
 from models.weights import save_weights
-from train.loop import run_folder
+from train.task import run_folder
 
 NAMES = ["noisy", "accumulated", "rae"]
 

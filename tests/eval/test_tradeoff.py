@@ -19,10 +19,10 @@ from eval.tradeoff.run import beaten_by, trade
 from eval.tradeoff.sample_cost import line, sample_cost
 from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
 from files import read_json, write_json
-from models.fusion import WINDOWS
+from models.parameters import WINDOWS
 from models.weights import save_weights
-from render.clip import PLAIN
-from train.loop import WEIGHTS, run_folder
+from render.clip import NO_OPTIONS
+from train.task import WEIGHTS_FILE, run_folder
 
 SIZE = (32, 48)
 
@@ -182,7 +182,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 def test_cost_of_samples(tiny):
     cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
-    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
 
 
@@ -245,7 +245,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else trained_as(name)
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")

@@ -5,7 +5,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_operators import flat_frame
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
@@ -13,6 +12,7 @@ from errors import BadInput
 from models import registry
 from models.rae import RAE, RAEState
 from models.weights import load_weights, save_weights
+from tests.helpers.frames import flat_frame, run
 
 NAMES = list(registry.DENOISERS)
 
@@ -23,13 +23,22 @@ def denoisers():
     return {name: registry.create(name).eval() for name in NAMES}
 
 
-def run(denoiser, frames):
-    state, outputs = None, []
-    with torch.no_grad():
-        for frame in frames:
-            output, state = denoiser(frame, state)
-            outputs.append(output)
-    return outputs
+@pytest.mark.parametrize("name", [*NAMES, "noisy+taa", "svgf+taa", "wskp6+taa", "ntd+taa"])
+def test_classes_tell_what_their_instances_are(name):
+    kind = registry.denoiser_class(name)
+    denoiser = registry.create(name)
+    assert type(denoiser).__name__ == kind.__name__
+    assert (kind.reads, kind.signal, kind.refuses) == (denoiser.reads, denoiser.signal, denoiser.refuses)
+    assert kind.is_network == (denoiser.parameter_count() > 0)
+    assert registry.inference_precision(name) == registry.inference_precision(kind)
+    assert {registry.create(name, signal).signal for signal in ("total", "indirect")} == {"total", "indirect"}
+
+
+def test_facts_are_known_without_building(monkeypatch):
+    monkeypatch.setattr(torch.nn.Module, "__init__", lambda self: pytest.fail("something was built"))
+    assert "dual_motion" in registry.channels_read(["ntd"]) and "normal" in registry.channels_read(["noisy+taa"])
+    assert registry.unavailable("rae+taa") is None
+    assert registry.inference_precision("svgf+taa") == torch.float32
 
 
 @pytest.mark.parametrize("name", NAMES)

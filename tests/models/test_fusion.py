@@ -13,7 +13,8 @@ from torch.nn import functional as F
 
 from eval.bench.fusion import unfold_fuse
 from models import compiled
-from models.fusion import WINDOWS, box_sum, fuse, shared_kernel, windowed_sums
+from models.fusion import box_sum, fuse, shared_kernel, windowed_sums
+from models.parameters import WINDOWS
 
 
 def both_ways(image, importance, mixture, windows=WINDOWS):

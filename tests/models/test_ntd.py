@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_operators import flat_frame
 from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
+from models import ntd as ntd_module
 from models.convolution import ConvReLU
-from models.ntd import NTD, NTDState, combine, reconstruct, warp
+from models.ntd import NTD, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
 from models.registry import create
-from models.registry import ntd as ntd_module
+from tests.helpers.frames import flat_frame, play, run
 
 OUTPUTS = (26, 26, 51)
 
@@ -30,17 +30,7 @@ def ntd() -> NTD:
 def frames(tiny) -> list[Frame]:
     """Three frames in which a mesh and the camera move."""
     clip = Dataset(tiny).clips("test")[1]
-    return [read_frame(clip, index, NTD("motion", "total").reads + NTD().reads) for index in range(2, 5)]
-
-
-@torch.no_grad()
-def run(ntd: NTD, frames: list[Frame]) -> tuple[list[Tensor], NTDState]:
-    outputs, state = [], None
-    for frame in frames:
-        output, state = ntd(frame, state)
-        outputs.append(output)
-    assert isinstance(state, NTDState)
-    return outputs, state
+    return [read_frame(clip, index, NTD(signal="total").reads) for index in range(2, 5)]
 
 
 def copy(frame: Frame, **channels: Tensor) -> Frame:
@@ -109,7 +99,7 @@ def test_combination_equals_eq_4(size):
     rng = np.random.default_rng(0)
     half = -(-size[0] // 2), -(-size[1] // 2)
     fine, coarse, alpha = rng.uniform(0, 5, (3, *size)), rng.uniform(0, 5, (3, *half)), rng.uniform(0, 1, (1, *half))
-    result = combine(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
+    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
     np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha), atol=1e-12)
 
 
@@ -131,7 +121,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     noisy, ones = torch.rand(1, 3, height, width), torch.ones(1, 3, height, width)
     seen: list[Tensor] = []
     monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
-    reconstruct(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
+    reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
     for image, block in zip(seen, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))
         for y in range(height // block):
@@ -140,7 +130,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
                 torch.testing.assert_close(image[0, :, y, x], part.mean(dim=(1, 2)))
         assert image.min() >= noisy.min() - 1e-6 and image.max() <= noisy.max() + 1e-6
     monkeypatch.undo()
-    flat, _ = reconstruct(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))
+    flat, _ = reconstruct_image(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))
     torch.testing.assert_close(flat, ones)
 
 
@@ -158,7 +148,7 @@ def test_reconstruction_equals_eq_4_at_both_levels():
     middle = naive_combine(half, quarter, np.full((1, 2, 3), a4))
     fine = naive_combine(noisy, middle, np.full((1, 4, 5), a2))
     maps = predictions(7, 10, (0.3, -0.6, 1.2), kernel=80.0)
-    result, alpha = reconstruct(*(torch.from_numpy(a).float()[None] for a in (noisy, warped)), maps)
+    result, alpha = reconstruct_image(*(torch.from_numpy(a).float()[None] for a in (noisy, warped)), maps)
     np.testing.assert_allclose(result[0], a_t * fine + (1 - a_t) * warped, atol=1e-5)
     assert alpha.shape == (1, 1, 7, 10) and alpha.flatten()[0].item() == pytest.approx(a_t)
 
@@ -167,10 +157,10 @@ def test_alpha_t_is_the_weight_of_the_current_frame():
     noisy, warped = torch.rand(1, 3, 9, 11), torch.rand(1, 3, 9, 11) + 10
     other = torch.rand(1, 3, 9, 11)
     now, then = (predictions(9, 11, (0, 0, logit)) for logit in (200.0, -200.0))
-    assert torch.equal(reconstruct(noisy, warped, now)[0], reconstruct(noisy, other, now)[0])
-    assert torch.equal(reconstruct(noisy, warped, then)[0], reconstruct(other, warped, then)[0])
+    assert torch.equal(reconstruct_image(noisy, warped, now)[0], reconstruct_image(noisy, other, now)[0])
+    assert torch.equal(reconstruct_image(noisy, warped, then)[0], reconstruct_image(other, warped, then)[0])
     mean = F.avg_pool2d(warped, 5, 1, 2, count_include_pad=False)  # what equal logits make of a window
-    torch.testing.assert_close(reconstruct(noisy, warped, then)[0], mean)
+    torch.testing.assert_close(reconstruct_image(noisy, warped, then)[0], mean)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -195,7 +185,8 @@ def test_the_network_is_the_one_described(ntd, frames, monkeypatch):
     seen: list[Tensor] = []
     genuine = ntd.network.forward
     monkeypatch.setattr(ntd.network, "forward", lambda x: seen.append(x) or genuine(x))
-    _, state = run(ntd, frames[:2])
+    _, state = play(ntd, frames[:2])
+    assert isinstance(state, NTDState)
     assert [tuple(p.shape[1:]) for p in genuine(seen[1])] == [(26, 16, 16), (26, 32, 32), (51, 64, 64)]
     x, frame = seen[1], frames[1]
     exposure = state.scale.exposure()
@@ -211,7 +202,7 @@ def test_the_network_is_the_one_described(ntd, frames, monkeypatch):
 
 def test_what_it_reads(ntd):
     assert set(ntd.reads) == {"indirect", "albedo", "normal", "depth", "motion", "dual_motion"}
-    assert set(NTD("motion").reads) == {"indirect", "albedo", "normal", "depth", "motion"}
+    assert set(NTDTraditional.reads) == {"indirect", "albedo", "normal", "depth", "motion"}
     assert {"direct", "emission"} <= set(NTD(signal="total").reads)
     assert [create(name).vectors for name in ("ntd-a", "ntd-b", "ntd")] == ["motion", "dual_motion", "dual_motion"]
     assert {create(name).signal for name in ("ntd-a", "ntd-b", "ntd")} == {"indirect"}
@@ -219,7 +210,8 @@ def test_what_it_reads(ntd):
 
 def test_the_previous_output_is_warped_by_the_dual_vectors(ntd, frames):
     now = copy(frames[1], dual_motion=frames[1].dual_motion + 7.3, motion=frames[1].motion + 7.3)
-    (_, state), before = run(ntd, [frames[0], now]), run(ntd, frames[:1])[1]
+    _, state = play(ntd, [frames[0], now])
+    _, before = play(ntd, frames[:1])
     warped, inside = naive_warp(before.irradiance[0].double().numpy(), now.dual_motion[0].double().numpy())
     noisy = (now.indirect / now.divisor)[0].numpy()
     assert 0.5 < inside.mean() < 1
@@ -231,17 +223,17 @@ def test_the_previous_output_is_warped_by_the_dual_vectors(ntd, frames):
 
 
 def test_equal_vectors_make_it_the_ablation_with_traditional_ones(ntd, frames):
-    traditional = NTD("motion").eval()
+    traditional = NTDTraditional().eval()
     traditional.load_state_dict(ntd.state_dict())
     same = [copy(frame, dual_motion=frame.motion) for frame in frames]
-    for a, b in zip(run(ntd, same)[0], run(traditional, frames)[0], strict=True):
+    for a, b in zip(run(ntd, same), run(traditional, frames), strict=True):
         assert torch.equal(a, b)
-    assert not torch.equal(run(ntd, frames)[0][1], run(traditional, frames)[0][1])
-    assert "disocclusion mask" not in run(traditional, frames)[1].pictures()
+    assert not torch.equal(run(ntd, frames)[1], run(traditional, frames)[1])
+    assert "disocclusion mask" not in play(traditional, frames)[1].pictures()
 
 
 def test_the_first_frame_s_noise_is_its_previous_output(ntd, frames):
-    state = run(ntd, frames[:1])[1]
+    state = play(ntd, frames[:1])[1]
     assert torch.equal(state.warped, frames[0].indirect / frames[0].divisor)
 
 
@@ -250,7 +242,7 @@ def test_where_vectors_leave_the_image_it_starts_anew(ntd, frames):
     far = torch.full_like(frames[1].motion, 1e5)
     cut = copy(frames[1], motion=far, dual_motion=far)
     bright = copy(frames[0], indirect=frames[0].indirect * 1.5 + 1)
-    states = [run(ntd, [first, cut])[1] for first in (frames[0], bright)]
+    states = [play(ntd, [first, cut])[1] for first in (frames[0], bright)]
     assert torch.equal(*(state.warped for state in states))
     assert torch.equal(states[0].warped, cut.indirect / cut.divisor)
 
@@ -261,7 +253,7 @@ def test_state_carries_over(ntd, frames):
         _, state = ntd(frames[0], None)
         with_state, _ = ntd(frames[1], state)
         without, _ = ntd(frames[1], None)
-    assert torch.equal(with_state, run(ntd, frames[:2])[0][1])
+    assert torch.equal(with_state, run(ntd, frames[:2])[1])
     assert not torch.allclose(with_state, without)
 
 
@@ -272,7 +264,7 @@ def test_a_poisoned_pixel_does_not_persist(ntd, poison):
         first.channels["indirect"] = second.channels["indirect"] = torch.rand(1, 3, 20, 24)
         first.channels[name] = first.channels[name].clone()
         first.channels[name][..., 7, 9] = poison
-        outputs, state = run(ntd, [first, second])
+        outputs, state = play(ntd, [first, second])
         assert all(torch.isfinite(output).all() for output in outputs), name
         assert all(torch.isfinite(picture).all() for picture in state.pictures().values()), name
 
@@ -281,14 +273,14 @@ def test_bfloat16_is_close_to_float32(ntd, frames):
     half = NTD()
     half.load_state_dict(ntd.state_dict())
     half.prepare(torch.bfloat16)
-    for a, b in zip(run(ntd, frames)[0], run(half, frames)[0], strict=True):
+    for a, b in zip(run(ntd, frames), run(half, frames), strict=True):
         assert b.dtype == torch.float32
         assert (a - b).abs().mean() < 0.01 * a.mean()
 
 
 def test_it_is_blind_to_the_scene_s_brightness(ntd, frames):
     bright = [copy(frame, indirect=frame.indirect * 1000) for frame in frames]
-    for a, b in zip(run(ntd, frames)[0], run(ntd, bright)[0], strict=True):
+    for a, b in zip(run(ntd, frames), run(ntd, bright), strict=True):
         torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3 * 1000 * a.mean().item())
 
 
@@ -298,9 +290,9 @@ def test_outputs_of_both_signals(ntd, frames):
     total.load_state_dict(ntd.state_dict())
     for frame in frames:
         both = copy(frame, direct=torch.zeros_like(frame.direct))
-        torch.testing.assert_close(run(total, [both])[0][0], run(ntd, [frame])[0][0] + frame.emission)
+        torch.testing.assert_close(run(total, [both])[0], run(ntd, [frame])[0] + frame.emission)
         dark = copy(frame, direct=frame.indirect, indirect=torch.zeros_like(frame.indirect))
-        assert torch.equal(run(total, [dark])[0][0], run(total, [both])[0][0])
+        assert torch.equal(run(total, [dark])[0], run(total, [both])[0])
 
 
 def test_training_sees_what_inference_cuts_off(frames):
@@ -323,9 +315,9 @@ def test_training_sees_what_inference_cuts_off(frames):
 def test_gain_changes_what_the_network_sees_and_not_the_filtered_light(ntd, frames):
     frame = frames[0]
     gained = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
-    _, state = run(ntd, [frame])
+    _, state = play(ntd, [frame])
     light = torch.rand(1, 3, 4, 4)
     plain, tinted = (ntd.compress(light, state.scale, f) for f in (frame, gained))
     torch.testing.assert_close(torch.expm1(tinted), torch.expm1(plain) * gained.gain)
     torch.testing.assert_close(ntd.compress(-light, state.scale, frame), -plain)
-    assert torch.equal(run(ntd, [gained])[1].warped, state.warped)
+    assert torch.equal(play(ntd, [gained])[1].warped, state.warped)

@@ -5,13 +5,13 @@ import sys
 import numpy as np
 import pytest
 import torch
-from test_operators import flat_frame
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
 from models.oidn import OIDN, OIDNAccumulated
+from tests.helpers.frames import flat_frame, run
 
 pytest.importorskip("pyoidn")
 
@@ -22,13 +22,6 @@ LEVELS = (1e-7, 1e-3, 1.0, 65504.0)
 def frames_of(tiny, count: int = 4) -> list[Frame]:
     clip = Dataset(tiny).clips("test")[0]
     return [read_frame(clip, i, CHANNELS) for i in range(count)]
-
-
-def last(denoiser, frames) -> torch.Tensor:
-    state = None
-    for frame in frames:
-        output, state = denoiser(frame, state)
-    return output
 
 
 def error(radiance: torch.Tensor, frame: Frame) -> float:
@@ -44,7 +37,7 @@ def noisy_wall(height: int, width: int, level: float = 1.0) -> Frame:
 
 def test_denoises_and_accumulation_helps(tiny):
     frames = frames_of(tiny, 6)
-    noisy, plain, accumulated = (last(registry.create(n), frames) for n in ("noisy", "oidn", "oidn-accumulated"))
+    noisy, plain, accumulated = (run(registry.create(n), frames)[-1] for n in ("noisy", "oidn", "oidn-accumulated"))
     assert error(plain, frames[-1]) < 0.2 * error(noisy, frames[-1])
     assert error(accumulated, frames[-1]) < error(plain, frames[-1])
 
@@ -82,8 +75,7 @@ def test_emission_is_untouched():
     lamp.emission[..., 8:] = 50.0
     denoiser = OIDN()
     torch.testing.assert_close(denoiser(lamp, None)[0] - denoiser(dark, None)[0], lamp.emission)
-    denoiser.signal = "indirect"
-    assert (denoiser(lamp, None)[0] < 0.1).all()  # all light is direct
+    assert (OIDN(signal="indirect")(lamp, None)[0] < 0.1).all()  # all light is direct
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf, -5.0])
@@ -96,6 +88,7 @@ def test_unusable_pixels_count_as_black(poison):
 
 
 def test_the_filter_is_made_once_a_size_and_thread_count(monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     denoiser = OIDN("fast")
     filters = []
     for size in ((20, 30), (20, 30), (30, 20), (30, 20)):

@@ -1,7 +1,5 @@
 """Shared operators against hand-computed images and slow, obvious versions in float64."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,46 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.clip import Dataset
-from datasets.frame import Cameras, Frame, read_frame
+from datasets.frame import Frame, read_frame
 from models import compiled
-from models.operators import Accumulation, Surfaces, accumulate, luminance, reproject, running_scale
-
-
-def flat_frame(height: int, width: int, motion=(0.0, 0.0), depth=2.0, mesh_id=None, irradiance=None) -> Frame:
-    """A wall that faces the camera at `depth`; its picture shifts by `motion` because the camera slides along it."""
-    focal = 10.0
-    K = torch.tensor([[-focal, 0, width / 2], [0, -focal, height / 2], [0, 0, 1.0]], dtype=torch.float64)[None]
-    now = torch.eye(4, dtype=torch.float64)[None]
-    before = now.clone()
-    # x_prev - x = motion: the camera's frame has x to the left and y up, and so does its slide.
-    before[0, 0, 3], before[0, 1, 3] = (depth * m / focal for m in motion)
-    ones = torch.ones(1, 1, height, width)
-    normal = torch.zeros(1, 3, height, width)
-    normal[:, 2] = -1
-    channels = {
-        "direct": ones.repeat(1, 3, 1, 1) if irradiance is None else irradiance,
-        "indirect": torch.zeros(1, 3, height, width),
-        "emission": torch.zeros(1, 3, height, width),
-        "albedo": torch.ones(1, 3, height, width),
-        "normal": normal,
-        "depth": depth * ones,
-        "roughness": ones,
-        "mesh_id": ones if mesh_id is None else mesh_id.float(),
-        "motion": torch.tensor(motion)[None, :, None, None].expand(1, 2, height, width).contiguous(),
-    }
-    channels["dual_motion"] = channels["motion"].clone()  # nothing is hidden
-    bodies = torch.eye(4, dtype=torch.float64).expand(1, 9, 4, 4)
-    return Frame(channels, Cameras(K, now, bodies), Cameras(K, before, bodies), torch.ones(1, 3, 1, 1), "test")
-
-
-def chain(frames: list[Frame]) -> list[Frame]:
-    """The frames as a sequence: each one's previous camera is moved to where the frame before it has its own."""
-    chained = frames[:1]
-    for frame in frames[1:]:
-        last, step = chained[-1].now, frame.previous.camera_to_world.inverse() @ frame.now.camera_to_world
-        now = replace(frame.now, camera_to_world=last.camera_to_world @ step)
-        chained.append(replace(frame, now=now, previous=replace(last, K=frame.previous.K)))
-    return chained
+from models.accumulation import Accumulation, accumulate
+from models.operators import image_luminance
+from models.reprojection import reproject
+from models.running_scale import running_scale
+from models.surfaces import Surfaces
+from tests.helpers.frames import flat_frame
 
 
 def ramp(height: int, width: int) -> torch.Tensor:
@@ -211,7 +177,7 @@ def test_running_scale_of_sparse_noise_is_near_that_of_its_mean():
 
 def test_luminance_weights():
     rgb = torch.eye(3)[None, :, :, None]
-    torch.testing.assert_close(luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
+    torch.testing.assert_close(image_luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
 
 
 def test_compiled_reprojection_equals_pytorch_s(tiny):

@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_operators import chain, flat_frame
 
 from datasets.channels import REFERENCES
 from datasets.clip import Dataset
@@ -21,6 +20,7 @@ from datasets.tonemap import display, psnr
 from errors import BadInput
 from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
 from models import registry
+from tests.helpers.frames import chain, flat_frame, play, run
 
 NAMES = [name for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa") if not registry.unavailable(name)]
 THREADS = torch.get_num_threads()
@@ -36,15 +36,6 @@ def denoisers():
         denoiser.prepare()
     yield made
     torch.set_num_threads(THREADS)
-
-
-@torch.no_grad()
-def run(denoiser, frames, state=None):
-    outputs = []
-    for frame in frames:
-        output, state = denoiser(frame, state)
-        outputs.append(output)
-    return outputs
 
 
 # --- Frames at the extremes -------------------------------------------------------------------------------------------
@@ -145,12 +136,9 @@ def noisy_sequence(count: int, size: int = 8):
         yield flat_frame(size, size, irradiance=torch.from_numpy(np.float32(light)))
 
 
-@torch.no_grad()
 def bounded_after(denoiser, count: int) -> None:
-    state = None
-    for frame in noisy_sequence(count):
-        output, state = denoiser(frame, state)
-    assert torch.isfinite(output).all() and output.max() <= 65504 * 2
+    outputs, state = play(denoiser, noisy_sequence(count))
+    assert torch.isfinite(outputs[-1]).all() and outputs[-1].max() <= 65504 * 2
     for picture in state.pictures().values():
         assert torch.isfinite(picture).all()
 

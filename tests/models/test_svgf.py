@@ -9,15 +9,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_operators import flat_frame
 
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled
+from models import compiled, eaw, svgf
 from models.baselines import Accumulated
 from models.eaw import EAW
-from models.operators import Surfaces, running_scale
-from models.registry import eaw, svgf
+from models.running_scale import running_scale
+from models.surfaces import Surfaces
 from models.svgf import SVGF, Integrated
+from tests.helpers.frames import flat_frame, play, run
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
@@ -37,15 +37,6 @@ def way(request):
     """The test runs with compiled kernels and the PyTorch way."""
     with WAYS[request.param]():
         yield request.param
-
-
-@torch.no_grad()
-def run(denoiser, frames):
-    state, outputs = None, []
-    for frame in frames:
-        output, state = denoiser(frame, state)
-        outputs.append(output)
-    return outputs, state
 
 
 def surfaces(rng, height, width):
@@ -275,7 +266,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
     variance = torch.tensor([0.04, 0.01]).view(1, 1, 1, 1, 2)
     difference = 0.2126 * 2 + 0.0722 * 1
     sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
-    out, spread = svgf.filter_level(colour, variance, geometry, 1)
+    out, spread = svgf.svgf_level(colour, variance, geometry, 1)
     centre, side = 9 / 64, 3 / 32
     for x in range(2):
         w = side * math.exp(-difference / (4 * sigma[x]))
@@ -284,7 +275,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
         v = (centre**2 * variance[..., x] + w**2 * variance[..., 1 - x]) / (centre + w) ** 2
         assert spread[..., x].item() == pytest.approx(v.item(), rel=1e-5)
     # Without variance, nothing that differs mixes.
-    out, spread = svgf.filter_level(colour, torch.zeros_like(variance), geometry, 1)
+    out, spread = svgf.svgf_level(colour, torch.zeros_like(variance), geometry, 1)
     torch.testing.assert_close(out, colour)
     assert (spread == 0).all()
 
@@ -301,7 +292,7 @@ def test_a_level_is_the_paper_s(name, size, step, seed):
     colour, variance = np.float32(rng.random((2, 3, *size))), np.float32(rng.random((2, *size)) / 4)
     with WAYS[name]():
         images = to_torch(colour, 1, 2, 3, *size), to_torch(variance, 1, 2, 1, *size)
-        out, spread = svgf.filter_level(*images, packed(depth, normal, mesh), step)
+        out, spread = svgf.svgf_level(*images, packed(depth, normal, mesh), step)
     for s in range(2):
         expected = naive_level(colour[s].astype(float), variance[s].astype(float), depth, normal, mesh, step)
         np.testing.assert_allclose(out[0, s].numpy(), expected[0], rtol=1e-4)
@@ -312,17 +303,17 @@ def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
     """Far from the border and with all weights 1, a level multiplies the variance by (Σ h²)²."""
     geometry = packed(*plane(65, 65))
     colour, variance = torch.ones(1, 1, 3, 65, 65), torch.full((1, 1, 1, 65, 65), 0.5)
-    _, spread = svgf.filter_level(colour, variance, geometry, 4)
+    _, spread = svgf.svgf_level(colour, variance, geometry, 4)
     assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
 
 
 def test_five_levels_and_the_first_is_the_history(monkeypatch):
     frame = synthetic_frame(3, 24, 32)
-    seen, original = [], svgf.filter_level
+    seen, original = [], svgf.svgf_level
     monkeypatch.setattr(
-        svgf, "filter_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
+        svgf, "svgf_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
     )
-    (output,), state = run(SVGF(), [frame])
+    (output,), state = play(SVGF(), [frame])
     assert [step for step, _, _ in seen] == [1, 2, 4, 8, 16]
     assert state.history.colour is seen[0][1]
     torch.testing.assert_close(output, frame.emission + seen[-1][1].sum(dim=1) * frame.albedo.clamp(min=0.01))
@@ -335,25 +326,24 @@ def test_five_levels_and_the_first_is_the_history(monkeypatch):
 @pytest.mark.parametrize("signal", ["total", "indirect"])
 def test_compiled_and_plain_agree(denoiser, signal):
     frames = [synthetic_frame(index, 41, 70) for index in range(6)]
-    made = denoiser()
-    made.signal = signal
+    made = denoiser(signal=signal)
     torch.set_num_threads(2)
-    fast = run(made, frames)[0]
+    fast = run(made, frames)
     torch.set_num_threads(1)
     with compiled.disabled():
-        slow = run(made, frames)[0]
+        slow = run(made, frames)
     for a, b in zip(fast, slow, strict=True):
         torch.testing.assert_close(a, b, rtol=2e-4, atol=1e-5)
 
 
 def test_indirect_alone_is_what_total_makes_of_it():
     frames = [synthetic_frame(index, 24, 32) for index in range(5)]
-    alone, total = SVGF(), SVGF()
-    alone.signal = "indirect"
-    a, state = run(alone, frames)
+    alone = SVGF(signal="indirect")
+    total = SVGF()
+    a, state = play(alone, frames)
     assert list(state.pictures()) == ["history length", "variance indirect"]
     dark = [replace(f, channels=f.channels | {"direct": 0 * f.direct, "emission": 0 * f.direct}) for f in frames]
-    for x, y in zip(a, run(total, dark)[0], strict=True):
+    for x, y in zip(a, run(total, dark), strict=True):
         torch.testing.assert_close(x, y)
 
 
@@ -364,8 +354,10 @@ def test_indirect_alone_is_what_total_makes_of_it():
 def test_the_output_stays_in_the_range_of_the_input(name, denoiser, size, seed, level):
     rng = np.random.default_rng(seed)
     depth, normal, mesh = surfaces(rng, *size)
-    low, high, state, made = np.inf, -np.inf, None, denoiser()
-    made.signal = "indirect"
+    low = np.inf
+    high = -np.inf
+    state = None
+    made = denoiser(signal="indirect")
     for _ in range(5):
         frame = flat_frame(*size, mesh_id=to_torch(mesh.astype(float)))
         light = level * to_torch(rng.choice([0.2, 0.9, 1.0], (3, *size)) * rng.random((3, *size)))
@@ -381,7 +373,7 @@ def test_a_thousand_times_the_light_is_a_thousand_times_the_output(denoiser):
     frames = [synthetic_frame(index, 30, 40) for index in range(5)]
     lights = ("direct", "indirect", "emission")
     bright = [replace(f, channels=f.channels | {name: 1000 * f.channels[name] for name in lights}) for f in frames]
-    for a, b in zip(run(denoiser(), frames)[0], run(denoiser(), bright)[0], strict=True):
+    for a, b in zip(run(denoiser(), frames), run(denoiser(), bright), strict=True):
         torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
 
 
@@ -398,7 +390,7 @@ def test_noise_on_a_wall_is_gone_and_the_sky_is_left_alone(denoiser):
         frame = flat_frame(48, 48, irradiance=light, mesh_id=mesh)
         frame.channels.update(depth=frame.depth * mesh, normal=frame.normal * mesh)
         frames.append(frame)
-    filtered, accumulated = (run(d, frames)[0][-1] for d in (denoiser(), Accumulated()))
+    filtered, accumulated = (run(d, frames)[-1] for d in (denoiser(), Accumulated()))
     torch.testing.assert_close(filtered[..., 30:], torch.full((1, 3, 48, 18), 100.0))
     errors = [(image[..., :30] - 1).square().mean() for image in (filtered, accumulated)]
     assert errors[0] < 0.3 * errors[1]
@@ -414,7 +406,7 @@ def test_a_level_of_eaw(name, size, step, seed):
     rng = np.random.default_rng(seed)
     colour, features = np.float32(rng.random((3, *size))), np.float32(rng.random((9, *size)))
     with WAYS[name]():
-        out = eaw.filter_level(to_torch(colour), to_torch(features), step)[0].numpy()
+        out = eaw.eaw_level(to_torch(colour), to_torch(features), step)[0].numpy()
     for p in np.ndindex(size):
         total, sums = 0.0, np.zeros(3)
         for q, j, i in window(p, size, 2, step):
@@ -427,7 +419,7 @@ def test_eaw_s_features(monkeypatch):
     """Exposed colour over σ_c, which halves from level to level; normal; position over the median depth."""
     frame = synthetic_frame(2, 20, 30)
     seen = []
-    monkeypatch.setattr(eaw, "filter_level", lambda colour, features, step: seen.append((features, step)) or colour)
+    monkeypatch.setattr(eaw, "eaw_level", lambda colour, features, step: seen.append((features, step)) or colour)
     run(EAW(), [frame])
     irradiance = frame.irradiance("total")
     exposure = running_scale(irradiance * frame.divisor, frame.depth, None).exposure()
@@ -444,4 +436,4 @@ def test_eaw_s_features(monkeypatch):
         y, x = torch.nonzero(hit, as_tuple=True)
         torch.testing.assert_close(pixel[0] / pixel[2], x + 0.5, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(pixel[1] / pixel[2], y + 0.5, rtol=1e-4, atol=1e-3)
-        assert (features[0, 6:, ~hit] == eaw.BACKGROUND).all()
+        assert (features[0, 6:, ~hit] == eaw.FAR_AWAY).all()

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_denoisers import run
-from test_operators import flat_frame
 from torch.nn import functional as F
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from eval.bench.fusion import unfold_fuse
 from models import compiled, registry
+from models.accumulation import accumulate
 from models.compiled.exponential import exp, log
-from models.operators import accumulate, running_scale
 from models.repvgg import RepVGGBlock, merge, repvgg
-from models.wskp import combine
+from models.running_scale import running_scale
+from models.wskp import combine_resolutions
+from tests.helpers.frames import flat_frame, run
 
 
 @pytest.mark.parametrize("widths", [(10, 24, 24, 12), (10, 24, 24, 24, 24, 24, 12), (3, 3)])
@@ -79,7 +79,7 @@ def test_combination_of_resolutions_is_equation_7():
             block = fine[y // 2 * 2 : y // 2 * 2 + 2, x // 2 * 2 : x // 2 * 2 + 2].mean()
             expected[y, x] = fine[y, x] - alpha[y, x] * block + alpha[y, x] * coarse[y // 2, x // 2]
     tensors = (torch.from_numpy(a)[None, None] for a in (fine, coarse, alpha))
-    np.testing.assert_allclose(combine(*tensors)[0, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(combine_resolutions(*tensors)[0, 0], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])

@@ -13,16 +13,19 @@ import torch
 from torch import Tensor
 
 from models import compiled
+from models.compiled import pixel_kernels as kernels
 
 
-def taps(logits: Tensor) -> Iterator[tuple[int, Any, Any]]:
+def kernel_taps(logits: Tensor) -> Iterator[tuple[int, Any, Any]]:
     """Of each tap t: its index, the pixels p for which p + t is inside the image, and these p + t, as indices."""
-    size, (height, width) = math.isqrt(logits.shape[1]), logits.shape[-2:]
+    size = math.isqrt(logits.shape[1])
+    height, width = logits.shape[-2:]
     for index in range(size * size):
-        dy, dx = index // size - size // 2, index % size - size // 2
+        dy = index // size - size // 2
+        dx = index % size - size // 2
         if abs(dy) < height and abs(dx) < width:
-            here = slice(max(0, -dy), height - max(0, dy)), slice(max(0, -dx), width - max(0, dx))
-            there = slice(max(0, dy), height + min(0, dy)), slice(max(0, dx), width + min(0, dx))
+            here = (slice(max(0, -dy), height - max(0, dy)), slice(max(0, -dx), width - max(0, dx)))
+            there = (slice(max(0, dy), height + min(0, dy)), slice(max(0, dx), width + min(0, dx)))
             yield index, (..., *here), (..., *there)
 
 
@@ -37,10 +40,11 @@ class ApplyKernels(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, logits: Tensor) -> Tensor:
         # The centre is inside the image for every pixel, so that this is the logit of a tap that counts.
         top = logits[:, logits.shape[1] // 2, None].to(image.dtype, copy=True)
-        for index, here, _ in taps(logits):
+        for index, here, _ in kernel_taps(logits):
             top[here] = torch.maximum(top[here], logits[:, index, None][here])
-        total, output = torch.zeros_like(top), torch.zeros_like(image)
-        for index, here, there in taps(logits):
+        total = torch.zeros_like(top)
+        output = torch.zeros_like(image)
+        for index, here, there in kernel_taps(logits):
             weight = torch.exp(logits[:, index, None][here] - top[here])
             total[here] += weight
             output[here].addcmul_(weight, image[there])
@@ -55,7 +59,7 @@ class ApplyKernels(torch.autograd.Function):
         to_image = torch.zeros_like(image) if ctx.needs_input_grad[0] else None
         to_logits = torch.zeros_like(logits)
         mean = (gradient * output).sum(dim=1, keepdim=True)
-        for index, here, there in taps(logits):
+        for index, here, there in kernel_taps(logits):
             weight = torch.exp(logits[:, index, None][here] - top[here]) / total[here]
             if to_image is not None:
                 to_image[there].addcmul_(weight, gradient[here])
@@ -64,6 +68,7 @@ class ApplyKernels(torch.autograd.Function):
         return to_image, to_logits
 
 
+@compiled.by(kernels.apply_kernels)
 def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
     """Filter `image` (B, C, H, W) with one k x k kernel a pixel; returns (B, C, H, W). Differentiable in both.
 
@@ -71,10 +76,6 @@ def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
         image: float32, finite, linear. Taps outside it are left out.
         logits: (B, k², H, W), k odd, the taps row by row from the top left; any finite numbers, also in half precision.
     """
-    if compiled.usable(image) and not (torch.is_grad_enabled() and logits.requires_grad):
-        from models.compiled.kernels import apply_kernels as apply_compiled
-
-        return apply_compiled(image, logits)
     # Taps that lie apart in memory would be gathered one by one, several times each.
     filtered: Tensor = ApplyKernels.apply(image, logits.contiguous())
     return filtered

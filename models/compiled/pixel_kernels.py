@@ -1,4 +1,4 @@
-"""models.kernels for the processor: a row at a time, its logits in float32 in a core's cache, rows in parallel."""
+"""models.pixel_kernels for the processor: rows in parallel, each with its logits in a core's cache."""
 
 import math
 from typing import Any
@@ -8,18 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled import array, threads
 from models.compiled.exponential import exp
+from models.compiled.jit import array, jit_in_order, jit_parallel
 
-LEAST_EXPONENT = np.float32(-87)  # exp of less is denormal in float32, which is slow; what it leaves is 2e-38
+LEAST_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
 ONE_LINE = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
 
-jit = numba.njit(cache=True, fastmath={"contract", "nsz"}, error_model="numpy", boundscheck=False)
 
-
-@jit
-def unpack(row: Any, logits: Any, bfloat: bool) -> None:
-    """Rows (taps, W) of float32, or of the bits of bfloat16, which are the upper half of a float32."""
+@jit_in_order
+def to_float32(row: Any, logits: Any, bfloat: bool) -> None:
+    """row (taps, W) from logits of float32, or of the bits of bfloat16, which are the upper half of a float32."""
     if bfloat:
         for x in range(logits.shape[1]):
             for tap in range(logits.shape[0]):
@@ -30,40 +28,42 @@ def unpack(row: Any, logits: Any, bfloat: bool) -> None:
                 row[tap, x] = logits[tap, x]
 
 
-@jit
+@jit_in_order
 def raise_top(top: Any, logits: Any) -> None:
     for x in range(top.size):
         top[x] = max(top[x], logits[x])
 
 
-@jit
+@jit_in_order
 def to_weights(logits: Any, top: Any, total: Any) -> None:
     """In place, weights relative to the largest logit; total += weights."""
     for x in range(top.size):
-        logits[x] = exp(max(logits[x] - top[x], LEAST_EXPONENT))
+        logits[x] = exp(max(logits[x] - top[x], LEAST_LOGIT))
         total[x] += logits[x]
 
 
-@jit
+@jit_in_order
 def add_weighted(line: Any, weight: Any, values: Any) -> None:
     for x in range(line.size):
         line[x] += weight[x] * values[x]
 
 
-@jit
-def filter_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
+@jit_in_order
+def apply_to_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
     """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
 
     Slices are taken where they can be seen to be contiguous: else no loop would be vectorised.
     """
     channels, height, width = image.shape
     radius = size // 2
-    top, total = row[size * radius + radius, :width].copy(), np.zeros(width, np.float32)
+    top = row[size * radius + radius, :width].copy()
+    total = np.zeros(width, np.float32)
     sums = np.zeros((channels, width), np.float32)
     for gather in (False, True):
         for dy in range(max(-radius, -y), min(radius + 1, height - y)):
             for dx in range(max(-radius, 1 - width), min(radius + 1, width)):
-                low, high = max(0, -dx), min(width, width - dx)
+                low = max(0, -dx)
+                high = min(width, width - dx)
                 logits = row[(dy + radius) * size + dx + radius, low:high]
                 if not gather:
                     raise_top(top[low:high], logits)
@@ -75,22 +75,21 @@ def filter_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
         output[c, y] = sums[c] / total
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def filter_image(output: Any, image: Any, logits: Any, size: int, bfloat: bool) -> None:
+@jit_parallel
+def apply_to_image(output: Any, image: Any, logits: Any, size: int, bfloat: bool) -> None:
     _, height, width = image.shape
     for y in numba.prange(height):
         row = np.empty((size * size, width + ONE_LINE), np.float32)
-        unpack(row, logits[:, y], bfloat)
-        filter_row(output, image, row, np.int64(y), size)  # prange counts unsigned, which would break -y
+        to_float32(row, logits[:, y], bfloat)
+        apply_to_row(output, image, row, np.int64(y), size)
 
 
 def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
-    """See models.kernels.apply_kernels; logits are read as they lie in memory, bfloat16 without a copy."""
-    threads()
+    """See models.pixel_kernels.apply_kernels; logits are read as they lie in memory, bfloat16 without a copy."""
     output = torch.empty_like(image, memory_format=torch.contiguous_format)
     bfloat = logits.dtype == torch.bfloat16
     bits = logits.view(torch.int16) if bfloat else logits.float()
     for item in range(len(image)):
         values = bits[item].detach().numpy()
-        filter_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), bfloat)
+        apply_to_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), bfloat)
     return output

@@ -1,0 +1,46 @@
+"""How Numba compiles the kernels here, and on how many threads they run."""
+
+import functools
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+# For functions that kernels call, by what LLVM may do to their roundings: "contract", round a product and a sum once;
+# "nsz", lose the sign of zero; "arcp", multiply by a reciprocal instead of dividing; "reassoc", add up in any order,
+# which lets it vectorise sums. None of them may take numbers to be finite.
+jit_inlined = numba.njit(inline="always", fastmath={"contract"}, error_model="numpy")
+jit_in_order = numba.njit(fastmath={"contract", "nsz"}, error_model="numpy", boundscheck=False)
+jit_with_reciprocals = numba.njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", boundscheck=False)
+jit_in_any_order = numba.njit(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", boundscheck=False)
+# For the kernels themselves, which alone are kept on disk, with all that they call. Numba counts the rows of a prange
+# without a sign: take np.int64(row) before anything is subtracted from it.
+jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
+
+
+def array(tensor: Tensor) -> NDArray[np.float32]:
+    """A tensor's values as a contiguous numpy array of float32, without a copy where it is that already."""
+    return tensor.detach().float().contiguous().numpy()
+
+
+@jit_parallel
+def nothing() -> None:
+    for _ in numba.prange(2):
+        pass
+
+
+@functools.cache
+def start_threads() -> None:
+    """Start Numba's threads. They share PyTorch's OpenMP, which that sets to all cores: set it back."""
+    count = torch.get_num_threads()
+    numba.set_num_threads(1)
+    nothing()
+    torch.set_num_threads(count)
+
+
+def match_threads() -> None:
+    """Let Numba use as many threads as PyTorch, for the parallel kernel that comes next."""
+    start_threads()
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]

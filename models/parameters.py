@@ -1,0 +1,25 @@
+"""Numbers that the PyTorch version of a filter and its compiled kernel share."""
+
+# --- Reprojection (SVGF §4.1) -----------------------------------------------------------------------------------------
+
+PLANE_TOLERANCE = 0.01  # of the depth: a tap's surface may lie this far off the point's plane
+NORMAL_TOLERANCE = 0.9  # smallest cosine between a tap's normal and the point's
+
+# --- SVGF (Schied et al. 2017) ----------------------------------------------------------------------------------------
+
+SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
+SIGMA_Z = 1.0  # §4.4
+SIGMA_L = 4.0
+SQUARINGS = 7  # σ_n = 128 = 2^7
+EPSILON_Z = 1e-3  # of the depth
+EPSILON_L = 1e-20  # luminance²
+LEAST_DIVISOR = 1e-30  # keeps quotients finite where lengths and depths are 0
+
+# --- Weight-shared kernels (Fan et al. 2021) --------------------------------------------------------------------------
+
+WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3
+FEATURES = 10  # what the network sees (§5.1): displayed colour, albedo, normal, depth
+GAMMA = 2.2  # of the display transform before the network (§5.1)
+SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither overflows nor vanishes in float32
+LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35
+OUTSIDE = -1e30  # logit of a tap outside the image

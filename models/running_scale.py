@@ -1,0 +1,71 @@
+"""Causal estimates of how bright and how deep a sequence is: what networks use instead of the clip's exposure."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from models.operators import image_luminance
+
+MIDDLE_GREY = 0.18  # what the geometric mean of luminance is exposed to
+SLOWEST_RATE = 0.1  # weight of the newest frame in running estimates, once they have settled
+MEDIAN_GRID = 64  # the median depth of large images is taken from about as many rows and columns
+LUMINANCE_BLOCK = 16  # px; the logarithm of a mean over a block is far less biased than that of single samples
+
+
+@dataclass(frozen=True)
+class RunningMean:
+    """A causal mean over frames, (B,): even at first, then with weight 0.1 for the newest."""
+
+    value: Tensor
+    count: Tensor  # frames that contributed
+
+    def update(self, new: Tensor, valid: Tensor) -> "RunningMean":
+        """With one more frame's `new` (B,), where `valid` (B,)."""
+        count = self.count + valid
+        rate = (1 / count.clamp(min=1)).clamp(min=SLOWEST_RATE)
+        return RunningMean(torch.where(valid, torch.lerp(self.value, new, rate), self.value), count)
+
+
+@dataclass(frozen=True)
+class RunningScale:
+    """Running means of the logarithms of a sequence's luminance and depth."""
+
+    log_luminance: RunningMean
+    log_depth: RunningMean
+
+    @staticmethod
+    def neutral(like: Tensor) -> "RunningScale":
+        """Exposure 1 and depth scale 1 for a batch of `like` (B, ...), until a frame tells better."""
+        zero = like.new_zeros(len(like))
+        return RunningScale(RunningMean(zero + math.log(MIDDLE_GREY), zero), RunningMean(zero, zero))
+
+    def exposure(self) -> Tensor:
+        """0.18 / geometric mean luminance, (B, 1, 1, 1)."""
+        return (MIDDLE_GREY * torch.exp(-self.log_luminance.value))[:, None, None, None]
+
+    def normalised_depth(self, depth: Tensor) -> Tensor:
+        """d / (d + s) in [0, 1) with s the running median depth; 1 for background (depth 0)."""
+        scale = torch.exp(self.log_depth.value)[:, None, None, None]
+        return torch.where(depth > 0, depth / (depth + scale), 1)
+
+
+def running_scale(radiance: Tensor, depth: Tensor, before: RunningScale | None) -> RunningScale:
+    """Update the estimates with one frame's noisy direct + indirect `radiance` (B, 3, H, W) and its `depth`.
+
+    The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
+    """
+    before = before or RunningScale.neutral(radiance)
+    luminance = image_luminance(radiance).clamp(min=0)
+    blocks = F.avg_pool2d(luminance, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False)
+    y = blocks.flatten(1).double()
+    mean = y.mean(dim=1)
+    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)).mean(dim=1).to(radiance.dtype)
+    stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
+    depths = depth[..., ::stride_y, ::stride_x].flatten(1)
+    median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
+    hit = ~median.isnan()
+    log_depth = torch.log(torch.where(hit, median, 1))
+    return RunningScale(before.log_luminance.update(log_y, mean > 0), before.log_depth.update(log_depth, hit))

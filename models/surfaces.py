@@ -1,0 +1,54 @@
+"""What a frame's pixels show, and where the previous camera saw it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from datasets.frame import Cameras, Frame
+
+BACKGROUND_ID = 0  # mesh id of pixels that show no surface
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The G-buffer that reprojection tests taps against."""
+
+    depth: Tensor  # (B, 1, H, W)
+    normal: Tensor  # (B, 3, H, W), world space
+    mesh_id: Tensor  # (B, 1, H, W)
+
+    @staticmethod
+    def of(frame: Frame) -> "Surfaces":
+        return Surfaces(frame.depth, frame.normal, frame.mesh_id)
+
+    def packed(self) -> Tensor:
+        """All in one, (B, 5, H, W)."""
+        return torch.cat([self.depth, self.normal, self.mesh_id], dim=1)
+
+
+def rays(K: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Directions (..., 3) in the camera frame, of unit length along the viewing axis, through pixels at x, y (...)."""
+    K = K.to(x)
+    return torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], dim=-1)
+
+
+def inverse_pose(matrix: Tensor) -> Tensor:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    inverse = torch.zeros_like(matrix)
+    inverse[..., :3, :3] = matrix[..., :3, :3].mT
+    inverse[..., :3, 3:] = -inverse[..., :3, :3] @ matrix[..., :3, 3:]
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def to_previous_camera(now: Cameras, previous: Cameras, item: int) -> Tensor:
+    """Transforms (M + 1, 4, 4) by mesh id: from this frame's camera to the previous one's, along with the mesh.
+
+    Products are taken in float64 and camera to camera, so that scenes far from the origin keep their precision.
+    """
+    to_world = now.camera_to_world[item]
+    from_world = inverse_pose(previous.camera_to_world[item])
+    moved = previous.object_to_world[item] @ inverse_pose(now.object_to_world[item])
+    still = torch.eye(4, dtype=moved.dtype, device=moved.device)[None]
+    return from_world @ torch.cat([still, moved]) @ to_world
