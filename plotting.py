@@ -1,5 +1,6 @@
-"""Figures on disk, whole or not at all."""
+"""Figures on disk, whole or not at all, and the sizes of what is in them."""
 
+import math
 from pathlib import Path
 
 import matplotlib
@@ -10,9 +11,25 @@ from files import replacing
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-__all__ = ["DPI", "plt", "save_figure"]
+__all__ = [
+    "DPI",
+    "ONE_LINE_CAPTION",
+    "SMALLEST_PANEL",
+    "TWO_LINE_CAPTION",
+    "enlargement",
+    "plt",
+    "save_figure",
+]
 
 DPI = 100
+ONE_LINE_CAPTION = 0.2  # inches
+TWO_LINE_CAPTION = 0.45  # inches
+SMALLEST_PANEL = 256  # px, the longer side of an image
+
+
+def enlargement(height: int, width: int, smallest: int = SMALLEST_PANEL) -> int:
+    """The whole factor that makes the longer side of an image at least `smallest` pixels."""
+    return max(1, math.ceil(smallest / max(height, width)))
 
 
 def save_figure(path: Path, figure: Figure) -> None:

@@ -11,6 +11,13 @@ from tqdm import tqdm
 Clock = Callable[[], float]  # seconds
 
 
+def device_clock(device: str) -> float:
+    """Seconds, once the device ("cpu" or "cuda") has done all that it was given."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
 def take_turns(
     work: Mapping[str, Callable[[], object]],
     measured: int,

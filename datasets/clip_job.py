@@ -16,7 +16,7 @@ from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
 from scenes.registry import build_scene
 
 
-class ClipJob(NamedTuple):
+class RenderJob(NamedTuple):
     """One clip to render, and everything that its bytes follow from."""
 
     path: Path  # DATA/SPLIT/SCENE/CLIP
@@ -34,7 +34,7 @@ class ClipOutcome(NamedTuple):
     reason: str = ""
 
 
-def run_clip_job(job: ClipJob) -> ClipOutcome:
+def run_clip_job(job: RenderJob) -> ClipOutcome:
     """Render a clip unless another process is rendering it or has done so.
 
     A failure of the renderer is an outcome. OSError is raised instead: a full disk is full for all clips.

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from datasets.clip import Dataset
-from datasets.clip_job import ClipJob, ClipOutcome, run_clip_job
+from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
 from datasets.generate import check_versions
 from errors import BadInput
 from render.backend import VARIANT, dr
@@ -79,14 +79,14 @@ def reserved_resources() -> dict[str, Any]:
     return {"num_cpus": 1, "runtime_env": {"env_vars": {"CUDA_VISIBLE_DEVICES": ""}}}
 
 
-def render_on_worker(job: ClipJob) -> ClipOutcome:
+def render_on_worker(job: RenderJob) -> ClipOutcome:
     """Render a clip on the one core that its task reserves: clips side by side use cores better than threads do."""
     dr.set_thread_count(1)
     check_versions(Dataset(job.path.parents[2]))
     return run_clip_job(job)
 
 
-def render_on_cluster(jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
+def render_on_cluster(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
     """Render clips on a Ray cluster; yields their outcomes in the order in which they end.
 
     Every clip has a worker process of its own, and a new one where that dies. All machines must reach the clips'
@@ -101,7 +101,7 @@ def render_on_cluster(jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
         yield from outcomes_of(ray, jobs)
 
 
-def outcomes_of(ray: Any, jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
+def outcomes_of(ray: Any, jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
     """Run all jobs on the cluster to which `ray` is connected, as `render_on_cluster` does."""
     task = ray.remote(max_calls=1, max_retries=WORKERS_PER_CLIP - 1, **reserved_resources())(render_on_worker)
     tasks = {task.remote(job._replace(path=job.path.absolute())): job for job in jobs}
@@ -117,7 +117,7 @@ def outcomes_of(ray: Any, jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
             ray.wait(waiting, num_returns=len(waiting), timeout=SECONDS_TO_CLEAN_UP)
 
 
-def outcome_of(ray: Any, reference: Any, job: ClipJob) -> ClipOutcome:
+def outcome_of(ray: Any, reference: Any, job: RenderJob) -> ClipOutcome:
     """The outcome of an ended task. Raises what the worker raised."""
     try:
         return ray.get(reference)._replace(path=job.path)

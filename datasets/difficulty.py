@@ -9,7 +9,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.clip import Clip
 from datasets.tonemap import luminance
 
-MEASURED_FRAMES = 8  # at most, spread evenly over a clip
+MOST_MEASURED_FRAMES = 8  # spread evenly over a clip
 
 
 class Difficulty(NamedTuple):
@@ -38,11 +38,11 @@ MEASURES = {  # by field of Difficulty
 
 
 def difficulty_of_clip(clip: Clip) -> Difficulty:
-    """The mean over up to MEASURED_FRAMES frames of a clip, in its first noise realisation.
+    """The mean over up to MOST_MEASURED_FRAMES frames of a clip, in its first noise realisation.
 
     Measures are NaN where a frame shows no surface or no light falls on any.
     """
-    frames = np.unique(np.linspace(0, clip.frames - 1, MEASURED_FRAMES).round().astype(int))
+    frames = np.unique(np.linspace(0, clip.frames - 1, MOST_MEASURED_FRAMES).round().astype(int))
     with np.errstate(divide="ignore", invalid="ignore"):
         measured = [difficulty_of_frame(clip, int(frame)) for frame in frames]
     return Difficulty(*np.mean(measured, axis=0))

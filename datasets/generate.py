@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Dataset, is_clip
-from datasets.clip_job import ClipJob, ClipOutcome, run_clip_job
+from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
 from datasets.profiles import plan
 from errors import BadInput
 from files import read_json, write_json
@@ -43,7 +43,7 @@ class Share:
 WHOLE_DATA_SET = Share(1, 1)
 
 
-def render_here(jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
+def render_here(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
     """Render clips in this process, one after the other."""
     return map(run_clip_job, jobs)
 
@@ -55,7 +55,7 @@ def generate(
     share: Share = WHOLE_DATA_SET,
     reads: Sequence[str] = tuple(CHANNELS),
     options: Options = NO_OPTIONS,
-    render: Callable[[Sequence[ClipJob]], Iterator[ClipOutcome]] = render_here,
+    render: Callable[[Sequence[RenderJob]], Iterator[ClipOutcome]] = render_here,
 ) -> int:
     """Render the clips that are missing from the share of a data set at `root`. Returns how many were rendered.
 
@@ -72,7 +72,7 @@ def generate(
     write_or_check_plan(root, wanted)
     dataset = Dataset(root)
     jobs = [
-        ClipJob(path, profile, seed, tuple(wanted["channels"][path.parts[-3]]), options)
+        RenderJob(path, profile, seed, tuple(wanted["channels"][path.parts[-3]]), options)
         for path in share.of(dataset.planned())
         if not is_clip(path)
     ]

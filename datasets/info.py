@@ -32,7 +32,7 @@ CLIP_HEAD = (
     "seconds",
 )
 
-Timing = dict[str, float]  # seconds by step
+SecondsByStep = dict[str, float]
 
 
 def summarise(root: Path, plot: Path | None = None) -> str:
@@ -45,7 +45,7 @@ def summarise(root: Path, plot: Path | None = None) -> str:
     rows: list[list[object]] = []
     clips: list[Clip] = []
     difficulties: list[Difficulty] = []
-    timings: list[Timing] = []
+    timings: list[SecondsByStep] = []
     for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
         label = str(path.relative_to(root))
         if not is_clip(path):
@@ -114,12 +114,12 @@ def channel_table(clips: list[Clip]) -> str:
     return tabulate(rows, ["channel", "stored as", "MB", "in full"], disable_numparse=True)
 
 
-def step_table(clips: list[Clip], timings: list[Timing]) -> str:
+def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
     """Seconds by step, and what was saved where dual motion was not rendered.
 
     The saving is estimated by the mean time per pixel in the clips that have dual motion.
     """
-    seconds: Timing = {}
+    seconds: SecondsByStep = {}
     for timing in timings:
         for step, spent in timing.items():
             seconds[step] = seconds.get(step, 0.0) + spent

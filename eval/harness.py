@@ -33,7 +33,7 @@ from eval.results import (
 from eval.selection import evaluated, with_indirect_baselines
 from eval.spec import DenoiserSpec
 from eval.strip import save_strip
-from eval.text_table import table
+from eval.text_table import results_table
 from provenance import device_in_words
 from timing import thread_count
 
@@ -159,5 +159,5 @@ def evaluate(
     content = write_results(runs, data, device_in_words(), results, weights)
     for group in by_clip(results):
         save_strips(runs, group)
-    print(table(list(by_clip(results))))
+    print(results_table(list(by_clip(results))))
     return content

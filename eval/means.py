@@ -1,11 +1,13 @@
 """Means over frames and over clips, and what noise of the references leaves of them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import fmean
 
 import numpy as np
 
 from eval.metrics import METRICS, Values, within_floor
+from eval.results import ClipResults
 
 
 def means(frames: list[Values]) -> Values:
@@ -42,3 +44,29 @@ def compared_mean(metric: str, clips: Sequence[Values], floors: Sequence[Values]
             near = floor is not None and within_floor(metric, value, floor)
             values.append(METRICS[metric].edge(floor) if near else value)  # type: ignore[arg-type]
     return float(METRICS[metric].form.format(fmean(values))) if values else None
+
+
+@dataclass(frozen=True)
+class ClipScores:
+    """A denoiser's metrics on each of several clips, and the noise floors of their references."""
+
+    values: list[Values]
+    floors: list[Values]
+
+    @property
+    def means(self) -> Values:
+        return means(self.values)
+
+    @property
+    def joint_floor(self) -> Values:
+        return joint_floor(self.values, self.floors)
+
+    def compared(self, metric: str) -> float | None:
+        """What to compare the mean by; None where the metric is nowhere defined."""
+        return compared_mean(metric, self.values, self.floors)
+
+
+def scores_of(clips: Sequence[ClipResults], denoiser: str) -> ClipScores:
+    """On those of the clips, all of one signal, for which there are results of the denoiser."""
+    pairs = [(result, clip.reference) for clip in clips for result in clip.results if result.denoiser == denoiser]
+    return ClipScores([result.metrics for result, _ in pairs], [reference.metrics for _, reference in pairs])

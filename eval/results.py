@@ -187,6 +187,22 @@ def by_clip(results: list[Result]) -> Iterator[ClipResults]:
                 yield ClipResults(scene, clip, signal, denoisers, references[0])
 
 
+def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
+    """In the order in which the signals come first."""
+    signals = dict.fromkeys(clip.signal for clip in clips)
+    return {signal: [clip for clip in clips if clip.signal == signal] for signal in signals}
+
+
+def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
+    """Without clips such as 000-4spp, which show the same frames again with other input: means do not mix them."""
+    return [clip for clip in clips if clip.noisy_spp == 1]
+
+
+def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
+    """The results of one denoiser, clip by clip."""
+    return [result for clip in clips for result in clip.results if result.denoiser == denoiser]
+
+
 def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     """What the last evaluation left: results.json and, of each of its rows, the folder.
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -10,62 +11,74 @@ from tabulate import tabulate
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from allocator import keep_freed_memory
 from datasets.frame import Frame
 from eval.bench.memory import alone, growth_mb
-from eval.bench.race import Contender, Timing, network_of, race
+from eval.bench.output import bench_folder
+from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
 from eval.selection import BASELINES, choose, unavailable
 from eval.spec import DenoiserSpec, create, precisions_of
 from files import read_json, write_json
+from models.oidn import OIDN
 from models.registry import DENOISERS
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 
-OIDN = "oidn"  # the baseline of the table
-ALSO_IN_PYTORCH = ("accumulated", "eaw", "svgf")  # filters that are also measured without compiled kernels
+BASELINE = "oidn"  # of the table
+ALSO_IN_PYTORCH = ("accumulated", "eaw", "svgf")  # filters that are measured without compiled kernels, too
 COUNTING_SIZE = 128  # px; a side that no network needs to pad
 
 
 @dataclass(frozen=True)
-class Row(Timing):
-    """A row of results.json: times, memory in MB, and what the network is made of."""
+class DenoiserCost(Timing):
+    """A row of results.json: times, memory in MB, and what the network is made of; None where there is no such thing.
+
+    Attributes:
+        peak_mb: what two frames add to memory: the state and everything in between.
+        parameters: of the form that runs.
+        prediction: the network's share of the time, between 0 and 1.
+    """
 
     peak_mb: float | None
     parameters: int | None
     macs_per_pixel: float | None
-    prediction: float | None  # the network's share of the time
+    prediction: float | None
 
     @property
-    def race(self) -> tuple[int, int, int]:
+    def conditions(self) -> tuple[int, int, int]:
+        """Height, width and threads, which the rows of one race have in common."""
         return self.height, self.width, self.threads
 
 
 def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
-    """All ways to run the named denoisers and OIDN, or all that can run here, networks of other sizes too.
+    """All ways to run the named denoisers and OIDN, or all that can run here, with networks of other sizes.
 
     Raises BadInput where a named one is unknown or cannot run.
     """
     everyone = (*DENOISERS, *(name for name in EXTRA if name not in (ALL_WINDOWS, FAST_OIDN)))
-    baseline = [] if unavailable(OIDN) else [OIDN]
-    found = []
+    baseline = [] if unavailable(BASELINE) else [BASELINE]
+    found: list[DenoiserSpec] = []
     for name in choose([*names, *baseline] if names else [], everyone, unavailable):
         found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
         if name in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(DenoiserSpec(name, compiled=False))
         if name in BASELINES:
             found.append(DenoiserSpec(name, signal="indirect", device=device))
-        if name == OIDN:
+        if name == BASELINE:
             found.append(DenoiserSpec(FAST_OIDN, device=device))
     return found
 
 
 @torch.inference_mode()
 def macs_per_pixel(spec: DenoiserSpec) -> float | None:
-    """Multiply-accumulates of the network's convolutions a pixel, in the form for inference; None without a network."""
+    """Multiply-accumulates a pixel of the network's convolutions, in the form for inference; None without a network."""
     denoiser = replace(spec, precision="float32", device="cpu").build()
     network = network_of(denoiser)
+    if network is None:
+        return None
     macs = 0
 
     def count(layer: nn.Module, inputs: Any, output: Tensor) -> None:
@@ -73,8 +86,6 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
         assert isinstance(layer, nn.Conv2d)
         macs += output.numel() * layer.weight[0].numel()
 
-    if network is None:
-        return None
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d):
             layer.register_forward_hook(count)
@@ -88,6 +99,7 @@ def peak_memory(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) -> fl
 
     That is the state and everything in between, without the frame itself, the weights and the code.
     """
+    keep_freed_memory()  # as commands do
     torch.set_num_threads(threads)
     contender = Contender.of(spec)
     contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE).to(spec.device))  # loads and compiles
@@ -113,13 +125,13 @@ def peaks(specs: Sequence[DenoiserSpec], size: Size, threads: int) -> list[float
     return [alone(peak_memory, spec, frames, threads) for spec in tqdm(specs, "memory", leave=False)]
 
 
-def row(contender: Contender, size: Size, peak_mb: float | None) -> Row:
+def cost(contender: Contender, size: Size, peak_mb: float | None) -> DenoiserCost:
+    """What a race has shown of a contender, with the peak memory that was measured apart."""
     spec = contender.spec
-    is_ours = not spec.name.startswith(OIDN)
-    return Row(
+    return DenoiserCost(
         **asdict(contender.timing(size)),
         peak_mb=peak_mb,
-        parameters=contender.denoiser.parameter_count() if is_ours else None,
+        parameters=None if issubclass(spec.kind, OIDN) else contender.denoiser.parameter_count(),
         macs_per_pixel=macs_per_pixel(spec),
         prediction=contender.share_of_network(),
     )
@@ -134,7 +146,13 @@ def results_file(runs: Path, device: str = "cpu") -> Path:
     return runs / "bench" / ("results.json" if device == "cpu" else f"results-{device}.json")
 
 
-def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], threads: Sequence[int] = ()) -> str:
+def bench_denoisers(
+    runs: Path,
+    names: Sequence[str] = (),
+    sizes: Sequence[str] = ("1280x720",),
+    threads: Sequence[int] = (),
+    measured: int = TIMED_FRAMES,
+) -> str:
     """Measure the named denoisers, or all that can run here: a table, and RUNS/bench/results.json.
 
     On the CPU with each number of `threads`; then, where there is one, on the GPU, into RUNS/bench/results-cuda.json.
@@ -143,12 +161,12 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
     pixels = [parse_size(size) for size in dict.fromkeys(sizes)]
     counts = thread_counts(threads)
     specs = {device: ways(names, device) for device in devices()}
-    (runs / "bench").mkdir(parents=True, exist_ok=True)
     tables = []
     for device, ours in specs.items():
         path = results_file(runs, device)
-        unfinished = path.with_name(f"unfinished-{path.name}")
-        rows = measure_all(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished)
+        unfinished = bench_folder(runs) / f"unfinished-{path.name}"
+        races = measure_races(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished, measured)
+        rows = [*chain.from_iterable(races)]
         content = {
             "schema": 1,
             "device": device_in_words(device, counts[-1]),
@@ -161,39 +179,45 @@ def bench_denoisers(runs: Path, names: Sequence[str], sizes: Sequence[str], thre
     return "\n\n".join(tables)
 
 
-def measure_all(
-    specs: Sequence[DenoiserSpec], sizes: Sequence[Size], counts: Sequence[int], unfinished: Path
-) -> list[Row]:
-    """The rows of results.json: size by size, and in each by rising numbers of threads.
+def measure_races(
+    specs: Sequence[DenoiserSpec],
+    sizes: Sequence[Size],
+    counts: Sequence[int],
+    unfinished: Path,
+    measured: int = TIMED_FRAMES,
+) -> Iterator[list[DenoiserCost]]:
+    """Yields the rows of each race: size by size, and in each by rising numbers of threads.
 
-    Each race is kept in the file `unfinished`, and not run again where that is of the same denoisers, code and device.
+    Each is kept in the file `unfinished`, and not run again where that is of the same denoisers, code and device.
     """
     modules = {module for spec in specs for module in spec.modules}
     call = {
         "specs": [repr(spec) for spec in specs],
+        "frames": measured,
         "code": code_digest(__name__, *sorted(modules)),
         "versions": versions(DENOISING),
         "device": device_in_words(specs[0].device),
     }
     before = read_json(unfinished, ("call", "rows")) if unfinished.exists() else {}
-    rows = [Row(**row) for row in before["rows"]] if before.get("call") == call else []
-    done = {row.race for row in rows}
+    rows = [DenoiserCost(**row) for row in before["rows"]] if before.get("call") == call else []
+    done = {row.conditions for row in rows}
     for size in sizes:
-        left = [count for count in counts if (*size, count) not in done]
-        memory = peaks(specs, size, counts[-1]) if left else []
-        for count in left:
-            with thread_count(count):
-                rows += [row(contender, size, peak) for contender, peak in zip(race(specs, size), memory, strict=True)]
-            write_json(unfinished, {"call": call, "rows": [asdict(row) for row in rows]})
-    wanted = [(*size, count) for size in sizes for count in counts]
-    return [row for key in wanted for row in rows if row.race == key]
+        missing = [count for count in counts if (*size, count) not in done]
+        memory = peaks(specs, size, counts[-1]) if missing else []
+        for count in counts:
+            if count in missing:
+                with thread_count(count):
+                    contenders = race(specs, size, measured)
+                    rows += [cost(contender, size, peak) for contender, peak in zip(contenders, memory, strict=True)]
+                write_json(unfinished, {"call": call, "rows": [asdict(row) for row in rows]})
+            yield [row for row in rows if row.conditions == (*size, count)]
 
 
-def table_lines(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
+def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
     """The rows for people: times next to OIDN's, and how they divide between the network and the rest."""
-    baselines = {row.race: row.ms_median for row in rows if row.denoiser == OIDN}
+    baselines = {row.conditions: row.ms_median for row in rows if row.denoiser == BASELINE}
     for row in rows:
-        baseline = baselines.get(row.race)
+        baseline = baselines.get(row.conditions)
         share = row.prediction
         yield {
             "denoiser": row.denoiser,
@@ -204,10 +228,10 @@ def table_lines(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
             "p10": row.ms_p10,
             "p90": row.ms_p90,
             "times oidn": row.ms_median / baseline if baseline else None,
-            "prediction": f"{share:.0%}" if share is not None else None,
-            "reconstruction": f"{1 - share:.0%}" if share is not None else None,
+            "prediction": None if share is None else f"{share:.0%}",
+            "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": create(row.denoiser).parameter_count() if share is not None else None,
+            "as trained": None if share is None else create(row.denoiser).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

@@ -1,10 +1,9 @@
-"""How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
+"""`onespp bench loading`: training sequences from disk: how fast, next to training on them, and in how much memory."""
 
-import multiprocessing
-import re
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import count, cycle
 from pathlib import Path
 from statistics import median
@@ -16,97 +15,133 @@ from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
 from datasets.info import size_of
+from eval.bench.memory import alone, status_mb
+from eval.bench.output import bench_folder
 from files import write_json
 from models.registry import create
+from timing import device_clock, take_turns
 from train.data import Items, items, loader, micro_batches
 from train.recipe import Recipe
 from train.recipes import recipe_for
 from train.registry import task_for
 from train.training import Training
 
-FASTEST = "rae"  # the network whose training consumes the most pixels a second
-WORKERS = (0, 1, 2)
-REPEATS = 5  # of each measurement, besides a first one that warms up; the median counts
-SEQUENCES = 300  # a measured epoch has, at least
-SIZES = (0.1e9, 5e9)  # bytes of the data sets whose memory is compared
+FASTEST_NETWORK = "rae"  # the one whose training consumes the most pixels a second
+WORKERS = (0, 1, 2)  # processes that load
+TIMED_EPOCHS = 5  # and training steps, besides a first one that warms up; the median counts
+EPOCH_SEQUENCES = 300  # a measured epoch has, at least
+DATASET_BYTES = (0.1e9, 5e9)  # of the data sets whose memory is compared
+TRAINING = "training"
 
 
-def bench_loading(data: Path, runs: Path, profile: str) -> str:
+@dataclass(frozen=True)
+class Rate:
+    """How fast sequences are loaded or trained on."""
+
+    what: str
+    sequences_s: float
+    megapixels_s: float
+    to_training: float  # times the rate of training
+
+
+@dataclass(frozen=True)
+class EpochMemory:
+    """Anonymous memory in MB of a process that loads a data set; None where the system does not tell."""
+
+    dataset_gb: float
+    clips: int
+    before_mb: float | None
+    after_mb: float | None
+
+    def line(self) -> dict[str, Any]:
+        """As it stands in the table and in loading.json."""
+        return {
+            "data set GB": self.dataset_gb,
+            "clips": self.clips,
+            "RssAnon MB before": self.before_mb,
+            "after an epoch": self.after_mb,
+        }
+
+
+def bench_loading(
+    data: Path,
+    runs: Path,
+    budget: str,
+    workers: Sequence[int] = WORKERS,
+    measured: int = TIMED_EPOCHS,
+    sequences: int = EPOCH_SEQUENCES,
+    sizes: Sequence[float] = DATASET_BYTES,
+) -> str:
     """Measure on the training clips of `data`; returns tables and writes RUNS/bench/loading.json.
 
-    Needs 5 GB of room in `runs` while it works. Raises BadInput for unusable data or an unknown profile.
+    Needs 5 GB of room in `runs` while it works. Raises BadInput for unusable data or an unknown budget.
     """
-    recipe, clips = recipe_for(FASTEST, profile), Dataset(data).clips("train")
-    folder = runs / "bench"
-    folder.mkdir(parents=True, exist_ok=True)
-    rates: dict[str, float] = {}
-    for workers in tqdm(WORKERS, "loading", leave=False):
-        rates[f"loading, {workers} workers"] = loading_rate(clips, recipe, workers)
-    trainer, rates["training"] = training_rate(data, profile)
-    memory = [memory_of(clips, recipe, folder, size) for size in tqdm(SIZES, "memory", leave=False)]
-    assert recipe.crop
-    pixels = recipe.length * recipe.crop**2
-    speeds = [
-        {
-            "what": what,
-            "sequences_s": rate,
-            "megapixels_s": rate * pixels / 1e6,
-            "to_training": rate / rates["training"],
-        }
-        for what, rate in rates.items()
-    ]
-    write_json(folder / "loading.json", {"profile": profile, "training": trainer, "speed": speeds, "memory": memory})
+    recipe = recipe_for(FASTEST_NETWORK, budget)
+    clips = Dataset(data).clips("train")
+    folder = bench_folder(runs)
+    with TemporaryDirectory() as temporary:
+        training = Training(task_for(FASTEST_NETWORK, data, Path(temporary), budget))
+        rates = measure_rates(training, clips, workers, measured, sequences)
+    memory = [memory_of(clips, recipe, folder, size).line() for size in tqdm(sizes, "memory", leave=False)]
+    trainer = f"{FASTEST_NETWORK}, {training.precision}, {training.fabric.device.type}"
+    speed = [asdict(rate) for rate in rates]
+    write_json(folder / "loading.json", {"profile": budget, "training": trainer, "speed": speed, "memory": memory})
     heads = {"to_training": "times training", "what": trainer, "sequences_s": "sequences/s", "megapixels_s": "Mpixel/s"}
-    return "\n\n".join([tabulate(speeds, heads, floatfmt=".3g"), tabulate(memory, "keys", floatfmt=".2f")])
+    speed_table = tabulate(speed, heads, floatfmt=".3g")
+    return f"{speed_table}\n\n{tabulate(memory, 'keys', floatfmt='.2f', missingval='-')}"
 
 
-def median_seconds(work: Callable[[], object]) -> float:
-    """Median time of a call, after one that does not count."""
-    seconds = []
-    for _ in range(1 + REPEATS):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    return median(seconds[1:])
+def measure_rates(
+    training: Training, clips: list[Clip], workers: Sequence[int], measured: int, sequences: int
+) -> list[Rate]:
+    """Augmented sequences a second, as the training loop gets them with so many workers, and as it takes them.
+
+    The start of the workers counts, and loading does not count as training.
+    """
+    recipe = training.recipe
+    assert recipe.crop
+    steps = -(-sequences // recipe.batch)
+    work = {f"loading, {processes} workers": loading_epochs(clips, recipe, steps, processes) for processes in workers}
+    clock = partial(device_clock, training.fabric.device.type)
+    seconds = take_turns(work | {TRAINING: training_steps(training)}, measured, clock=clock, label="loading")
+    rates = {what: steps * recipe.batch / median(seconds[what]) for what in work}
+    rates[TRAINING] = recipe.batch / median(seconds[TRAINING])
+    pixels = recipe.length * recipe.crop**2
+    return [Rate(what, rate, rate * pixels / 1e6, rate / rates[TRAINING]) for what, rate in rates.items()]
 
 
 def sequences_of(clips: list[Clip], recipe: Recipe) -> Items:
-    return items(clips, recipe, create(FASTEST), True, 0, Path())  # sequences need no cache
+    return items(clips, recipe, create(FASTEST_NETWORK), True, 0, Path())  # sequences need no cache
 
 
-def loading_rate(clips: list[Clip], recipe: Recipe, workers: int) -> float:
-    """Augmented sequences a second as the training loop gets them, start of the workers included."""
+def loading_epochs(clips: list[Clip], recipe: Recipe, steps: int, workers: int) -> Callable[[], None]:
+    """A function that loads the next epoch of so many steps."""
     sequences = sequences_of(clips, recipe)
-    steps = -(-SEQUENCES // recipe.batch)
     batches = micro_batches(0, steps, recipe.batch, recipe.batch)
     epochs = count()
 
-    def epoch() -> None:
+    def load() -> None:
         sequences.set_epoch(next(epochs))
         for _ in loader(sequences, batches, workers):
             pass
 
-    return steps * recipe.batch / median_seconds(epoch)
+    return load
 
 
-def training_rate(data: Path, profile: str) -> tuple[str, float]:
-    """What was trained, and how many sequences a second, with loading left out."""
-    with TemporaryDirectory() as folder:
-        training = Training(task_for(FASTEST, data, Path(folder), profile))
-        batch = training.recipe.batch
-        batches = cycle(list(loader(training.items, micro_batches(0, 2, batch, batch))))
-        seconds = median_seconds(lambda: training.step([next(batches)]))
-    return f"{FASTEST}, {training.precision}, {training.fabric.device.type}", training.recipe.batch / seconds
+def training_steps(training: Training) -> Callable[[], object]:
+    """A function that takes a training step with a batch that is in memory already."""
+    batch = training.recipe.batch
+    batches = cycle(list(loader(training.items, micro_batches(0, 2, batch, batch))))
+    return lambda: training.step([next(batches)])
 
 
-def memory_of(clips: list[Clip], recipe: Recipe, folder: Path, size: float) -> dict[str, Any]:
-    """Anonymous memory of a process, before and after an epoch over copies of the clips that make up `size` bytes."""
+def memory_of(clips: list[Clip], recipe: Recipe, folder: Path, size: float) -> EpochMemory:
+    """Of a process of its own, before and after an epoch over copies of the clips that make up `size` bytes."""
     with TemporaryDirectory(dir=folder) as temporary:
         copies = list(copy_clips(clips, Path(temporary), size))
         total = sum(size_of(copy) for copy in copies)
-        with multiprocessing.get_context("spawn").Pool(1) as process:
-            before, after = process.apply(anonymous_memory, (copies, recipe))
-    return {"data set GB": total / 1e9, "clips": len(copies), "RssAnon MB before": before, "after an epoch": after}
+        before, after = alone(anonymous_memory, copies, recipe)
+    return EpochMemory(total / 1e9, len(copies), before, after)
 
 
 def copy_clips(clips: list[Clip], folder: Path, size: float) -> Iterator[Path]:
@@ -118,19 +153,13 @@ def copy_clips(clips: list[Clip], folder: Path, size: float) -> Iterator[Path]:
         yield Path(shutil.copytree(clip.path, folder / f"{index:05d}"))
 
 
-def anonymous_memory(paths: list[Path], recipe: Recipe) -> tuple[float | str, float | str]:
+def anonymous_memory(paths: list[Path], recipe: Recipe) -> tuple[float | None, float | None]:
     """Megabytes before and after an epoch. Pages of memory-mapped files are not among them: they can go at any time."""
     sequences = sequences_of([Clip(path) for path in paths], recipe)
     steps = max(1, len(sequences) // recipe.batch)
     batches = iter(loader(sequences, micro_batches(0, steps, recipe.batch, recipe.batch)))
     next(batches)
-    before = rss_anon()
+    before = status_mb("RssAnon")
     for _ in batches:
         pass
-    return before, rss_anon()
-
-
-def rss_anon() -> float | str:
-    status = Path("/proc/self/status")
-    match = re.search(r"RssAnon:\s*(\d+) kB", status.read_text()) if status.exists() else None
-    return int(match[1]) * 1024 / 1e6 if match else "only on Linux"
+    return before, status_mb("RssAnon")

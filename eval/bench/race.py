@@ -1,7 +1,6 @@
 """A race of denoisers: what a frame costs each of them, from noisy Frame to radiance."""
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -10,18 +9,18 @@ import torch
 from torch import nn
 
 from datasets.frame import Frame
-from eval.bench.memory import release
+from eval.bench.memory import release_memory
 from eval.bench.sizes import Size, size_name
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.spec import DenoiserSpec
 from models.denoiser import Denoiser, State
 from models.taa import inner_denoiser
-from timing import take_turns
+from timing import device_clock, take_turns
 
 WARM_UP_FRAMES = 2
-MEASURED_FRAMES = 10
-FEWEST_FRAMES = 5  # measured, where all denoisers together take longer than
-PATIENCE = 240.0  # seconds
+TIMED_FRAMES = 10
+FEWEST_FRAMES = 5  # timed, where all denoisers together take longer than
+RACE_SECONDS = 240.0
 
 
 @dataclass(frozen=True)
@@ -41,13 +40,18 @@ class Timing:
 
 @dataclass
 class Contender:
-    """A denoiser on its way through the sequence."""
+    """A denoiser on its way through the sequence.
+
+    Attributes:
+        in_network: seconds that each frame spent in the network; empty without one.
+        seconds: of each frame that counts.
+    """
 
     spec: DenoiserSpec
     denoiser: Denoiser
     state: State | None = None
-    in_network: list[float] = field(default_factory=list)  # seconds of each frame; empty without a network
-    seconds: list[float] = field(default_factory=list)  # of each frame that counts
+    in_network: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
 
     @staticmethod
     def of(spec: DenoiserSpec) -> "Contender":
@@ -57,15 +61,11 @@ class Contender:
             network.register_forward_hook(lambda *_: contender.leave_network())
         return contender
 
-    def clock(self) -> float:
-        """Seconds, once the device has done all that it was given."""
-        return device_clock(self.spec.device)
-
     def enter_network(self) -> None:
-        self.in_network.append(-self.clock())
+        self.in_network.append(-device_clock(self.spec.device))
 
     def leave_network(self) -> None:
-        self.in_network[-1] += self.clock()
+        self.in_network[-1] += device_clock(self.spec.device)
 
     def step(self, frame: Frame) -> None:
         """Denoise the next frame, which is on the device already."""
@@ -88,10 +88,11 @@ class Contender:
         )
 
     def share_of_network(self) -> float | None:
-        """Of a frame's time; None without a network."""
+        """The part of a frame's time that the network takes, between 0 and 1; None without a network."""
         if not self.in_network:
             return None
-        return float(np.median(np.divide(self.in_network[-len(self.seconds) :], self.seconds)))
+        timed = self.in_network[-len(self.seconds) :]
+        return float(np.median(np.divide(timed, self.seconds)))
 
 
 def network_of(denoiser: Denoiser) -> nn.Module | None:
@@ -99,33 +100,32 @@ def network_of(denoiser: Denoiser) -> nn.Module | None:
     return network if isinstance(network, nn.Module) else None
 
 
-def device_clock(device: str) -> float:
-    """Seconds, once the device has done all that it was given."""
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
 @torch.inference_mode()
 def race(
-    specs: Sequence[DenoiserSpec], size: Size, measured: int = MEASURED_FRAMES, patience: float = PATIENCE
+    specs: Sequence[DenoiserSpec], size: Size, measured: int = TIMED_FRAMES, patience: float = RACE_SECONDS
 ) -> list[Contender]:
-    """Time all specs, of one device, on one sequence: each frame by each of them in turn."""
-    release()  # what earlier races took: all these states of 1920 x 1080 fill most of 24 GB
+    """Time all specs, of one device, on one sequence: each frame by each of them in turn.
+
+    After `patience` seconds it ends with fewer than `measured` frames, but at least FEWEST_FRAMES.
+    """
+    release_memory()  # what earlier races took: all these states of 1920 x 1080 fill most of 24 GB
     contenders = [Contender.of(spec) for spec in specs]
     device = specs[0].device
-    frames: list[Frame] = []
+    frame: Frame
 
-    def next_frame(index: int) -> None:
-        frames[:] = [synthetic_frame(index, *size).to(device)]
+    def make_frame(index: int) -> None:
+        nonlocal frame
+        frame = synthetic_frame(index, *size).to(device)
 
-    steps = [partial(step_with, contender, frames) for contender in contenders]
+    def stepping(contender: Contender) -> Callable[[], None]:
+        return lambda: contender.step(frame)
+
     seconds = take_turns(
-        {f"{c.spec.way} {c.spec.precision}": step for c, step in zip(contenders, steps, strict=True)},
+        {f"{contender.spec.way} {contender.spec.precision}": stepping(contender) for contender in contenders},
         measured,
         warm_up=WARM_UP_FRAMES,
-        before_round=next_frame,
-        fewest=min(measured, FEWEST_FRAMES),
+        before_round=make_frame,
+        fewest=FEWEST_FRAMES,
         patience=patience,
         clock=partial(device_clock, device),
         label=size_name(size),
@@ -133,7 +133,3 @@ def race(
     for contender, spent in zip(contenders, seconds.values(), strict=True):
         contender.seconds = spent
     return contenders
-
-
-def step_with(contender: Contender, frames: Sequence[Frame]) -> None:
-    contender.step(frames[0])

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from eval.bench.race import Timing, race
+from eval.bench.output import bench_folder
+from eval.bench.race import TIMED_FRAMES, Timing, race
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.extra_denoisers import FAST_OIDN
 from eval.selection import choose, unavailable
@@ -19,7 +21,7 @@ from plotting import DPI, plt, save_figure
 from provenance import device_in_words
 from timing import thread_count
 
-SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
+SCALING_SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1080")
 
 
 def in_use(names: Sequence[str]) -> list[DenoiserSpec]:
@@ -38,17 +40,22 @@ def exponent(pixels: Sequence[int], ms: Sequence[float]) -> float | None:
 
 
 def by_denoiser(rows: Sequence[Timing]) -> dict[str, list[Timing]]:
-    return {row.denoiser: [other for other in rows if other.denoiser == row.denoiser] for row in rows}
+    groups: dict[str, list[Timing]] = {}
+    for row in rows:
+        groups.setdefault(row.denoiser, []).append(row)
+    return groups
 
 
-def draw(rows: Sequence[Timing]) -> Figure:
+def scaling_figure(rows: Sequence[Timing]) -> Figure:
     """Median milliseconds against pixels, both logarithmic, and how far they spread (p10 to p90)."""
     figure, axis = plt.subplots(figsize=(8, 5.5), dpi=DPI, layout="constrained")
     for index, (name, ours) in enumerate(by_denoiser(rows).items()):
         pixels = [row.width * row.height for row in ours]
-        ms, low, high = (np.array([getattr(row, key) for row in ours]) for key in ("ms_median", "ms_p10", "ms_p90"))
+        ms = np.array([row.ms_median for row in ours])
+        below = ms - [row.ms_p10 for row in ours]
+        above = [row.ms_p90 for row in ours] - ms
         style = ("-", "--", ":")[index // 10 % 3]  # ten colours
-        axis.errorbar(pixels, ms, (ms - low, high - ms), fmt="o", ls=style, ms=3, lw=1.2, capsize=2, label=name)
+        axis.errorbar(pixels, ms, (below, above), fmt="o", ls=style, ms=3, lw=1.2, capsize=2, label=name)
     axis.set(xlabel="pixels", ylabel="ms a frame", xscale="log", yscale="log")
     axis.set_title(f"{rows[0].threads} threads", fontsize=9)
     axis.grid(alpha=0.3, which="both")
@@ -56,39 +63,41 @@ def draw(rows: Sequence[Timing]) -> Figure:
     return figure
 
 
-def table(rows: Sequence[Timing]) -> str:
-    """A row a denoiser: milliseconds at each size, and the exponent."""
-    lines = []
-    for name, ours in by_denoiser(rows).items():
-        ms = {size_name((row.height, row.width)): row.ms_median for row in ours}
-        k = exponent([row.width * row.height for row in ours], list(ms.values()))
-        lines.append({"denoiser": name, "dtype": ours[0].dtype} | ms | {"ms ~ pixels^": k})
-    return tabulate(lines, "keys", floatfmt=".3g", missingval="-")
+def table_line(name: str, rows: Sequence[Timing]) -> dict[str, Any]:
+    """A denoiser's milliseconds at each size, and the exponent."""
+    ms = {size_name((row.height, row.width)): row.ms_median for row in rows}
+    law = exponent([row.width * row.height for row in rows], [row.ms_median for row in rows])
+    return {"denoiser": name, "dtype": rows[0].dtype, **ms, "ms ~ pixels^": law}
 
 
-def bench_scaling(runs: Path, names: Sequence[str], sizes: Sequence[str] = (), threads: Sequence[int] = ()) -> str:
+def bench_scaling(
+    runs: Path,
+    names: Sequence[str] = (),
+    sizes: Sequence[str] = (),
+    threads: int | None = None,
+    measured: int = TIMED_FRAMES,
+) -> str:
     """Time the denoisers on the CPU at rising sizes: a table, RUNS/bench/scaling.json and a plot for the report.
 
-    With the largest number of `threads`, by default all. Raises BadInput for unknown names, sizes, numbers of threads.
+    At SCALING_SIZES by default, with `threads`, by default all. Raises BadInput for unknown
+    names, sizes and numbers of threads.
     """
-    pixels = sorted({parse_size(size) for size in sizes or SIZES}, key=lambda size: size[0] * size[1])
+    pixels = sorted({parse_size(size) for size in sizes or SCALING_SIZES}, key=lambda size: size[0] * size[1])
     specs = in_use(names)
-    count = thread_counts(threads)[-1]
+    count = thread_counts([threads] if threads is not None else [])[-1]
     rows: list[Timing] = []
     with thread_count(count):
         for size in pixels:
-            rows += [contender.timing(size) for contender in race(specs, size)]
-    (runs / "bench").mkdir(parents=True, exist_ok=True)
+            rows += [contender.timing(size) for contender in race(specs, size, measured)]
+    content = {
+        "schema": 1,
+        "device": device_in_words(threads=count),
+        "threads": count,
+        "rows": [asdict(row) for row in rows],
+    }
+    write_json(bench_folder(runs) / "scaling.json", content)
     figures = runs / "report" / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    write_json(
-        runs / "bench" / "scaling.json",
-        {
-            "schema": 1,
-            "device": device_in_words(threads=count),
-            "threads": count,
-            "rows": [asdict(row) for row in rows],
-        },
-    )
-    save_figure(figures / "scaling.png", draw(rows))
-    return table(rows)
+    save_figure(figures / "scaling.png", scaling_figure(rows))
+    lines = [table_line(name, ours) for name, ours in by_denoiser(rows).items()]
+    return tabulate(lines, "keys", floatfmt=".3g", missingval="-")

@@ -1,8 +1,11 @@
-"""How long a training step takes, in both precisions, and where the time goes."""
+"""`onespp bench training`: how long a training step takes, in both precisions, and where the time goes."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -14,70 +17,124 @@ from tabulate import tabulate
 from torch.profiler import ProfilerActivity, profile, record_function
 from tqdm import tqdm
 
+from eval.bench.output import bench_folder
 from files import write_json
+from timing import device_clock, take_turns
 from train.data import in_parts, loader, micro_batches
 from train.precision import BFLOAT16, FLOAT32
 from train.recipes import DEFAULT
 from train.registry import task_for
 from train.training import Training
 
-PRECISIONS = (FLOAT32, BFLOAT16)
-REPEATS = 5  # steps of each, in turns, besides a first one that warms up; the median counts
-CONVOLUTIONS, NETWORK, LOSS, OPTIMISER, LOADING, REST = (
-    "convolutions",
-    "rest of the network",
-    "loss",
-    "Adam",
-    "loading",
-    "other",
-)
+TIMED_STEPS = 5  # in each precision, besides a first one that warms up; the median counts
+
+# The parts of a step.
+CONVOLUTIONS = "convolutions"
+NETWORK = "rest of the network"
+LOSS = "loss"
+OPTIMISER = "Adam"
+REST = "other"
+LOADING = "loading"
 BACKWARD = "autograd::engine::evaluate_function"
 
 
-def bench_training(data: Path, runs: Path, profile_name: str, names: Sequence[str]) -> str:
+@dataclass(frozen=True)
+class StepTimes:
+    """Milliseconds of a network's training step in both precisions."""
+
+    network: str
+    full_ms: float
+    mixed_ms: float
+
+    @property
+    def fastest(self) -> str:
+        return FLOAT32 if self.full_ms <= self.mixed_ms else BFLOAT16
+
+    def line(self) -> dict[str, Any]:
+        """As it stands in the table and in training.json."""
+        return {
+            "network": self.network,
+            f"{FLOAT32} ms": self.full_ms,
+            f"{BFLOAT16} ms": self.mixed_ms,
+            "times faster": self.full_ms / self.mixed_ms,
+        }
+
+
+@dataclass(frozen=True)
+class StepShares:
+    """Where the time of a step goes, in the faster precision: the share of each part, between 0 and 1."""
+
+    network: str
+    precision: str
+    shares: Mapping[str, float]
+
+    def line(self) -> dict[str, Any]:
+        """As it stands in training.json."""
+        return {"network": self.network, "precision": self.precision, **self.shares}
+
+    def percent(self) -> dict[str, str]:
+        """As it stands in the table."""
+        shares = {part: f"{share:.1%}" for part, share in self.shares.items()}
+        return {"network": self.network, "precision": self.precision, **shares}
+
+
+def bench_training(data: Path, runs: Path, budget: str, names: Sequence[str] = (), measured: int = TIMED_STEPS) -> str:
     """Measure steps of the named networks; returns tables and writes RUNS/bench/training.json.
 
-    Raises BadInput for unusable data or an unknown name or profile.
+    Raises BadInput for unusable data or an unknown name or budget.
     """
-    speeds, shares = [], []
+    times: list[StepTimes] = []
+    shares: list[StepShares] = []
     for name in tqdm(names or DEFAULT, "training", leave=False):
         with TemporaryDirectory() as folder:
-            trainings = {p: Training(task_for(name, data, Path(folder), profile_name, precision=p)) for p in PRECISIONS}
-            times = step_times(trainings)
-            fastest = min(times, key=lambda precision: times[precision])
-            row = {f"{precision} ms": ms for precision, ms in times.items()}
-            speeds.append({"network": name, **row, "times faster": times["float32"] / times["bfloat16"]})
-            shares.append({"network": name, "precision": fastest, **step_shares(trainings[fastest])})
-    (runs / "bench").mkdir(parents=True, exist_ok=True)
-    device = f"{'cuda' if torch.cuda.is_available() else 'cpu'}, {torch.get_num_threads()} threads"
-    content = {"schema": 1, "profile": profile_name, "device": device, "steps": speeds, "shares": shares}
-    write_json(runs / "bench" / "training.json", content)
-    percent = [
-        {key: f"{value:.1%}" if isinstance(value, float) else value for key, value in row.items()} for row in shares
-    ]
-    return "\n\n".join([tabulate(speeds, "keys", floatfmt=(".0f", ".0f", ".0f", ".2f")), tabulate(percent, "keys")])
+            trainings = {
+                precision: Training(task_for(name, data, Path(folder), budget, precision=precision))
+                for precision in (FLOAT32, BFLOAT16)
+            }
+            ms = step_ms(trainings, measured)
+            times.append(StepTimes(name, ms[FLOAT32], ms[BFLOAT16]))
+            fastest = times[-1].fastest
+            shares.append(StepShares(name, fastest, step_shares(trainings[fastest])))
+    content = {
+        "schema": 1,
+        "profile": budget,
+        "device": f"{training_device()}, {torch.get_num_threads()} threads",
+        "steps": [row.line() for row in times],
+        "shares": [row.line() for row in shares],
+    }
+    write_json(bench_folder(runs) / "training.json", content)
+    time_table = tabulate(content["steps"], "keys", floatfmt=(".0f", ".0f", ".0f", ".2f"))
+    return f"{time_table}\n\n{tabulate([row.percent() for row in shares], 'keys')}"
 
 
-def step_times(trainings: dict[str, Training]) -> dict[str, float]:
+def training_device() -> str:
+    """The device that trains: "cpu" or "cuda"."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def step_ms(trainings: Mapping[str, Training], measured: int) -> dict[str, float]:
     """Median milliseconds of a whole step, loading included, of trainings that take turns."""
-    times: dict[str, list[float]] = {name: [] for name in trainings}
-    for repeat in range(1 + REPEATS):
-        for name, training in trainings.items():
-            ms = one_step(training, repeat)["step_ms"]
-            times[name] += [ms] if repeat else []
-    return {name: median(values) for name, values in times.items()}
+
+    def stepping(training: Training) -> Callable[[], object]:
+        numbers = count()
+        return lambda: one_step(training, next(numbers))
+
+    work = {name: stepping(training) for name, training in trainings.items()}
+    seconds = take_turns(work, measured, clock=partial(device_clock, training_device()))
+    return {name: 1e3 * median(spent) for name, spent in seconds.items()}
 
 
 def one_step(training: Training, number: int) -> dict[str, float]:
+    """Take the step with the items of step `number`; returns what the training notes of it."""
     batches = micro_batches(number, number + 1, training.recipe.batch, training.micro_batch)
     return training.step(next(in_parts(loader(training.items, batches), training.parts)))
 
 
-def named(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, seen under a name by the profiler."""
+def named(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, which the profiler sees under `name`."""
 
     def recorded(*args: Any) -> Any:
-        with record_function(what):
+        with record_function(name):
             return function(*args)
 
     return recorded
@@ -92,12 +149,12 @@ def step_shares(training: Training) -> dict[str, float]:
                 stack.enter_context(patch.object(loss.denoiser, method, named(NETWORK, getattr(loss.denoiser, method))))
         stack.enter_context(patch.object(loss, "forward", named(LOSS, loss.forward)))
         with profile(activities=[ProfilerActivity.CPU]) as profiler:
-            measured = one_step(training, 0)
+            noted = one_step(training, 0)
     totals = attribute(list(profiler.events() or []))
-    loading = measured["loading_ms"] / measured["step_ms"]
+    loading = noted["loading_ms"] / noted["step_ms"]
     whole = sum(totals.values())
-    shares = {what: (1 - loading) * totals[what] / whole for what in (CONVOLUTIONS, NETWORK, LOSS, OPTIMISER, REST)}
-    return {**shares, LOADING: loading}
+    parts = (CONVOLUTIONS, NETWORK, LOSS, OPTIMISER, REST)
+    return {part: (1 - loading) * totals[part] / whole for part in parts} | {LOADING: loading}
 
 
 def attribute(events: list[Any]) -> dict[str, float]:

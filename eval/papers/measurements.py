@@ -7,11 +7,10 @@ from pathlib import Path
 from datasets.frame import Signal
 from eval.ablation.variant_run import VariantRun, over_seeds
 from eval.bench.sizes import size_name
-from eval.means import joint_floor
+from eval.means import scores_of
 from eval.metrics import within_floor
 from eval.papers.tables import PaperTable
-from eval.report.table_rows import mean_of, of, one_spp
-from eval.results import read_results
+from eval.results import of_one_spp, read_results, results_of
 from files import read_json
 
 TABLE_3_SIZE = (720, 1280)  # height and width of the frames that WSKP's Table 3 times
@@ -41,16 +40,14 @@ class Measurements:
 def from_evaluation(runs: Path, budget: str, signal: Signal) -> Measurements:
     """Means over the clips of 1 spp of RUNS/eval/results.json where a metric is defined."""
     path = runs / "eval" / "results.json"
-    clips = one_spp(read_results(runs)[1]) if path.exists() else []
+    clips = of_one_spp(read_results(runs)[1]) if path.exists() else []
     ours = [clip for clip in clips if clip.signal == signal]
-    floors = [clip.reference.metrics for clip in ours]
 
     def value(denoiser: str, metric: str) -> float | None:
-        return mean_of(ours, denoiser)[metric] if of(ours, denoiser) else None
+        return scores_of(ours, denoiser).means[metric] if results_of(ours, denoiser) else None
 
     def floor(denoiser: str, metric: str) -> float | None:
-        results = [result.metrics for result in of(ours, denoiser)]
-        return joint_floor(results, floors).get(metric) if results else None
+        return scores_of(ours, denoiser).joint_floor.get(metric) if results_of(ours, denoiser) else None
 
     return Measurements(value, f"onespp eval --budget {budget} --runs {runs}", floor)
 

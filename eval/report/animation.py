@@ -8,37 +8,42 @@ from PIL import Image, ImageDraw, ImageFont
 
 from eval.results import ClipResults, folders_of, load_picture, signal_label
 from files import replacing
+from plotting import enlargement
 
-BEST = 2  # denoisers that are shown
-FRAMES, MILLISECONDS = 240, 83  # at most so many frames, so long each
-SMALLEST_PANEL = 256  # px; smaller images are enlarged by a whole factor
-CAPTION = 22  # px
+BEST_SHOWN = 2  # denoisers
+MOST_FRAMES = 240
+MILLISECONDS = 83  # that each frame is shown
+BANNER = 22  # px above the panels, for their names
 
 
-def shown(clip: ClipResults) -> list[str]:
+def panel_names(clip: ClipResults) -> list[str]:
     """What stands side by side: the noisy frame, the best denoisers by FLIP, the reference."""
-    flips = {track.denoiser: track.metrics["flip"] or 0.0 for track in clip.results if track.denoiser != "noisy"}
-    noisy = [track.denoiser for track in clip.results if track.denoiser == "noisy"]
-    return [*noisy, *sorted(flips, key=flips.__getitem__)[:BEST], clip.reference.denoiser]
+    flips = {result.denoiser: result.metrics["flip"] or 0.0 for result in clip.results if result.denoiser != "noisy"}
+    noisy = [result.denoiser for result in clip.results if result.denoiser == "noisy"]
+    return [*noisy, *sorted(flips, key=flips.__getitem__)[:BEST_SHOWN], clip.reference.denoiser]
 
 
 def side_by_side(folders: Sequence[Path], names: Sequence[str], index: int) -> Image.Image:
+    """Frame `index` of what is in each of the folders, under its name."""
     images = [load_picture(folder, index) for folder in folders]
-    zoom = max(1, -(-SMALLEST_PANEL // max(images[0].shape[:2])))
+    zoom = enlargement(*images[0].shape[:2])
     panels = Image.fromarray(np.concatenate([image.repeat(zoom, 0).repeat(zoom, 1) for image in images], axis=1))
-    picture = Image.new("RGB", (panels.width, panels.height + CAPTION), "white")
-    picture.paste(panels, (0, CAPTION))
+    picture = Image.new("RGB", (panels.width, panels.height + BANNER), "white")
+    picture.paste(panels, (0, BANNER))
     for position, name in enumerate(names):
-        place = position * panels.width // len(names) + 4, 3
-        ImageDraw.Draw(picture).text(place, name, "black", ImageFont.load_default(14))
+        left = position * panels.width // len(names)
+        ImageDraw.Draw(picture).text((left + 4, 3), name, "black", ImageFont.load_default(14))
     return picture
 
 
 def save_animation(runs: Path, clip: ClipResults) -> Path:
-    """Write RUNS/report/SCENE-CLIP.webp, an endless loop over the clip; of a long clip, its beginning."""
-    names = shown(clip)
+    """Write RUNS/report/SCENE-CLIP.webp, an endless loop over the clip; of a long clip, its beginning.
+
+    Returns its path. Raises BadInput for missing and damaged pictures.
+    """
+    names = panel_names(clip)
     folders = [folders_of(runs, clip)[name] for name in names]
-    count = min(FRAMES, len(clip.reference.frames))
+    count = min(MOST_FRAMES, len(clip.reference.frames))
     frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in range(count))
     path = runs / "report" / f"{signal_label(f'{clip.scene}-{clip.clip}', clip.signal)}.webp"
     first = next(frames)

@@ -1,6 +1,7 @@
 """`onespp report`: one page, in one file, of all that was measured."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from tqdm import tqdm
 from errors import BadInput
 from eval.metrics import METRICS
 from eval.report.animation import save_animation
-from eval.report.page_data import clip_data, data_uri, step_for
+from eval.report.page_data import data_uri, page_clip, step_for
 from eval.report.table_rows import table_rows
-from eval.report.trade_plot import trades
+from eval.report.trade_plot import trade_plots
 from eval.results import ClipResults, read_results
 from eval.text_table import LEGEND
+from eval.tradeoff.times import times_of_first_size
 from files import write_file
 from plotting import plt
 
@@ -34,18 +36,18 @@ def page_file(name: str) -> str:
 
 def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float) -> str:
     """The page's HTML."""
-    bench, trade_plots = trades(runs, clips)
+    times = times_of_first_size(runs)
+    plots = trade_plots(times, clips) if times else []
     step = step_for(runs, clips, megabytes * 1e6)
-    pictures = [clip_data(runs, clip, step) for clip in tqdm(clips, "report", unit="clip")]
+    pictures = [page_clip(runs, clip, step) for clip in tqdm(clips, "report", unit="clip")]
     rows = table_rows(clips)
-    measured = [key for key in METRICS if any(row.values.get(key) is not None for row in rows)]
-    denoisers = list(dict.fromkeys(track.denoiser for clip in clips for track in clip.results))
+    metrics = {key: METRICS[key] for key in METRICS if any(row.values.get(key) is not None for row in rows)}
     data = {
-        "metrics": {key: {"title": METRICS[key].title, "more": METRICS[key].more_is_better} for key in measured},
-        "denoisers": denoisers,
+        "metrics": {key: {"title": metric.title, "more": metric.more_is_better} for key, metric in metrics.items()},
+        "denoisers": list(dict.fromkeys(result.denoiser for clip in clips for result in clip.results)),
         "magma": (255 * plt.get_cmap("magma")(np.arange(256))[:, :3]).round().astype(int).tolist(),
-        "clips": pictures,
-        "trades": trade_plots,
+        "clips": [asdict(clip) for clip in pictures],
+        "trades": [asdict(plot) for plot in plots],
     }
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # metrics and denoisers keep their order
@@ -53,9 +55,9 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
         results=results,
         clips=clips,
         rows=rows,
-        metrics={key: METRICS[key] for key in measured},
+        metrics=metrics,
         legend=LEGEND,
-        bench=bench,
+        times=times,
         figures=figures(runs),
         data=data,
         style=Markup(page_file("style.css")),
@@ -67,7 +69,7 @@ def report(runs: Path, megabytes: float = 24) -> list[Path]:
     """Write RUNS/report/index.html, and an animated WebP a clip; returns their paths.
 
     The page's pictures take about `megabytes` at most: where all frames do not fit, it shows every n-th.
-    Raises BadInput where nothing has been evaluated.
+    Raises BadInput where nothing has been evaluated, and where what was is damaged.
     """
     if megabytes <= 0:
         raise BadInput(f"{megabytes} megabytes hold no page: name more than 0")

@@ -4,8 +4,8 @@ import base64
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,29 +15,54 @@ from tqdm import tqdm
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, folders_of, load_picture, picture_path
 
-MAPS = 1.4  # bytes of images and their FLIP maps over those of images
-BASE64 = 4 / 3
-CROPS = 3  # a clip
+WITH_FLIP_MAPS = 1.4  # bytes of images and their FLIP maps over those of images
+BASE64 = 4 / 3  # bytes of text over those that it encodes
+MOST_CROPS = 3  # a clip
+
+
+@dataclass(frozen=True)
+class PageClip:
+    """A clip on the page.
+
+    Attributes:
+        count: of all its frames.
+        frames: which of them have pictures.
+        images: data URIs of each denoiser's pictures and of the reference's.
+        flips: of each denoiser's FLIP maps.
+        curves: each metric, frame by frame (all of them), of each denoiser, and of the reference its noise floor.
+        crops: where most comes into view.
+    """
+
+    name: str
+    count: int
+    frames: list[int]
+    height: int
+    width: int
+    images: dict[str, list[str]]
+    flips: dict[str, list[str]]
+    curves: dict[str, dict[str, list[float | None]]]
+    crops: list[dict[str, int]]
 
 
 def data_uri(content: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def rounded(value: float | None) -> float | None:
-    return None if value is None else float(f"{value:.4g}")
-
-
-def encoded(image: NDArray[np.uint8]) -> str:
+def webp_uri(image: NDArray[np.uint8]) -> str:
+    """A data URI of an image (H, W) or (H, W, 3), lossless."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "WEBP", lossless=True, method=2)
     return data_uri(buffer.getvalue(), "webp")
 
 
-def step_for(runs: Path, clips: Sequence[ClipResults], budget: float) -> int:
-    """Of how many frames one is shown, so that all pictures take about `budget` bytes."""
+def four_digits(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.4g}")
+
+
+def step_for(runs: Path, clips: Sequence[ClipResults], size: float) -> int:
+    """One of how many frames is shown, so that all pictures take about `size` bytes."""
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
-    return max(1, math.ceil(sum(path.stat().st_size for path in paths) * MAPS * BASE64 / budget))
+    return max(1, math.ceil(sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64 / size))
 
 
 def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int]]:
@@ -46,29 +71,50 @@ def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int
     chosen: list[dict[str, int]] = []
     for crop in sorted(clip.reference.crops or [], key=lambda crop: -crop["pixels"]):
         far = all(abs(crop["frame"] - other["frame"]) >= apart for other in chosen)
-        if crop["frame"] in frames and far and len(chosen) < CROPS:
+        if crop["frame"] in frames and far and len(chosen) < MOST_CROPS:
             chosen.append(crop)
     return chosen
 
 
-def clip_data(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
-    """What the page needs of a clip: pictures as data URIs, errors frame by frame, crops."""
-    everyone, folders, count = [*clip.results, clip.reference], folders_of(runs, clip), len(clip.reference.frames)
+def curves_of(clip: ClipResults) -> dict[str, dict[str, list[float | None]]]:
+    """Of each metric that is defined in any frame: the values of the denoisers, and the reference's noise floors."""
+    defined = [
+        metric
+        for metric in METRICS
+        if any(values.get(metric) is not None for result in clip.results for values in result.frames)
+    ]
+    return {
+        metric: {
+            result.denoiser: [four_digits(values.get(metric)) for values in result.frames]
+            for result in (*clip.results, clip.reference)
+        }
+        for metric in defined
+    }
+
+
+def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
+    """The clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
+    folders = folders_of(runs, clip)
+    count = len(clip.reference.frames)
     frames = range(0, count, step)
     images: dict[str, list[str]] = {name: [] for name in folders}
-    flips: dict[str, list[str]] = {track.denoiser: [] for track in clip.results}
+    flips: dict[str, list[str]] = {result.denoiser: [] for result in clip.results}
     for index in tqdm(frames, clip.name, unit="frame", leave=False):
-        shown = {name: load_picture(folder, index) for name, folder in folders.items()}
-        for name, image in shown.items():
+        pictures = {name: load_picture(folder, index) for name, folder in folders.items()}
+        for name, picture in pictures.items():
             images[name].append(data_uri(picture_path(folders[name], index).read_bytes(), "webp"))
             if name in flips:
-                errors = flip_map(image / 255, shown[clip.reference.denoiser] / 255)
-                flips[name].append(encoded((255 * errors + 0.5).astype(np.uint8)))
-    height, width = shown[clip.reference.denoiser].shape[:2]
-    curves = {
-        metric: {r.denoiser: [rounded(values.get(metric)) for values in r.frames] for r in everyone}
-        for metric in METRICS
-        if any(values.get(metric) is not None for track in clip.results for values in track.frames)
-    }
-    facts = {"name": clip.name, "count": count, "frames": [*frames], "height": height, "width": width}
-    return facts | {"images": images, "flips": flips, "curves": curves, "crops": chosen_crops(clip, frames)}
+                errors = flip_map(picture / 255, pictures[clip.reference.denoiser] / 255)
+                flips[name].append(webp_uri((255 * errors + 0.5).astype(np.uint8)))
+    height, width = pictures[clip.reference.denoiser].shape[:2]
+    return PageClip(
+        name=clip.name,
+        count=count,
+        frames=[*frames],
+        height=height,
+        width=width,
+        images=images,
+        flips=flips,
+        curves=curves_of(clip),
+        crops=chosen_crops(clip, frames),
+    )

@@ -1,19 +1,23 @@
 """The report's table: denoisers, clip by clip and on average, with noise floors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from eval.means import joint_floor, mean_floor, means
-from eval.metrics import Values, within_floor
-from eval.results import FLOOR, ClipResults, Result
-from eval.text_table import cell, floor_cell
+from eval.means import mean_floor, scores_of
+from eval.metrics import METRICS, Values, within_floor
+from eval.results import FLOOR, ClipResults, by_signal, of_one_spp, results_of
+from eval.text_table import floor_cell, value_cell
 
-ALL = "mean of clips of 1 spp"
+MEAN = "mean of clips of 1 spp"  # instead of a clip's name
 
 
-@dataclass
-class Row:
-    """Of the table: a denoiser on a clip, or the noise floor."""
+@dataclass(frozen=True)
+class TableRow:
+    """A denoiser on a clip, or the noise floor.
+
+    Attributes:
+        best: the metrics by which it is the best of its clip and signal.
+    """
 
     clip: str
     denoiser: str
@@ -21,62 +25,63 @@ class Row:
     values: Values
     floors: Values
     nonfinite: int = 0
+    best: frozenset[str] = frozenset()
 
     @property
     def is_floor(self) -> bool:
         return self.denoiser == FLOOR
 
+    @property
+    def is_mean(self) -> bool:
+        return self.clip == MEAN
+
     def text(self, metric: str) -> str:
         value = self.values.get(metric)
-        return floor_cell(metric, value) if self.is_floor else cell(metric, value, self.floors.get(metric))
+        return floor_cell(metric, value) if self.is_floor else value_cell(metric, value, self.floors.get(metric))
 
     def near(self, metric: str) -> bool:
+        """Whether the value is within its noise floor."""
         return not self.is_floor and within_floor(metric, self.values.get(metric), self.floors.get(metric))
 
 
-def rows_of(clip: str, signal: str, tracks: Sequence[Result], floors: Values) -> list[Row]:
-    rows = [Row(clip, track.denoiser, signal, track.metrics, floors, track.nonfinite) for track in tracks]
-    return [*rows, Row(clip, FLOOR, signal, floors, floors)]
-
-
-def mean_rows(signal: str, clips: Sequence[ClipResults]) -> list[Row]:
-    floors, rows = [clip.reference.metrics for clip in clips], []
-    for name in (track.denoiser for track in clips[0].results):
-        metrics = [result.metrics for result in of(clips, name)]
-        rows.append(Row(ALL, name, signal, means(metrics), joint_floor(metrics, floors), nonfinite_of(clips, name)))
-    floor = mean_floor(floors)
-    return [*rows, Row(ALL, FLOOR, signal, floor, floor)]
-
-
-def table_rows(clips: Sequence[ClipResults]) -> list[Row]:
+def table_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
     """Means over the clips of one sample a pixel, if there are several, and then clip by clip."""
+    groups = [mean_rows(ours) for ours in by_signal(of_one_spp(clips)).values() if len(ours) > 1]
+    groups += [clip_rows(clip) for clip in clips]
+    return [row for rows in groups for row in with_best(rows)]
+
+
+def clip_rows(clip: ClipResults) -> list[TableRow]:
+    """The denoisers on one clip, and the noise floor."""
+    name = f"{clip.scene}/{clip.clip}"
+    floors = clip.reference.metrics
+    rows = [TableRow(name, r.denoiser, clip.signal, r.metrics, floors, r.nonfinite) for r in clip.results]
+    return [*rows, TableRow(name, FLOOR, clip.signal, floors, floors)]
+
+
+def mean_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
+    """Means of the denoisers over clips of one signal, and that of the noise floors."""
+    signal = clips[0].signal
     rows = []
-    for clip in clips:
-        rows += rows_of(f"{clip.scene}/{clip.clip}", clip.signal, clip.results, clip.reference.metrics)
-    together = []
-    for signal, ours in by_signal(one_spp(clips)).items():
-        if len(ours) > 1:
-            together += mean_rows(signal, ours)
-    return together + rows
+    for name in (result.denoiser for result in clips[0].results):
+        scores = scores_of(clips, name)
+        nonfinite = sum(result.nonfinite for result in results_of(clips, name))
+        rows.append(TableRow(MEAN, name, signal, scores.means, scores.joint_floor, nonfinite))
+    floor = mean_floor([clip.reference.metrics for clip in clips])
+    return [*rows, TableRow(MEAN, FLOOR, signal, floor, floor)]
 
 
-def one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
-    """Without clips such as 000-4spp, which show the same frames again with other input: means do not mix them."""
-    return [clip for clip in clips if clip.noisy_spp == 1]
+def with_best(rows: Sequence[TableRow]) -> list[TableRow]:
+    """The rows of one clip and signal, each with the metrics by which it is the best of them."""
+    best = {metric: best_denoisers(rows, metric) for metric in METRICS}
+    return [replace(row, best=frozenset(key for key in METRICS if row.denoiser in best[key])) for row in rows]
 
 
-def by_signal(clips: Sequence[ClipResults]) -> dict[str, list[ClipResults]]:
-    signals = dict.fromkeys(clip.signal for clip in clips)
-    return {signal: [clip for clip in clips if clip.signal == signal] for signal in signals}
-
-
-def of(clips: Sequence[ClipResults], name: str) -> list[Result]:
-    return [track for clip in clips for track in clip.results if track.denoiser == name]
-
-
-def mean_of(clips: Sequence[ClipResults], name: str) -> Values:
-    return means([track.metrics for track in of(clips, name)])
-
-
-def nonfinite_of(clips: Sequence[ClipResults], name: str) -> int:
-    return sum(track.nonfinite for track in of(clips, name))
+def best_denoisers(rows: Sequence[TableRow], metric: str) -> set[str]:
+    """Who has the best value; where that is within its noise floor, whose digits mean nothing, all that are."""
+    values = {row.denoiser: row.values.get(metric) for row in rows if not row.is_floor}
+    more = METRICS[metric].more_is_better
+    ranks = {name: -value if more else abs(value) for name, value in values.items() if value is not None}
+    best = {name for name, rank in ranks.items() if rank == min(ranks.values())}
+    near = {row.denoiser for row in rows if row.near(metric)}
+    return best | near if best & near else best

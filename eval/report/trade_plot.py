@@ -1,51 +1,61 @@
-"""The report's plot of quality against time."""
+"""The report's plots of quality against time."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
-from eval.means import compared_mean
-from eval.metrics import METRICS
-from eval.report.table_rows import by_signal, mean_of, of, one_spp
-from eval.results import ClipResults
-from eval.tradeoff.pareto import Point, dominators
-from eval.tradeoff.times import median_ms, timed_as
-from files import read_json
+from eval.means import scores_of
+from eval.results import ClipResults, by_signal, of_one_spp
+from eval.spec import DenoiserSpec
+from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.times import Times
 
-TRADED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
+PLOTTED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
 
 
-def trades(runs: Path, clips: Sequence[ClipResults]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The bench's results, if there are any, and for each signal and metric the points of the plot."""
-    path = runs / "bench" / "results.json"
-    if not path.exists():
-        return {}, []
-    bench = read_json(path, ("device", "threads", "rows"))
-    if not bench["rows"]:
-        return {}, []
-    height, width = (bench["rows"][0][side] for side in ("height", "width"))
-    times = median_ms(bench, (height, width), bench["threads"])  # of the first size, with as many threads as there are
-    plots = [
-        trade(signal, ours, metric, times) | {"size": f"{width} × {height}"}
-        for signal, ours in by_signal(one_spp(clips)).items()
-        for metric in TRADED
+@dataclass(frozen=True)
+class PlotPoint:
+    """A denoiser: milliseconds a frame, the mean of a metric, and by whom it is beaten; None on the Pareto front."""
+
+    name: str
+    ms: float
+    quality: float
+    by: str | None
+
+
+@dataclass(frozen=True)
+class TradePlot:
+    """Points of one signal and metric, fastest first; `missing` are the denoisers without."""
+
+    signal: str
+    metric: str
+    points: list[PlotPoint]
+    missing: list[str]
+    size: str
+
+
+def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[TradePlot]:
+    """A plot for each signal and metric, over the clips of 1 spp; without those that would be empty."""
+    plots = [trade_plot(times, ours, metric) for ours in by_signal(of_one_spp(clips)).values() for metric in PLOTTED]
+    return [plot for plot in plots if plot.points]
+
+
+def trade_plot(times: Times, clips: Sequence[ClipResults], metric: str) -> TradePlot:
+    """A point for each denoiser that was timed in the precision in which it was evaluated. Clips are of one signal."""
+    offers = {}
+    for result in clips[0].results:
+        spec = DenoiserSpec(result.denoiser, result.signal, result.precision)
+        offers[result.denoiser] = Offer(times.of(spec), scores_of(clips, result.denoiser))
+    beaten = beaten_by(offers, metric)
+    points = [
+        PlotPoint(name, mean.ms, mean.quality, beaten[name])
+        for name, offer in offers.items()
+        if (mean := offer.mean(metric))
     ]
-    return bench, [plot for plot in plots if plot["points"]]
-
-
-def trade(
-    signal: str, clips: Sequence[ClipResults], metric: str, times: dict[tuple[str, str], float]
-) -> dict[str, Any]:
-    """A point for each denoiser that was timed in the precision in which it was evaluated."""
-    floors = [clip.reference.metrics for clip in clips]
-    points, values = dict[str, Point](), dict[str, float]()
-    for track in clips[0].results:
-        ms = times.get((timed_as(track.denoiser, signal), track.precision))
-        quality = mean_of(clips, track.denoiser)[metric]
-        seen = compared_mean(metric, [result.metrics for result in of(clips, track.denoiser)], floors)
-        if ms is not None and quality is not None and seen is not None:
-            points[track.denoiser], values[track.denoiser] = Point(ms, seen), quality
-    by = dominators(points, METRICS[metric].more_is_better)
-    missing = [track.denoiser for track in clips[0].results if track.denoiser not in points]
-    shown = [{"name": name, "ms": points[name].ms, "quality": values[name], "by": by[name]} for name in points]
-    return {"signal": signal, "metric": metric, "points": shown, "missing": missing}
+    height, width = times.size
+    return TradePlot(
+        signal=clips[0].signal,
+        metric=metric,
+        points=sorted(points, key=lambda point: point.ms),
+        missing=[name for name in offers if name not in beaten],
+        size=f"{width} × {height}",
+    )

@@ -1,7 +1,11 @@
 """Who is worth the time: the Pareto front of quality against time."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
+
+from eval.means import ClipScores
+from eval.metrics import METRICS
 
 
 class Point(NamedTuple):
@@ -9,6 +13,33 @@ class Point(NamedTuple):
 
     ms: float
     quality: float
+
+    @staticmethod
+    def of(ms: float | None, quality: float | None) -> "Point | None":
+        """None where the time was not measured, or the metric is not defined."""
+        return None if ms is None or quality is None else Point(ms, quality)
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What a denoiser offers: quality, for milliseconds a frame, or None where those were not measured."""
+
+    ms: float | None
+    scores: ClipScores
+
+    def mean(self, metric: str) -> Point | None:
+        """Where plots show it."""
+        return Point.of(self.ms, self.scores.means[metric])
+
+    def compared(self, metric: str) -> Point | None:
+        """Where it stands beside others."""
+        return Point.of(self.ms, self.scores.compared(metric))
+
+
+def beaten_by(offers: Mapping[str, Offer], metric: str) -> dict[str, str | None]:
+    """By which other each offer is beaten, None on the front. Offers without a time or value are left out."""
+    points = {name: point for name, offer in offers.items() if (point := offer.compared(metric))}
+    return dominators(points, METRICS[metric].more_is_better)
 
 
 def dominators(points: Mapping[str, Point], more_is_better: bool) -> dict[str, str | None]:

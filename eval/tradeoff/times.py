@@ -1,9 +1,8 @@
 """What a frame takes, from what `onespp bench denoisers` left."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from datasets.frame import Signal
 from errors import BadInput
 from eval.bench.denoisers import results_file
 from eval.bench.sizes import Size, size_name
@@ -14,18 +13,9 @@ from files import read_json
 TIMED_AS = {ALL_WINDOWS: "wskp6", "ntd-b": "ntd"}  # the same computation: another training of a network
 
 
-def timed_as(name: str, signal: Signal) -> str:
-    """What the bench calls whatever computes the same as a denoiser of this name that returns `signal`."""
-    return DenoiserSpec(TIMED_AS.get(name, name), signal=signal).way
-
-
-def median_ms(bench: dict[str, Any], size: Size, threads: int) -> dict[tuple[str, str], float]:
-    """Milliseconds by (denoiser, dtype) in the bench's results, at a size and a number of threads."""
-    return {
-        (row["denoiser"], row["dtype"]): row["ms_median"]
-        for row in bench["rows"]
-        if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, threads)
-    }
+def timed_as(spec: DenoiserSpec) -> str:
+    """What the bench calls whatever computes the same."""
+    return replace(spec, name=TIMED_AS.get(spec.name, spec.name)).way
 
 
 class Times:
@@ -42,15 +32,27 @@ class Times:
         if not path.exists():
             raise BadInput(f"there are no times at {path}: measure them with `{self.command}`")
         bench = read_json(path, ("device", "threads", "rows"))
-        self.device = bench["device"]
-        self.threads = threads or bench["threads"]
-        self.ms = median_ms(bench, size, self.threads)
+        self.device: str = bench["device"]
+        self.threads: int = threads or bench["threads"]
+        # By denoiser, as the bench calls it, and precision. Rows of old files are all of the threads at the top.
+        self.ms: dict[tuple[str, str], float] = {
+            (row["denoiser"], row["dtype"]): row["ms_median"]
+            for row in bench["rows"]
+            if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, self.threads)
+        }
         if not self.ms:
             raise BadInput(
                 f"{path} has no times of {self.name} with {self.threads} threads: measure them with "
                 f"`{self.command} --threads {self.threads}`"
             )
 
-    def of(self, spec: DenoiserSpec, signal: Signal) -> float | None:
-        """Of a spec's denoiser that returns `signal`; None where that was not measured."""
-        return self.ms.get((timed_as(spec.name, signal), spec.precision))
+    def of(self, spec: DenoiserSpec) -> float | None:
+        """Milliseconds a frame; None where that was not measured."""
+        return self.ms.get((timed_as(spec), spec.precision))
+
+
+def times_of_first_size(runs: Path) -> Times | None:
+    """What the bench has measured on the CPU at the first of its sizes; None where it has measured nothing."""
+    path = results_file(runs)
+    rows = read_json(path, ("rows",))["rows"] if path.exists() else []
+    return Times(runs, (rows[0]["height"], rows[0]["width"])) if rows else None

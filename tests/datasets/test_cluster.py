@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets.clip_job import ClipJob, ClipOutcome
+from datasets.clip_job import ClipOutcome, RenderJob
 from datasets.cluster import connected_ray, outcomes_of, render_on_cluster
 from errors import BadInput
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
@@ -54,7 +54,7 @@ def test_a_killed_worker_costs_nothing_but_time(tiny, tiny_copy):
 def test_a_failing_clip_does_not_stop_the_others_but_a_full_disk_does(tiny, tmp_path):
     """A negative seed fails in the renderer; a file where a folder should be stands in for trouble with the disk."""
     root = tmp_path / "data"
-    jobs: list[ClipJob] = []
+    jobs: list[RenderJob] = []
     generate_tiny(root, render=lambda planned: iter(jobs.extend(planned) or ()))
     good = jobs[0]
     bad = good._replace(path=root / "val" / "cornell_box" / "000", seed=-1)

@@ -15,7 +15,7 @@ import pytest
 
 import datasets.clip_job
 from datasets.clip import Dataset, is_clip
-from datasets.clip_job import ClipJob
+from datasets.clip_job import RenderJob
 from datasets.generate import Share, generate
 from datasets.info import summarise
 from datasets.profiles import plan
@@ -124,7 +124,7 @@ def test_two_processes_on_one_folder_share_the_work(tiny, tiny_copy):
 def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path):
     """Here clips are not rendered: those of the fixture take their place, in the same folder."""
 
-    def copied(jobs: list[ClipJob]):
+    def copied(jobs: list[RenderJob]):
         for job in jobs:
             shutil.copytree(tiny / job.path.relative_to(root), job.path)
             yield datasets.clip_job.ClipOutcome(job.path, "rendered")

@@ -14,10 +14,11 @@ import torch
 from PIL import Image
 
 from errors import BadInput
-from eval.disocclusion_crops import Window, densest_window
+from eval.disocclusion_crops import Crop, densest_crop
 from eval.metrics import METRICS, flip_map
 from eval.report.page import report
-from eval.results import folder_of, load_picture
+from eval.report.table_rows import TableRow, best_denoisers
+from eval.results import FLOOR, folder_of, load_picture, load_result
 from eval.tradeoff.pareto import Point, dominators
 from onespp import main
 
@@ -35,12 +36,15 @@ class Page(HTMLParser):
         self.attributes: list[tuple[str, str, str | None]] = []
         self.scripts: list[str] = []
         self.rows: list[list[str]] = []
+        self.classes: dict[str, str] = {}  # of the table's cells, by their values
         self.feed(path.read_text())
         assert self.open == []
         self.data = json.loads(self.scripts[0])
 
     def handle_starttag(self, tag, attrs):
         self.attributes += [(tag, name, value) for name, value in attrs]
+        if "data-value" in dict(attrs):
+            self.classes[dict(attrs)["data-value"]] = dict(attrs)["class"]
         self.open += [tag] if tag not in self.VOID else []
         if tag == "script":
             self.scripts.append("")
@@ -86,6 +90,35 @@ def test_the_table_has_every_result_and_floor(page):
     assert {row[2] for row in rows if row[1] == "ntd"} == {"indirect"}
     assert len(rows) == 3 * (len(NAMES) - 1 + 1) + 3 * (3 + 1)
     assert all(len(row) == 3 + len(shown) + (row[1] != "(noise floor)") for row in rows)
+
+
+def test_the_best_are_marked(page, evaluated):
+    """By RMSE: the least of each clip and signal, here never within the noise floor."""
+    for clip in (("cornell_box", "000"), ("cornell_box_moving", "000")):
+        rmse = {}
+        for name in ("noisy", "accumulated", "eaw"):
+            rmse[name] = load_result(folder_of(evaluated, *clip, name, "total")).metrics["rmse"]
+        best = repr(min(rmse.values()))
+        assert page.classes[best] == "number best"
+        assert all(page.classes[repr(value)] == "number" for value in rmse.values() if repr(value) != best)
+
+
+def row(name: str, floor: float | None = None, **values: float | None) -> TableRow:
+    return TableRow("cornell_box/000", name, "total", values, dict.fromkeys(values, floor))
+
+
+def test_who_is_best():
+    rows = [row("a", psnr=30.0, rmse=0.1), row("b", psnr=31.0, rmse=0.1), row("c", psnr=None, rmse=0.2)]
+    assert best_denoisers(rows, "psnr") == {"b"} and best_denoisers(rows, "rmse") == {"a", "b"}
+    assert best_denoisers(rows, "flicker") == set()
+    rows = [row("a", 40.0, psnr=38.0), row("b", 40.0, psnr=37.5), row("c", 40.0, psnr=36.0), row(FLOOR, psnr=40.0)]
+    assert best_denoisers(rows, "psnr") == {"a", "b"}  # both within the floor
+    rows = [row("a", 40.0, psnr=36.0), row("b", 45.0, psnr=37.5)]
+    assert best_denoisers(rows, "psnr") == {"b"}
+    rows = [row("a", mse_unbiased=-3e-4), row("b", mse_unbiased=2e-4)]
+    assert best_denoisers(rows, "mse_unbiased") == {"b"}  # the nearest to 0
+    rows = [row("a", ssim=-0.2), row("b", ssim=0.1)]
+    assert best_denoisers(rows, "ssim") == {"b"}
 
 
 def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
@@ -185,18 +218,18 @@ def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
 
 
-def test_densest_window():
+def test_densest_crop():
     mask = torch.zeros(100, 80, dtype=torch.bool)
-    assert densest_window(mask) is None
+    assert densest_crop(mask) is None
     mask[40:44, 30:36] = True
-    window = densest_window(mask)
+    window = densest_crop(mask)
     assert window.size == 20 and window.pixels == 24
     assert abs(window.x + 9.5 - 32.5) <= 1 and abs(window.y + 9.5 - 41.5) <= 1
     mask[:] = False
     mask[0, 79] = True
-    assert densest_window(mask) == Window(60, 0, 20, 1)
-    assert densest_window(torch.ones(3, 50, dtype=torch.bool)).size == 3
-    assert densest_window(torch.ones(1, 1, dtype=torch.bool)) == Window(0, 0, 1, 1)
+    assert densest_crop(mask) == Crop(60, 0, 20, 1)
+    assert densest_crop(torch.ones(3, 50, dtype=torch.bool)).size == 3
+    assert densest_crop(torch.ones(1, 1, dtype=torch.bool)) == Crop(0, 0, 1, 1)
 
 
 def test_pareto_front():

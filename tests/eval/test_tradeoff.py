@@ -5,19 +5,22 @@ import shutil
 
 import numpy as np
 import pytest
-from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.bench.denoisers import Variant
+from eval.bench.sample_cost import fit_cost, sample_cost
+from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
-from eval.means import compared_mean, joint_floor
-from eval.tradeoff.candidates import Candidate, Times, candidates
-from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
-from eval.tradeoff.run import beaten_by, trade
-from eval.tradeoff.sample_cost import line, sample_cost
-from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
+from eval.means import ClipScores, compared_mean, joint_floor
+from eval.results import REFERENCE, ClipResults, Result
+from eval.spec import DenoiserSpec, create
+from eval.tradeoff.candidates import candidates
+from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
+from eval.tradeoff.run import trade
+from eval.tradeoff.samples import SampleTrade, check_levels, generalisation, sample_trades
+from eval.tradeoff.times import Times, timed_as
 from files import read_json, write_json
 from models.parameters import WINDOWS
 from models.weights import save_weights
@@ -51,12 +54,14 @@ def bench_of(runs, labels, ms=lambda index: 1.0 + index, threads=(1, 2)) -> None
 def test_fronts_by_brute_force(metric, sign):
     rng = np.random.default_rng(0)
     ms, values = rng.integers(1, 9, 40), rng.integers(20, 30, 40)  # with ties
-    rows = [
-        {"label": str(i), "ms": float(a), "compared": {metric: float(b)}}
+    offers = {
+        str(i): Offer(float(a), ClipScores([{metric: float(b)}], [{}]))
         for i, (a, b) in enumerate(zip(ms, values, strict=True))
-    ]
-    found = beaten_by([*rows, {"label": "untimed", "ms": None, "compared": {metric: 0.0}}], metric)
-    assert "untimed" not in found and None in found.values() and len(set(found.values())) > 1
+    }
+    offers["untimed"] = Offer(None, ClipScores([{metric: 0.0}], [{}]))
+    offers["undefined"] = Offer(0.0, ClipScores([{metric: None}], [{}]))
+    found = beaten_by(offers, metric)
+    assert not {"untimed", "undefined"} & found.keys() and None in found.values() and len(set(found.values())) > 1
     for i, (a, b) in enumerate(zip(ms, values, strict=True)):
         better = {
             str(j)
@@ -94,13 +99,27 @@ def test_a_hard_clips_floor_hides_no_error_of_another():
     assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
 
 
-def test_samples_that_are_not_worth_their_time():
-    rows = [
-        {"label": label, "spp": spp, "ms": ms, "compared": {"psnr": psnr}}
-        for label, spp, ms, psnr in (("noisy", 1, 1.0, 20.0), ("noisy", 4, 9.0, 26.0), ("rae", 1, 5.0, 30.0))
+def clip_results(**psnr: float) -> ClipResults:
+    """Results of total light on a clip, by denoiser."""
+
+    def result(name: str, value: float) -> Result:
+        return Result("", name, "total", "cornell_box", "000", {"psnr": value, "mse_unbiased": 0.0}, [])
+
+    return ClipResults("cornell_box", "000", "total", [result(*pair) for pair in psnr.items()], result(REFERENCE, 99.0))
+
+
+def test_samples_that_are_not_worth_their_time(tmp_path):
+    bench_of(tmp_path, ["noisy", "rae"], ms=lambda index: 0.5 + 4 * index, threads=(1,))
+    fed = {1: [clip_results(noisy=20.0, rae=30.0)], 4: [clip_results(noisy=26.0, rae=29.0)]}
+    rows = sample_trades([DenoiserSpec("noisy"), DenoiserSpec("rae")], fed, {1: 0.5, 4: 8.5}, Times(tmp_path, SIZE))
+    assert [(row.name, row.ms) for row in rows] == [
+        ("noisy, 1 spp", 1.0),
+        ("rae, 1 spp", 5.0),
+        ("noisy, 4 spp", 9.0),
+        ("rae, 4 spp", 13.0),
     ]
-    mark_beaten(rows)
-    assert [row["dominated_by"] for row in rows] == [None, "rae, 1 spp", None]
+    assert [row.dominated_by for row in rows] == [None, None, "rae, 1 spp", "rae, 1 spp"]
+    assert [row.metrics["psnr"] for row in rows] == [20, 30, 26, 29]
 
 
 # --- Samples ----------------------------------------------------------------------------------------------------------
@@ -180,7 +199,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 
 
 def test_cost_of_samples(tiny):
-    cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
+    cost = fit_cost([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
     measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
@@ -190,27 +209,30 @@ def test_cost_of_samples(tiny):
 
 
 def test_sizes_are_the_networks_of_the_ablation():
-    assert [trained_as(name) for name in SIZES][:2] == ["3", "3+5"] and SIZES[WHOLE] == WINDOWS
-    for name, windows in SIZES.items():
-        assert create_any(name).windows == windows
-    assert [timed_as(name, "total") for name in (WHOLE, "wskp6-2w", "ntd-b")] == ["wskp6", "wskp6-2w", "ntd"]
-    assert timed_as("svgf", "indirect") == "svgf (indirect)" and timed_as("ntd", "indirect") == "ntd"
+    assert [windows_label(windows) for windows in WINDOW_SETS.values()][:2] == ["3", "3+5"]
+    assert WINDOW_SETS[ALL_WINDOWS] == WINDOWS
+    for name, windows in WINDOW_SETS.items():
+        assert create(name).windows == windows
+    names = (ALL_WINDOWS, "wskp6-2w", "ntd", "ntd-b")
+    assert [timed_as(DenoiserSpec(name)) for name in names] == ["wskp6", "wskp6-2w", "ntd", "ntd"]
+    assert timed_as(DenoiserSpec("svgf", signal="indirect")) == "svgf (indirect)"
+    assert timed_as(DenoiserSpec("ntd", signal="indirect")) == "ntd"
 
 
 def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
-    with pytest.raises(BadInput, match=r"rae has no weights.*`onespp train rae --profile tiny --runs"):
+    with pytest.raises(BadInput, match=r"rae: it has no weights.*`onespp train rae --budget tiny --runs"):
         candidates(["rae"], tmp_path, "tiny")
-    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --profile tiny --runs"):
+    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --budget tiny --runs"):
         candidates(["wskp6-2w"], tmp_path, "tiny")
     with pytest.raises(BadInput, match="unknown denoiser 'magic'"):
         candidates(["magic"], tmp_path, "tiny")
     labels = {candidate.label for candidate in candidates([], tmp_path, "tiny")}
     assert {"noisy", "svgf"} <= labels and "rae" not in labels
-    assert "skipped: wskp3 has no weights" in capsys.readouterr().out
+    assert "wskp3: skipped, it has no weights" in capsys.readouterr().out
     (tmp_path / "ablation" / "wskp-windows").mkdir(parents=True)
     write_json(tmp_path / "ablation" / "wskp-windows" / "results.json", {"profile": "quick"})
     assert "svgf" in {candidate.label for candidate in candidates([], tmp_path, "tiny")}
-    with pytest.raises(BadInput, match="is of the profile quick"):
+    with pytest.raises(BadInput, match="is of the budget quick"):
         candidates(["wskp6-2w"], tmp_path, "tiny")
 
 
@@ -222,10 +244,10 @@ def test_times_come_from_the_bench(tmp_path):
     with pytest.raises(BadInput, match=r"no times at .*`onespp bench denoisers --size 48x32 --runs"):
         Times(tmp_path, SIZE)
     bench_of(tmp_path, ["noisy", "rae"])
-    rae = Candidate(Variant("rae", "rae", "bfloat16"), None)
-    assert [Times(tmp_path, SIZE, threads=n).of(rae, "total") for n in (None, 1)] == [1.0, 2.0]
-    assert Times(tmp_path, SIZE).of(Candidate(Variant("kp", "kp"), None), "total") is None
-    assert Times(tmp_path, SIZE).of(Candidate(Variant("noisy", "noisy"), None), "indirect") is None  # of total light
+    rae = DenoiserSpec("rae", precision="bfloat16")
+    assert [Times(tmp_path, SIZE, threads=n).of(rae) for n in (None, 1)] == [1.0, 2.0]
+    assert Times(tmp_path, SIZE).of(DenoiserSpec("kp")) is None
+    assert Times(tmp_path, SIZE).of(DenoiserSpec("noisy", signal="indirect")) is None  # of total light alone
     with pytest.raises(BadInput, match=r"results-cuda.json"):
         Times(tmp_path, SIZE, device="cuda")
     with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
@@ -244,8 +266,8 @@ def traded(tiny, tmp_path_factory):
         ("wskp6-2w", runs / "ablation" / "wskp-windows" / "3+5-0"),
     ):
         folder.mkdir(parents=True)
-        label = "wskp6" if name == "wskp6" else trained_as(name)
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
+        label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
+        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
@@ -284,7 +306,7 @@ def test_more_samples_cost_more_and_show_more(traded):
 
 
 def test_generalisation_shows_what_was_fed(traded):
-    rows = read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]
+    rows = [SampleTrade(**row) for row in read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]]
     lines = [line.split()[:2] for line in generalisation(rows).splitlines()[2:]]
     assert lines == [[name, spp] for spp in ("1", "4") for name in ("noisy", "accumulated", "svgf")]
 

@@ -3,6 +3,7 @@
 import hashlib
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,14 @@ def dataset_command(root: Path) -> list[str]:
     return [sys.executable, "-m", "onespp", "dataset", "--profile", "tiny", "--data", str(root)]
 
 
+@cache  # it creates every denoiser
+def channels_read_by_all() -> tuple[str, ...]:
+    return channels_read()
+
+
 def generate_tiny(root: Path, **arguments: Any) -> int:
     """What `dataset_command` does, in this process. `arguments` are further ones of datasets.generate.generate."""
-    return generate(root, "tiny", seed=0, reads=channels_read(), **arguments)
+    return generate(root, "tiny", seed=0, reads=channels_read_by_all(), **arguments)
 
 
 def digest(root: Path) -> dict[str, str]:

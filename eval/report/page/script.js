@@ -48,35 +48,13 @@ function sortTable(header) {
 
 function filterTable() {
   const clip = byId("table-clip").value;
-  for (const row of byId("table").tBodies[0].rows) row.hidden = clip ? row.dataset.clip !== clip : row.dataset.clip.startsWith("mean of");
-}
-
-function markBest() {
-  const rows = [...byId("table").tBodies[0].rows].filter(row => !row.classList.contains("floor"));
-  const groups = new Map();
-  for (const row of rows) {
-    const name = row.dataset.clip + row.cells[2].textContent;
-    groups.set(name, [...(groups.get(name) ?? []), row]);
-  }
-  Object.entries(data.metrics).forEach(([metric, { more }], index) => {
-    for (const group of groups.values()) {
-      const cells = group.map(row => row.cells[3 + index]).filter(cell => cell.dataset.value !== undefined);
-      const size = cell => (more ? -cell.dataset.value : Math.abs(cell.dataset.value));
-      const best = Math.min(...cells.map(size));
-      const bestIsNear = cells.some(cell => size(cell) === best && cell.classList.contains("near"));
-      for (const cell of cells) {
-        // Within the noise floor digits mean nothing: all are best alike.
-        cell.classList.toggle("best", size(cell) === best || (bestIsNear && cell.classList.contains("near")));
-      }
-    }
-  });
+  for (const row of byId("table").tBodies[0].rows) row.hidden = clip ? row.dataset.clip !== clip : "mean" in row.dataset;
 }
 
 function startTable() {
   for (const header of byId("table").tHead.rows[0].cells) header.firstElementChild.onclick = () => sortTable(header);
   byId("table-clip").onchange = filterTable;
   filterTable();
-  markBest();
 }
 
 // --- plots ---
@@ -141,7 +119,7 @@ function plotTrade(plot) {
   const width = 640, height = 400, box = { left: 50, right: width - 96, top: 10, bottom: height - 34 };
   const metric = data.metrics[plot.metric], svg = draw("svg", { viewBox: `0 0 ${width} ${height}`, role: "img" });
   svg.setAttribute("aria-label", `${metric.title} against milliseconds a frame`);
-  const points = [...plot.points].sort((a, b) => a.ms - b.ms);
+  const { points } = plot; // fastest first
   const log = !metric.more && Math.min(...points.map(point => point.quality)) > 0;
   const x = scaleOf(points.map(point => point.ms), true, box.left, box.right);
   const y = scaleOf(points.map(point => point.quality), log, box.bottom, box.top);

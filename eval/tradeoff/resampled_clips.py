@@ -1,4 +1,4 @@
-"""Clips with other noisy input: the same frames and reference, with more samples a pixel."""
+"""Clips with more samples a pixel: a data set's clips with other noisy input, rendered or averaged, kept on disk."""
 
 import zlib
 from collections.abc import Iterator
@@ -22,10 +22,10 @@ from render.sampler import CYCLE
 from scenes.animation import Scene
 from scenes.registry import build_scene
 
-NOISY = ("direct", "indirect")
+NOISY_CHANNELS = ("direct", "indirect")
 
 Source = Literal["averaged", "rendered"]
-Images = dict[str, NDArray[np.floating]]  # direct and indirect (H, W, 3)
+NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS, (H, W, 3)
 
 
 def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
@@ -36,40 +36,44 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
     check_versions(dataset)
-    split, name, kind = clip.path.parent.parent.name, clip.scene, ClipKind.of(clip.name)
-    seed = clip_seed(dataset.facts["seed"], name, split, kind.number)
-    scene = build_scene(name, seed, profile_of(dataset.facts["profile"]).frames)
+    split = clip.path.parent.parent.name
+    kind = ClipKind.of(clip.name)
+    seed = clip_seed(dataset.facts["seed"], clip.scene, split, kind.number)
+    scene = build_scene(clip.scene, seed, profile_of(dataset.facts["profile"]).frames)
     return scene.still() if kind.still else scene, seed
 
 
-def averaged(clip: Clip, count: int) -> Iterator[Images]:
-    """Frame by frame the mean of the first `count` noise realisations, which are independent."""
+def averaged(clip: Clip, count: int) -> Iterator[NoisyFrame]:
+    """Frame by frame the mean of the clip's first `count` noise realisations, which are independent."""
     for frame in range(clip.frames):
         yield {
-            name: np.mean([clip.read(name, frame, realisation=s).astype(np.float32) for s in range(count)], axis=0)
-            for name in NOISY
+            name: np.mean([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)], axis=0)
+            for name in NOISY_CHANNELS
         }
 
 
-def rendered(clip: Clip, dataset: Dataset, spp: int) -> Iterator[Images]:
-    """Frame by frame what the renderer makes of `spp` samples, stratified: the bytes of a clip such as 000-4spp."""
+def rendered(clip: Clip, dataset: Dataset, spp: int) -> Iterator[NoisyFrame]:
+    """Frame by frame what the renderer makes of `spp` stratified samples: the bytes of a clip such as 000-4spp.
+
+    Raises BadInput as `scene_of` does.
+    """
     scene, seed = scene_of(clip, dataset)
-    sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # of a reference nothing is kept
-    for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, NOISY):
-        yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in NOISY}
+    sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # nothing is kept of the reference
+    for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, NOISY_CHANNELS):
+        yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in NOISY_CHANNELS}
 
 
 def source(clip: Clip, most: int) -> Source:
-    """How input of up to `most` samples a pixel is made: all in one way, so that it can be compared."""
+    """How a clip gets input of up to `most` samples a pixel: always in one way, so that it can be compared."""
     return "averaged" if clip.realisations * clip.facts["noisy_spp"] >= most else "rendered"
 
 
 def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path) -> Clip:
-    """`clip` with `spp` samples a pixel as its noisy input, kept as a clip of one realisation below `root`.
+    """`clip` with `spp` samples a pixel as its noisy input: a clip of one realisation below the folder `root`.
 
-    Every other channel is that of `clip`, in its place. What is there already is kept.
-    Raises BadInput where `spp` is no multiple of the clip's own, or more than its sampler has, or another process
-    is making it.
+    It is made unless it is there already, of what `clip` is now. Its other channels are the files of `clip`.
+    Raises BadInput where `spp` is no multiple of the clip's own samples, or more than its sampler has; where another
+    process is making it; and as `scene_of` does.
     """
     own = clip.facts["noisy_spp"]
     if spp == own:
@@ -81,8 +85,11 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     if spp % own:
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"
-    made_of = {"clip": str(clip.path.resolve()), "crc32": clip.fingerprint}
-    made_of["how"] = how
+    made_of = {
+        "clip": str(clip.path.resolve()),
+        "crc32": clip.fingerprint,
+        "how": how,
+    }
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)
     path.mkdir(parents=True, exist_ok=True)
@@ -91,22 +98,30 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
             raise BadInput(f"another process is making {path}: wait for it")
         frames = averaged(clip, spp // own) if how == "averaged" else rendered(clip, dataset, spp)
         progress = tqdm(frames, f"{clip.scene}/{path.name}", clip.frames, unit="frame", leave=False)
-        write_clip(path, clip, list(progress), {"noisy_spp": spp, "made_of": made_of})
+        write_resampled(path, clip, list(progress), {"noisy_spp": spp, "made_of": made_of})
     return Clip(path)
 
 
-def write_clip(path: Path, clip: Clip, frames: list[Images], facts: dict[str, Any]) -> None:
-    """Store `frames` as the noisy input of a clip like `clip`; clip.json, which makes it one, comes last."""
+def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dict[str, Any]) -> None:
+    """Store `frames` as the noisy input of a clip that is otherwise `clip`, but for `facts` of its clip.json.
+
+    That file, which makes it a clip, is written last.
+    """
     (path / "clip.json").unlink(missing_ok=True)
     entries = {
         name: entry | {"file": str((clip.path / entry["file"]).resolve())} if "file" in entry else entry
         for name, entry in clip.channels.items()
     }
-    for name in NOISY:
+    for name in NOISY_CHANNELS:
         array = to_storage(np.stack([frame[name] for frame in frames])[:, None], "<f4")[0]
         file = path / f"{name}.npy"
         np.save(file, array)
         crc32 = f"{zlib.crc32(file.read_bytes()):08x}"
-        shape = {"dtype": "<f4", "shape": list(array.shape), "unit": CHANNELS[name].unit}
-        entries[name] = {"file": file.name, **shape, "crc32": crc32}
+        entries[name] = {
+            "file": file.name,
+            "dtype": "<f4",
+            "shape": list(array.shape),
+            "unit": CHANNELS[name].unit,
+            "crc32": crc32,
+        }
     write_json(path / "clip.json", clip.facts | facts | {"channels": entries})

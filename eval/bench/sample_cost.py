@@ -1,9 +1,10 @@
 """What samples cost: milliseconds of path tracing a frame."""
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple
+from itertools import count
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +13,11 @@ from render.clip import Options
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Scene
+from timing import take_turns
 
 RENDERER = VARIANT.partition("_")[0].replace("llvm", "cpu")  # the device that renders: cpu or cuda
-SPP, REPEATS = (1, 2, 4, 8), 3
+TIMED_SPP = (1, 2, 4, 8)
+TIMED_FRAMES_EACH = 3  # besides a first one, which compiles
 
 
 class Cost(NamedTuple):
@@ -28,31 +31,39 @@ class Cost(NamedTuple):
 
 
 @contextmanager
-def render_threads(count: int) -> Iterator[None]:
+def render_threads(threads: int) -> Iterator[None]:
+    """Dr.Jit takes so many threads within the context."""
     before = dr.thread_count()
-    dr.set_thread_count(count)
+    dr.set_thread_count(threads)
     try:
         yield
     finally:
         dr.set_thread_count(before)
 
 
-def line(spp: list[int], ms: list[float]) -> Cost:
+def fit_cost(spp: Sequence[int], ms: Sequence[float]) -> Cost:
     """The line through measured times, by least squares; neither part is below 0."""
     sample_ms, frame_ms = np.polyfit(spp, ms, 1)
     return Cost(max(0.0, float(frame_ms)), max(0.0, float(sample_ms)))
+
+
+def tracing(tracer: PathTracer, ray: Any, spp: int) -> Callable[[], None]:
+    """A function that traces so many samples a pixel, with another seed at every call."""
+    seeds = count()
+
+    def trace() -> None:
+        tracer.radiance(ray, next(seeds), spp)
+
+    return trace
 
 
 def sample_cost(scene: Scene, height: int, width: int, threads: int, options: Options) -> Cost:
     """Measured on the scene's first frame, without its G-buffer, which costs the same whatever the samples."""
     stage = Stage(scene, height, width)
     stage.pose(0)
-    ray, tracer = stage.rays(stage.view(0)), PathTracer(stage, *options)
-    spent: dict[int, list[float]] = {spp: [] for spp in SPP}
+    ray = stage.rays(stage.view(0))
+    tracer = PathTracer(stage, *options)
+    work = {f"{spp} spp": tracing(tracer, ray, spp) for spp in TIMED_SPP}
     with render_threads(threads):
-        for repeat in range(-1, REPEATS):  # the first time compiles
-            for spp in SPP:  # interleaved, so that drift of the machine hits all alike
-                start = time.perf_counter()
-                tracer.radiance(ray, 1 + repeat, spp)
-                spent[spp] += [1e3 * (time.perf_counter() - start)] if repeat >= 0 else []
-    return line([*SPP], [float(np.median(spent[spp])) for spp in SPP])
+        seconds = take_turns(work, TIMED_FRAMES_EACH, label="samples")
+    return fit_cost(TIMED_SPP, [1e3 * median(spent) for spent in seconds.values()])
