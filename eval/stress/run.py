@@ -15,7 +15,7 @@ from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
 from eval.stress.check import StressCheck
 from eval.stress.logits import last_layers
 from eval.stress.outcome import FRESH, StressRow
-from eval.stress.tables import details, heat_map, overview, verdict_text
+from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS
@@ -101,6 +101,6 @@ def stress(
     write_json(folder / "results.json", results)
     write_file(folder / "table.md", (details(rows, cases, "pipe") + "\n").encode())
     save_figure(folder / "errors.png", heat_map(rows, cases))
-    print(overview(rows, cases))
+    print(error_table(rows, cases))
     print("\n" + verdict_text(rows, cases))
     return not any(row.outcome.broken for row in rows)
