@@ -15,7 +15,7 @@ from models.parameters import FEATURES, GAMMA
 from models.running_scale import RunningScale
 
 LEAST_ALBEDO = np.float32(ALBEDO_FLOOR)
-POWER = np.float32(1 / GAMMA)
+INVERSE_GAMMA = np.float32(1 / GAMMA)
 LEAST_EXPOSED = np.float32(1e-30)  # its power is 0 as far as a network can tell, and its logarithm is finite
 
 
@@ -26,7 +26,7 @@ def feature_row(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any,
     for c in range(3):
         for x in range(line.size):
             exposed = exposure[c] * irradiance[c, x] * max(albedo[c, x], LEAST_ALBEDO)
-            line[x] = exp(POWER * log(min(max(exposed, LEAST_EXPOSED), np.float32(1))))
+            line[x] = exp(INVERSE_GAMMA * log(min(max(exposed, LEAST_EXPOSED), np.float32(1))))
         for x in range(line.size):
             out[x, c] = line[x]
             out[x, 3 + c] = albedo[c, x]
