@@ -1,5 +1,6 @@
 # One call of `onespp` a target. Everything below `setup` runs in the virtual environment it makes.
 PROFILE ?= quick
+BUDGET ?= $(PROFILE)
 DATA ?= data/$(PROFILE)
 RUNS ?= runs
 PYTHON ?= python3
@@ -33,10 +34,10 @@ dataset: $(READY)
 	$(BIN)/onespp dataset --profile $(PROFILE) --data $(DATA)
 
 train: $(READY)
-	$(BIN)/onespp train --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
+	$(BIN)/onespp train --budget $(BUDGET) --data $(DATA) --runs $(RUNS)
 
 eval: $(READY)
-	$(BIN)/onespp eval --profile $(PROFILE) --data $(DATA) --runs $(RUNS)
+	$(BIN)/onespp eval --budget $(BUDGET) --data $(DATA) --runs $(RUNS)
 
 bench: $(READY)
 	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
@@ -44,7 +45,7 @@ bench: $(READY)
 	$(BIN)/onespp bench rendering --runs $(RUNS)
 
 stress: $(READY)
-	$(BIN)/onespp stress --long --profile $(PROFILE) --runs $(RUNS)
+	$(BIN)/onespp stress --long --budget $(BUDGET) --runs $(RUNS)
 
 report: $(READY)
 	$(BIN)/onespp report --runs $(RUNS)

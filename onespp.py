@@ -1,157 +1,52 @@
-"""The command line: one subcommand a step, each thin."""
+"""onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."""
 
 import errno
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import wrap
 from typing import Annotated, Literal
 
 import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from allocator import keep_freed_memory
 from errors import BadInput
 
-Data = Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="the data set's folder; by default data/PROFILE")]
-Runs = Annotated[Path, tyro.conf.arg(metavar="DIR", help="where trainings and results are kept")]
+Data = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/PROFILE")]
+DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/BUDGET")]
+Runs = Annotated[Path, arg(metavar="DIR", help="where trainings and results are kept")]
 Profile = Annotated[
     str,
-    tyro.conf.arg(
-        metavar="NAME", help="how much of everything: tiny (seconds), quick (minutes), release (days), or its sketch"
+    arg(
+        metavar="{tiny,quick,sketch,release}",
+        help="which clips, how well sampled: seconds, minutes, a small release, the release (days)",
     ),
 ]
-Precision = Annotated[
-    Literal["32-true", "bf16-mixed"] | None, tyro.conf.arg(help="of training; by default the fastest on this machine")
-]
-Names = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DENOISER...")]
-PartArgument = Annotated[
-    str | None,
-    tyro.conf.arg(metavar="K/N", help="render only the K-th of N disjoint shares, to spread the work over machines"),
-]
-Reads = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(metavar="DENOISER...", help="render for training only what these denoisers read, or else all known"),
-]
-RayArgument = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(
-        help="render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach "
-        "the data set's folder under the same path"
+Budget = Annotated[
+    str,
+    arg(
+        metavar="{tiny,quick,release,paper}",
+        help="how long networks are trained, as long as their paper at most; names the weights, RUNS/train/NAME-BUDGET",
     ),
 ]
-Halton = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(help="draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE)"),
-]
-Regularise = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(help="blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics"),
-]
-Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-Scenes = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE...")]
+Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default those named above")]
+Scenes = Annotated[tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box or room-3")]
+ClipFolder = Annotated[Path, Positional, arg(metavar="CLIP", help="its folder")]
+Size = Annotated[str, arg(metavar="WxH", help="of the images")]
+Sizes = Annotated[tuple[str, ...], arg(metavar="WxH...", help="of the images")]
+Png = Annotated[Path, arg(metavar="PNG", help="the picture to write")]
+SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
-def data_folder(data: Path | None, profile: str) -> Path:
-    return Path("data") / profile if data is None else data
+def data_folder(data: Path | None, name: str) -> Path:
+    return data or Path("data") / name
 
 
-def dataset(
-    data: Data = None,
-    profile: Profile = "quick",
-    seed: int = 0,
-    reads: Reads = (),
-    part: PartArgument = None,
-    ray: RayArgument = False,
-    halton: Halton = False,
-    regularise: Regularise = False,
-) -> None:
-    """Render the clips of a profile that are not there yet."""
-    from datasets.generate import Part, generate, render_here
-    from models.registry import channels_read
-    from render.clip import Options
-
-    if ray:
-        from datasets.cluster import render_on_cluster
-    folder = data_folder(data, profile)
-    share = Part.parse(part) if part else None
-    channels = channels_read(reads)
-    options = Options(halton, regularise)
-    render = render_on_cluster if ray else render_here
-    rendered = generate(folder, profile, seed, share, channels, options, render)
-    print(f"{folder}: {rendered} clips rendered")
-
-
-def verify(folder: Folder) -> None:
-    """Check every file of a data set against its checksum and shape; names what is damaged."""
-    from datasets.inspect import verify as find_problems
-
-    problems = find_problems(folder)
-    for problem in problems:
-        print(problem)
-    if problems:
-        raise BadInput(f"{folder}: {len(problems)} problems; delete the clips named above and rerun `onespp dataset`")
-    print(f"{folder}: everything is as it was written")
-
-
-def info(folder: Folder, plot: Path | None = None) -> None:
-    """Print what is in a data set: clips, how hard they are, channels, sizes and what is saved, noise floors, times.
-
-    Args:
-        plot: write a histogram of how hard the clips are to this PNG as well.
-    """
-    from datasets.inspect import info as describe
-
-    print(describe(folder, plot))
-
-
-def train(
-    names: Names = (),
-    data: Data = None,
-    runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    seed: int = 0,
-    precision: Precision = None,
-    at_once: int | None = None,
-) -> None:
-    """Train denoisers (rae, wskp6 and ntd, unless some are named), or go on where a training was interrupted.
-
-    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. A batch is shared by all processes,
-    so the steps stay the same.
-
-    Args:
-        at_once: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
-    """
-    from train.loop import task_for, train_network
-    from train.recipes import DEFAULT
-
-    for name in names or DEFAULT:
-        train_network(task_for(name, data_folder(data, profile), runs, profile, seed, precision, at_once))
-
-
-def evaluate(
-    names: Names = (),
-    data: Data = None,
-    runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    processes: int = os.cpu_count() or 1,
-) -> None:
-    """Judge denoisers (all that can run, unless some are named) on the test clips: table, pictures, results.json.
-
-    What has been judged before, of the same clips, weights and code, is kept.
-
-    Args:
-        processes: at most so many clips side by side; by default one on each processor.
-    """
-    from eval.harness import evaluate as run
-
-    run(data_folder(data, profile), runs, profile, list(names) or None, processes)
-
-
-def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
-    """Draw a contact sheet of scenes (16 rooms, unless some are named): the middle frame of each, its own exposure."""
+def preview(names: Scenes = (), out: Png = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
+    """Draw a contact sheet of scenes: the middle frame of each, of 16 rooms unless some are named."""
     from eval.figures.contact_sheet import contact_sheet
 
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -159,121 +54,244 @@ def preview(names: Scenes = (), out: Path = Path("runs/preview.png"), seed: int 
     print(out)
 
 
-def show(
-    clip: Folder,
-    names: Names = (),
-    out: Path = Path("runs/show"),
-    runs: Runs = Path("runs"),
+def dataset(
+    data: Data = None,
     profile: Profile = "quick",
+    seed: int = 0,
+    reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
+    part: Annotated[str | None, arg(metavar="K/N")] = None,
+    ray: Annotated[bool, FlagCreatePairsOff] = False,
+    halton: Annotated[bool, FlagCreatePairsOff] = False,
+    regularise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
-    """Draw a clip's folder as denoisers (all that can run, unless some are named) show it: PNGs into --out.
+    """Render the clips of a profile that are not there yet.
+
+    Args:
+        reads: render for training only what these denoisers read, or else all known ones.
+        part: render only the K-th of N disjoint shares, to spread the work over machines.
+        ray: render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach
+            the data set's folder under the same path.
+        halton: draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE).
+        regularise: blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
+    """
+    from datasets.generate import Share, generate, render_here
+    from models.registry import channels_read
+    from render.clip import Options
+
+    if ray:
+        from datasets.cluster import render_on_cluster
+    folder = data_folder(data, profile)
+    share = Share.parse(part or "1/1")
+    options = Options(halton, regularise)
+    render = render_on_cluster if ray else render_here
+    rendered = generate(folder, profile, seed, share, channels_read(reads), options, render)
+    print(f"{folder}: {rendered} clips rendered")
+
+
+def train(
+    names: Denoisers = (),
+    data: DataOfBudget = None,
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+    seed: int = 0,
+    precision: Literal["float32", "bfloat16"] | None = None,
+    micro_batch: Annotated[int | None, arg(metavar="N")] = None,
+) -> None:
+    """Train rae, wskp6 and ntd, or the networks named, or go on where a training was interrupted.
+
+    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. A batch is shared by all processes,
+    so the steps stay the same.
+
+    Args:
+        precision: by default the fastest on this machine.
+        micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
+    """
+    from train.loop import train_network
+    from train.recipes import DEFAULT
+    from train.registry import task_for
+
+    for name in names or DEFAULT:
+        train_network(task_for(name, data_folder(data, budget), runs, budget, seed, precision, micro_batch))
+
+
+def evaluate(
+    names: Denoisers = (),
+    data: DataOfBudget = None,
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+    processes: Annotated[int, arg(metavar="N", help="at most so many clips side by side")] = os.cpu_count() or 1,
+) -> None:
+    """Judge all denoisers that can run, or those named, on the test clips: table, pictures, results.json.
+
+    What has been judged before, of the same clips, weights and code, is kept.
+    """
+    from eval.harness import evaluate as evaluate_on
+
+    evaluate_on(data_folder(data, budget), runs, budget, names, processes)
+
+
+def report(
+    runs: Runs = Path("runs"),
+    megabytes: Annotated[float, arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
+) -> None:
+    """Make one page of all results, RUNS/report/index.html, which needs no network; and an animation of each clip."""
+    from eval.report.page import report as make_report
+
+    for path in make_report(runs, megabytes):
+        print(path)
+
+
+def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metavar="PNG")] = None) -> None:
+    """Print what is in a data set: clips, how hard they are, channels, sizes, noise floors, times.
+
+    Args:
+        data: the data set.
+        plot: draw a histogram of how hard the clips are as well.
+    """
+    from datasets.info import summarise
+
+    print(summarise(data, plot))
+
+
+def verify(data: Path = Path("data/quick")) -> None:
+    """Check every file of a data set against its checksum and shape, and name what is damaged.
+
+    Args:
+        data: the data set.
+    """
+    from datasets.verify import find_problems
+
+    problems = find_problems(data)
+    for problem in problems:
+        print(problem)
+    if problems:
+        raise BadInput(f"{data}: {len(problems)} problems; delete the clips named above and rerun `onespp dataset`")
+    print(f"{data}: everything is as it was written")
+
+
+def exr(clip: ClipFolder, out: Annotated[Path, Positional, arg(metavar="OUT")]) -> None:
+    """Write a multi-layer OpenEXR file of each frame of a clip's folder, such as data/quick/test/cornell_box/000."""
+    from datasets.exr import export_clip
+
+    print(f"{out}: {export_clip(clip, out)} files")
+
+
+def show(
+    clip: ClipFolder,
+    names: Denoisers = (),
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/show"),
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+) -> None:
+    """Draw a clip as all denoisers that can run show it, or those named.
 
     A contact sheet with errors, difference maps, and what each denoiser carries from frame to frame.
     """
     from eval.figures.show import show as draw
 
-    for path in draw(clip, out, runs, profile, names):
+    for path in draw(clip, out, runs, budget, names):
         print(path)
 
 
-def figure(
-    what: Annotated[Literal["variance", "unbiased"], tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(metavar="PNG")],
-) -> None:
-    """Draw a figure of the papers or of the docs.
+def figure_variance(out: Png = Path("runs/variance.png")) -> None:
+    """Draw SVGF's Fig. 9: its estimates of variance, spatial and temporal, on noise that grows from left to right."""
+    from eval.figures.variance import variance_figure
 
-    variance: SVGF's estimate of variance, spatial and temporal, on noise that grows from left to right (Fig. 9).
-    unbiased: an image's plain and unbiased MSE against references of 16 to 1024 spp, and how true noise floors are.
-    """
     out.parent.mkdir(parents=True, exist_ok=True)
-    if what == "variance":
-        from eval.figures.variance import variance_figure as draw
-    else:
-        from eval.figures.unbiased import unbiased_figure as draw
-    draw(out)
+    variance_figure(out)
     print(out)
 
 
-def bench(
-    what: Annotated[
-        Literal["denoisers", "scaling", "fusion", "loading", "rendering", "training"], tyro.conf.Positional
-    ],
-    names: Names = (),
-    data: Data = None,
+def figure_unbiased(out: Png = Path("runs/unbiased.png")) -> None:
+    """Draw plain and unbiased MSE against references of 16 to 1024 spp, and how true noise floors are."""
+    from eval.figures.unbiased import unbiased_figure
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unbiased_figure(out)
+    print(out)
+
+
+def bench_denoisers(
+    names: Denoisers = (),
     runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    size: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WxH...")] = (),
-    threads: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (),
+    size: Sizes = ("1280x720",),
+    threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default 1, and all of PyTorch's")] = (),
 ) -> None:
-    """Measure this machine.
+    """Milliseconds and memory of a frame, next to OIDN, of all denoisers or those named."""
+    from eval.bench.denoisers import bench_denoisers as bench
 
-    denoisers: milliseconds and memory a frame, next to OIDN, of all denoisers unless some are named.
-    scaling: milliseconds against pixels, of all denoisers unless some are named; a plot.
-    fusion: weight-shared kernel fusion, next to the straightforward way.
-    loading: how fast training sequences come from disk, next to how fast they are trained on, and in how much memory.
-    rendering: samples a second and seconds to a noise floor of 40 dB, next to Mitsuba's stock integrator and sampler.
-    training: milliseconds a step of rae, wskp6 and ntd, unless some are named, and where they go.
+    print(bench(runs, names, size, threads))
 
-    Args:
-        size: of images, by default 1280x720 (several for denoisers), and 320x180 to 1920x1080 for scaling.
-        threads: for denoisers (several; by default 1 and all that PyTorch takes), scaling and fusion (by default all).
-    """
-    usual = ("1280x720",)
-    if what == "denoisers":
-        from eval.bench.denoisers import bench_denoisers
 
-        print(bench_denoisers(runs, names, size or usual, threads))
-    elif what == "scaling":
-        from eval.bench.scaling import bench_scaling
+def bench_scaling(
+    names: Denoisers = (),
+    runs: Runs = Path("runs"),
+    size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="by default 320x180 to 1920x1080")] = (),
+    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+) -> None:
+    """Milliseconds against pixels, of all denoisers or those named; with a plot."""
+    from eval.bench.scaling import bench_scaling as bench
 
-        print(bench_scaling(runs, names, size, threads))
-    elif what == "fusion":
-        from eval.bench.denoisers import parse_size
-        from eval.bench.fusion import bench_fusion
+    print(bench(runs, names, size, threads))
 
-        print(bench_fusion(runs, *parse_size((size or usual)[0]), max(threads, default=None)))
-    elif what == "rendering":
-        from eval.bench.rendering import bench_rendering
 
-        print(bench_rendering(runs))
-    elif what == "training":
-        from eval.bench.training import bench_training
+def bench_fusion(
+    runs: Runs = Path("runs"),
+    size: Size = "1280x720",
+    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+) -> None:
+    """Weight-shared kernel fusion, next to the straightforward way."""
+    from eval.bench.fusion import bench_fusion as bench
 
-        print(bench_training(data_folder(data, profile), runs, profile, names))
-    else:
-        from eval.bench.loading import bench_loading
+    print(bench(runs, size, threads))
 
-        print(bench_loading(data_folder(data, profile), runs, profile))
+
+def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
+    """Samples a second and seconds to a noise floor of 40 dB, next to stock Mitsuba, of eight scenes or those named."""
+    from eval.bench.rendering import bench_rendering as bench
+
+    print(bench(runs, names))
+
+
+def bench_loading(data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
+    """How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
+    from eval.bench.loading import bench_loading as bench
+
+    print(bench(data_folder(data, budget), runs, budget))
+
+
+def bench_training(
+    names: Denoisers = (), data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick"
+) -> None:
+    """Milliseconds of a training step and where they go, of rae, wskp6 and ntd or the networks named."""
+    from eval.bench.training import bench_training as bench
+
+    print(bench(data_folder(data, budget), runs, budget, names))
 
 
 def stress(
-    names: Names = (),
+    names: Denoisers = (),
     runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    long: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-    precision: Annotated[
-        Literal["float32", "bfloat16", "float16"], tyro.conf.arg(help="of networks; at all extremes")
-    ] = "float32",
+    budget: Budget = "quick",
+    long: Annotated[bool, FlagCreatePairsOff, arg(help="play sequences of 10 000 frames as well (minutes)")] = False,
+    precision: Annotated[Literal["float32", "bfloat16", "float16"], arg(help="of networks, in all cases")] = "float32",
 ) -> None:
-    """Put denoisers (all that can run, unless some are named) to the extremes: tables, results.json, a picture.
+    """Put all denoisers that can run, or those named, to the extremes: tables, results.json, a picture.
 
-    Networks have the weights trained in this profile, or else fresh ones. Exits with 1 if a requirement is broken.
-
-    Args:
-        long: play sequences of 10 000 frames as well (minutes).
+    Networks have the weights trained in this budget, or else fresh ones. Exits with 1 if a requirement is broken.
     """
-    from eval.stress.run import stress as run
+    from eval.stress.run import stress as put_to_the_extremes
 
-    if not run(runs, names, profile, long, precision):
+    if not put_to_the_extremes(runs, names, budget, long, precision):
         sys.exit(1)
 
 
 def ablate(
-    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd"], tyro.conf.Positional],
-    data: Data = None,
+    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd"], Positional],
+    data: DataOfBudget = None,
     runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    seeds: int = 1,
+    budget: Budget = "quick",
+    seeds: Annotated[int, arg(metavar="N", help="trainings of each network; mean and spread are shown")] = 1,
 ) -> None:
     """Repeat an ablation of the papers, or go on with it: table beside the paper's findings, plot, results.json.
 
@@ -282,89 +300,139 @@ def ablate(
     wskp-windows: windows of 3 to 13 pixels alone and together (WSKP, Fig. 9 and 10).
     wskp-repvgg: wskp6 and kp with and without RepVGG blocks (WSKP, Table 5).
     ntd: ntd-a, ntd-b and ntd where meshes move (NTD §6.3).
-
-    Args:
-        seeds: trainings of each network, whose mean and spread are shown.
     """
-    from eval.ablation.run import ablate as run
+    from eval.ablation.run import ablate as repeat
 
-    print(run(what, data_folder(data, profile), runs, profile, seeds))
+    print(repeat(what, data_folder(data, budget), runs, budget, seeds))
 
 
 def trade(
-    names: Names = (),
-    data: Data = None,
+    names: Denoisers = (),
+    data: DataOfBudget = None,
     runs: Runs = Path("runs"),
-    profile: Profile = "quick",
-    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "1280x720",
-    threads: int | None = None,
-    spp: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 2, 4, 8, 16, 32, 64, 128, 256),
+    budget: Budget = "quick",
+    size: Annotated[str, arg(metavar="WxH", help="of the images that were timed")] = "1280x720",
+    threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
+    spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples a pixel to feed, rising")] = SAMPLES,
 ) -> None:
-    """Weigh quality against milliseconds: denoisers, precisions, sizes of networks, samples a pixel; tables and plots.
+    """Weigh quality against milliseconds: denoisers, precisions, sizes of networks, samples a pixel.
 
-    Judges denoisers (all that can run, unless some are named) on the test clips, for RUNS/report/trade.json and the
-    report. Times are those that `onespp bench denoisers` has measured.
-
-    Args:
-        size: of images, for the times.
-        threads: for the times; by default the most that the bench has measured.
-        spp: samples a pixel to feed, rising.
+    Judges all denoisers that can run, or those named, on the test clips: tables, plots, RUNS/report/trade.json. Times
+    are those that `onespp bench denoisers` has measured.
     """
-    from eval.tradeoff.run import trade as run
+    from eval.tradeoff.run import trade as weigh
 
-    print(run(data_folder(data, profile), runs, profile, names, size, threads, spp))
+    print(weigh(data_folder(data, budget), runs, budget, names, size, threads, spp))
 
 
-def papers(runs: Runs = Path("runs"), profile: Profile = "quick") -> None:
+def papers(runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     """Print what the papers measured on their scenes beside what was measured here, and which orders hold here too."""
     from eval.papers.compare import against_papers
 
-    print(against_papers(runs, profile))
+    print(against_papers(runs, budget))
 
 
-def report(
-    runs: Runs = Path("runs"),
-    megabytes: Annotated[float, tyro.conf.arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
-) -> None:
-    """Make one page of all results, RUNS/report/index.html, which needs no network; and an animated picture a clip."""
-    from eval.report.page import report as make
+Command = Callable[..., None]
+Commands = dict[str, "Command | Commands"]
 
-    for path in make(runs, megabytes):
-        print(path)
-
-
-def exr(clip: Folder, out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]) -> None:
-    """Write one multi-layer OpenEXR file a frame of a clip's folder (such as data/quick/test/cornell_box/000)."""
-    from datasets.exr import export_clip
-
-    print(f"{out}: {export_clip(clip, out)} files")
-
-
-COMMANDS: dict[str, Callable[..., None]] = {
-    **{"preview": preview, "dataset": dataset, "verify": verify, "info": info, "train": train, "eval": evaluate},
-    **{"show": show, "figure": figure, "exr": exr, "bench": bench, "stress": stress, "ablate": ablate},
-    **{"trade": trade, "papers": papers, "report": report},
+GROUPS: dict[str, Commands] = {
+    "A first day": {
+        "preview": preview,
+        "dataset": dataset,
+        "train": train,
+        "eval": evaluate,
+        "report": report,
+    },
+    "Data sets": {
+        "info": info,
+        "verify": verify,
+        "exr": exr,
+    },
+    "A closer look": {
+        "show": show,
+        "figure": {
+            "variance": figure_variance,
+            "unbiased": figure_unbiased,
+        },
+        "papers": papers,
+        "ablate": ablate,
+    },
+    "What it costs, what it stands": {
+        "bench": {
+            "denoisers": bench_denoisers,
+            "scaling": bench_scaling,
+            "fusion": bench_fusion,
+            "rendering": bench_rendering,
+            "loading": bench_loading,
+            "training": bench_training,
+        },
+        "trade": trade,
+        "stress": stress,
+    },
+}
+MARGIN = 14  # characters left of the summaries
+SUMMARIES = {
+    "figure": "Draw a figure of the papers or of the docs: variance, unbiased.",
+    "bench": "Measure this machine: denoisers, scaling, fusion, rendering, loading, training.",
 }
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one subcommand. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
+    """Run one command. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
+    words = sys.argv[1:] if arguments is None else arguments
     keep_freed_memory()
     try:
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="onespp", args=arguments, description=__doc__)
+        run(words)
     except BadInput as error:
-        sys.exit(_complain(str(error)))
+        sys.exit(complain(str(error)))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "make room" if full else "mend that or choose another folder"
-        sys.exit(_complain(f"{where}{error.strerror or error}; {remedy} and run it again"))
+        sys.exit(complain(f"{where}{error.strerror or error}; {remedy} and run it again"))
     except KeyboardInterrupt:
         print("\ninterrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(130)
 
 
-def _complain(message: str) -> int:
+def run(words: list[str]) -> None:
+    """Find the command that `words` begin with, and call it with the rest. Prints an overview where it is asked for."""
+    path = "onespp"
+    groups = GROUPS
+    while True:
+        commands = {name: command for group in groups.values() for name, command in group.items()}
+        if not words or words[0] in ("-h", "--help"):
+            print("\n".join(overview(path, groups)))
+            return
+        name, *words = words
+        if name not in commands:
+            raise BadInput(f"unknown command '{path} {name}'; the commands are {', '.join(commands)}")
+        path = f"{path} {name}"
+        command = commands[name]
+        if not isinstance(command, dict):
+            tyro.cli(command, prog=path, args=words)
+            return
+        groups = {SUMMARIES[name]: command}
+
+
+def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
+    """The lines of `--help`: all commands, in groups, a sentence each."""
+    if path == "onespp":
+        yield f"{__doc__}\n"
+    yield f"usage: {path} COMMAND ...\n"
+    for title, commands in groups.items():
+        yield f"{title}\n"
+        for name, command in commands.items():
+            summary = SUMMARIES[name] if isinstance(command, dict) else (command.__doc__ or "").partition("\n\n")[0]
+            first, *rest = wrap(" ".join(summary.split()), min(100, get_terminal_size().columns - MARGIN))
+            yield f"  {name:<{MARGIN - 2}}{first}"
+            yield from (f"{'':<{MARGIN}}{line}" for line in rest)
+        yield ""
+    yield f"`{path} COMMAND --help` shows the options of each."
+
+
+def complain(message: str) -> int:
+    """Print what the user can fix. Returns the exit code."""
     print(f"onespp: {message}", file=sys.stderr)
     return 2
 

@@ -10,23 +10,9 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import torch
-
 ROOT = Path(__file__).parent
-OURS = (
-    "allocator",
-    "errors",
-    "files",
-    "plotting",
-    "provenance",
-    "timing",
-    "scenes",
-    "render",
-    "datasets",
-    "models",
-    "train",
-    "eval",
-)
+FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval")
+BESIDE_THEM = ("allocator", "errors", "files", "plotting", "provenance", "timing")
 
 # What decides the bytes of a data set, and the numbers of whatever denoises it.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")
@@ -44,6 +30,8 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 def device_in_words(kind: str = "cpu", threads: int | None = None) -> str:
     """What computes: the GPU's name, or the processor's and its threads, by default all that PyTorch takes."""
+    import torch  # takes a second, which rendering must not wait for
+
     if kind == "cuda":
         return f"cuda, {torch.cuda.get_device_name()}"
     try:
@@ -83,8 +71,9 @@ def sources(*modules: str) -> dict[str, Path]:
 def source_of(module: str) -> Path | None:
     """The file of one of onespp's modules; None for whatever else has a name."""
     path = ROOT.joinpath(*module.split("."))
+    is_ours = module.split(".")[0] in FOLDERS + BESIDE_THEM
     files = (path / "__init__.py", path.with_suffix(".py"))
-    return next((file for file in files if module.split(".")[0] in OURS and file.is_file()), None)
+    return next((file for file in files if is_ours and file.is_file()), None)
 
 
 def imported_by(path: Path) -> Iterator[str]:

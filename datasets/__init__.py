@@ -1,1 +1,1 @@
-"""From arrays to disk and back: the channel table, clip shards, the generation job, training sequences."""
+"""From arrays to disk and back: the channel table, clips, the generation job and training sequences."""

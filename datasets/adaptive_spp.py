@@ -1,18 +1,19 @@
-"""How many samples a reference needs: a few frames are rendered and their noise is measured."""
+"""How many samples a reference needs: a pilot renders a few frames and measures their noise."""
 
 import numpy as np
 
-from datasets.profiles import Quality
+from datasets.profiles import SamplingQuality
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
-from render.clip import PLAIN, Options
+from render.clip import NO_OPTIONS, Options
 from render.shot import Shot
 from render.stage import Stage
 from scenes.animation import Scene
 
 
 def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: Options) -> float:
-    """Mean squared error, as displayed, of a reference of `spp` samples: over the first, middle and last frame."""
-    halves, emissions = [], []
+    """Mean squared error, as displayed, of references of `spp` samples for the first, middle and last frame."""
+    halves = []
+    emissions = []
     for frame in sorted({0, frames // 2, frames - 1}):
         shot = Shot(stage, frame, options.regularise)
         halves.append([shot.reflected(seed % 2**32 ^ half, spp // 2) for half in (0, 1)])
@@ -23,19 +24,29 @@ def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: 
 
 
 def reference_spp(
-    scene: Scene, frames: int, height: int, width: int, quality: Quality, seed: int, options: Options = PLAIN
+    scene: Scene,
+    frames: int,
+    height: int,
+    width: int,
+    quality: SamplingQuality,
+    seed: int,
+    options: Options = NO_OPTIONS,
 ) -> int:
-    """Samples of both halves together, a power of two times quality.reference_spp and at most quality.most_spp.
+    """Samples a pixel of both halves together that bring a clip's references down to the noise floor of `quality`.
 
-    The noise of independent samples falls as 1 / spp, so a measurement says how many would do. But few samples miss
-    paths that are rare and bright: it is measured again with as many, until it is down to the floor.
+    They are a power of two times quality.reference_spp, and at most quality.most_spp.
+
+    The noise of independent samples falls as 1 / spp, so one measurement predicts how many samples suffice. But few
+    samples miss paths that are rare and bright, so the noise is measured again with the predicted number until it is
+    down to the floor.
     """
     spp = quality.reference_spp
     if quality.floor is None:
         return spp
-    stage, target = Stage(scene, height, width), 10 ** (-quality.floor / 10)
+    stage = Stage(scene, height, width)
+    wanted_noise = 10 ** (-quality.floor / 10)
     while spp < quality.most_spp:
-        excess = noise_of_reference(stage, frames, spp, seed, options) / target
+        excess = noise_of_reference(stage, frames, spp, seed, options) / wanted_noise
         if excess <= 1:
             break
         spp <<= int(np.ceil(np.log2(excess)))

@@ -1,40 +1,44 @@
-"""The channel table: what a clip holds, in which shape, precision and unit, and the constants of its light."""
+"""The channel table: what a clip holds, in which shape, precision and unit; and constants of its light."""
 
 from typing import NamedTuple
 
 
 class Channel(NamedTuple):
-    """One row of the table. Axes: F frames, S noise realisations, 2 reference halves, H rows, W columns, M meshes."""
+    """One row of the table.
+
+    Axes are F frames, S noise realisations, H rows, W columns and M meshes; a number stands for its own length.
+    """
 
     axes: tuple[str | int, ...]
-    dtype: str  # as stored; radiance falls back to float32 where float16 would lose by it
+    dtype: str  # as stored; radiance is float32 where float16 would lose precision
     unit: str
     radiance: bool = False
 
     @property
     def components(self) -> int:
-        """Numbers a pixel, for channels with pixels."""
+        """Numbers per pixel of a channel that is an image."""
         return int(self.axes[-1])
 
     @property
     def is_image(self) -> bool:
+        """Whether the channel has pixels."""
         return "H" in self.axes
 
     def shape(self, **sizes: int) -> list[int]:
-        """The stored shape for F=, S=, H=, W=, M=."""
+        """The stored shape, for the lengths of the axes given by name: F, S, H, W and M."""
         return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
 
 
-RADIANCE = "W sr^-1 m^-2"
-LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue, Rec. 709
-ALBEDO_FLOOR = 0.01  # demodulation divides by no less
+RADIANCE_UNIT = "W sr^-1 m^-2"
+LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (ITU-R BT.709)
+ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
 CHANNELS: dict[str, Channel] = {
-    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE, radiance=True),
-    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE, radiance=True),
-    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE, radiance=True),
-    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE, radiance=True),
-    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE, radiance=True),
+    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
     "albedo": Channel(("F", "H", "W", 3), "<f2", "1"),
     "normal": Channel(("F", "H", "W", 3), "<f2", "1"),
     "depth": Channel(("F", "H", "W", 1), "<f4", "world units"),
@@ -47,5 +51,6 @@ CHANNELS: dict[str, Channel] = {
     "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
 }
 
+MOTION_CHANNELS = ("motion", "dual_motion")
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
 REFERENCES = ("direct_reference", "indirect_reference")

@@ -1,6 +1,5 @@
-"""Reading clips and data sets straight from memory maps."""
+"""Clips and data sets on disk, read through memory maps."""
 
-import math
 import resource
 import zlib
 from collections.abc import Sequence
@@ -19,26 +18,26 @@ from scenes.camera import View, motion_vectors, pixel_centres
 
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
-CLIP_FACTS = ("frames", "height", "width", "exposure", "channels", "floor_mse", "nonfinite", "clamped", "complete")
-WHOLE = (slice(None), slice(None))
+FACTS_OF_A_CLIP = ("frames", "height", "width", "exposure", "channels", "floor_mse", "nonfinite", "clamped", "complete")
 
-Window = tuple[slice, slice]  # rows, columns
+ImageWindow = tuple[slice, slice]  # rows, columns
+WHOLE_IMAGE: ImageWindow = (slice(None), slice(None))
 
 
 def is_clip(path: Path) -> bool:
-    """Whether a whole clip stands at `path`: clips appear by renaming, with clip.json inside."""
+    """Whether there is a clip at `path`. A folder with clip.json is a whole one, because clips appear by renaming."""
     return (path / "clip.json").exists()
 
 
 class Clip:
-    """One clip on disk. Nothing is read until it is asked for, and then only the window asked for.
+    """One clip on disk, of which only what is asked for is read.
 
     Raises BadInput, naming the file, where the clip is missing, incomplete or damaged.
     """
 
     def __init__(self, path: Path):
         self.path = path
-        self.facts = read_json(path / "clip.json", CLIP_FACTS)
+        self.facts = read_json(path / "clip.json", FACTS_OF_A_CLIP)
         if not self.facts["complete"]:
             raise BadInput(f"{path} is not a complete clip: delete it and rerun `onespp dataset`")
         self.frames: int = self.facts["frames"]
@@ -49,28 +48,32 @@ class Clip:
 
     @property
     def scene(self) -> str:
+        """The scene's name, such as "room-3"."""
         return self.path.parent.name
 
     @property
     def name(self) -> str:
+        """The clip's name within its scene, such as "000" or "still"; see datasets.clip_kind."""
         return self.path.name
 
     @property
     def fingerprint(self) -> str:
-        """The checksum (crc32, 8 hex digits) of clip.json, which has those of all channels."""
+        """The checksum (crc32, 8 hex digits) of clip.json, which in turn holds those of all channels."""
         return f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
 
     @property
     def exposure(self) -> float:
+        """The factor by which pictures and metrics multiply the clip's radiance; see tonemap.clip_exposure."""
         return float(self.facts["exposure"])
 
     @property
     def realisations(self) -> int:
+        """Number of independent noise realisations of the noisy channels."""
         entry = self.entry("direct")
         return entry["shape"][1] if "shape" in entry else 1
 
     def entry(self, channel: str) -> dict[str, Any]:
-        """How a channel is stored. Raises BadInput where it was not rendered."""
+        """What clip.json says of how a channel is stored. Raises BadInput where the channel was not rendered."""
         if channel not in self.channels:
             raise BadInput(f"{self.path} holds no '{channel}': it was not rendered; render the data set with it")
         return self.channels[channel]
@@ -78,22 +81,25 @@ class Clip:
     def map(self, channel: str) -> NDArray[Any]:
         """The memory-mapped array of a channel that has a file, checked against the shape that clip.json states."""
         if channel not in self._maps:
-            entry, path = self.entry(channel), self.path / self.entry(channel)["file"]
+            entry = self.entry(channel)
+            path = self.path / entry["file"]
+            empty = 0 in entry["shape"]  # an empty file cannot be mapped
             try:
-                array = np.load(path, mmap_mode="r" if math.prod(entry["shape"]) else None)  # nothing cannot be mapped
+                array = np.load(path, mmap_mode=None if empty else "r")
             except FileNotFoundError:
                 raise BadInput(f"{path} is missing: delete {self.path} and rerun `onespp dataset`") from None
-            except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load parses the header as Python
+            except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load reads the header as Python
                 raise BadInput(f"{path} is damaged ({error}): delete {self.path} and rerun `onespp dataset`") from None
             if list(array.shape) != entry["shape"] or array.dtype != np.dtype(entry["dtype"]):
                 raise BadInput(f"{path} is not what clip.json says: delete {self.path} and rerun `onespp dataset`")
             self._maps[channel] = array
         return self._maps[channel]
 
-    def read(self, channel: str, frame: int, window: Window = WHOLE, realisation: int = 0) -> NDArray[Any]:
-        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for the reference halves.
+    def read(self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0) -> NDArray[Any]:
+        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for the halves of a reference.
 
-        The same array whether the channel is stored in full, as one value or to be derived.
+        The array is the same whether the channel is stored in full, stored as one value or derived from others.
+        Raises BadInput where the channel was not rendered, or its file is missing or damaged.
         """
         rows, columns = window
         entry = self.entry(channel)
@@ -111,10 +117,14 @@ class Clip:
         return array[frame, ..., rows, columns, :]
 
     def view(self, frame: int) -> View:
-        return View(*(np.array(self.map(name)[frame]) for name in ("K", "camera_to_world", "object_to_world")))
+        """The camera and the poses of all meshes in one frame."""
+        return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
-    def motion_to(self, frame: int, other: int, window: Window = WHOLE) -> NDArray[np.float32]:
-        """Motion vectors (h, w, 2) from `frame` to any `other` frame of the clip, from depth, cameras and meshes."""
+    def motion_to(self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE) -> NDArray[np.float32]:
+        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip.
+
+        They are computed from depth, the cameras and the poses of the meshes.
+        """
         pixels = pixel_centres(self.height, self.width)[window]
         depth = self.read("depth", frame, window)[..., 0].astype(np.float64)
         mesh_id = self.read("mesh_id", frame, window)[..., 0]
@@ -125,12 +135,13 @@ class Clip:
         indirect = self.read("indirect_reference", frame).astype(np.float32)
         if signal == "indirect":
             return indirect
-        direct, emission = (self.read(name, frame).astype(np.float32) for name in ("direct_reference", "emission"))
+        direct = self.read("direct_reference", frame).astype(np.float32)
+        emission = self.read("emission", frame).astype(np.float32)
         return direct + indirect + emission
 
 
 class Dataset:
-    """A data set on disk: dataset.json and the clips it plans, by split.
+    """A data set on disk: dataset.json and the clips that it plans for each split.
 
     Raises BadInput where there is none, or one of another schema version.
     """
@@ -147,11 +158,11 @@ class Dataset:
             )
 
     def planned(self, splits: Sequence[str] = SPLITS) -> list[Path]:
-        """Folders of all clips of `splits`, rendered or not, in a fixed order."""
+        """The folders of all clips of `splits`, rendered or not, in a fixed order."""
         return [self.path / split / clip for split in splits for clip in self.facts["splits"][split]]
 
     def clips(self, split: str) -> list[Clip]:
-        """The clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
+        """All clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
         paths = self.planned([split])
         missing = [path for path in paths if not is_clip(path)]
         if missing:
@@ -166,9 +177,12 @@ class Dataset:
 
 
 def allow_open_files(count: int) -> None:
-    """Raise this process's limit by `count`, as far as it may: every memory map keeps a file open; 1024 are usual."""
+    """Raise this process's limit of open files by `count`, as far as the system allows.
+
+    Every memory map keeps its file open, and the usual limit is 1024.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY:
         wanted = soft + count if hard == resource.RLIM_INFINITY else min(soft + count, hard)
-        with suppress(ValueError, OSError):  # macOS has a limit beyond the one it tells
+        with suppress(ValueError, OSError):  # macOS has a lower limit than the hard one it states
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

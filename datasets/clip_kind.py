@@ -1,4 +1,4 @@
-"""What the name of a clip says of it."""
+"""What the name of a clip says about it."""
 
 import re
 from typing import NamedTuple
@@ -7,15 +7,15 @@ from errors import BadInput
 
 
 class ClipKind(NamedTuple):
-    """What a clip's name says: a number; `still`, in which nothing moves; 000-4spp, with 4 spp as noisy input."""
+    """What a clip's name says: 000 is a number, in `still` nothing moves, 000-4spp has noisy input of 4 spp."""
 
     number: int
     still: bool
-    noisy_spp: int
+    noisy_spp: int  # samples a pixel of the noisy channels
 
     @staticmethod
     def of(name: str) -> "ClipKind":
-        """Raises BadInput for a name that is none."""
+        """The kind of the clip of that name. Raises BadInput where no clip is called so."""
         match = re.fullmatch(r"(\d+|still)(?:-(\d+)spp)?", name)
         if not match:
             raise BadInput(f"'{name}' does not name a clip: clips are called 000, still or 000-4spp")

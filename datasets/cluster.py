@@ -1,4 +1,4 @@
-"""Rendering clips on a Ray cluster: many machines, one shared folder, and a lost worker costs one clip."""
+"""Rendering clips on a Ray cluster: many machines share one folder, and a lost worker costs one clip."""
 
 import os
 import signal
@@ -8,37 +8,38 @@ from contextlib import contextmanager
 from typing import Any
 
 from datasets.clip import Dataset
-from datasets.generate import ClipJob, Outcome, check_versions, render_clip_job
+from datasets.clip_job import ClipJob, ClipOutcome, run_clip_job
+from datasets.generate import check_versions
 from errors import BadInput
 from render.backend import VARIANT, dr
 
-TRIES = 4  # of a clip whose worker dies
-PATIENCE = 10  # seconds that workers have to clean up when the job is given up
+WORKERS_PER_CLIP = 4  # that may die before the clip counts as failed
+SECONDS_TO_CLEAN_UP = 10  # for workers when the job is given up
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """The first Ctrl-C takes effect at the end: in the middle of Ray's start it would crash the process."""
-    came = False
+    """Within the context the first Ctrl-C is put off to the end: amid Ray's start it would crash the process."""
+    interrupted = False
     usual = signal.getsignal(signal.SIGINT)
 
-    def wait(*_: object) -> None:
-        nonlocal came
-        came = True
+    def put_off(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
         signal.signal(signal.SIGINT, usual)
 
-    signal.signal(signal.SIGINT, wait)
+    signal.signal(signal.SIGINT, put_off)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, usual)
-    if came:
+    if interrupted:
         raise KeyboardInterrupt
 
 
 @contextmanager
-def connected() -> Iterator[Any]:
-    """The ray module, connected to the cluster that RAY_ADDRESS names or that runs here, else to one of this machine.
+def connected_ray() -> Iterator[Any]:
+    """The ray module, connected to the cluster that RAY_ADDRESS names or that runs here, or else to a new one here.
 
     Raises BadInput where Ray is not installed, or no cluster answers.
     """
@@ -49,13 +50,14 @@ def connected() -> Iterator[Any]:
         raise BadInput("--ray needs Ray: pip install 'onespp[ray]'") from None
     try:
         with uninterrupted():
-            start(ray)
+            connect(ray)
         yield ray
     finally:
         ray.shutdown()
 
 
-def start(ray: Any) -> None:
+def connect(ray: Any) -> None:
+    """Join a cluster or start one on this machine. Raises BadInput where RAY_ADDRESS names one that does not answer."""
     host, _, port = os.environ.get("RAY_ADDRESS", "").rpartition(":")
     try:
         if port.isdigit():
@@ -67,51 +69,59 @@ def start(ray: Any) -> None:
         ) from None
 
 
-def requirements() -> dict[str, Any]:
-    """What a clip's task reserves: a GPU where this machine renders on one, else one core, with GPUs out of sight.
+def reserved_resources() -> dict[str, Any]:
+    """What the task of a clip reserves: a GPU where this machine renders on one, else one core without sight of GPUs.
 
-    All clips of a data set are rendered by the variant that this machine renders with, or their bytes would differ.
+    All workers render with the variant of this machine, or the bytes of their clips would differ.
     """
     if VARIANT.startswith("cuda"):
         return {"num_cpus": 1, "num_gpus": 1}
     return {"num_cpus": 1, "runtime_env": {"env_vars": {"CUDA_VISIBLE_DEVICES": ""}}}
 
 
-def render_on_worker(job: ClipJob) -> Outcome:
-    """What a worker does. On one core, as it has reserved: clips side by side use all cores better than threads do."""
+def render_on_worker(job: ClipJob) -> ClipOutcome:
+    """Render a clip on the one core that its task reserves: clips side by side use cores better than threads do."""
     dr.set_thread_count(1)
     check_versions(Dataset(job.path.parents[2]))
-    return render_clip_job(job)
+    return run_clip_job(job)
 
 
-def render_on_cluster(jobs: Sequence[ClipJob]) -> Iterator[Outcome]:
+def render_on_cluster(jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
     """Render clips on a Ray cluster; yields their outcomes in the order in which they end.
 
-    Every clip has a worker process of its own, and is tried again in another where that dies. All machines must reach
-    the clips' folder under the same path. Raises OSError and BadInput of a worker at once, giving the rest up.
+    Every clip has a worker process of its own, and a new one where that dies. All machines must reach the clips'
+    folder under the same path.
+
+    Raises BadInput where there is no cluster to use; and at once, giving up the rest, what a worker raises: OSError for
+    a full disk, BadInput for other versions of packages.
     """
-    with connected() as ray:
+    with connected_ray() as ray:
         if VARIANT.startswith("cuda") and not ray.cluster_resources().get("GPU"):
             raise BadInput("this machine renders on its GPU and the cluster has none: set CUDA_VISIBLE_DEVICES=''")
-        task = ray.remote(max_calls=1, max_retries=TRIES - 1, **requirements())(render_on_worker)
-        tasks = {task.remote(job._replace(path=job.path.absolute())): job for job in jobs}
-        waiting = list(tasks)
-        try:
-            while waiting:
-                [done], waiting = ray.wait(waiting)
-                yield outcome_of(ray, done, tasks[done])
-        finally:
-            for unfinished in waiting:
-                ray.cancel(unfinished)  # interrupts Python in the worker, which then removes what it has begun
-            if waiting:
-                ray.wait(waiting, num_returns=len(waiting), timeout=PATIENCE)
+        yield from outcomes_of(ray, jobs)
 
 
-def outcome_of(ray: Any, reference: Any, job: ClipJob) -> Outcome:
+def outcomes_of(ray: Any, jobs: Sequence[ClipJob]) -> Iterator[ClipOutcome]:
+    """Run all jobs on the cluster to which `ray` is connected, as `render_on_cluster` does."""
+    task = ray.remote(max_calls=1, max_retries=WORKERS_PER_CLIP - 1, **reserved_resources())(render_on_worker)
+    tasks = {task.remote(job._replace(path=job.path.absolute())): job for job in jobs}
+    waiting = list(tasks)
+    try:
+        while waiting:
+            [done], waiting = ray.wait(waiting)
+            yield outcome_of(ray, done, tasks[done])
+    finally:
+        for unfinished in waiting:
+            ray.cancel(unfinished)  # interrupts the worker, which then removes what it has begun
+        if waiting:
+            ray.wait(waiting, num_returns=len(waiting), timeout=SECONDS_TO_CLEAN_UP)
+
+
+def outcome_of(ray: Any, reference: Any, job: ClipJob) -> ClipOutcome:
     """The outcome of an ended task. Raises what the worker raised."""
     try:
         return ray.get(reference)._replace(path=job.path)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from error
     except ray.exceptions.RayError as error:  # the worker died, or its machine
-        return Outcome(job.path, "failed", f"{TRIES} workers died: {str(error).splitlines()[0]}")
+        return ClipOutcome(job.path, "failed", f"{WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}")

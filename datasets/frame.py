@@ -1,4 +1,4 @@
-"""The Frame: the one type that flows from the data set to denoisers and metrics."""
+"""The Frame: the one type that goes from data sets to denoisers and metrics."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.channels import ALBEDO_FLOOR, CAMERA_CHANNELS, CHANNELS, REFERENCES
-from datasets.clip import WHOLE, Clip, Window
+from datasets.channels import ALBEDO_FLOOR, CAMERA_CHANNELS, CHANNELS, MOTION_CHANNELS, REFERENCES
+from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow
 from errors import BadInput
 from scenes.camera import View
 
@@ -17,26 +17,36 @@ Signal = Literal["total", "indirect"]
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
-    """Whether what a pixel shows was hidden in the previous frame, (B, 1, H, W): vectors differ by over 1/64 px."""
+    """Whether what a pixel shows was hidden in the previous frame: (B, 1, H, W) of bool.
+
+    Both vectors (B, 2, H, W), in pixels, are equal where the surface was visible (Zeng et al. 2021, §3.2), up to the
+    rounding that 1/64 px allows for.
+    """
     return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """What projects a frame's surfaces; float64.
+    """What projects the surfaces of a batch of frames; float64. See scenes.camera for the conventions."""
 
-    K (B, 3, 3), camera_to_world (B, 4, 4), object_to_world (B, M, 4, 4).
-    """
-
-    K: Tensor
-    camera_to_world: Tensor
-    object_to_world: Tensor
+    K: Tensor  # (B, 3, 3)
+    camera_to_world: Tensor  # (B, 4, 4)
+    object_to_world: Tensor  # (B, M, 4, 4), entry mesh_id - 1: rigid transform from the rest pose
 
     @staticmethod
-    def of(view: View, window: Window = WHOLE) -> "Cameras":
+    def of(view: View, window: ImageWindow = WHOLE_IMAGE) -> "Cameras":
+        """The cameras (B = 1) of an image that is cut to `window`."""
         K = view.K.copy()
         K[:2, 2] -= [window[1].start or 0, window[0].start or 0]
-        return Cameras(*(torch.from_numpy(a)[None] for a in (K, view.camera_to_world, view.object_to_world)))
+        return Cameras(
+            torch.from_numpy(K)[None],
+            torch.from_numpy(view.camera_to_world)[None],
+            torch.from_numpy(view.object_to_world)[None],
+        )
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Cameras":
+        """The cameras with `function` of every matrix."""
+        return Cameras(function(self.K), function(self.camera_to_world), function(self.object_to_world))
 
     def rot90(self, width: int) -> "Cameras":
         """The cameras that see the image turned by 90° counter-clockwise: rolled about the viewing axis.
@@ -47,6 +57,22 @@ class Cameras:
         roll[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
         turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, width], [0.0, 0.0, 1.0]], dtype=torch.float64)
         return replace(self, K=turn @ self.K @ roll[:3, :3], camera_to_world=self.camera_to_world @ roll)
+
+    @staticmethod
+    def stack(cameras: Sequence["Cameras"]) -> "Cameras":
+        """One batch of all `cameras`. Scenes with fewer meshes than others are padded with meshes at rest."""
+        meshes = max(each.object_to_world.shape[1] for each in cameras)
+
+        def padded(poses: Tensor) -> Tensor:
+            batch, count = poses.shape[:2]
+            rest = torch.eye(4, dtype=torch.float64).expand(batch, meshes - count, 4, 4)
+            return torch.cat([poses, rest], dim=1)
+
+        return Cameras(
+            torch.cat([each.K for each in cameras]),
+            torch.cat([each.camera_to_world for each in cameras]),
+            torch.cat([padded(each.object_to_world) for each in cameras]),
+        )
 
 
 @dataclass(frozen=True)
@@ -61,16 +87,16 @@ class Moment:
 class Frame:
     """One frame of one noise realisation: tensors (B, C, H, W), float32, as attributes named like the channels.
 
-    `direct_reference` and `indirect_reference` are (B, 2, 3, H, W), where they were asked for. Reading a channel that
-    was not asked for raises BadInput. `gain` (B, 3, 1, 1) is the per-channel gain of training augmentation (RAE §4.3):
-    a network multiplies its exposure by it; radiance stays as rendered.
+    `direct_reference` and `indirect_reference` are (B, 2, 3, H, W). Using a channel that was not read raises BadInput.
+    Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
+    networks multiply their exposure by it, while radiance stays as rendered.
     """
 
     channels: dict[str, Tensor]
     now: Cameras
-    previous: Cameras
-    gain: Tensor
-    source: str = ""
+    previous: Cameras  # of the frame that motion vectors lead to
+    gain: Tensor  # (B, 3, 1, 1)
+    source: str = ""  # names the clip in messages
 
     def __getattr__(self, name: str) -> Tensor:
         if name not in CHANNELS:
@@ -92,13 +118,14 @@ class Frame:
 
     @property
     def moment(self) -> Moment:
+        """What identifies this frame among those of its sequence."""
         return Moment(self.shape, self.now)
 
     def follows(self, moment: Moment) -> bool:
-        """Whether this frame continues a sequence: of the same size, and moved to it from the cameras of `moment`.
+        """Whether this frame comes right after `moment`: it has the same size and its previous cameras are those.
 
-        So a cut needs no flag: the first frame of another place names other previous cameras. Where neither camera nor
-        meshes differ, as between two still shots from one place, nothing tells it: pass None as the state there.
+        So a cut needs no flag: the first frame of another shot names other previous cameras. Between two still shots
+        from the same place neither camera nor meshes differ, and a cut goes unnoticed: pass None as the state there.
         """
         return moment.shape == self.shape and all(
             a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, atol=1e-12)
@@ -111,16 +138,16 @@ class Frame:
         return self.albedo.clamp(min=ALBEDO_FLOOR)
 
     def finite(self) -> "Frame":
-        """The frame with NaN and infinities as 0, in whatever channel: one bad pixel must not poison a filter.
+        """The frame with 0 instead of NaN and infinities in all channels: one bad pixel must not poison a filter.
 
-        A sum tells whether there are any, at a fraction of the cost of looking at every pixel.
+        The sum of a channel tells whether it has any, at a fraction of the cost of looking at every pixel.
         """
         bad = [name for name, tensor in self.channels.items() if not torch.isfinite(tensor.sum())]
         mended = {name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0) for name in bad}
         return replace(self, channels=self.channels | mended) if bad else self
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
-        """The frame with `function` of every channel."""
+        """The frame with `function` of every channel; cameras and gain stay."""
         return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})
 
     def radiance(self, signal: Signal) -> Tensor:
@@ -128,16 +155,18 @@ class Frame:
         return self.indirect if signal == "indirect" else self.emission + self.direct + self.indirect
 
     def irradiance(self, signal: Signal) -> Tensor:
-        """Noisy demodulated radiance (B, 3, H, W), without emission."""
-        return (self.indirect if signal == "indirect" else self.direct + self.indirect) / self.divisor
+        """Noisy irradiance (B, 3, H, W): radiance without emission, divided by the albedo."""
+        reflected = self.indirect if signal == "indirect" else self.direct + self.indirect
+        return reflected / self.divisor
 
     def reference_irradiance(self, signal: Signal) -> Tensor:
-        """The same of the reference, mean of its halves."""
+        """Irradiance (B, 3, H, W) of the reference, the mean of its halves."""
         indirect = self.indirect_reference.mean(dim=1)
-        return (indirect if signal == "indirect" else self.direct_reference.mean(dim=1) + indirect) / self.divisor
+        reflected = indirect if signal == "indirect" else self.direct_reference.mean(dim=1) + indirect
+        return reflected / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
-        """Radiance of denoised irradiance: times the same divisor, plus the untouched emission for "total"."""
+        """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, plus the noise-free emission for "total"."""
         radiance = irradiance * self.divisor
         return radiance + self.emission if signal == "total" else radiance
 
@@ -151,34 +180,30 @@ class Frame:
         """The frame turned by 90° counter-clockwise: images, motion vectors and cameras alike."""
         width = self.size[1]
         channels = {name: torch.rot90(tensor, dims=(-2, -1)) for name, tensor in self.channels.items()}
-        for name in channels.keys() & {"motion", "dual_motion"}:
+        for name in channels.keys() & set(MOTION_CHANNELS):
             dx, dy = channels[name].unbind(dim=1)
             channels[name] = torch.stack([dy, -dx], dim=1)
         return replace(self, channels=channels, now=self.now.rot90(width), previous=self.previous.rot90(width))
 
     def to(self, device: torch.device | str) -> "Frame":
-        moved = {name: tensor.to(device) for name, tensor in self.channels.items()}
-        cameras = [Cameras(*(t.to(device) for t in vars(c).values())) for c in (self.now, self.previous)]
-        return replace(self, channels=moved, now=cameras[0], previous=cameras[1], gain=self.gain.to(device))
+        """The frame with all tensors on `device`."""
+
+        def move(tensor: Tensor) -> Tensor:
+            return tensor.to(device)
+
+        moved = self.map(move)
+        return replace(moved, now=self.now.map(move), previous=self.previous.map(move), gain=move(self.gain))
 
     @staticmethod
     def stack(frames: Sequence["Frame"]) -> "Frame":
-        """One frame of all the frames' batches. Scenes with fewer meshes are padded with meshes at rest."""
-        meshes = max(frame.now.object_to_world.shape[1] for frame in frames)
-
-        def cameras(which: str) -> Cameras:
-            items: list[Cameras] = [getattr(frame, which) for frame in frames]
-            rest = torch.eye(4, dtype=torch.float64)
-            poses = [
-                torch.cat([c.object_to_world, rest.expand(len(c.K), meshes - c.object_to_world.shape[1], 4, 4)], dim=1)
-                for c in items
-            ]
-            K, camera_to_world = (torch.cat([getattr(c, name) for c in items]) for name in ("K", "camera_to_world"))
-            return Cameras(K, camera_to_world, torch.cat(poses))
-
-        channels = {name: torch.cat([frame.channels[name] for frame in frames]) for name in frames[0].channels}
-        gain = torch.cat([frame.gain for frame in frames])
-        return Frame(channels, cameras("now"), cameras("previous"), gain, frames[0].source)
+        """One frame of the batches of all `frames`, which have the same channels and size."""
+        return Frame(
+            {name: torch.cat([frame.channels[name] for frame in frames]) for name in frames[0].channels},
+            now=Cameras.stack([frame.now for frame in frames]),
+            previous=Cameras.stack([frame.previous for frame in frames]),
+            gain=torch.cat([frame.gain for frame in frames]),
+            source=frames[0].source,
+        )
 
 
 def read_frame(
@@ -187,20 +212,23 @@ def read_frame(
     channels: Iterable[str],
     realisation: int = 0,
     previous: int | None = None,
-    window: Window = WHOLE,
+    window: ImageWindow = WHOLE_IMAGE,
 ) -> Frame:
-    """Frame `index` (B = 1) of a clip with the named channels, cut to `window` (slices with start and stop).
+    """Frame `index` (B = 1) of a clip, with the named channels of one noise realisation, cut to `window`.
 
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
-    another one (reversed playback, a stopped camera), motion vectors are made for it.
+    another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
+
+    Raises BadInput where a channel was not rendered or is damaged, and for dual motion in reversed playback.
     """
-    before = max(index - 1, 0)
-    previous = before if previous is None else previous
+    stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead
+    if previous is None:
+        previous = stored_previous
     tensors = {}
     for name in channels:
         if name in CAMERA_CHANNELS:
             continue
-        if name in ("motion", "dual_motion") and previous != before:
+        if name in MOTION_CHANNELS and previous != stored_previous:
             array = motion_for_playback(clip, name, index, previous, window)
         else:
             array = clip.read(name, index, window, realisation)
@@ -214,15 +242,19 @@ def read_frame(
     )
 
 
-def motion_for_playback(clip: Clip, name: str, index: int, previous: int, window: Window) -> np.ndarray:
-    """Motion vectors (h, w, 2) to a frame that is not the one before. A camera that stands still hides nothing."""
+def motion_for_playback(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> np.ndarray:
+    """The channel `name`, "motion" or "dual_motion" (h, w, 2), to a frame that is not the one before in the clip.
+
+    Dual motion vectors depend on what hid a surface, which only the renderer sees: they cannot be computed afterwards.
+    But while the camera stands still nothing is hidden, and they equal motion vectors.
+    """
     if name == "dual_motion" and previous != index:
         raise BadInput(f"{clip.path}: dual motion vectors exist for forward playback only; train without reversing")
     return clip.motion_to(index, previous, window)
 
 
 def to_tensor(array: np.ndarray, has_halves: bool = False) -> Tensor:
-    """(H, W, C) to (1, C, H, W), or (2, H, W, C) to (1, 2, C, H, W); float32."""
+    """(H, W, C) as (1, C, H, W), or with halves (2, H, W, C) as (1, 2, C, H, W); float32."""
     tensor = torch.from_numpy(np.ascontiguousarray(np.moveaxis(array.astype(np.float32), -1, -3)))
     assert tensor.ndim == (4 if has_halves else 3)
     return tensor[None]

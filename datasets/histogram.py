@@ -1,33 +1,28 @@
 """How hard the clips of a data set are, as a picture."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from plotting import plt, save_figure
+from datasets.difficulty import MEASURES, Difficulty
+from plotting import plt
 
 BINS = 16
-# In the order of datasets.inspect.Difficulty. What lies below the lowest is shown there.
-TITLES = (
-    "share of black pixels at 1 spp",
-    "relative MSE at 1 spp",
-    "P99.9 over mean at 1 spp",
-    "P95 over P5 of the reference",
-)
-LOWEST = (1e-3, 1e-2, 1.0, 1.0)
 
 
-def plot_difficulty(measures: Sequence[Sequence[float]], path: Path) -> None:
-    """A PNG with a histogram of each of the four measures (N clips, 4), on logarithmic axes."""
-    figure, axes = plt.subplots(1, 4, figsize=(12, 2.6), layout="constrained")
-    for axis, title, lowest, values in zip(axes, TITLES, LOWEST, np.array(measures).T, strict=True):
-        finite = np.maximum(values[np.isfinite(values)], lowest)
-        edges = np.geomspace(lowest, max(finite.max(initial=lowest), 2 * lowest) * 1.0001, BINS + 1)
+def difficulty_histograms(clips: Sequence[Difficulty]) -> Figure:
+    """A histogram of each measure over all clips, on logarithmic axes. Infinite and undefined values are left out."""
+    figure, axes = plt.subplots(1, len(MEASURES), figsize=(12, 2.6), layout="constrained")
+    for axis, (field, measure) in zip(axes, MEASURES.items(), strict=True):
+        values = np.array([getattr(clip, field) for clip in clips])
+        finite = np.maximum(values[np.isfinite(values)], measure.lowest)
+        highest = max(finite.max(initial=measure.lowest), 2 * measure.lowest)
+        edges = np.geomspace(measure.lowest, highest * 1.0001, BINS + 1)
         axis.hist(finite, edges, color="#4477aa", edgecolor="white")
-        axis.set(xscale="log", xlabel=title)
+        axis.set(xscale="log", xlabel=measure.title)
         if len(finite):
             low, middle, high = np.percentile(finite, [5, 50, 95])
             axis.set_title(f"5 %: {low:.2g}   50 %: {middle:.2g}   95 %: {high:.2g}", fontsize=8)
-    axes[0].set_ylabel(f"clips of {len(measures)}")
-    save_figure(path, figure)
+    axes[0].set_ylabel(f"clips of {len(clips)}")
+    return figure

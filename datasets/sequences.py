@@ -1,4 +1,4 @@
-"""Training sequences: random crops of consecutive frames, augmented, straight from memory maps."""
+"""Training sequences: random crops of consecutive frames, augmented, read through memory maps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,19 +8,19 @@ import torch
 from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import REFERENCES
-from datasets.clip import Clip, Window
+from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Which of RAE §4.3's augmentations are on. Each transforms every channel and camera consistently."""
+    """Which augmentations of RAE §4.3 are on. Each transforms all channels and cameras consistently."""
 
     reverse: bool = False  # half of the sequences are played backward
     stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
-    rotate: bool = False  # by a random multiple of 90 degrees
-    gain: bool = False  # a factor in [0, 2] of its own for each colour channel
+    rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
+    gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
@@ -34,19 +34,21 @@ def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
             )
 
 
-def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> Window:
-    """`crop` x `crop` pixels somewhere in the image, or all of it."""
+def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> ImageWindow:
+    """`crop` x `crop` pixels at a random place in the image, or all of it where `crop` is None."""
     if crop is None:
         return slice(0, clip.height), slice(0, clip.width)
-    top, left = (int(rng.integers(size - crop + 1)) for size in (clip.height, clip.width))
+    top = int(rng.integers(clip.height - crop + 1))
+    left = int(rng.integers(clip.width - crop + 1))
     return slice(top, top + crop), slice(left, left + crop)
 
 
 class TrainingSequences(TorchDataset[list[Frame]]):
-    """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames).
+    """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
 
-    Item i of epoch e depends on (seed, e, i) only. An epoch holds as many sequences as it takes to see as many pixels
-    as the clips have. Raises BadInput where a clip is shorter than a sequence or smaller than a crop.
+    References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
+    have together as many pixels as the clips. Raises BadInput where a clip is shorter than a sequence or smaller than a
+    crop.
     """
 
     def __init__(
@@ -59,11 +61,15 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         seed: int,
     ):
         check_fits(clips, length, crop)
-        self.clips, self.length, self.crop = clips, length, crop
+        self.clips = clips
         self.channels = tuple(dict.fromkeys([*reads, *REFERENCES]))
-        self.augmentation, self.seed, self.epoch = augmentation, seed, 0
+        self.length = length
+        self.crop = crop
+        self.augmentation = augmentation
+        self.seed = seed
+        self.epoch = 0
         pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
-        self.share = pixels / pixels.sum()
+        self.probabilities = pixels / pixels.sum()
         area = crop * crop if crop else pixels.sum() / sum(clip.frames for clip in clips)
         self.count = max(1, round(pixels.sum() / (length * area)))
 
@@ -76,17 +82,18 @@ class TrainingSequences(TorchDataset[list[Frame]]):
 
     def __getitem__(self, index: int) -> list[Frame]:
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        clip = self.clips[rng.choice(len(self.clips), p=self.share)]
+        clip = self.clips[rng.choice(len(self.clips), p=self.probabilities)]
         playback = self._playback(clip, rng)
         window = random_window(clip, self.crop, rng)
-        # Dealt out rather than drawn, so that a stopped camera sees new noise as long as there are realisations.
+        # Dealt out rather than drawn, so that a stopped camera sees new noise while there are unused realisations.
         deal = rng.permutation(clip.realisations)
         turns = int(rng.integers(4)) if self.augmentation.rotate else 0
         gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.augmentation.gain else None
 
         frames = []
         for t, position in enumerate(playback):
-            realisation, previous = int(deal[t % len(deal)]), playback[max(t - 1, 0)]
+            realisation = int(deal[t % len(deal)])
+            previous = playback[max(t - 1, 0)]
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
             for _ in range(turns):
                 frame = frame.rot90()
@@ -105,17 +112,19 @@ class TrainingSequences(TorchDataset[list[Frame]]):
 
 
 class Batch:
-    """What a training step sees: for each time step one Frame of all sequences.
+    """What a training step sees: for each time step, one Frame of all sequences.
 
-    Not a list: Fabric converts the tensors of collections, and the cameras' float64 must stay.
+    It is not a list, because Fabric converts the tensors in collections, and cameras must stay float64.
     """
 
     def __init__(self, frames: list[Frame]):
         self.frames = frames
 
     def to(self, device: torch.device | str) -> "Batch":
+        """The batch with all tensors on `device`."""
         return Batch([frame.to(device) for frame in self.frames])
 
 
 def collate(sequences: list[list[Frame]]) -> Batch:
+    """One batch of several sequences of equal length."""
     return Batch([Frame.stack(step) for step in zip(*sequences, strict=True)])

@@ -1,4 +1,7 @@
-"""Exposure and the display transform, for metrics and pictures only: networks never see them."""
+"""Exposure and the display transform, for metrics and pictures only: networks never see them.
+
+Numpy, as data sets and renderers have it; `models.operators.luminance` is the luminance of tensors.
+"""
 
 import math
 from typing import Any, TypeVar
@@ -8,19 +11,19 @@ from numpy.typing import NDArray
 
 from datasets.channels import LUMINANCE_WEIGHTS
 
-Image = TypeVar("Image", bound=Any)
+ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
 
 def luminance(radiance: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Rec. 709 luminance (...,) of linear RGB (..., 3)."""
+    """Luminance (...,) of linear RGB (..., 3), by the weights of ITU-R BT.709."""
     return radiance @ np.array(LUMINANCE_WEIGHTS)
 
 
 def clip_exposure(y: NDArray[np.floating]) -> float:
-    """Exposure of a clip from the luminance of its reference's direct + indirect, all frames, any shape.
+    """The exposure of a clip, from the luminance of direct + indirect light in its reference: all frames, any shape.
 
-    min(0.18 / exp(mean ln max(Y, 1e-4 mean Y)), 1 / P95(Y)): middle grey for the geometric mean, but at most 5 % of the
-    pixels clipped. 1 where everything is black.
+    min(0.18 / exp(mean ln max(Y, 1e-4 mean Y)), 1 / P95(Y)): the geometric mean becomes middle grey, unless that
+    clipped more than 5 % of the pixels. It is 1 where everything is black.
     """
     y = y.astype(np.float64)
     mean = y.mean()
@@ -31,17 +34,17 @@ def clip_exposure(y: NDArray[np.floating]) -> float:
     return float(min(exposure, 1 / percentile) if percentile > 0 else exposure)
 
 
-def display(radiance: Image, exposure: float) -> Image:
-    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1], of a numpy array or a tensor."""
+def display(radiance: ArrayOrTensor, exposure: float) -> ArrayOrTensor:
+    """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1], as an array or a tensor of the same shape."""
     exposed: Any = exposure * radiance
     return exposed.clip(0, 1) ** (1 / 2.2)
 
 
 def noise_of_halves(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Squared error of the mean of two independent images as displayed: mean((a - b)^2) / 4."""
+    """Expected squared error of the mean of two independent images, as displayed: mean((a - b)^2) / 4."""
     return float(((a - b) ** 2).mean() / 4)
 
 
 def psnr(mse: float) -> float:
-    """min(100, -10 log10 mse) in dB, for signals in [0, 1]."""
+    """Peak signal-to-noise ratio in dB of signals in [0, 1]: min(100, -10 log10 mse)."""
     return min(100.0, -10 * math.log10(mse)) if mse > 0 else 100.0

@@ -1,4 +1,4 @@
-"""Writing one clip: frames in, one finished folder out, or nothing."""
+"""Writing one clip: frames in, one finished folder out or nothing."""
 
 import shutil
 import zlib
@@ -17,33 +17,39 @@ HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in it
 
 
 def working_dtype(channel: Channel) -> str:
-    """Precision in which frames wait for the decision what to store: float16 only after the whole clip is known."""
+    """The precision in which frames are kept until the clip is whole and the precision to store can be decided."""
     return "<f4" if channel.dtype == "<f2" else channel.dtype
 
 
 class RawChannel:
-    """One channel's frames on their way to disk, with what the decision on their storage needs to know."""
+    """The frames of one channel on their way to disk, and what decides how they are stored."""
 
     def __init__(self, folder: Path, name: str):
-        self.name, self.channel = name, CHANNELS[name]
+        self.name = name
+        self.channel = CHANNELS[name]
         self.path = folder / f"{name}.raw"
         self.file = self.path.open("wb")
         self.frame_shape: tuple[int, ...] = ()
-        self.frames = self.nonfinite = 0
-        self.first: NDArray[Any] | None = None
-        self.constant = self.channel.is_image
-        self.half_loses = False
+        self.frames = 0
+        self.nonfinite = 0
+        self.first_pixel: NDArray[Any] | None = None  # of an image
+        self.constant = self.channel.is_image  # whether all pixels so far are equal
+        self.half_loses = False  # whether float16 would lose precision of radiance
 
     def add(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Append one frame (axes without F). What is not finite is counted and becomes 0. Returns what was added."""
+        """Append one frame, with the channel's axes but F. Non-finite numbers are counted and become 0.
+
+        Returns the frame as it was appended.
+        """
         array = np.ascontiguousarray(array, dtype=working_dtype(self.channel))
         if array.dtype.kind == "f":
             finite = np.isfinite(array)
             self.nonfinite += int(array.size - finite.sum())
             array = np.where(finite, array, 0)
-        if self.first is None:
-            self.first, self.frame_shape = array[(0,) * (array.ndim - 1)] if self.constant else array, array.shape
-        self.constant = self.constant and bool((array == self.first).all())
+        if self.frames == 0:
+            self.frame_shape = array.shape
+            self.first_pixel = array[(0,) * (array.ndim - 1)] if self.channel.is_image else None
+        self.constant = self.constant and bool((array == self.first_pixel).all())
         if self.channel.radiance:
             with np.errstate(over="ignore"):
                 error = np.abs(array.astype("<f2").astype("<f8") - array).sum()
@@ -53,24 +59,27 @@ class RawChannel:
         return array
 
     def read(self, frame: int) -> NDArray[Any]:
-        """One frame back, in working precision."""
+        """An appended frame, in working precision."""
         dtype = np.dtype(working_dtype(self.channel))
         count = int(np.prod(self.frame_shape))
         return np.fromfile(self.path, dtype, count, offset=frame * count * dtype.itemsize).reshape(self.frame_shape)
 
     def storage_dtype(self) -> str:
-        """float32 for radiance of which float16 would round a frame worse than it rounds normal numbers."""
+        """float32 for radiance of which float16 would round some frame worse than it rounds normal numbers."""
         return "<f4" if self.half_loses else self.channel.dtype
 
     def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:
-        """Write the final file where one is needed. Returns the entry of clip.json and the count of clamped numbers."""
+        """Write the final file where one is needed; `derived` says what the channel is derived from, if it is.
+
+        Returns the entry of clip.json and how many numbers were clamped.
+        """
         dtype = self.storage_dtype()
         if derived:
             entry: dict[str, Any] = {"derived": derived}
             clamped = 0
         elif self.constant:
-            assert self.first is not None
-            stored, clamped = to_storage(self.first, dtype)
+            assert self.first_pixel is not None
+            stored, clamped = to_storage(self.first_pixel, dtype)
             entry = {"value": stored.tolist()}
         else:
             entry, clamped = self._write_array(dtype)
@@ -94,18 +103,20 @@ class RawChannel:
 
 
 class ChecksummedFile:
-    """A binary file that sums up what passes through it."""
+    """A binary file that keeps the checksum of what is written to it."""
 
     def __init__(self, file: BinaryIO):
-        self.file, self.crc32 = file, 0
+        self.file = file
+        self.crc32 = 0
 
     def write(self, data: bytes) -> int:
+        """Append `data`. Returns how many bytes were written."""
         self.crc32 = zlib.crc32(data, self.crc32)
         return self.file.write(data)
 
 
 def to_storage(array: NDArray[Any], dtype: str) -> tuple[NDArray[Any], int]:
-    """The array as `dtype`, saturated instead of infinite, and how many numbers that changed."""
+    """The array as `dtype`, and how many numbers were clamped to the range of float16 to stay finite."""
     if dtype != "<f2":
         return array.astype(dtype), 0
     limit = float(np.finfo(np.float16).max)
@@ -113,10 +124,10 @@ def to_storage(array: NDArray[Any], dtype: str) -> tuple[NDArray[Any], int]:
 
 
 class ClipWriter:
-    """Collects a clip's frames beside its destination and moves the whole there at the end.
+    """Collects the frames of a clip in a hidden folder beside `destination`, which takes its place at the end.
 
-    Use as a context manager: `add` every frame, then `finish`. Leaving without `finish` removes everything written.
-    Frames pass through to disk; only the luminance of the reference is kept for the exposure.
+    Use it as a context manager: `add` every frame, then `finish`. Leaving without `finish` removes everything written.
+    Frames go to disk at once; only the luminance of the reference stays in memory, for the exposure.
     """
 
     def __init__(self, destination: Path):
@@ -133,12 +144,12 @@ class ClipWriter:
 
     def __exit__(self, *_: object) -> None:
         for raw in self.channels.values():
-            with suppress(OSError):  # a full disk fails again on closing; the first error is the one to report
+            with suppress(OSError):  # on a full disk closing fails as well, and the first error is the one to report
                 raw.file.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def add(self, channels: dict[str, NDArray[Any]], seconds: dict[str, float]) -> None:
-        """Append one frame: arrays as in the channel table without F, and seconds by step."""
+        """Append one frame: arrays by channel, with the axes of the channel table but F, and seconds by step."""
         if not self.channels:
             self.channels = {name: RawChannel(self.folder, name) for name in channels}
         added = {name: raw.add(channels[name]) for name, raw in self.channels.items()}
@@ -148,7 +159,7 @@ class ClipWriter:
             self.timing[step] = self.timing.get(step, 0.0) + spent
 
     def noise_floor(self, exposure: float) -> float:
-        """Mean over frames of mean((display A - display B)^2) / 4: the squared error of the mean of the two halves."""
+        """The squared error of references as displayed: mean over frames of mean((display A - display B)^2) / 4."""
         floors = []
         for frame in range(len(self.luminances)):
             emission = self.channels["emission"].read(frame)
@@ -158,13 +169,14 @@ class ClipWriter:
         return float(np.mean(floors))
 
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
-        """Complete the clip. `facts` join clip.json; `derived` names channels the reader computes, and from what."""
+        """Complete the clip. `facts` join clip.json; `derived` says which channels readers derive, and from what."""
         for raw in self.channels.values():
             raw.file.close()
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape
-        entries, clamped = {}, {}
+        entries = {}
+        clamped = {}
         for name, raw in self.channels.items():
             entries[name], clamped[name] = raw.finish(derived.get(name))
         content = {
@@ -181,5 +193,5 @@ class ClipWriter:
         }
         write_json(self.folder / "timing.json", self.timing)
         write_json(self.folder / "clip.json", content)
-        shutil.rmtree(self.destination, ignore_errors=True)  # what stands there has no clip.json, so it is no clip
+        shutil.rmtree(self.destination, ignore_errors=True)  # whatever is there has no clip.json, so it is no clip
         self.folder.rename(self.destination)

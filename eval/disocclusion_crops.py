@@ -1,14 +1,15 @@
-"""Where the most comes into view at once: the places to look at for what denoisers make of disocclusions."""
+"""Where most comes into view at once: the places to look at for what denoisers make of disocclusions."""
 
 from typing import NamedTuple
 
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-SMALLEST, SHARE = 16, 4  # px; a crop is a quarter of the image's shorter side, but no less than this
+SMALLEST_CROP = 16  # px
+CROPS_A_SIDE = 4  # a crop is a quarter of the image's shorter side
 
 
-class Window(NamedTuple):
+class Crop(NamedTuple):
     """A square of an image, in pixels, and how many of them it is about."""
 
     x: int
@@ -17,18 +18,20 @@ class Window(NamedTuple):
     pixels: int
 
 
-def densest_window(mask: Tensor) -> Window | None:
+def densest_crop(mask: Tensor) -> Crop | None:
     """Of the windows that hold most pixels of a mask (H, W), one with them in its middle, as far as the border lets it.
 
     None for an empty mask.
     """
     height, width = mask.shape
-    size = min(height, width, max(SMALLEST, min(height, width) // SHARE))
+    shorter = min(height, width)
+    size = min(shorter, max(SMALLEST_CROP, shorter // CROPS_A_SIDE))
     best = int(avg_pool2d(mask[None, None].double(), size, stride=1).argmax())
     y, x = divmod(best, width - size + 1)
     inside = mask[y : y + size, x : x + size].nonzero().double()
     if not len(inside):
         return None
     dy, dx = (inside.mean(dim=0) - (size - 1) / 2).round().int().tolist()
-    y, x = min(max(0, y + dy), height - size), min(max(0, x + dx), width - size)
-    return Window(x, y, size, int(mask[y : y + size, x : x + size].sum()))
+    y = min(max(0, y + dy), height - size)
+    x = min(max(0, x + dx), width - size)
+    return Crop(x, y, size, int(mask[y : y + size, x : x + size].sum()))

@@ -9,18 +9,12 @@ import csv
 import hashlib
 import io
 import json
-import platform
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -28,105 +22,45 @@ from datasets.clip import Clip
 from datasets.clip_kind import ClipKind
 from datasets.frame import Signal
 from errors import BadInput
-from eval.metrics import METRICS
+from eval.metrics import METRICS, Values
 from files import read_json, write_file, write_json
+from provenance import DENOISING, code_digest, versions
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
-REFERENCE, FLOOR = "reference", "(noise floor)"
-BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
-PACKAGES = ("onespp", "torch", "numpy", "numba", "flip-evaluator", "pyoidn")
-RESULT, RESULTS, FRAMES = "result.json", "results.json", "frames.csv"
-# What results follow from, besides packages, weights and clips.
-SOURCES = (
-    "models",
-    "datasets/channels.py",
-    "datasets/clip.py",
-    "datasets/tonemap.py",
-    "datasets/frame.py",
-    "scenes/camera.py",
-    "eval/metrics.py",
-    "eval/disocclusion_crops.py",
-    "eval/noise_floor.py",
-    "eval/ssim.py",
-    "eval/clip_run.py",
-    "eval/harness.py",
-)
+REFERENCE = "reference"  # the name under which the reference's noise floors are kept
+FLOOR = "(noise floor)"  # what tables call them
+RESULT_FILE = "result.json"
+RESULTS_FILE = "results.json"
+FRAMES_FILE = "frames.csv"
 KEYS = ("denoiser", "signal", "scene", "clip")
 
-Values = dict[str, float | None]
 
-
-def versions() -> dict[str, str]:
-    """Of the packages that results follow from, as far as they are installed."""
-    found = {}
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
-
-
-def device(kind: str = "cpu", threads: int | None = None) -> str:
-    """What computes, in words; with all threads that PyTorch takes, unless told."""
-    if kind == "cuda":
-        return f"cuda, {torch.cuda.get_device_name()}"
-    try:
-        model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    except OSError:
-        model = None
-    return f"cpu, {model[1] if model else platform.machine()}, {threads or torch.get_num_threads()} threads"
-
-
-@cache
-def code(sources: tuple[str, ...] = SOURCES) -> str:
-    """A digest of the code that results follow from."""
-    root = Path(__file__).parent.parent
-    files = [file for source in sources for file in ((root / source).rglob("*.py"), [root / source])["." in source]]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(files))).hexdigest()
-
-
-def digest(file: str) -> str:
-    with open(file, "rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
-
-
-def key(clip: Clip, **facts: Any) -> str:
-    """A digest of all that a result follows from. clip.json has checksums of the clip's files."""
-    everything = [digest(str(clip.path / "clip.json")), code(), versions(), facts]
+def result_key(clip: Clip, modules: Sequence[str], facts: Mapping[str, Any]) -> str:
+    """A digest of all that a result follows from: the clip, the code of `modules`, packages, and further facts."""
+    everything = [clip.fingerprint, code_digest(*modules), versions(DENOISING), facts]
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
 
-def label(name: str, signal: str) -> str:
+def signal_label(name: str, signal: str) -> str:
     return name if signal == "total" else f"{name}-{signal}"
 
 
 def folder_of(runs: Path, scene: str, clip: str, name: str, signal: str) -> Path:
-    return runs / "eval" / "clips" / f"{scene}-{clip}" / label(name, signal)
+    return runs / "eval" / "clips" / f"{scene}-{clip}" / signal_label(name, signal)
 
 
-def means(frames: list[Values]) -> Values:
-    """Arithmetic means over the frames where a metric is defined, None where it never is."""
-    columns = {name: [row[name] for row in frames if row[name] is not None] for name in frames[0]}
-    return {name: float(np.mean(values)) if values else None for name, values in columns.items()}  # type: ignore[arg-type]
-
-
-def mean_floor(frames: list[Values]) -> Values:
-    """Noise floors of means over frames. The frames' noise is independent: standard errors add up as variances."""
-    errors = [row["mse_unbiased"] for row in frames]
-    return means(frames) | {"mse_unbiased": float(np.linalg.norm(errors) / len(errors))}  # type: ignore[arg-type]
-
-
-def picture(folder: Path, index: int) -> Path:
+def picture_path(folder: Path, index: int) -> Path:
     return folder / f"{index:04d}.webp"
 
 
 def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
     """Keep an image (H, W, 3) in [0, 1], rounded to 8 bits."""
-    Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(picture(folder, index), lossless=True, method=2)
+    Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(picture_path(folder, index), lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:
     """Raises BadInput where it is missing or damaged."""
-    path = picture(folder, index)
+    path = picture_path(folder, index)
     try:
         with Image.open(path) as image:
             return np.array(image.convert("RGB"))
@@ -140,7 +74,7 @@ class Result:
 
     key: str
     denoiser: str
-    signal: str
+    signal: Signal
     scene: str
     clip: str
     metrics: Values  # means
@@ -154,15 +88,15 @@ class Result:
         return self.denoiser == REFERENCE
 
     def save(self, runs: Path) -> None:
-        write_json(folder_of(runs, self.scene, self.clip, self.denoiser, self.signal) / RESULT, vars(self))
+        write_json(folder_of(runs, self.scene, self.clip, self.denoiser, self.signal) / RESULT_FILE, asdict(self))
 
 
 def load_result(folder: Path) -> Result:
     """Raises BadInput where it is missing or damaged."""
     try:
-        return Result(**read_json(folder / RESULT))
+        return Result(**read_json(folder / RESULT_FILE))
     except (TypeError, BadInput) as error:
-        raise BadInput(f"{folder / RESULT} is missing or damaged ({error}): run `onespp eval` again") from None
+        raise BadInput(f"{folder / RESULT_FILE} is missing or damaged ({error}): run `onespp eval` again") from None
 
 
 def is_finished(folder: Path, wanted: str) -> bool:
@@ -171,7 +105,7 @@ def is_finished(folder: Path, wanted: str) -> bool:
         result = load_result(folder)
     except BadInput:
         return False
-    return result.key == wanted and all(picture(folder, index).exists() for index in range(len(result.frames)))
+    return result.key == wanted and all(picture_path(folder, index).exists() for index in range(len(result.frames)))
 
 
 def write_results(
@@ -192,9 +126,15 @@ def write_results(
         for result in results
         if not result.floor
     ]
-    content = {"schema": 1, "dataset": str(dataset), "device": device, "versions": versions(), "rows": rows}
-    write_file(runs / "eval" / FRAMES, frames_csv(results).encode())
-    write_json(runs / "eval" / RESULTS, content)
+    content = {
+        "schema": 1,
+        "dataset": str(dataset),
+        "device": device,
+        "versions": versions(DENOISING),
+        "rows": rows,
+    }
+    write_file(runs / "eval" / FRAMES_FILE, frames_csv(results).encode())
+    write_json(runs / "eval" / RESULTS_FILE, content)
     return content
 
 
@@ -215,8 +155,8 @@ class ClipResults:
 
     scene: str
     clip: str
-    signal: str
-    tracks: list[Result]
+    signal: Signal
+    results: list[Result]  # of the denoisers
     reference: Result
 
     @property
@@ -230,7 +170,7 @@ class ClipResults:
 
 def folders_of(runs: Path, clip: ClipResults) -> dict[str, Path]:
     """The folders with pictures of all denoisers, and of the reference."""
-    everyone = [*clip.tracks, clip.reference]
+    everyone = [*clip.results, clip.reference]
     return {r.denoiser: folder_of(runs, r.scene, r.clip, r.denoiser, r.signal) for r in everyone}
 
 
@@ -243,8 +183,8 @@ def by_clip(results: list[Result]) -> Iterator[ClipResults]:
         for signal in SIGNALS:
             ours = [result for result in group if result.signal == signal]
             if references := [result for result in ours if result.floor]:
-                tracks = [result for result in ours if not result.floor]
-                yield ClipResults(scene, clip, signal, tracks, references[0])
+                denoisers = [result for result in ours if not result.floor]
+                yield ClipResults(scene, clip, signal, denoisers, references[0])
 
 
 def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
@@ -252,7 +192,7 @@ def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
 
     Raises BadInput where there is none, or where files have changed since.
     """
-    path = runs / "eval" / RESULTS
+    path = runs / "eval" / RESULTS_FILE
     if not path.exists():
         raise BadInput(f"there are no results at {path}: make them with `onespp eval --runs {runs}`")
     content = read_json(path, ("schema", "dataset", "device", "versions", "rows"))

@@ -1,6 +1,7 @@
 """Weights on disk: safetensors, with the network's name and training recipe in the metadata."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,16 @@ from files import write_file
 from models.denoiser import Denoiser
 
 
-def save_weights(denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path) -> None:
-    """Write atomically: a reader sees the old file or the whole new one."""
+def save_weights(
+    denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path, made_by: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """Write atomically: a reader sees the old file or the whole new one.
+
+    `made_by` names the code and the packages that have trained them, see train/made_by.py.
+    """
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
-    write_file(path, save(tensors, {"denoiser": name, "recipe": json.dumps(recipe)}))
+    metadata = {"denoiser": name, "recipe": json.dumps(recipe), "made_by": json.dumps(list(made_by))}
+    write_file(path, save(tensors, metadata))
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Mitsuba and Dr.Jit, set up: import `mi` and `dr` from here and nowhere else.
+"""Mitsuba and Dr.Jit with the variant chosen: import `mi` and `dr` from here and nowhere else.
 
 The CUDA variant is used where a GPU works. Otherwise Dr.Jit compiles through LLVM and would load whatever libLLVM it
-finds first; versions before 17 abort the whole process on AVX-512 machines, so one is chosen before Mitsuba loads.
+finds first; versions before 17 abort the process on AVX-512 machines, so one is chosen before Mitsuba loads.
 """
 
 import ctypes
@@ -14,11 +14,12 @@ from pathlib import Path
 
 from errors import BadInput
 
-OLDEST_LLVM, TESTED_LLVM = 17, 19
+OLDEST_LLVM = 17
+TESTED_LLVM = 19
 
 
 def installed_llvms() -> list[tuple[int, str]]:
-    """(major version, path) of every libLLVM that the loader or the usual folders know."""
+    """(major version, path) of every libLLVM that the loader knows or the usual folders hold."""
     listing = ""
     if sys.platform.startswith("linux"):
         with suppress(OSError):  # no ldconfig (musl): the folders below remain
@@ -43,7 +44,10 @@ def installed_llvms() -> list[tuple[int, str]]:
 
 
 def choose_llvm() -> None:
-    """Point DRJIT_LIBLLVM_PATH at the usable libLLVM nearest to the tested version, unless the user has set it."""
+    """Point DRJIT_LIBLLVM_PATH at the usable libLLVM nearest to the tested version, unless the user has set it.
+
+    Raises BadInput where there is none.
+    """
     if "DRJIT_LIBLLVM_PATH" in os.environ:
         return
     usable = [(abs(version - TESTED_LLVM), path) for version, path in installed_llvms() if version >= OLDEST_LLVM]
@@ -56,7 +60,7 @@ def choose_llvm() -> None:
 
 
 def has_cuda() -> bool:
-    """Whether the CUDA driver is there and has a device."""
+    """Whether there is a CUDA driver with a device."""
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:

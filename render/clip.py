@@ -1,4 +1,4 @@
-"""All channels of a clip, frame by frame."""
+"""Renders a clip frame by frame, with all its channels."""
 
 import time
 from collections.abc import Collection, Iterator
@@ -8,98 +8,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.gbuffer import render_gbuffer
-from render.motion import dual_motion
+from render.motion import dual_motion_vectors
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Scene
-from scenes.camera import motion_vectors, pixel_centres
+from scenes.camera import View, motion_vectors, pixel_centres
+
+Arrays = dict[str, NDArray[Any]]  # channels of one frame by name
 
 
 class Options(NamedTuple):
-    """What the papers' renderers did: Halton cycles in noisy frames, regularised paths in them and in references."""
+    """What the papers' renderers did: Halton cycles in noisy frames, regularised paths in these and in references."""
 
     halton: bool = False
     regularise: bool = False
 
 
-PLAIN = Options()
+NO_OPTIONS = Options()
 
 
 class Sampling(NamedTuple):
-    """How many samples: `realisations` of `noisy_spp` each, and a reference of `reference_spp` in two halves."""
+    """Samples of a frame: `realisations` of `noisy_spp` a pixel, and a reference of `reference_spp` in two halves."""
 
     realisations: int
     noisy_spp: int
     reference_spp: int
-    options: Options = PLAIN
+    options: Options = NO_OPTIONS
 
 
-def stream_seed(seed: int, frame: int, kind: int, index: int) -> int:
-    """A 32-bit seed of its own for every frame and realisation (kind 0) or reference half (kind 1)."""
-    return int(np.random.SeedSequence([seed, frame, kind, index]).generate_state(1)[0])
-
-
-def render_clip(
-    scene: Scene,
-    frames: int,
-    height: int,
-    width: int,
-    sampling: Sampling,
-    seed: int,
-    channels: Collection[str] | None = None,
-) -> Iterator[tuple[dict[str, NDArray[Any]], dict[str, float]]]:
-    """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
-
-    Of the channels only those in `channels` are yielded, and what the others alone would cost is not spent.
-
-    Deterministic in its arguments on one variant and processor.
-    """
-    stage = Stage(scene, height, width)
-    halton, regularise = sampling.options
-    tracer = PathTracer(stage, regularise=regularise)
-    noisy_tracer = PathTracer(stage, halton, regularise) if halton else tracer
-    centres = pixel_centres(height, width)
-    wants_dual = channels is None or "dual_motion" in channels
-    ahead, clock = render_gbuffer(stage, stage.view(0)), Clock()
-    ahead["motion"] = ahead["dual_motion"] = np.zeros((height, width, 2))
-    clock.lap("gbuffer")
-    for frame in range(frames):
-        clock.start()
-        arrays, view, more = ahead, stage.view(frame), frame + 1 < frames
-        if more:
-            stage.pose(frame + 1)
-            now = stage.view(frame + 1)
-            ahead = render_gbuffer(stage, now)
-            clock.lap("gbuffer")
-            depth, mesh_id = ahead["depth"][..., 0].astype(np.float64), ahead["mesh_id"][..., 0]
-            ahead["motion"] = motion_vectors(centres, depth, mesh_id, now, view)
-            clock.lap("motion")
-        stage.pose(frame)
-        clock.lap("gbuffer")
-        if more and wants_dual:  # they look into the scene as it is posed in this frame
-            ahead["dual_motion"] = dual_motion(stage, depth, mesh_id, ahead["motion"], now, view)
-            clock.lap("dual_motion")
-
-        ray = stage.rays(view)
-        spp = sampling.noisy_spp
-        # A Halton cycle goes on from frame to frame with the shift of its realisation.
-        stream = 0 if halton else frame
-        noisy = [
-            noisy_tracer.radiance(ray, stream_seed(seed, stream, 0, i), spp, first=frame * spp if halton else 0)
-            for i in range(sampling.realisations)
-        ]
-        clock.lap("noisy")
-        spp = sampling.reference_spp // 2
-        halves = [tracer.radiance(ray, stream_seed(seed, frame, 1, i), spp) for i in range(2)]
-        clock.lap("reference")
-        for name, images in (("", noisy), ("_reference", halves)):
-            arrays["direct" + name] = np.stack([direct for direct, _ in images])
-            arrays["indirect" + name] = np.stack([indirect for _, indirect in images])
-        arrays.update(K=view.K, camera_to_world=view.camera_to_world, object_to_world=view.object_to_world)
-        yield {name: a for name, a in arrays.items() if channels is None or name in channels}, clock.read()
-
-
-class Clock:
+class StepTimer:
     """Seconds by step since it was last read."""
 
     def __init__(self) -> None:
@@ -110,13 +47,100 @@ class Clock:
         """Leave out the time until now."""
         self.last = time.perf_counter()
 
-    def lap(self, name: str) -> None:
-        """Count the time since the last lap as `name`."""
+    def lap(self, step: str) -> None:
+        """Count the time since the last lap as `step`."""
         now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self.last
         self.last = now
 
     def read(self) -> dict[str, float]:
-        """The table, which starts anew."""
-        seconds, self.seconds = self.seconds, {}
+        """Seconds by step; the count begins anew."""
+        seconds = self.seconds
+        self.seconds = {}
         return seconds
+
+
+NOISY_STREAM = 0
+REFERENCE_STREAM = 1
+
+
+def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:
+    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM) or reference half (REFERENCE_STREAM)."""
+    return int(np.random.SeedSequence([seed, frame, stream, index]).generate_state(1)[0])
+
+
+def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTimer) -> Iterator[tuple[View, Arrays]]:
+    """Yield for each frame its view, G-buffer and motion vectors, with the stage posed for it.
+
+    Dual motion vectors need rays through the scene as it stood a frame before, so the G-buffer is a frame ahead.
+    """
+    centres = pixel_centres(stage.height, stage.width)
+    view = stage.view(0)
+    arrays = render_gbuffer(stage, view)
+    arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
+    timer.lap("gbuffer")
+    for following in range(1, frames):
+        stage.pose(following)
+        following_view = stage.view(following)
+        ahead = render_gbuffer(stage, following_view)
+        timer.lap("gbuffer")
+        depth = ahead["depth"][..., 0].astype(np.float64)
+        mesh_id = ahead["mesh_id"][..., 0]
+        motion = motion_vectors(centres, depth, mesh_id, following_view, view)
+        ahead["motion"] = motion
+        timer.lap("motion")
+        stage.pose(following - 1)
+        timer.lap("gbuffer")
+        if wants_dual:
+            ahead["dual_motion"] = dual_motion_vectors(stage, depth, mesh_id, motion, following_view, view)
+            timer.lap("dual_motion")
+        yield view, arrays
+        timer.start()
+        view = following_view
+        arrays = ahead
+    stage.pose(frames - 1)
+    timer.lap("gbuffer")
+    yield view, arrays
+
+
+def render_clip(
+    scene: Scene,
+    frames: int,
+    height: int,
+    width: int,
+    sampling: Sampling,
+    seed: int,
+    channels: Collection[str] | None = None,
+) -> Iterator[tuple[Arrays, dict[str, float]]]:
+    """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
+
+    With `channels` only those are yielded, and the time that the others alone would take is saved.
+
+    Deterministic in its arguments on one variant and processor.
+    """
+    stage = Stage(scene, height, width)
+    halton, regularise = sampling.options
+    tracer = PathTracer(stage, regularise=regularise)
+    noisy_tracer = PathTracer(stage, halton, regularise) if halton else tracer
+    wants_dual = channels is None or "dual_motion" in channels
+    timer = StepTimer()
+    for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
+        ray = stage.rays(view)
+        spp = sampling.noisy_spp
+        # A Halton cycle goes on from frame to frame with the shift of its realisation.
+        first = frame * spp if halton else 0
+        shift = 0 if halton else frame
+        noisy = [
+            noisy_tracer.radiance(ray, stream_seed(seed, shift, NOISY_STREAM, i), spp, first)
+            for i in range(sampling.realisations)
+        ]
+        timer.lap("noisy")
+        spp = sampling.reference_spp // 2
+        halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), spp) for i in range(2)]
+        timer.lap("reference")
+        arrays["direct"] = np.stack([direct for direct, _ in noisy])
+        arrays["indirect"] = np.stack([indirect for _, indirect in noisy])
+        arrays["direct_reference"] = np.stack([direct for direct, _ in halves])
+        arrays["indirect_reference"] = np.stack([indirect for _, indirect in halves])
+        arrays |= view._asdict()  # K, camera_to_world, object_to_world
+        yield {name: array for name, array in arrays.items() if channels is None or name in channels}, timer.read()

@@ -10,15 +10,18 @@ from render.stage import Stage
 from scenes.camera import Array, View
 
 
-def depth_along_axis(stage: Stage, si: Any, ray: Any, view: View) -> NDArray[np.float32]:
-    """Distance (N,) along the viewing axis; 0 where nothing is hit. float32, as stored."""
+def depth_along_axis(stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View) -> NDArray[np.float32]:
+    """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored."""
     distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64) * stage.unit
     cosine = np.array(ray.d, dtype=np.float64).T @ view.camera_to_world[:3, 2]
     return (distance * cosine).astype(np.float32)
 
 
 def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArray[np.uint32], Array]:
-    """Depth (N,), mesh id (N,) and geometric normal (N, 3) of what is seen through `pixels` (N, 2) as now posed."""
+    """Depth (N,), mesh id (N,) and geometric normal (N, 3) of what is seen through `pixels` (N, 2).
+
+    The stage must be posed for `view`'s frame.
+    """
     ray = stage.rays(view, pixels)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
     mesh_id = stage.mesh_id(si)
@@ -28,11 +31,16 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArr
 
 
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
-    """The noise-free channels (H, W, C) of the design's table, as the stage is now posed.
+    """The noise-free channels (H, W, C), named and shaped as in the channel table (datasets/channels.py).
 
-    albedo, in [0, 1]: diffuse reflectance and specular reflectance at normal incidence, 1 for background. normal: world
-    space, unit, toward the viewer, 0 for background. roughness: GGX alpha, 1 for diffuse surfaces and background.
-    emission: radiance seen directly.
+    The stage must be posed for `view`'s frame.
+
+    albedo: diffuse reflectance + specular reflectance at normal incidence, in [0, 1]; 1 for background.
+    normal: the shading normal in world space, of unit length, toward the viewer; 0 for background.
+    roughness: GGX alpha in [0, 1]; 1 for diffuse surfaces and background.
+    emission: the radiance of lamps and sky that are seen directly.
+    depth: along the viewing axis, in world units; 0 for background.
+    mesh_id: index of the shape + 1; 0 for background.
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)

@@ -7,13 +7,13 @@ from render.gbuffer import trace_visible
 from render.stage import Stage
 from scenes.camera import Array, View, motion_vectors, move, pixel_centres, unproject
 
-SAME_SURFACE = 0.002  # of the depth: farther from the plane of what is seen there, a point was hidden
+SAME_SURFACE = 0.002  # of the depth: a point farther than this from the plane of what is seen there was hidden
 
 
-def dual_motion(
+def dual_motion_vectors(
     stage: Stage, depth: Array, mesh_id: NDArray[np.integer], motion: Array, now: View, previous: View
 ) -> Array:
-    """Dual motion vectors (H, W, 2) in pixels. The stage must be posed at the previous frame.
+    """Dual motion vectors (H, W, 2) in pixels. The stage must be posed for the previous frame.
 
     depth, mesh_id (H, W) and motion (H, W, 2) are of the current frame. With y = x + motion the traditional position
     and z the place, now, of the surface seen at y then, the vector is y + (x - z) - x (NTD Eq. 2). It equals `motion`
@@ -23,7 +23,8 @@ def dual_motion(
     x = pixel_centres(height, width)
     y = x + motion
     traced_depth, traced_mesh, traced_normal = trace_visible(stage, previous, y.reshape(-1, 2))
-    then_depth, then_mesh = traced_depth.reshape(height, width), traced_mesh.reshape(height, width)
+    then_depth = traced_depth.reshape(height, width)
+    then_mesh = traced_mesh.reshape(height, width)
     then_normal = traced_normal.reshape(height, width, 3)
 
     seen = unproject(y, then_depth, previous)

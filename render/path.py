@@ -4,27 +4,36 @@ Unidirectional with next-event estimation, multiple importance sampling and Russ
 but the primary ray is traced once however many samples a pixel gets, and the first bounce is kept apart.
 """
 
-from typing import Any
+# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
+# mypy: disable-error-code="arg-type, call-overload, operator, return-value"
 
 import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.regularise import BlurredTable
-from render.sampler import Halton, Sampler, hash32
+from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
 
+AnySampler = Sampler | HaltonSampler
 ROULETTE = 3.0  # times the throughput is the chance that a path goes on
 
 
-def mis_weight(pdf: Any, other: Any) -> Any:
+def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
     """The power heuristic (Veach 1997, §9.2.4) with exponent 2."""
     return dr.select(pdf > 0, pdf**2 / (pdf**2 + other**2), 0)
 
 
-def bounce(scene: Any, si: Any, bsdf: Any, throughput: Any, sampler: Sampler | Halton) -> tuple[Any, Any, Any, Any]:
-    """Radiance that comes to `si` straight from emitters, and the next vertex: (radiance, si, throughput, active)."""
-    u_emitter, u_lobe, u_direction = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
+def bounce(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, throughput: mi.Color3f, sampler: AnySampler
+) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool]:
+    """(radiance, si, throughput, active): light that reaches `si` straight from emitters, and the path's next vertex.
+
+    Both strategies of multiple importance sampling count: a point on an emitter, and the direction that goes on.
+    """
+    u_emitter = sampler.next_2d()
+    u_lobe = sampler.next_1d()
+    u_direction = sampler.next_2d()
 
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     light, emitter_weight = scene.sample_emitter_direction(si, u_emitter, False, smooth)
@@ -38,9 +47,7 @@ def bounce(scene: Any, si: Any, bsdf: Any, throughput: Any, sampler: Sampler | H
 
     throughput = throughput * bsdf_weight
     active = dr.any(throughput != 0)
-    following = scene.ray_intersect(
-        si.spawn_ray(si.to_world(sample.wo)), mi.RayFlags.All, coherent=False, active=active
-    )
+    following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
     emitter = following.emitter(scene, active)
     towards = mi.DirectionSample3f(scene, following, si)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
@@ -50,28 +57,42 @@ def bounce(scene: Any, si: Any, bsdf: Any, throughput: Any, sampler: Sampler | H
     return radiance, following, throughput, active & following.is_valid()
 
 
-def survive(throughput: Any, depth: Any, active: Any, u: Any) -> tuple[Any, Any]:
-    """Russian roulette from the second bounce on: (throughput, active) with dim paths mostly ended."""
+def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Float) -> tuple[mi.Color3f, mi.Bool]:
+    """Russian roulette from the second bounce on: (throughput, active) after most dim paths have ended.
+
+    `u` in [0, 1) decides.
+    """
     chance = dr.select(depth > 1, dr.clip(ROULETTE * dr.max(throughput), 0.05, 1), 1)
     return throughput / chance, active & (u < chance)
 
 
 @dr.syntax
 def sample_mean(
-    scene: Any, ray: Any, seed: Any, first: Any, spp: Any, max_depth: Any, draw: type, blurred: BlurredTable | None
-) -> tuple[Any, Any]:
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    seed: mi.UInt32,
+    first: mi.UInt32,
+    spp: mi.UInt32,
+    max_depth: mi.UInt32,
+    draw: type[AnySampler],
+    blurred: BlurredTable | None,
+) -> tuple[mi.Color3f, mi.Color3f]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
-    `seed`, `first` (sample), `spp` and `max_depth` are opaque mi.UInt32: one kernel serves all their values. A lane
-    whose path has ended goes on with its next sample at once, so that short paths leave no lane idle. `draw` is the
-    sampler; `blurred` regularises (see PathTracer).
+    `seed`, `first` (the index of the first sample), `spp` and `max_depth` are opaque, so one kernel serves all their
+    values. A lane whose path has ended goes on with its next sample at once, so that short paths leave no lane idle.
+    `draw` is the sampler; `blurred` regularises (see PathTracer).
     """
     primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     lane = dr.arange(mi.UInt32, dr.width(ray))
     # Hash the lane before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
     key = hash32(hash32(lane) ^ seed)
-    direct, indirect = mi.Color3f(0), mi.Color3f(0)
-    si, throughput, depth, index = dr.copy(primary), mi.Color3f(1), mi.UInt32(1), mi.UInt32(0)
+    direct = mi.Color3f(0)
+    indirect = mi.Color3f(0)
+    si = dr.copy(primary)
+    throughput = mi.Color3f(1)
+    depth = mi.UInt32(1)
+    index = mi.UInt32(0)
     while primary.is_valid() & (index < spp):
         sampler = draw(key, first + index, depth)
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
@@ -90,31 +111,43 @@ def sample_mean(
 
 
 class PathTracer:
-    """Path-traces the scene on a stage, as that is posed at the time.
+    """Path-traces the scene on a stage as the stage is posed at the time.
 
-    halton: draw from a cycle of 16 Halton points (see Halton), of which `radiance` starts at its argument `first`.
+    halton: draw from a cycle of 16 Halton points (see HaltonSampler); `radiance` starts at the point `first`.
     regularise: blur glossy materials from the second vertex of a path on (see BlurredTable). Biased, less noisy.
     """
 
     def __init__(self, stage: Stage, halton: bool = False, regularise: bool = False):
-        self.stage, self.pose = stage, -1
-        self.draw = Halton if halton else Sampler
+        self.stage = stage
+        self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
+        self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        self.freezes = not halton and not regularise  # Dr.Jit 1.5 refuses to freeze these
+        # Dr.Jit 1.5 refuses to freeze the rest: Halton points, regularised paths, and scenes without shapes (these only
+        # while another scene is loaded).
+        self.freezes = bool(stage.shapes) and not halton and not regularise
 
     def radiance(
-        self, ray: Any, seed: int, spp: int, first: int = 0
+        self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary `ray`s of all pixels.
+        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary rays `ray` of all pixels.
 
-        `seed` in [0, 2^32); different seeds are independent, equal seeds give equal bytes. Emission is not included.
+        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes. Emission is not included.
         """
         stage = self.stage
-        if self.pose != stage.poses:
+        if self.frozen_pose != stage.poses:
             # Tracing the program in Python takes longer than running it at 1 spp: frozen, it is replayed. But a frozen
             # function does not notice all changes of meshes (seen with Dr.Jit 1.5), so it lasts as long as a pose.
-            self.sample_mean, self.pose = dr.freeze(sample_mean) if self.freezes else sample_mean, stage.poses
-        a, b, c, d = (dr.opaque(mi.UInt32, number) for number in (seed, first, spp, stage.scene.max_depth))
-        images = self.sample_mean(stage.mitsuba_scene, ray, a, b, c, d, self.draw, self.blurred)
-        dr.eval(images)
-        return stage.image(images[0]), stage.image(images[1])
+            self.sample_mean = dr.freeze(sample_mean) if self.freezes else sample_mean
+            self.frozen_pose = stage.poses
+        direct, indirect = self.sample_mean(
+            stage.mitsuba_scene,
+            ray,
+            seed=dr.opaque(mi.UInt32, seed),
+            first=dr.opaque(mi.UInt32, first),
+            spp=dr.opaque(mi.UInt32, spp),
+            max_depth=dr.opaque(mi.UInt32, stage.scene.max_depth),
+            draw=self.draw,
+            blurred=self.blurred,
+        )
+        dr.eval(direct, indirect)
+        return stage.image(direct), stage.image(indirect)

@@ -1,8 +1,8 @@
 """Path-space regularisation: glossy materials are blurred where a path has scattered before.
 
-After Kaplanyan and Dachsbacher (2013), as RAE §3.1 uses it: paths that meet a mirror or a sharp highlight only after a
-diffuse bounce are nearly never sampled and become fireflies. With more roughness they are found often, and caustics and
-reflections within reflections become softer than they are.
+Kaplanyan and Dachsbacher (2013, "Path Space Regularization for Holistic and Robust Light Transport"), as RAE §3.1 uses
+it: paths that meet a mirror or a sharp highlight only after a diffuse bounce are hardly ever sampled and become
+fireflies. With more roughness they are found often; caustics and reflections of reflections come out too soft.
 """
 
 from typing import Any
@@ -16,34 +16,39 @@ from render.stage import Stage, to_mitsuba
 LEAST_ALPHA = 0.3
 
 
-def at_least(value: Any, least: float) -> Any:
-    """A roughness of a Mitsuba dictionary, number or bitmap, nowhere below `least`."""
-    if isinstance(value, dict):
-        key = "data" if "data" in value else "value"
-        return {**value, key: np.maximum(value[key], least) if key == "data" else max(value[key], least)}
-    return max(value, least)
+Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
+
+
+def at_least(roughness: Roughness, least: float) -> Roughness:
+    """The roughness, nowhere below `least`."""
+    if not isinstance(roughness, dict):
+        return max(roughness, least)
+    if "data" in roughness:
+        return roughness | {"data": np.maximum(roughness["data"], least)}
+    return roughness | {"value": max(roughness["value"], least)}
 
 
 ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
 
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The BSDF with GGX alpha of at least LEAST_ALPHA; what has none stays as it is."""
+    """The Mitsuba BSDF dictionary with a GGX alpha of at least LEAST_ALPHA; what has none stays as it is."""
     nested = {key: blurred(value) if is_bsdf(value) else value for key, value in bsdf.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
-        return {**nested, "type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), LEAST_ALPHA)}
+        return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), LEAST_ALPHA)}
     if kind == "principled":
-        return {**nested, "roughness": at_least(bsdf.get("roughness", 0.5), LEAST_ALPHA**0.5)}
+        return nested | {"roughness": at_least(bsdf.get("roughness", 0.5), LEAST_ALPHA**0.5)}
     return nested
 
 
-def is_bsdf(value: Any) -> bool:
+def is_bsdf(value: object) -> bool:
+    """Whether a value in a Mitsuba dictionary is a BSDF that another one, such as `twosided`, may wrap."""
     return isinstance(value, dict) and value.get("type") in (*ROUGH, *ROUGH.values(), "principled", "diffuse")
 
 
 class BlurredTable:
-    """For every BSDF of a stage its blurred version."""
+    """The blurred version of every BSDF of a stage, looked up by the BSDF's registry index."""
 
     def __init__(self, stage: Stage):
         self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape in stage.shapes])
@@ -51,8 +56,8 @@ class BlurredTable:
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(shape.bsdf))) for shape in stage.scene.shapes]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 
-    def after_first(self, si: Any, depth: Any) -> Any:
-        """mi.BSDFPtr: the surface's own at depth 1, the blurred one from then on."""
+    def after_first(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> mi.BSDFPtr:
+        """The surface's own BSDF at depth 1, the blurred one from then on."""
         own = si.bsdf()
         row = dr.gather(mi.UInt32, self.row, registry_index(own), si.is_valid())
         return dr.select(depth > 1, dr.gather(mi.BSDFPtr, self.pointers, row, si.is_valid()), own)

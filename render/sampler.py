@@ -1,27 +1,26 @@
 """Random numbers as a pure function of (pixel, seed, sample index, dimension): no state, no layout to get wrong.
 
 Every pair of dimensions is a (0, 2)-sequence of its own: the first two Sobol dimensions, Owen-scrambled by hashing and
-visited in an Owen-shuffled order (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4), §3). One sample alone
-is uniform and independent of every other seed's; many samples of one seed stratify.
+visited in an Owen-shuffled order (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4), §3). A single sample
+is uniform and independent of those of every other seed; many samples of one seed are stratified.
 """
-
-from typing import Any
 
 import numpy as np
 
 from render.backend import dr, mi
 
 ONE_MINUS_EPSILON = float(np.nextafter(np.float32(1), np.float32(0)))
+GOLDEN_RATIO = 0x9E3779B9  # times 2^-32, its fractional part: spreads small integers over all 32 bits
 
 
-def hash32(x: Any) -> Any:
+def hash32(x: mi.UInt32) -> mi.UInt32:
     """The output permutation of PCG (O'Neill 2014, RXS M XS 32), a good integer hash."""
     x = x * 747796405 + 2891336453
     x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737
     return (x >> 22) ^ x
 
 
-def scramble_reversed(x: Any, seed: Any) -> Any:
+def scramble_reversed(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Owen scrambling of an integer whose bits are reversed: every bit is flipped by a hash of the lower ones.
 
     The Laine-Karras permutation with the constants that Vegdahl (2021) found by search.
@@ -33,8 +32,8 @@ def scramble_reversed(x: Any, seed: Any) -> Any:
     return x ^ (x * 0x53A22864)
 
 
-def sobol_second_reversed(index: Any) -> Any:
-    """The second Sobol dimension, bits reversed: index times the Pascal triangle mod 2, one Kronecker factor a line."""
+def sobol_second_reversed(index: mi.UInt32) -> mi.UInt32:
+    """The second Sobol dimension, bits reversed: `index` times Pascal's triangle mod 2, one Kronecker factor a line."""
     index = index ^ ((index & 0xAAAAAAAA) >> 1)
     index = index ^ ((index & 0xCCCCCCCC) >> 2)
     index = index ^ ((index & 0xF0F0F0F0) >> 4)
@@ -42,43 +41,52 @@ def sobol_second_reversed(index: Any) -> Any:
     return index ^ (index >> 16)
 
 
-def to_unit(x: Any) -> Any:
-    """Integers to floats in [0, 1)."""
+def to_unit(x: mi.UInt32) -> mi.Float:
+    """Integers of 32 bits to floats in [0, 1)."""
     return mi.Float(x >> 8) * 2**-24
 
 
 class Sampler:
-    """Sample `index` (mi.UInt32) of the sequences that `key` (a hash of pixel and seed) and the path's `depth` name."""
+    """Owen-scrambled Sobol numbers for one bounce: each call of `next_1d` or `next_2d` takes the next dimensions.
 
-    def __init__(self, key: Any, index: Any, depth: Any):
-        self.key, self.reversed_index, self.dimension = hash32(key ^ depth), dr.brev(index), 0
+    `key` is a hash of pixel and seed; with `depth`, the bounce counted from 1, it names the sequences. `index` is the
+    sample, that is, which of their points is drawn.
+    """
 
-    def _next(self) -> tuple[Any, Any]:
+    def __init__(self, key: mi.UInt32, index: mi.UInt32, depth: mi.UInt32):
+        self.key = hash32(key ^ depth)
+        self.reversed_index = dr.brev(index)
+        self.dimension = 0
+
+    def _next(self) -> tuple[mi.UInt32, mi.UInt32]:
+        """The shuffled index in the next sequence, and that sequence's seed."""
         self.dimension += 1
-        seed = hash32(self.key ^ mi.UInt32(self.dimension * 0x9E3779B9 & 0xFFFFFFFF))
+        seed = hash32(self.key ^ mi.UInt32(self.dimension * GOLDEN_RATIO & 0xFFFFFFFF))
         return dr.brev(scramble_reversed(self.reversed_index, seed)), seed
 
-    def next_1d(self) -> Any:
-        """mi.Float in [0, 1)."""
+    def next_1d(self) -> mi.Float:
+        """A number in [0, 1)."""
         index, seed = self._next()
         return to_unit(dr.brev(scramble_reversed(index, hash32(seed + 1))))
 
-    def next_2d(self) -> Any:
-        """mi.Point2f in [0, 1)^2."""
+    def next_2d(self) -> mi.Point2f:
+        """A point in [0, 1)^2."""
         index, seed = self._next()
         x = dr.brev(scramble_reversed(index, hash32(seed + 1)))
         y = dr.brev(scramble_reversed(sobol_second_reversed(index), hash32(seed + 2)))
         return mi.Point2f(to_unit(x), to_unit(y))
 
 
-CYCLE = 16  # frames
-PRIMES = (  # six numbers a bounce, four bounces
-    *((2, 3, 5, 7, 11, 13), (17, 19, 23, 29, 31, 37)),
-    *((41, 43, 47, 53, 59, 61), (67, 71, 73, 79, 83, 89)),
+CYCLE = 16  # points, one a frame
+PRIMES = (  # a row a bounce: the bases of the six numbers that a bounce draws
+    (2, 3, 5, 7, 11, 13),
+    (17, 19, 23, 29, 31, 37),
+    (41, 43, 47, 53, 59, 61),
+    (67, 71, 73, 79, 83, 89),
 )
 
 
-class Halton:
+class HaltonSampler:
     """Point `index` mod 16 of the Halton sequence, shifted in every pixel by its own random vector (mod 1).
 
     Real-time renderers draw one point of the cycle a frame (SVGF §3, RAE §3.1): each frame alone is unbiased, and the
@@ -86,25 +94,31 @@ class Halton:
     realisation share it. Bounces beyond the fourth repeat the primes of the first with other shifts.
     """
 
-    def __init__(self, key: Any, index: Any, depth: Any):
-        self.key, self.index, self.dimension = hash32(key ^ depth), index & (CYCLE - 1), 0
+    def __init__(self, key: mi.UInt32, index: mi.UInt32, depth: mi.UInt32):
+        self.key = hash32(key ^ depth)
+        self.index = index & (CYCLE - 1)
         self.bounce = (depth - 1) & (len(PRIMES) - 1)
+        self.dimension = 0
 
-    def next_1d(self) -> Any:
-        """mi.Float in [0, 1)."""
+    def next_1d(self) -> mi.Float:
+        """A number in [0, 1)."""
         base = mi.UInt32(PRIMES[0][self.dimension])
         for bounce in range(1, len(PRIMES)):
             base = dr.select(self.bounce == bounce, PRIMES[bounce][self.dimension], base)
-        shift = to_unit(hash32(self.key ^ mi.UInt32(self.dimension * 0x9E3779B9 & 0xFFFFFFFF)))
+        shift = to_unit(hash32(self.key ^ mi.UInt32(self.dimension * GOLDEN_RATIO & 0xFFFFFFFF)))
         self.dimension += 1
-        remaining, scale, inverse = self.index, dr.rcp(mi.Float(base)), mi.Float(0)
+
+        scale = dr.rcp(mi.Float(base))
         weight = scale
+        remaining = self.index
+        inverse = mi.Float(0)
         for _ in range(4):  # 16 has four digits in base 2, fewer in others
             inverse += mi.Float(remaining % base) * weight
-            remaining, weight = remaining // base, weight * scale
+            remaining = remaining // base
+            weight = weight * scale
         shifted = inverse + shift
         return dr.minimum(shifted - dr.floor(shifted), ONE_MINUS_EPSILON)
 
-    def next_2d(self) -> Any:
-        """mi.Point2f in [0, 1)^2."""
+    def next_2d(self) -> mi.Point2f:
+        """A point in [0, 1)^2."""
         return mi.Point2f(self.next_1d(), self.next_1d())

@@ -12,20 +12,22 @@ from scenes.camera import Array, View, directions, pixel_centres
 
 
 def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba dictionary whose numpy arrays (the values and placement of bitmaps) have become Mitsuba's types."""
+    """A Mitsuba dictionary with its numpy arrays, the values and placement of bitmaps, as Mitsuba's types."""
 
-    def convert(key: str, value: Any) -> Any:
+    def convert(key: str, value: Any) -> object:
         if isinstance(value, dict):
             return to_mitsuba(value)
         if key == "to_uv":
             return mi.ScalarTransform3f(value)
-        return mi.TensorXf(np.ascontiguousarray(value, np.float32)) if isinstance(value, np.ndarray) else value
+        if isinstance(value, np.ndarray):
+            return mi.TensorXf(np.ascontiguousarray(value, np.float32))
+        return value
 
     return {key: convert(key, value) for key, value in description.items()}
 
 
-def load_mesh(shape: Shape) -> Any:
-    """A mi.Mesh in the shape's rest pose."""
+def load_mesh(shape: Shape) -> mi.Mesh:
+    """The shape in its rest pose, with its material, and lit as in frame 0."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
     if shape.radiance is not None:
@@ -51,8 +53,8 @@ def load_mesh(shape: Shape) -> Any:
     return mesh
 
 
-def upload(values: Array) -> Any:
-    """mi.Float (N,) of `values` (N,), as data: Python numbers would be compiled into the kernel.
+def upload(values: Array) -> mi.Float:
+    """`values` (N,) as data for kernels: Python numbers would be compiled into them.
 
     On the CPU Dr.Jit borrows numpy's memory and compiles its alignment in as well, so it is always aligned here.
     """
@@ -64,43 +66,51 @@ def upload(values: Array) -> Any:
 
 
 def unit_of(scene: Scene) -> float:
-    """World units that a unit of Mitsuba's stands for: 1, or a power of two for very small and very large scenes.
+    """How many world units a unit of Mitsuba's is: 1, or a power of two for very small and very large scenes.
 
-    Mitsuba keeps rays from hitting what they leave by steps that suit scenes of human size.
+    Mitsuba keeps a ray from hitting the surface it leaves by a step that suits scenes of human size.
     """
     sizes = [np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max() for shape in scene.shapes]
     extent = float(max(sizes, default=1))
-    return 1.0 if 1 / 16 < extent < 1024 or extent == 0 else float(2.0 ** np.round(np.log2(extent)))
+    if extent == 0 or 1 / 16 < extent < 1024:
+        return 1.0
+    return float(2.0 ** np.round(np.log2(extent)))
 
 
 class Stage:
-    """`scene` loaded for images of `height` x `width` pixels. `pose` before every use of `mitsuba_scene`."""
+    """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
+
+    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. Raises BadInput, naming the
+    shape, for a material that is not supported.
+    """
 
     def __init__(self, scene: Scene, height: int, width: int):
-        self.scene, self.height, self.width = scene, height, width
+        self.scene = scene
+        self.height = height
+        self.width = width
         self.unit = unit_of(scene)
-        meshes = {shape.name: load_mesh(shape) for shape in scene.shapes}
-        sky = (
-            {} if scene.sky is None else {"sky": {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}}
-        )
+        content: dict[str, object] = {"type": "scene"}
+        content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
+        if scene.sky is not None:
+            content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
-        self.mitsuba_scene = mi.load_dict({"type": "scene", **meshes, **sky}, optimize=False)
+        self.mitsuba_scene = mi.load_dict(content, optimize=False)
         self.parameters = mi.traverse(self.mitsuba_scene)
         loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
         self.shapes = [loaded[shape.name] for shape in scene.shapes]
         self.materials = MaterialTable(self.shapes)
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
-        self.posed: dict[str, NDArray[Any]] = {}
+        self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)
 
-    def mesh_id(self, si: Any) -> Any:
-        """mi.UInt32: which of the scene's shapes (index + 1) a surface interaction lies on, 0 for none."""
+    def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
+        """Which of the scene's shapes a surface interaction lies on: its index + 1, or 0 for none."""
         return dr.gather(mi.UInt32, self.mesh_id_of_shape, registry_index(si.shape), si.is_valid())
 
     def pose(self, frame: float) -> None:
-        """Move meshes and set lights to where they are in `frame`. All changes enter the kernels as data."""
-        changes: dict[str, NDArray[Any]] = {}
+        """Move the meshes and set the lights as in `frame`. All changes enter the kernels as data."""
+        changes: dict[str, NDArray[np.float32]] = {}
         for shape in self.scene.shapes:
             if shape.motion.varies() or not self.posed:
                 matrix = shape.motion.matrix(frame)
@@ -119,21 +129,22 @@ class Stage:
         for name, value in changes.items():
             self.parameters[name] = mi.Color3f(*map(mi.Float, value[:, None])) if value.shape == (3,) else value
         if changes:
-            self.parameters.update()  # once a frame: every update rebuilds the top level of the ray-tracing structure
+            self.parameters.update()  # once a pose: every update rebuilds the top level of the ray-tracing structure
             self.posed.update(changes)
             self.poses += 1
 
-    def image(self, value: Any) -> NDArray[Any]:
-        """(H, W, C) of a Dr.Jit value with a lane a pixel, or one for all."""
+    def image(self, value: dr.AnyArray) -> NDArray[Any]:
+        """(H, W, C) of a Dr.Jit value of C components with a lane for each pixel, or one for all; its own dtype."""
         array = np.array(value)
         planes = np.atleast_2d(array).reshape(-1, array.shape[-1])
         return np.broadcast_to(planes.T, (self.height * self.width, len(planes))).reshape(self.height, self.width, -1)
 
     def view(self, frame: float) -> View:
+        """Camera and meshes of `frame`, whatever the stage is posed for."""
         return self.scene.view(frame, self.height, self.width)
 
-    def rays(self, view: View, pixels: Array | None = None) -> Any:
-        """mi.Ray3f through `pixels` (N, 2) of `view`; without them through all pixel centres, row by row."""
+    def rays(self, view: View, pixels: Array | None = None) -> mi.Ray3f:
+        """Rays through `pixels` (N, 2) of `view`; without them through all pixel centres, row by row."""
         if pixels is None:
             pixels = pixel_centres(self.height, self.width).reshape(-1, 2)
         towards = directions(pixels, view)

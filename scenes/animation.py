@@ -1,22 +1,21 @@
-"""Animated scenes as data: shapes with rigid motions, lights that change, a camera path, all evaluated at any frame."""
+"""Animated scenes as data: shapes, lights and a camera that move and change, and what they are in any frame."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from scenes.camera import View, intrinsics, look_at
-
-Array = NDArray[np.float64]
+from scenes.bsdf import Bsdf
+from scenes.camera import Array, View, intrinsics, look_at
 
 
 @dataclass(frozen=True)
 class Track:
-    """A value over time: a Catmull-Rom spline through `keys` (N, D) or (N,), spread evenly over frames `first`..`last`.
+    """A value over time: a spline through `keys` (N, D) or (N,), which are spread evenly over frames `first`..`last`.
 
-    One key is a constant. Between keys the first derivative is continuous; outside first..last the ends are held.
+    It is that of Catmull and Rom 1974, "A class of local interpolating splines": its first derivative is continuous
+    between the ends. Before `first` and after `last` the ends are held. One key is a constant.
     """
 
     keys: Array
@@ -25,9 +24,11 @@ class Track:
 
     @staticmethod
     def constant(value: ArrayLike) -> "Track":
+        """The same `value`, a scalar or (D,), for ever."""
         return Track(np.asarray(value, dtype=np.float64)[None])
 
     def at(self, frame: float) -> Array:
+        """The value, (D,) or a scalar, in a `frame`, which may lie between whole ones."""
         keys = self.keys
         if len(keys) == 1:
             return keys[0]
@@ -37,7 +38,8 @@ class Track:
         # Ends are extended linearly, so that the path leaves and arrives at constant speed.
         before = keys[k - 1] if k > 0 else 2 * keys[0] - keys[1]
         after = keys[k + 2] if k + 2 < len(keys) else 2 * keys[-1] - keys[-2]
-        a, b = keys[k], keys[k + 1]
+        a = keys[k]
+        b = keys[k + 1]
         return 0.5 * (
             2 * a
             + (b - before) * u
@@ -46,10 +48,11 @@ class Track:
         )
 
     def varies(self) -> bool:
+        """Whether the value ever changes."""
         return bool((self.keys != self.keys[0]).any())
 
     def held(self) -> "Track":
-        """For good what it is in frame 0."""
+        """The value of frame 0, for ever."""
         return Track.constant(self.at(0))
 
 
@@ -62,25 +65,32 @@ class RigidMotion:
 
     def matrix(self, frame: float) -> Array:
         """object_to_world (4, 4), rigid."""
-        c, s = np.cos(self.angle.at(frame)), np.sin(self.angle.at(frame))
-        matrix = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+        cos = np.cos(self.angle.at(frame))
+        sin = np.sin(self.angle.at(frame))
+        matrix = np.array([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0], [0, 0, 0, 1.0]])
         matrix[:3, 3] = self.position.at(frame)
         return matrix
 
     def varies(self) -> bool:
+        """Whether it ever moves or turns anything."""
         return self.position.varies() or self.angle.varies()
 
 
-STILL = RigidMotion(Track.constant([0.0, 0.0, 0.0]), Track.constant(0.0))
+def still(place: ArrayLike, angle: float) -> RigidMotion:
+    """At rest at `place` (3,), turned by `angle` radians about the vertical axis."""
+    return RigidMotion(Track.constant(place), Track.constant(angle))
+
+
+STILL = still([0.0, 0.0, 0.0], 0.0)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh in its rest pose, with one material, perhaps emitting light, perhaps moving."""
+    """A mesh in its rest pose with one material, which may emit light and may move."""
 
     name: str
-    mesh: trimesh.Trimesh  # with texture coordinates in visual.uv where a texture is to be used
-    bsdf: dict[str, Any]  # a Mitsuba BSDF dictionary; bitmaps have their values as a numpy array under "data"
+    mesh: trimesh.Trimesh  # with texture coordinates in visual.uv where the material has a texture
+    bsdf: Bsdf
     radiance: Track | None = None  # emitted radiance (3,), linear RGB; None does not emit
     motion: RigidMotion = STILL
     smooth: bool = False  # shade with the mesh's vertex normals instead of its faces'
@@ -88,7 +98,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the camera is, what it looks at and how wide, over time."""
+    """Where the camera is, what it looks at and how wide its view is, over time."""
 
     eye: Track  # (3,) world units
     target: Track  # (3,) world units
@@ -97,7 +107,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a renderer needs at any frame. A mesh's id is its index in `shapes` plus one; 0 is the background."""
+    """All that a renderer needs in any frame. A mesh's id is its index in `shapes` plus one; 0 is the background."""
 
     shapes: tuple[Shape, ...]
     camera: Camera
@@ -105,7 +115,7 @@ class Scene:
     sky: Array | None = None  # radiance (H, W, 3) from all directions, latitude-longitude, y up; None is black
 
     def view(self, frame: float, height: int, width: int) -> View:
-        """Projection and object poses of `frame` for an image of `height` x `width` pixels."""
+        """The projection and the objects' poses in a `frame`, for an image of `height` x `width` pixels."""
         return View(
             K=intrinsics(float(self.camera.x_fov.at(frame)), height, width),
             camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame)),
@@ -113,7 +123,7 @@ class Scene:
         )
 
     def still(self) -> "Scene":
-        """The scene of frame 0, in which nothing moves or changes any more, the camera included."""
+        """The scene of frame 0 for ever: nothing moves or changes, the camera included."""
         shapes = [
             replace(
                 shape,

@@ -1,4 +1,4 @@
-"""The pinhole camera: projection, its inverse, and where surfaces stood in another frame. Numpy, float64.
+"""The pinhole camera: projection, its inverse, and where surfaces stand in another frame. Numpy only, in float64.
 
 Camera frame (Mitsuba's): x left, y up, z forward. Pixel positions are (x right, y down), the centre of column c, row r
 at (c + 0.5, r + 0.5). With C = inverse(camera_to_world): pixel = (K C p)_xy / depth, depth = (K C p)_z.
@@ -11,25 +11,25 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FAR_OUTSIDE = 1e5  # px; stands for "behind the camera": finite, and outside any image
+FAR_OUTSIDE = 1e5  # px, outside any image yet finite: stands for "behind the camera"
 
 
 class View(NamedTuple):
-    """What projects a surface point in one frame."""
+    """What projects the points of surfaces in one frame."""
 
     K: Array  # (3, 3)
     camera_to_world: Array  # (4, 4)
-    object_to_world: Array  # (M, 4, 4), row mesh_id - 1: rigid transform from the rest pose
+    object_to_world: Array  # (M, 4, 4), rigid, from the rest pose of the mesh with id index + 1
 
 
 def intrinsics(x_fov: float, height: int, width: int) -> Array:
-    """K (3, 3) of a camera with horizontal field of view `x_fov` in degrees and square pixels."""
+    """K (3, 3) of a camera with square pixels whose horizontal field of view is `x_fov` degrees."""
     focal = 0.5 * width / np.tan(np.radians(x_fov) / 2)
     return np.array([[-focal, 0, width / 2], [0, -focal, height / 2], [0, 0, 1.0]])
 
 
 def look_at(eye: Array, target: Array) -> Array:
-    """camera_to_world (4, 4) of a camera at `eye` that sees `target` in its centre, the world's y axis up."""
+    """camera_to_world (4, 4) of a camera at `eye` (3,) with `target` (3,) in its centre and the world's y axis up."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     left = np.cross([0.0, 1.0, 0.0], forward)
     left /= np.linalg.norm(left)
@@ -38,8 +38,8 @@ def look_at(eye: Array, target: Array) -> Array:
     return matrix
 
 
-def rigid_inverse(matrix: Array) -> Array:
-    """Inverse of rigid transforms (..., 4, 4)."""
+def inverse_pose(matrix: Array) -> Array:
+    """Inverses (..., 4, 4) of poses: rigid transforms (..., 4, 4)."""
     inverse = np.zeros_like(matrix)
     inverse[..., :3, :3] = np.swapaxes(matrix[..., :3, :3], -1, -2)
     inverse[..., :3, 3:] = -inverse[..., :3, :3] @ matrix[..., :3, 3:]
@@ -54,17 +54,16 @@ def pixel_centres(height: int, width: int) -> Array:
 
 
 def directions(pixels: Array, view: View) -> Array:
-    """World directions (..., 3) through `pixels` (..., 2), of unit length along the viewing axis (not normalised)."""
+    """World directions (..., 3) through `pixels` (..., 2), not normalised: of length 1 along the viewing axis."""
     x = (pixels[..., 0] - view.K[0, 2]) / view.K[0, 0]
     y = (pixels[..., 1] - view.K[1, 2]) / view.K[1, 1]
     return np.stack([x, y, np.ones_like(x)], axis=-1) @ view.camera_to_world[:3, :3].T
 
 
 def unproject(pixels: Array, depth: Array, view: View) -> Array:
-    """Points (..., 3) seen at `pixels` (..., 2) at `depth` (...,) along the viewing axis.
+    """Points (..., 3) that are seen at `pixels` (..., 2) at `depth` (...,) along the viewing axis.
 
-    In homogeneous terms their fourth coordinate is 1; where depth = 0 (background) it is the direction, to be read with
-    fourth coordinate 0.
+    Where the depth is 0 (background) these are directions: in homogeneous coordinates their fourth is 0 instead of 1.
     """
     hit = (depth > 0)[..., None]
     ray = directions(pixels, view)
@@ -82,18 +81,18 @@ def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
     ahead = depth > 1e-9 * np.linalg.norm(in_camera, axis=-1)
     homogeneous = in_camera @ view.K.T
     pixel = homogeneous[..., :2] / np.where(ahead, depth, 1)[..., None]
-    # Nearly in the image plane a projection is huge but finite; keep it within the same bound.
+    # A point nearly in the plane of the eye projects to a huge but finite position: the same bound holds for it.
     return np.where(ahead[..., None], np.clip(pixel, -FAR_OUTSIDE, FAR_OUTSIDE), FAR_OUTSIDE)
 
 
 def move(points: Array, mesh_id: NDArray[np.integer], source: View, target: View) -> Array:
-    """Where the surface points (..., 3) of `source`'s frame stand in `target`'s, by their meshes' rigid motion.
+    """Where surface points (..., 3) of the frame `source` are in the frame `target`, moved along with their meshes.
 
-    Points with `mesh_id` (...,) 0 (background directions) stay.
+    Background directions, whose `mesh_id` (...,) is 0, stay.
     """
-    relative = target.object_to_world @ rigid_inverse(source.object_to_world)
+    relative = target.object_to_world @ inverse_pose(source.object_to_world)
     relative = np.concatenate([np.eye(4)[None], relative])
-    # A mesh that does not move must not pick up rounding: M times its inverse is not exactly the identity.
+    # A mesh that does not move must not pick up rounding errors: M times its inverse is not exactly the identity.
     same = (target.object_to_world == source.object_to_world).all(axis=(1, 2))
     relative[1:][same] = np.eye(4)
     if same.all():
@@ -103,10 +102,10 @@ def move(points: Array, mesh_id: NDArray[np.integer], source: View, target: View
 
 
 def motion_vectors(pixels: Array, depth: Array, mesh_id: NDArray[np.integer], now: View, other: View) -> Array:
-    """Pixels (..., 2) to add to `pixels` of frame `now` to find the same surface point in frame `other`.
+    """What to add to `pixels` (..., 2) of the frame `now` to find the same surface points in the frame `other`; pixels.
 
-    With the previous frame as `other` this is the channel `motion`; with the next one, the forward vectors that
-    reversed playback needs. Background (depth 0) moves with its direction.
+    With the previous frame as `other` this is the channel `motion`, with the next one the forward motion that reversed
+    playback needs. Background (depth 0) moves with its direction.
     """
     if all(np.array_equal(a, b) for a, b in zip(now, other, strict=True)):
         return np.zeros_like(pixels)

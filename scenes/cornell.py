@@ -1,23 +1,25 @@
-"""The Cornell box (Goral et al. 1984), two units wide, open towards +z, and a version in which its content moves.
+"""The Cornell box, two units wide, open towards +z, and a version in which its content moves.
 
-The reflectances and the light's colour are the RGB values that renderers commonly ship for the measured originals.
+The box is that of Goral et al. 1984, "Modeling the interaction of light between diffuse surfaces". The reflectances and
+the light's colour are the RGB values that renderers commonly ship for the measured originals.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
 
-from scenes.animation import Array, Camera, RigidMotion, Scene, Shape, Track
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.bsdf import diffuse_bsdf, rgb
+from scenes.camera import Array
+from scenes.draws import Rng
 
-WHITE, RED, GREEN = (0.885, 0.699, 0.666), (0.570, 0.043, 0.044), (0.105, 0.378, 0.076)
-LIGHT = np.array([18.4, 14.0, 6.8])
-FLOOR = -1.0
-
-
-def diffuse(rgb: tuple[float, float, float]) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
+WHITE_REFLECTANCE = (0.885, 0.699, 0.666)
+RED_REFLECTANCE = (0.570, 0.043, 0.044)
+GREEN_REFLECTANCE = (0.105, 0.378, 0.076)
+LIGHT_RADIANCE = np.array([18.4, 14.0, 6.8])
+FLOOR_HEIGHT = -1.0
+FRAMES_BETWEEN_KEYS = 48
 
 
 def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -25,41 +27,47 @@ def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices=np.array(corners), faces=[[0, 1, 2], [0, 2, 3]], process=False)
 
 
-def box(width: float, height: float) -> trimesh.Trimesh:
+def block_mesh(width: float, height: float) -> trimesh.Trimesh:
     """A square block standing on the origin, so that its rest pose turns about its own vertical axis."""
     mesh: trimesh.Trimesh = trimesh.creation.box((width, height, width))
     mesh.apply_translation((0, height / 2, 0))
     return mesh
 
 
-def room() -> list[Shape]:
+def empty_box() -> list[Shape]:
+    """Floor, ceiling and walls."""
+    white = diffuse_bsdf(rgb(WHITE_REFLECTANCE))
+    red = diffuse_bsdf(rgb(RED_REFLECTANCE))
+    green = diffuse_bsdf(rgb(GREEN_REFLECTANCE))
     return [
-        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), diffuse(WHITE)),
-        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), diffuse(WHITE)),
-        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), diffuse(WHITE)),
-        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), diffuse(RED)),
-        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), diffuse(GREEN)),
+        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), white),
+        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), white),
+        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), white),
+        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), red),
+        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), green),
     ]
 
 
 def light(position: Track, radiance: Track) -> Shape:
+    """A rectangle that shines down from positions (x, y, z)."""
     corners = [(-0.235, 0, -0.19), (0.235, 0, -0.19), (0.235, 0, 0.19), (-0.235, 0, 0.19)]
     motion = RigidMotion(position, Track.constant(0.0))
-    return Shape("light", quad(*corners), diffuse(WHITE), radiance=radiance, motion=motion)
+    return Shape("light", quad(*corners), diffuse_bsdf(rgb(WHITE_REFLECTANCE)), radiance, motion)
 
 
 def block(name: str, width: float, height: float, position: Track, angle: Track) -> Shape:
     """A white block that passes through floor positions (x, y, z) and turns through angles."""
-    return Shape(name, box(width, height), diffuse(WHITE), motion=RigidMotion(position, angle))
-
-
-FRAMES_BETWEEN_KEYS = 48
+    white = diffuse_bsdf(rgb(WHITE_REFLECTANCE))
+    return Shape(name, block_mesh(width, height), white, motion=RigidMotion(position, angle))
 
 
 class Keys:
-    """Draws tracks: speeds are alike in clips of any length, and a clip sees the middle of what happens."""
+    """Tracks through random keys at equal intervals, of which a clip sees the middle.
 
-    def __init__(self, rng: np.random.Generator, frames: int):
+    The interval is the same in clips of any length, and so are the speeds.
+    """
+
+    def __init__(self, rng: Rng, frames: int):
         self.rng = rng
         spans = max(1, -(-(frames - 1) // FRAMES_BETWEEN_KEYS))
         self.count = spans + 1
@@ -67,29 +75,29 @@ class Keys:
         self.last = self.first + spans * FRAMES_BETWEEN_KEYS
 
     def track(self, keys: Array) -> Track:
-        """Through keys (count, ...)."""
+        """Through `keys` (count, ...)."""
         return Track(keys, self.first, self.last)
 
     def between(self, low: Sequence[float], high: Sequence[float]) -> Track:
-        """Through random points of a box."""
+        """Through random points of the box low..high."""
         return self.track(self.rng.uniform(low, high, (self.count, len(low))))
 
 
 def fly(keys: Keys, low: Sequence[float], high: Sequence[float]) -> Camera:
-    """A smooth flight through random points of the box low..high that looks around the middle of the room."""
+    """A smooth flight through random points of the box low..high that looks around the middle of the Cornell box."""
     target = keys.between([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4])
     return Camera(keys.between(low, high), target, Track.constant(75.0))
 
 
-def cornell_box(rng: np.random.Generator, frames: int) -> Scene:
-    """The classic box: two white blocks, a ceiling light, nothing moves but the camera, which flies around in it."""
-    short = block("short-block", 0.6, 0.6, Track.constant([0.33, FLOOR, 0.35]), Track.constant(-0.29))
-    tall = block("tall-block", 0.6, 1.2, Track.constant([-0.33, FLOOR, -0.28]), Track.constant(0.30))
-    lamp = light(Track.constant([0.0, 0.99, 0.0]), Track.constant(LIGHT))
-    return Scene((*room(), short, tall, lamp), fly(Keys(rng, frames), [-0.8, -0.4, 0.75], [0.8, 0.7, 0.98]))
+def cornell_box(rng: Rng, frames: int) -> Scene:
+    """The classic box: two white blocks and a ceiling light; nothing moves but the camera, which flies around in it."""
+    short = block("short-block", 0.6, 0.6, Track.constant([0.33, FLOOR_HEIGHT, 0.35]), Track.constant(-0.29))
+    tall = block("tall-block", 0.6, 1.2, Track.constant([-0.33, FLOOR_HEIGHT, -0.28]), Track.constant(0.30))
+    lamp = light(Track.constant([0.0, 0.99, 0.0]), Track.constant(LIGHT_RADIANCE))
+    return Scene((*empty_box(), short, tall, lamp), fly(Keys(rng, frames), [-0.8, -0.4, 0.75], [0.8, 0.7, 0.98]))
 
 
-def cornell_box_moving(rng: np.random.Generator, frames: int) -> Scene:
+def cornell_box_moving(rng: Rng, frames: int) -> Scene:
     """The blocks slide past each other and past the back wall and turn, each in its own lane; the light moves slowly.
 
     The lanes are farther apart than the blocks' diagonals reach, so nothing ever touches. Speeds are bounded so that a
@@ -100,13 +108,13 @@ def cornell_box_moving(rng: np.random.Generator, frames: int) -> Scene:
 
     def lane(z: float, side: Array) -> Track:
         x = side * rng.uniform(0.25, 0.55, keys.count)
-        return keys.track(np.stack([x, np.full(keys.count, FLOOR), np.full(keys.count, z)], axis=1))
+        return keys.track(np.stack([x, np.full(keys.count, FLOOR_HEIGHT), np.full(keys.count, z)], axis=1))
 
     def turn() -> Track:
         return keys.track(rng.uniform(-np.pi, np.pi) + np.cumsum(rng.uniform(-0.3, 0.3, keys.count)))
 
     short = block("short-block", 0.5, 0.6, lane(0.3, sides), turn())
     tall = block("tall-block", 0.5, 1.2, lane(-0.5, -sides), turn())
-    brightness = keys.track(LIGHT * rng.uniform(0.7, 1.3, (keys.count, 1)))
+    brightness = keys.track(LIGHT_RADIANCE * rng.uniform(0.7, 1.3, (keys.count, 1)))
     lamp = light(keys.between([-0.6, 0.99, -0.5], [0.6, 0.99, 0.5]), brightness)
-    return Scene((*room(), short, tall, lamp), fly(keys, [-0.3, 0.0, 0.85], [0.3, 0.5, 0.98]))
+    return Scene((*empty_box(), short, tall, lamp), fly(keys, [-0.3, 0.0, 0.85], [0.3, 0.5, 0.98]))

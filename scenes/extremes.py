@@ -1,33 +1,29 @@
-"""Scenes at the limits of what numbers and denoisers bear, variations of the Cornell box."""
+"""Variations of the Cornell box at the limits of what number formats and denoisers bear."""
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from scenes.animation import Array, Camera, RigidMotion, Scene, Shape, Track
-from scenes.cornell import box, cornell_box, cornell_box_moving
-from scenes.lighting import sky
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
+from scenes.cornell import block_mesh, cornell_box, cornell_box_moving
+from scenes.draws import Rng
+from scenes.sky import sky
 
-Rng = np.random.Generator
-Build = Callable[[Rng, int], Scene]
+SceneBuilder = Callable[[Rng, int], Scene]  # of a clip's number of frames
 
 TINY_LIGHT = 0.005  # of the size of the Cornell box's
 
 
-def repaint(scene: Scene, paint: Callable[[Shape], dict[str, Any]]) -> Scene:
-    """The scene with other materials on everything that does not shine."""
+def repaint(scene: Scene, paint: Callable[[Shape], Bsdf]) -> Scene:
+    """The scene with the materials that `paint` gives to all shapes that emit no light."""
     shapes = [s if s.radiance is not None else replace(s, bsdf=paint(s)) for s in scene.shapes]
     return replace(scene, shapes=tuple(shapes))
 
 
-def grey(value: float) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value] * 3}}
-
-
-def sharp(rng: Rng, frames: int) -> Scene:
-    """Blocks of metal so smooth (alpha 0.001) that their highlights are nearly never sampled."""
+def sharp_highlights(rng: Rng, frames: int) -> Scene:
+    """Blocks of metal so smooth (alpha 0.001) that their highlights are hardly ever sampled."""
     metal = {"type": "roughconductor", "material": "Al", "alpha": 0.001}
     return repaint(cornell_box(rng, frames), lambda shape: metal if "block" in shape.name else shape.bsdf)
 
@@ -38,17 +34,19 @@ def tiny_light(rng: Rng, frames: int) -> Scene:
     light = scene.shapes[-1]
     mesh = light.mesh.copy()
     mesh.apply_scale(TINY_LIGHT)
-    small = replace(light, mesh=mesh, radiance=Track.constant([1e5, 1e5, 1e5]))
-    return replace(scene, shapes=(*scene.shapes[:-1], small))
+    tiny = replace(light, mesh=mesh, radiance=Track.constant([1e5, 1e5, 1e5]))
+    return replace(scene, shapes=(*scene.shapes[:-1], tiny))
 
 
 def black_and_white(rng: Rng, frames: int) -> Scene:
     """Blocks that reflect nothing in a room that reflects everything."""
-    return repaint(cornell_box(rng, frames), lambda shape: grey(0.0 if "block" in shape.name else 1.0))
+    black = diffuse_bsdf(rgb([0.0, 0.0, 0.0]))
+    white = diffuse_bsdf(rgb([1.0, 1.0, 1.0]))
+    return repaint(cornell_box(rng, frames), lambda shape: black if "block" in shape.name else white)
 
 
-def scaled(scene: Scene, factor: float) -> Scene:
-    """The same scene in other units."""
+def rescaled(scene: Scene, factor: float) -> Scene:
+    """The same scene in units that are 1 / `factor` as long."""
 
     def grow(track: Track) -> Track:
         return replace(track, keys=track.keys * factor)
@@ -62,44 +60,41 @@ def scaled(scene: Scene, factor: float) -> Scene:
     return replace(scene, shapes=tuple(map(larger, scene.shapes)), camera=camera)
 
 
-def small(rng: Rng, frames: int) -> Scene:
-    """The moving box in units of 1e-3."""
-    return scaled(cornell_box_moving(rng, frames), 1e-3)
+def small_numbers(rng: Rng, frames: int) -> Scene:
+    """The moving box with all lengths times 1e-3."""
+    return rescaled(cornell_box_moving(rng, frames), 1e-3)
 
 
-def large(rng: Rng, frames: int) -> Scene:
-    """The moving box in units of 1e4."""
-    return scaled(cornell_box_moving(rng, frames), 1e4)
+def large_numbers(rng: Rng, frames: int) -> Scene:
+    """The moving box with all lengths times 1e4."""
+    return rescaled(cornell_box_moving(rng, frames), 1e4)
 
 
 def only_sky(rng: Rng, frames: int) -> Scene:
-    """Nothing at all before a sky; the camera turns."""
+    """A sky with nothing before it; the camera turns."""
     turn = rng.uniform(-np.pi, np.pi) + np.linspace(0, 0.02 * frames, 5)
-    target: Array = np.stack([np.cos(turn), np.full(5, 0.3), np.sin(turn)], axis=1)
-    return Scene(
-        (),
-        Camera(Track.constant([0.0, 0.0, 0.0]), Track(target, 0, max(frames - 1, 1))),
-        sky=sky(rng, sun=np.array([1.0, 1.0, 1.0])),
-    )
+    target = np.stack([np.cos(turn), np.full(5, 0.3), np.sin(turn)], axis=1)
+    camera = Camera(Track.constant([0.0, 0.0, 0.0]), Track(target, 0, max(frames - 1, 1)))
+    return Scene((), camera, sky=sky(rng, sun=np.array([1.0, 1.0, 1.0])))
 
 
 def mirrors(rng: Rng, frames: int) -> Scene:
-    """The camera in a closed box of mirrors with the blocks and the light."""
+    """A closed box of mirrors around the camera, the blocks and the light."""
     scene = cornell_box(rng, frames)
     silver = {"type": "conductor", "material": "Ag"}
-    room = box(2.0, 2.0)
-    room.apply_translation((0, -1, 0))
-    room.invert()
+    walls = block_mesh(2.0, 2.0)
+    walls.apply_translation((0, -1, 0))
+    walls.invert()
     inside = [shape for shape in scene.shapes if "block" in shape.name or shape.radiance is not None]
-    return replace(scene, shapes=(Shape("mirrors", room, silver), *inside), max_depth=8)
+    return replace(scene, shapes=(Shape("mirrors", walls, silver), *inside), max_depth=8)
 
 
-EXTREMES: dict[str, Build] = {
-    "extremes-roughness": sharp,
+EXTREME_SCENES: dict[str, SceneBuilder] = {
+    "extremes-roughness": sharp_highlights,
     "extremes-light": tiny_light,
     "extremes-albedo": black_and_white,
-    "extremes-small": small,
-    "extremes-large": large,
+    "extremes-small": small_numbers,
+    "extremes-large": large_numbers,
     "extremes-sky": only_sky,
     "extremes-mirrors": mirrors,
 }

@@ -1,30 +1,22 @@
-"""Putting things into a room so that nothing touches: everything reserves the box it ever occupies."""
+"""Putting things into a room so that nothing touches: everything reserves the box that it ever occupies."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from scenes.animation import Array, RigidMotion, Shape
-from scenes.finish import Bsdf, finish
+from scenes.animation import RigidMotion, Shape, still
+from scenes.boxes import enclosing_box, overlaps, transformed_box
+from scenes.bsdf import Bsdf
+from scenes.camera import Array
+from scenes.draws import Rng, one_of
+from scenes.finish import finish
 from scenes.meshes import Surface, join
-from scenes.objects import DECOR, Support, Thing
-from scenes.shell import Opening, pose, still, wall_pose
+from scenes.objects.catalogue import DECOR
+from scenes.objects.thing import Support, Thing
+from scenes.shell import Opening, pose, wall_pose
 
-Rng = np.random.Generator
-MOST_THINGS = 54  # leaves a few for what hangs
+MAX_THINGS = 54  # before what hangs, for which a few are left
 GAP = 0.002  # m, between things that stand on or beside each other
-
-
-def box_of(bounds: Array, matrix: Array) -> Array:
-    """The axis-aligned box (2, 3) around the box `bounds` (2, 3) moved by `matrix`."""
-    corners = np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3)
-    moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
-    return np.stack([moved.min(axis=0), moved.max(axis=0)])
-
-
-def overlap(a: Array, boxes: Array) -> bool:
-    """Whether box `a` (2, 3) meets any of `boxes` (N, 2, 3)."""
-    return bool(((a[0] < boxes[:, 1]) & (a[1] > boxes[:, 0])).all(axis=1).any())
 
 
 @dataclass(frozen=True)
@@ -35,45 +27,48 @@ class Group:
 
     @property
     def bounds(self) -> Array:
-        boxes = np.stack([box_of(thing.bounds, matrix) for thing, matrix in self.members])
-        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        """Lowest and highest x, y, z (2, 3)."""
+        return enclosing_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in self.members]))
 
     @staticmethod
     def of(thing: Thing) -> "Group":
+        """The thing alone."""
         return Group(((thing, np.eye(4)),))
 
 
 def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
-    """Up to `most` small things on a support, apart from each other."""
-    low, high = np.array(support.low), np.array(support.high)
+    """Up to `most` small things with their poses (4, 4) on a support, apart from each other."""
+    low = np.array(support.low)
+    high = np.array(support.high)
     placed: list[tuple[Thing, Array]] = []
     taken = np.empty((0, 2, 3))
     makers = list(DECOR.values())
     for _ in range(2 * most):
         if len(placed) == most:
             break
-        thing = makers[int(rng.integers(len(makers)))](rng)
+        thing = one_of(rng, makers)(rng)
         angle = rng.uniform(-np.pi, np.pi)
-        size = box_of(thing.bounds, pose(0, 0, 0, angle))
-        room_low, room_high = low - size[0, [0, 2]], high - size[1, [0, 2]]
+        size = transformed_box(thing.bounds, pose(0, 0, 0, angle))
+        room_low = low - size[0, [0, 2]]
+        room_high = high - size[1, [0, 2]]
         if (room_low >= room_high).any() or size[1, 1] + GAP >= support.clearance:
             continue
         x, z = rng.uniform(room_low, room_high)
         matrix = pose(x, support.height + GAP, z, angle)
-        box = box_of(thing.bounds, matrix)
-        if not overlap(box, taken):
+        box = transformed_box(thing.bounds, matrix)
+        if not overlaps(box, taken):
             placed.append((thing, matrix))
             taken = np.concatenate([taken, box[None]])
     return placed
 
 
 def laden(rng: Rng, thing: Thing, share: float = 0.8) -> Group:
-    """The thing with small ones on its supports."""
-    group = [(thing, np.eye(4))]
+    """The thing with small ones on that `share` of its supports, on average."""
+    members = [(thing, np.eye(4))]
     for support in thing.supports:
         if rng.random() < share:
-            group += scatter(rng, support, int(rng.integers(1, 6)))
-    return Group(tuple(group))
+            members += scatter(rng, support, int(rng.integers(1, 6)))
+    return Group(tuple(members))
 
 
 @dataclass
@@ -85,45 +80,54 @@ class Layout:
     frames: int
     gloss: float  # see scenes.finish
     shapes: list[Shape] = field(default_factory=list)
-    boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # taken
-    centres: list[Array] = field(default_factory=list)  # of things, worth looking at
-    moving: int = 0
-    walls: int = 0  # the first boxes, those of walls inside the room
+    boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # reserved
+    centres: list[Array] = field(default_factory=list)  # (3,) of things, worth looking at
+    moving: int = 0  # groups
+    walls: int = 0  # inside the room; the first boxes are theirs
     openings: dict[int, list[Opening]] = field(default_factory=dict)  # of walls 0 to 3
     backs: list[tuple[RigidMotion, Array]] = field(default_factory=list)  # of furniture before walls: pose, bounds
 
     @property
     def things(self) -> int:
+        """How many there are."""
         return len(self.centres)
 
+    @property
+    def last_frame(self) -> int:
+        """At which tracks end; at least 1, so that they last in clips of one frame, too."""
+        return max(self.frames - 1, 1)
+
     def swept(self, bounds: Array, motion: RigidMotion) -> Array:
-        """The box that `bounds` ever occupies during the clip."""
-        times = range(self.frames) if motion.varies() else range(1)
-        boxes = np.stack([box_of(bounds, motion.matrix(frame)) for frame in times])
-        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        """The box (2, 3) that `bounds` (2, 3) ever occupies during the clip."""
+        frames = range(self.frames) if motion.varies() else range(1)
+        return enclosing_box(np.stack([transformed_box(bounds, motion.matrix(frame)) for frame in frames]))
 
     def fits(self, box: Array) -> bool:
+        """Whether `box` (2, 3) lies in the room and overlaps nothing that is reserved."""
         x, z = self.size[[0, 2]] / 2
-        low, high = np.array([-x, 0, -z]), np.array([x, self.size[1], z])
-        return bool((box[0] > low).all() and (box[1] < high).all()) and not overlap(box, self.boxes)
+        low = np.array([-x, 0, -z])
+        high = np.array([x, self.size[1], z])
+        return bool((box[0] > low).all() and (box[1] < high).all()) and not overlaps(box, self.boxes)
 
     def reserve(self, *boxes: Array) -> None:
+        """Keep later things out of these boxes (2, 3)."""
         self.boxes = np.concatenate([self.boxes, np.stack(boxes)])
 
     def try_add(self, group: Group, motion: RigidMotion) -> bool:
         """Add the group where `motion` takes it, if nothing is in its way."""
         box = self.swept(group.bounds + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
-        if not self.fits(box) or self.things + len(group.members) > MOST_THINGS:
+        if not self.fits(box) or self.things + len(group.members) > MAX_THINGS:
             return False
         self.add(group, motion)
         return True
 
     def add(self, group: Group, motion: RigidMotion) -> None:
-        """Add the group without looking."""
+        """Add the group without looking what is in its way."""
         self.reserve(self.swept(group.bounds, motion))
         for thing, matrix in group.members:
-            number, size = self.things, float(np.ptp(thing.bounds, axis=0).max())
-            self.centres.append(box_of(thing.bounds, motion.matrix(0) @ matrix).mean(axis=0))
+            number = self.things
+            size = float(np.ptp(thing.bounds, axis=0).max())
+            self.centres.append(transformed_box(thing.bounds, motion.matrix(0) @ matrix).mean(axis=0))
             for part in thing.parts:
                 mesh = part.mesh.copy(include_cache=True)  # without it the authored normals are lost
                 mesh.apply_transform(matrix)
@@ -134,12 +138,13 @@ class Layout:
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:
         """Put a thing on a wall, if nothing is in its way, at (x, y) seen from inside and `z` before it."""
         place = wall_pose(wall, self.size) @ [x, y, z, 1]
-        motion, group = still(place[:3], wall * np.pi / 2), Group.of(thing)
-        if not overlap(self.swept(group.bounds, motion), self.boxes):
+        motion = still(place[:3], wall * np.pi / 2)
+        group = Group.of(thing)
+        if not overlaps(self.swept(group.bounds, motion), self.boxes):
             self.add(group, motion)
 
     def build(self, name: str, surfaces: list[Surface], matrix: Array, bsdf: Bsdf | None = None) -> None:
-        """Add a fixed part of the building, given in the frame `matrix` (4, 4); painted like a wall by default."""
+        """Add a fixed part of the building, given in the frame `matrix` (4, 4); finished like a wall by default."""
         surface = join(surfaces)
         mesh = surface.mesh()
         mesh.apply_transform(matrix)

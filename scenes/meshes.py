@@ -1,4 +1,4 @@
-"""Surfaces to build objects from: boxes, pads, lathes, tubes, sheets and blobs, with normals and texture coordinates.
+"""Surfaces to build objects from: boxes, superellipsoids, lathes, tubes, sheets and blobs.
 
 Metres, y up. Texture coordinates are in metres too, unless a function says otherwise.
 """
@@ -11,7 +11,9 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from scenes.animation import Array, Track
+from scenes.animation import Track
+from scenes.camera import Array
+from scenes.draws import Rng
 
 Faces = NDArray[np.int64]
 
@@ -35,19 +37,23 @@ class Surface:
 
     def turned(self, angle: float, axis: int = 1) -> "Surface":
         """Turned by `angle` radians about the line through the origin along x, y or z (`axis` 0, 1, 2)."""
-        i, j = (axis + 1) % 3, (axis + 2) % 3
+        i = (axis + 1) % 3
+        j = (axis + 2) % 3
         matrix = np.eye(3)
-        matrix[i, i] = matrix[j, j] = np.cos(angle)
-        matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
+        matrix[i, i] = np.cos(angle)
+        matrix[i, j] = -np.sin(angle)
+        matrix[j, i] = np.sin(angle)
+        matrix[j, j] = np.cos(angle)
         return replace(self, points=self.points @ matrix.T, normals=self.normals @ matrix.T)
 
     def mesh(self) -> trimesh.Trimesh:
+        """With the normals and texture coordinates as they are."""
         visual = trimesh.visual.TextureVisuals(uv=self.uv)
         return trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """One surface of all triangles; smooth if any is (flat ones have their own vertices, so they stay flat)."""
+    """One surface of all triangles; smooth if any of them is (flat ones stay flat: their facets share no vertices)."""
     starts = np.cumsum([0] + [len(surface.points) for surface in surfaces])
     return Surface(
         np.concatenate([surface.points for surface in surfaces]),
@@ -59,43 +65,57 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def unit(vectors: Array) -> Array:
+    """The vectors (..., D) at length 1."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def area_vectors(points: Array, faces: Faces) -> Array:
     """Normals (F, 3) of the triangles, as long as twice their areas."""
-    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    a = points[faces[:, 0]]
+    b = points[faces[:, 1]]
+    c = points[faces[:, 2]]
     return np.cross(b - a, c - a)
 
 
+def arc_lengths(path: Array) -> Array:
+    """How far (N,) along a `path` (N, D) each of its points lies."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return np.concatenate([[0], np.cumsum(steps)])
+
+
+def full_turn(segments: int) -> Array:
+    """Angles (segments + 1,) around a circle; the last is the first, bit for bit."""
+    return np.asarray(2 * np.pi / segments * (np.arange(segments + 1) % segments))
+
+
 def mean_normals(points: Array, faces: Faces) -> Array:
-    """Unit normals (V, 3): means of the adjacent triangles' normals by area."""
+    """Unit normals (V, 3): means of the adjacent triangles' normals, weighted by area."""
     areas = np.repeat(area_vectors(points, faces), 3, axis=0)
     return unit(np.stack([np.bincount(faces.ravel(), areas[:, k], len(points)) for k in range(3)], axis=1))
 
 
-def unwrapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Surface:
-    """With every triangle's texture coordinates projected along the axis it mostly faces.
+def box_mapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Surface:
+    """Box mapping: every triangle's texture coordinates are its points, projected along the axis that it mostly faces.
 
-    Vertices that are seen along several axes are duplicated.
+    Vertices of triangles that face several axes are duplicated.
     """
     axis = np.abs(area_vectors(points, faces)).argmax(axis=1)
     keys, corners = np.unique(3 * faces + axis[:, None], return_inverse=True)
-    vertex, along = keys // 3, keys % 3
-    across = np.array([[2, 1], [0, 2], [0, 1]])[along]
+    vertex = keys // 3
+    across = np.array([[2, 1], [0, 2], [0, 1]])[keys % 3]
     uv = np.take_along_axis(points[vertex], across, axis=1)
     return Surface(points[vertex], normals[vertex], uv, corners.reshape(-1, 3), smooth)
 
 
-def flat(points: Array, faces: Faces) -> Surface:
+def flat_shaded(points: Array, faces: Faces) -> Surface:
     """Facets: every triangle has its own vertices and normal."""
     normals = np.repeat(unit(area_vectors(points, faces)), 3, axis=0)
-    return unwrapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
+    return box_mapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
 
 
-def rounded(points: Array, faces: Faces) -> Surface:
-    """A smooth closed surface."""
-    return unwrapped(points, mean_normals(points, faces), faces, True)
+def smooth_shaded(points: Array, faces: Faces) -> Surface:
+    """A smooth closed surface: every vertex has the mean normal of its triangles."""
+    return box_mapped(points, mean_normals(points, faces), faces, True)
 
 
 @cache
@@ -117,29 +137,32 @@ def unit_sphere(subdivisions: int) -> tuple[Array, Faces]:
 def slab(width: float, height: float, depth: float) -> Surface:
     """A box along x, y, z, standing on the origin."""
     points, faces = unit_box(0)
-    return flat((points + UP) * (width / 2, height / 2, depth / 2), faces)
+    return flat_shaded((points + UP) * (width / 2, height / 2, depth / 2), faces)
 
 
-def pad(width: float, height: float, depth: float, power: float, subdivisions: int = 2) -> Surface:
-    """A box with soft edges (the unit sphere of the `power` norm; 2 is an ellipsoid), standing on the origin."""
+def superellipsoid(width: float, height: float, depth: float, power: float, subdivisions: int = 2) -> Surface:
+    """A box with soft edges, the unit sphere of the `power` norm, standing on the origin; with power 2 an ellipsoid.
+
+    The special case of equal exponents of Barr 1981, "Superquadrics and angle-preserving transformations".
+    """
     points, faces = unit_box(subdivisions)
     points = np.sin(np.pi / 2 * points)  # more points near the edges
     points = points / np.linalg.norm(points, ord=power, axis=1, keepdims=True)
-    return rounded((points + UP) * (width / 2, height / 2, depth / 2), faces)
+    return smooth_shaded((points + UP) * (width / 2, height / 2, depth / 2), faces)
 
 
-def blob(rng: np.random.Generator, radius: float, roughness: float, subdivisions: int) -> Surface:
+def blob(rng: Rng, radius: float, roughness: float, subdivisions: int) -> Surface:
     """A ball of `radius` displaced by smooth noise of relative amplitude `roughness`, about the origin."""
     points, faces = unit_sphere(subdivisions)
     waves = rng.normal(0, 2.0, (3, 12))
     noise = np.sin(points @ waves + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / np.sqrt(6)
-    return rounded(points * radius * np.exp(roughness * noise)[:, None], faces)
+    return smooth_shaded(points * radius * np.exp(roughness * noise)[:, None], faces)
 
 
-def gem(rng: np.random.Generator, radius: float, subdivisions: int) -> Surface:
+def gem(rng: Rng, radius: float, subdivisions: int) -> Surface:
     """Facets of a jittered icosahedron (20 triangles, or 80), about the origin."""
     points, faces = unit_sphere(subdivisions)
-    return flat(points * radius * rng.uniform(0.75, 1.0, (len(points), 1)), faces)
+    return flat_shaded(points * radius * rng.uniform(0.75, 1.0, (len(points), 1)), faces)
 
 
 def sheet(points: Array, uv: Array, normals: Array | None = None) -> Surface:
@@ -149,20 +172,23 @@ def sheet(points: Array, uv: Array, normals: Array | None = None) -> Surface:
     """
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    a = index[:-1, :-1].ravel()
+    b = index[:-1, 1:].ravel()
+    c = index[1:, 1:].ravel()
+    d = index[1:, :-1].ravel()
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    points, uv = points.reshape(-1, 3), uv.reshape(-1, 2)
+    points = points.reshape(-1, 3)
     faces = faces[np.linalg.norm(area_vectors(points, faces), axis=1) > 1e-12]
-    smooth = mean_normals(points, faces) if normals is None else normals.reshape(-1, 3)
-    return Surface(points, smooth, uv, faces, True)
+    normals = mean_normals(points, faces) if normals is None else normals.reshape(-1, 3)
+    return Surface(points, normals, uv.reshape(-1, 2), faces, True)
 
 
 def profile_normals(profile: Array) -> tuple[Array, Array]:
-    """Normals (N - 1, 2) at the begin and at the end of every piece of a lathe's profile (N, 2)."""
+    """Normals (N - 1, 2) at the start and at the end of every piece of a lathe's profile (N, 2)."""
     normals = unit(np.diff(profile, axis=0)[:, ::-1] * (1, -1))
     before = np.roll(normals, 1, axis=0)
     if not np.array_equal(profile[0], profile[-1]):
-        # On the axis the profile goes on as its mirror image, elsewhere it just ends.
+        # On the axis the profile continues as its mirror image, elsewhere it just ends.
         mirror = np.array([-1, 1])
         before[0] = normals[0] * mirror if profile[0, 0] == 0 else normals[0]
         last = normals[-1] * mirror if profile[-1, 0] == 0 else normals[-1]
@@ -180,24 +206,24 @@ def profile_normals(profile: Array) -> tuple[Array, Array]:
 def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
     """The surface that `profile` (N, 2), radii and heights, sweeps about the y axis; closed if it ends on the axis.
 
-    The outside is to the right of the way along the profile: it runs outward along the bottom, up, and inward along
-    the top. Texture: u runs around and repeats seamlessly, v along the profile at the same scale; about a metre each.
+    The outside is to the right of the way along the profile, which runs outward along the bottom, up, and inward along
+    the top. Texture coordinates: u runs around and repeats seamlessly, v runs along the profile at the same scale,
+    which is about a metre each.
     """
     profile = np.asarray(profile, dtype=np.float64)
-    length = np.linalg.norm(np.diff(profile, axis=0), axis=1)
-    along = np.concatenate([[0], np.cumsum(length)])
-    begin, end = profile_normals(profile)
-    # Every piece has its own two rows of vertices, so that it can have its own normals; gaps between have no area.
+    along = arc_lengths(profile)
+    start, end = profile_normals(profile)
+    # Every piece has two rows of vertices of its own, so that it can have its own normals. Gaps between have no area.
     rows = np.stack([profile[:-1], profile[1:]], axis=1).reshape(-1, 2)
-    normals = np.stack([begin, end], axis=1).reshape(-1, 2)
+    normals = np.stack([start, end], axis=1).reshape(-1, 2)
     v = np.stack([along[:-1], along[1:]], axis=1).ravel()
-    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)
+    angle = full_turn(segments)
     around = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
 
     def sweep(pairs: Array) -> Array:
-        flat_part = pairs[:, None, :1] * around
-        height = np.broadcast_to(pairs[:, None, 1:], (*flat_part.shape[:2], 1))
-        return np.concatenate([flat_part[..., :1], height, flat_part[..., 1:]], axis=2)
+        level = pairs[:, None, :1] * around
+        height = np.broadcast_to(pairs[:, None, 1:], (*level.shape[:2], 1))
+        return np.concatenate([level[..., :1], height, level[..., 1:]], axis=2)
 
     circumference = 2 * np.pi * profile[:, 0].max()
     repeats = max(1, round(circumference))
@@ -220,14 +246,14 @@ def solid(outer: ArrayLike) -> Array:
 
 
 def hollow(outer: Array, wall: float, base: float) -> Array:
-    """The closed profile of a vessel with side `outer` (N, 2), a `wall` that thick and its inner floor at `base`."""
+    """The closed profile of a vessel whose side is `outer` (N, 2), with a `wall` that thick and a floor at `base`."""
     inner = outer[(outer[:, 1] > base) & (outer[:, 0] > 1.5 * wall)] - (wall, 0)
     return np.concatenate([[(0, outer[0, 1])], outer, inner[::-1], [(0, base)]])
 
 
 def circle(radius: float, thickness: float, segments: int = 10) -> Array:
     """The profile (segments + 1, 2) of a torus: a circle of radius `thickness` about (`radius`, 0)."""
-    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)
+    angle = full_turn(segments)
     return np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1)
 
 
@@ -236,11 +262,11 @@ def disc(radius: float, thickness: float, segments: int = 40) -> Surface:
     bevel = min(radius, thickness) * 0.15
     side = [(radius - bevel, 0), (radius, bevel), (radius, thickness - bevel), (radius - bevel, thickness)]
     turned = lathe(solid(side), segments)
-    return unwrapped(turned.points, turned.normals, turned.faces, True)
+    return box_mapped(turned.points, turned.normals, turned.faces, True)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
-    """A closed round tube along `path` (N, 3), of one radius or of radii (N,)."""
+    """A closed round tube along `path` (N, 3), of one `radius` or of one (N,) at every point."""
     path = np.asarray(path, dtype=np.float64)
     radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), len(path))
     step = unit(np.diff(path, axis=0))
@@ -250,7 +276,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
     for k, forward in enumerate(tangent):
         side = unit(side - forward * (side @ forward))  # turns no more than it must
         right[k] = side
-    angle = 2 * np.pi / segments * (np.arange(segments + 1) % segments)[:, None]
+    angle = full_turn(segments)[:, None]
     around = np.cos(angle) * right[:, None] + np.sin(angle) * np.cross(tangent, right)[:, None]
     # Caps: a ring with the cap's normal, and the centre.
     ends = [0, 0, *range(len(path)), -1, -1]
@@ -258,8 +284,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
     points = path[ends][:, None] + radii[:, None, None] * around[ends]
     cap = np.broadcast_to(tangent[[0, 0, -1, -1], None], (4, segments + 1, 3)) * np.array([-1, -1, 1, 1])[:, None, None]
     normals = np.concatenate([cap[:2], around, cap[2:]])
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points[:, 0], axis=0), axis=1))])
-    u, v = np.meshgrid(np.linspace(0, 2 * np.pi * radii.max(), segments + 1), along)
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi * radii.max(), segments + 1), arc_lengths(points[:, 0]))
     return sheet(points, np.stack([u, v], axis=2), normals)
 
 
@@ -273,6 +298,6 @@ def leaf(path: Array, width: float, fold: float) -> Surface:
     side = share[:, None] * across
     edge = path + UP * (fold * share)[:, None]
     points = np.stack([edge - side, path, edge + side], axis=1)
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    uv = np.stack([share[:, None] * (-1, 0, 1), np.broadcast_to(along[:, None], (len(path), 3))], axis=2)
+    along = np.broadcast_to(arc_lengths(path)[:, None], (len(path), 3))
+    uv = np.stack([share[:, None] * (-1, 0, 1), along], axis=2)
     return sheet(points, uv)

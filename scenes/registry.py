@@ -1,28 +1,27 @@
-"""The scenes that have names."""
+"""Scenes by name."""
 
 import re
-from collections.abc import Callable
 
 import numpy as np
 
 from errors import BadInput
 from scenes.animation import Scene
 from scenes.cornell import cornell_box, cornell_box_moving
-from scenes.extremes import EXTREMES
+from scenes.extremes import EXTREME_SCENES, SceneBuilder
 from scenes.rooms import room
 
-SCENES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
+SCENES: dict[str, SceneBuilder] = {
     "cornell_box": cornell_box,
     "cornell_box_moving": cornell_box_moving,
-    **EXTREMES,
+    **EXTREME_SCENES,
 }
 
 
 def build_scene(name: str, seed: int, frames: int) -> Scene:
-    """The animated scene `name` with the camera flight and motions that `seed` draws, for a clip of `frames` frames.
+    """The animated scene `name` for a clip of `frames` frames, with the camera flight and motions that `seed` draws.
 
-    In `room-N` all is drawn from the integer N: every number is another room with its own flight, whatever the seed.
-    Deterministic in its arguments. Raises BadInput for a name that is not a scene's.
+    The name is one of SCENES, or `room-N` with any integer N. Every number is another room with its own flight,
+    whatever the seed. The same arguments give the same scene. Raises BadInput for other names.
     """
     number = re.fullmatch(r"room-(-?\d+)", name)
     if number:

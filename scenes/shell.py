@@ -5,27 +5,22 @@ from itertools import pairwise
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
 
-from scenes.animation import Array, RigidMotion, Track
-from scenes.meshes import Surface, flat, join, sheet, slab
-
-
-def still(place: ArrayLike, angle: float) -> RigidMotion:
-    """At rest at `place` (3,), turned by `angle` radians about the vertical axis."""
-    return RigidMotion(Track.constant(place), Track.constant(angle))
+from scenes.animation import still
+from scenes.camera import Array
+from scenes.meshes import Surface, flat_shaded, join, sheet, slab
 
 
 def pose(x: float, y: float, z: float, angle: float) -> Array:
-    """object_to_world (4, 4) of a thing that is still."""
+    """object_to_world (4, 4) of what is at rest at (x, y, z), turned by `angle` radians about the vertical axis."""
     return still((x, y, z), angle).matrix(0)
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A hole in a wall, seen from inside: x to the right of the wall's middle, y above the floor; metres."""
+    """A hole in a wall, seen from inside; metres."""
 
-    low: tuple[float, float]
+    low: tuple[float, float]  # x to the right of the wall's middle, y above the floor
     high: tuple[float, float]
 
     @property
@@ -42,23 +37,25 @@ class Opening:
 
 
 def wall_pose(wall: int, size: Array) -> Array:
-    """Pose (4, 4) of wall 0 to 3: its frame has z into the room, x along it and y up from the floor's edge."""
+    """Pose (4, 4) of wall 0 to 3 of a room of `size` (3,): x along the wall, y up from the floor, z into the room."""
     distance = size[2] / 2 if wall % 2 == 0 else size[0] / 2
     return pose(0, 0, 0, wall * np.pi / 2) @ pose(0, 0, -distance, 0)
 
 
 def wall_width(wall: int, size: Array) -> float:
+    """How wide wall 0 to 3 of a room of `size` (3,) is."""
     return float(size[0] if wall % 2 == 0 else size[2])
 
 
-def panel(width: float, height: float, openings: list[Opening]) -> trimesh.Trimesh:
-    """A rectangle in the xy plane on the origin, facing +z, without its openings; texture coordinates in metres."""
+def wall_with_openings(width: float, height: float, openings: list[Opening]) -> trimesh.Trimesh:
+    """A rectangle in the xy plane on the origin, facing +z, with holes; texture coordinates in metres."""
     xs = np.unique([-width / 2, width / 2, *(e for o in openings for e in (o.low[0], o.high[0]))])
     ys = np.unique([0.0, height, *(e for o in openings for e in (o.low[1], o.high[1]))])
     cells = []
     for x0, x1 in pairwise(xs):
         for y0, y1 in pairwise(ys):
-            x, y = (x0 + x1) / 2, (y0 + y1) / 2
+            x = (x0 + x1) / 2
+            y = (y0 + y1) / 2
             if not any(o.low[0] < x < o.high[0] and o.low[1] < y < o.high[1] for o in openings):
                 points = np.array([[(x0, y0, 0), (x1, y0, 0)], [(x0, y1, 0), (x1, y1, 0)]])
                 cells.append(sheet(points, points[..., :2]))
@@ -66,7 +63,7 @@ def panel(width: float, height: float, openings: list[Opening]) -> trimesh.Trime
 
 
 def reveal(opening: Opening, thickness: float) -> Surface:
-    """The four sides of an opening through a wall of this thickness, behind the plane z = 0."""
+    """The four sides of an opening through a wall of that thickness, behind the plane z = 0."""
     x, _ = opening.middle
     border = 0.02
     sides = [
@@ -78,8 +75,9 @@ def reveal(opening: Opening, thickness: float) -> Surface:
     return join(sides)
 
 
-def floor(width: float, depth: float) -> trimesh.Trimesh:
+def horizontal_rectangle(width: float, depth: float) -> trimesh.Trimesh:
     """A rectangle in the xz plane, facing up."""
-    x, z = width / 2, depth / 2
+    x = width / 2
+    z = depth / 2
     points = np.array([(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)])
-    return flat(points, np.array([[0, 1, 2], [0, 2, 3]])).mesh()
+    return flat_shaded(points, np.array([[0, 1, 2], [0, 2, 3]])).mesh()

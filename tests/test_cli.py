@@ -1,10 +1,13 @@
 """The command line: help, and bad input answered by one line and exit code 2, with nothing half-written."""
 
+import contextlib
 import shutil
 
 import pytest
 
-from onespp import COMMANDS, main
+from datasets.profiles import DATA_PROFILES
+from onespp import GROUPS, main
+from train.recipes import RECIPES
 
 
 def fails(capsys, *arguments: str) -> str:
@@ -18,33 +21,68 @@ def fails(capsys, *arguments: str) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help(capsys, command):
+def help_of(capsys, *words: str) -> str:
+    with contextlib.suppress(SystemExit):  # tyro exits, with code 0
+        main([*words, "--help"])
+    return capsys.readouterr().out
+
+
+def commands(groups, *before: str):
+    """The words of every command."""
+    for group in groups.values():
+        for name, command in group.items():
+            yield from commands({"": command}, *before, name) if isinstance(command, dict) else [(*before, name)]
+
+
+@pytest.mark.parametrize("words", list(commands(GROUPS)), ids=" ".join)
+def test_every_command_has_help_under_its_own_name(capsys, words):
+    shown = help_of(capsys, *words)
+    assert shown.startswith(f"usage: onespp {' '.join(words)}")
+
+
+def test_help_begins_with_a_first_day(capsys):
+    shown = help_of(capsys)
+    places = [shown.index(f"\n  {name} ") for name in ("preview", "dataset", "train", "eval", "report")]
+    assert places == sorted(places) and places[-1] < shown.index("Data sets")
+    assert all(f"\n  {name} " in shown for group in GROUPS.values() for name in group)
+    assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "rendering", "training"))
+
+
+def test_help_names_every_profile_and_budget(capsys):
+    assert "{" + ",".join(DATA_PROFILES) + "}" in help_of(capsys, "dataset")
+    assert "{" + ",".join(dict.fromkeys(budget for _, budget in RECIPES)) + "}" in help_of(capsys, "train")
+
+
+def test_a_bench_refuses_what_it_does_not_honour(capsys):
     with pytest.raises(SystemExit) as exit_:
-        main([command, "--help"])
-    assert exit_.value.code == 0
-    assert "usage: onespp" in capsys.readouterr().out
+        main(["bench", "rendering", "room-3", "--threads", "1"])
+    assert exit_.value.code == 2 and "--threads" in capsys.readouterr().err
+
+
+def test_unknown_commands(capsys):
+    assert "unknown command 'onespp fly'" in fails(capsys, "fly")
+    assert "denoisers, scaling" in fails(capsys, "bench", "everything")
 
 
 def test_unknown_names(capsys, tiny, tmp_path):
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs")]
     assert "unknown profile 'fast'" in fails(capsys, "dataset", "--profile", "fast", "--data", str(tmp_path / "d"))
-    assert "unknown profile 'fast'" in fails(capsys, "train", "--profile", "fast", *there)
-    assert "'oidn' is not a network" in fails(capsys, "train", "oidn", "--profile", "tiny", *there)
-    assert "unknown denoiser 'magic'" in fails(capsys, "eval", "magic", "--profile", "tiny", *there)
+    assert "unknown budget 'fast'" in fails(capsys, "train", "--budget", "fast", *there)
+    assert "'oidn' is not a network" in fails(capsys, "train", "oidn", "--budget", "tiny", *there)
+    assert "unknown denoiser 'magic'" in fails(capsys, "eval", "magic", "--budget", "tiny", *there)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_or_damaged_data(capsys, tiny, tmp_path):
     nowhere = str(tmp_path / "nowhere")
-    for command in (["verify"], ["info"], ["train", "--data"], ["eval", "--data"]):
-        assert "there is no data set" in fails(capsys, *command, nowhere)
+    for command in ("verify", "info", "train", "eval"):
+        assert "there is no data set" in fails(capsys, command, "--data", nowhere)
     copy = shutil.copytree(tiny, tmp_path / "copy")
     (copy / "test" / "cornell_box" / "000" / "direct.npy").write_bytes(b"\x93NUMPY")
     message = fails(capsys, "eval", "noisy", "--data", str(copy), "--runs", str(tmp_path / "runs"))
     assert "direct.npy is damaged" in message and "onespp dataset" in message
     assert not (tmp_path / "runs" / "eval" / "results.json").exists()
-    assert "1 problems" in fails(capsys, "verify", str(copy))
+    assert "1 problems" in fails(capsys, "verify", "--data", str(copy))
 
 
 def test_unwritable_folder(capsys, tiny, tmp_path):
@@ -55,7 +93,7 @@ def test_unwritable_folder(capsys, tiny, tmp_path):
 
 
 def test_verify_and_info_of_good_data(capsys, tiny):
-    main(["verify", str(tiny)])
-    main(["info", str(tiny)])
+    main(["verify", "--data", str(tiny)])
+    main(["info", "--data", str(tiny)])
     out = capsys.readouterr().out
     assert "everything is as it was written" in out and "floor dB" in out

@@ -12,12 +12,12 @@ from datasets.clip import Clip
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from models.denoiser import Denoiser
 from models.wskp import KernelPredictor
-from train.accumulated import AccumulatedCrops, Crops
-from train.recipes import Recipe
+from train.crops import AccumulatedCrops, Crops
+from train.recipe import Recipe
 
 Items = TrainingSequences | AccumulatedCrops
 
-PIXELS_AT_ONCE = 2**20  # of all frames of the sequences that are in memory together, if not told otherwise
+PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, if not told otherwise
 
 
 def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool, seed: int, cache: Path) -> Items:
@@ -28,31 +28,33 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
     if recipe.crops:
         assert isinstance(denoiser, KernelPredictor)
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
-    length = recipe.trained or recipe.length if training else recipe.length
     augmentation = recipe.augmentation if training else Augmentation()
-    return TrainingSequences(clips, denoiser.reads, length, recipe.crop, augmentation, seed)
+    return TrainingSequences(clips, denoiser.reads, recipe.frames(training), recipe.crop, augmentation, seed)
 
 
-def most_at_once(recipe: Recipe, clip: Clip) -> int:
+def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:
     """How many items of a batch are in memory together by default."""
     area = recipe.crop**2 if recipe.crop else clip.height * clip.width
-    return max(1, min(recipe.batch, PIXELS_AT_ONCE // (recipe.length * area)))
+    return max(1, min(recipe.batch, PIXELS_IN_MEMORY // (recipe.length * area)))
 
 
-def split(count: int, most: int) -> list[range]:
-    """The fewest equal parts of range(count) of at most `most`: equal, so that a mean of their means is the mean."""
-    parts = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= most)
+def equal_parts(count: int, largest: int) -> list[range]:
+    """The fewest equal parts of range(count) of at most `largest`.
+
+    Equal, so that the mean of their means is the mean of all.
+    """
+    parts = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= largest)
     return [range(i, i + count // parts) for i in range(0, count, count // parts)]
 
 
-def micro_batches(first: int, stop: int, batch: int, at_once: int, rank: int = 0, world: int = 1) -> list[list[int]]:
+def micro_batches(first: int, stop: int, batch: int, largest: int, rank: int = 0, world: int = 1) -> list[list[int]]:
     """Item numbers of the steps `first` to `stop`: `batch` a step, of which process `rank` of `world` takes its share.
 
-    A share comes in parts of at most `at_once`, the same number of parts every step.
+    A share comes in parts of at most `largest` items, the same number of parts every step.
     """
     share = batch // world
-    start = [step * batch + rank * share for step in range(first, stop)]
-    return [[s + i for i in part] for s in start for part in split(share, at_once)]
+    starts = [step * batch + rank * share for step in range(first, stop)]
+    return [[start + i for i in part] for start in starts for part in equal_parts(share, largest)]
 
 
 def loader(items: Items, batches: Sequence[list[int]], workers: int = 0) -> DataLoader[Any]:

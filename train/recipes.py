@@ -1,63 +1,16 @@
-"""Recipes: each paper's hyper-parameters as data. Profiles scale the budget, never the method."""
+"""The recipes of the papers as data, each number with its section. Budgets scale the effort, never the method."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import Any
 
 from datasets.sequences import Augmentation
 from errors import BadInput
+from train.losses.ntd import NTDTerms
+from train.losses.rae import RAETerms
+from train.losses.wskp import SMAPETerms
+from train.recipe import Recipe
 
-
-@dataclass(frozen=True)
-class RAETerms:
-    """Weights of the loss of RAE §4.4."""
-
-    spatial: float = 0.8  # w_s
-    gradient: float = 0.1  # w_g
-    temporal: float = 0.1  # w_t
-    frames: tuple[float, ...] = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)  # of a sequence, a Gaussian
-
-
-@dataclass(frozen=True)
-class SMAPETerms:
-    """The loss of WSKP §5.2, Eq. 6."""
-
-    epsilon: float = 0.01
-
-
-@dataclass(frozen=True)
-class NTDTerms:
-    """The three equal parts of the loss of NTD §5, Eq. 6."""
-
-    spatial: float = 1.0  # L_spat
-    temporal: float = 1.0  # L_temp
-    occlusion: float = 1.0  # L_occ
-    masks: tuple[float, ...] = (1.0, 0.8, 0.6)  # w^0, w^1, w^2 of §4.4
-    occlusion_start: float = 0.5  # of the epochs: L_occ joins for the last 100 of 200
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How one network is trained."""
-
-    loss: RAETerms | SMAPETerms | NTDTerms
-    rate: float  # Adam's learning rate, at the end of the ramp if there is one
-    batch: int  # sequences a step
-    crop: int | None  # pixels; None: whole frames
-    length: int  # frames a sequence
-    epochs: int
-    betas: tuple[float, float] = (0.9, 0.999)  # of Adam; these are its authors' and PyTorch's
-    ramp: int = 0  # epochs of a geometric ramp from rate / 10; then rate * sqrt(ramp / e). 0: a constant rate
-    trained: int | None = None  # frames of a sequence that are trained on; the rest is for validation
-    crops: tuple[int, int] | None = None  # of each accumulated frame, for training and validation; None: sequences
-    augmentation: Augmentation = field(default_factory=Augmentation)
-
-    def learning_rate(self, epoch: float) -> float:
-        """Learning rate after `epoch` epochs, fractions included."""
-        if epoch < self.ramp:
-            return self.rate * 10 ** (epoch / self.ramp - 1)
-        return self.rate * (self.ramp / epoch) ** 0.5 if self.ramp else self.rate
-
-
-RAE = Recipe(
+RAE_RECIPE = Recipe(
     loss=RAETerms(),  # §4.4
     rate=1e-3,  # §5.3
     betas=(0.9, 0.99),  # §5.3
@@ -69,7 +22,7 @@ RAE = Recipe(
     augmentation=Augmentation(reverse=True, stop=True, rotate=True, gain=True),  # §4.3
 )
 
-WSKP = Recipe(
+WSKP_RECIPE = Recipe(
     loss=SMAPETerms(),  # §5.2
     rate=1e-3,  # §5.3
     batch=64,  # §5.3
@@ -79,7 +32,7 @@ WSKP = Recipe(
     epochs=500,  # §5.3
 )
 
-NTD = Recipe(
+NTD_RECIPE = Recipe(
     loss=NTDTerms(),  # §4.4, §5
     rate=1e-4,  # §5
     batch=1,  # a clip
@@ -88,16 +41,9 @@ NTD = Recipe(
     trained=9,  # §5
     epochs=200,  # §5
 )
-NTD_WITHOUT_OCCLUSION = replace(NTD, loss=NTDTerms(occlusion=0.0))  # §6.3, experiments A and B
+NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDTerms(occlusion=0.0))  # §6.3, experiments A and B
 
-PAPER = {
-    "rae": RAE,
-    **dict.fromkeys(("wskp3", "wskp6", "wskp-mr", "kp"), WSKP),
-    **dict.fromkeys(("ntd-a", "ntd-b"), NTD_WITHOUT_OCCLUSION),
-    "ntd": NTD,
-}
-
-# What a profile changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
+# What a budget changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
 RAE_BUDGETS = {
     "tiny": {"epochs": 15, "crop": 32, "ramp": 1},
     "quick": {"epochs": 50, "crop": 64, "ramp": 2},
@@ -117,23 +63,32 @@ NTD_BUDGETS = {
     "paper": {},
 }
 
-RECIPES: dict[tuple[str, str], Recipe] = {
-    (name, profile): replace(recipe, **budget)
-    for name, recipe in PAPER.items()
-    for kind, budgets in (("rae", RAE_BUDGETS), ("wskp", WSKP_BUDGETS), ("kp", WSKP_BUDGETS), ("ntd", NTD_BUDGETS))
-    if name.startswith(kind)
-    for profile, budget in budgets.items()
+PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
+    "rae": (RAE_RECIPE, RAE_BUDGETS),
+    "wskp3": (WSKP_RECIPE, WSKP_BUDGETS),
+    "wskp6": (WSKP_RECIPE, WSKP_BUDGETS),
+    "wskp-mr": (WSKP_RECIPE, WSKP_BUDGETS),
+    "kp": (WSKP_RECIPE, WSKP_BUDGETS),
+    "ntd-a": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
+    "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
+    "ntd": (NTD_RECIPE, NTD_BUDGETS),
 }
 
-TRAINABLE = tuple(PAPER)
+RECIPES: dict[tuple[str, str], Recipe] = {
+    (name, budget): replace(recipe, **changes)
+    for name, (recipe, budgets) in PAPER_AND_BUDGETS.items()
+    for budget, changes in budgets.items()
+}
+
+TRAINABLE = tuple(PAPER_AND_BUDGETS)
 DEFAULT = ("rae", "wskp6", "ntd")  # one a paper; what is trained unless something else is named
 
 
-def recipe_for(name: str, profile: str) -> Recipe:
-    """The recipe of a denoiser in a profile. Raises BadInput for an unknown one."""
+def recipe_for(name: str, budget: str) -> Recipe:
+    """The recipe of a network in a budget. Raises BadInput for an unknown one."""
     if name not in TRAINABLE:
         raise BadInput(f"'{name}' is not a network that can be trained; those are {', '.join(TRAINABLE)}")
-    if (name, profile) not in RECIPES:
-        profiles = [p for n, p in RECIPES if n == name]
-        raise BadInput(f"unknown profile '{profile}'; the profiles of '{name}' are {', '.join(profiles)}")
-    return RECIPES[name, profile]
+    if (name, budget) not in RECIPES:
+        budgets = [known for network, known in RECIPES if network == name]
+        raise BadInput(f"unknown budget '{budget}'; the budgets of '{name}' are {', '.join(budgets)}")
+    return RECIPES[name, budget]

@@ -16,7 +16,9 @@ from models.parameters import WINDOWS
 from models.rae import AUXILIARY, RAE, RAEState
 from models.registry import create
 from models.wskp import KP, WSKP
-from train.recipes import RAETerms, Recipe, recipe_for
+from train.losses.rae import RAETerms
+from train.recipe import Recipe
+from train.recipes import recipe_for
 
 SHARE = 1 / 4  # of the profile's epochs; an ablation trains up to eleven networks
 SINGLE = [(window,) for window in WINDOWS]

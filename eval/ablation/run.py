@@ -17,16 +17,18 @@ from datasets.frame import read_frame
 from errors import BadInput
 from eval.ablation.definitions import SHARE, Ablation, Variant, ablation_for
 from eval.ablation.summary import Run, draw, report, verdicts
-from eval.clip_run import Track
+from eval.clip_run import Entrant
 from eval.harness import clips_of_one_spp, evaluate_clip
-from eval.results import device, versions
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.weights import load_weights
 from models.wskp import KernelPredictor
 from plotting import save_figure
-from train.log import METRICS, read_metrics
-from train.loop import CHECKPOINT, Task, load_checkpoint, train_network
+from provenance import DENOISING, device_in_words, versions
+from train.checkpoint import CHECKPOINT_FILE, load_checkpoint
+from train.log import METRICS_CSV, read_metrics
+from train.loop import train_network
+from train.task import Task
 
 RESULTS, TABLE, PLOT = "results.json", "table.md", "plot.png"
 WARM_UP, REPEATS = 3, 30  # of a timing
@@ -88,7 +90,9 @@ def fusion_ms(denoisers: Mapping[str, Denoiser], clip: Clip) -> dict[str, float]
 
 def judge(name: str, denoiser: Denoiser, weights: Path, clips: Sequence[Clip], folder: Path) -> dict[str, Any]:
     """Means of the harness's metrics on each clip. What was judged before is kept, with pictures, in folder/eval."""
-    results = [evaluate_clip(clip, [Track(name, denoiser, str(weights))], folder)[0] for clip in clips]
+    kind = type(denoiser)
+    entrant = Entrant(name, denoiser.signal, "float32", weights, (kind.__module__,), lambda: denoiser)
+    results = [evaluate_clip(clip, [entrant], folder)[0] for clip in clips]
     return {f"{result.scene}/{result.clip}": result.metrics for result in results}
 
 
@@ -100,9 +104,9 @@ def train_and_judge(ablation: Ablation, tasks: Mapping[tuple[str, int], Task], f
     precision: str | None = None
     for (label, seed), task in tqdm(tasks.items(), folder.name, unit="network"):
         weights = train_network(replace(task, precision=precision))
-        precision = load_checkpoint(task.folder / CHECKPOINT)["precision"]
+        precision = load_checkpoint(task.folder / CHECKPOINT_FILE)["precision"]
         denoiser = networks[label] = trained(variants[label], weights)
-        losses = epoch_losses(task.folder / METRICS, task.recipe.epochs)
+        losses = epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs)
         parameters = task.create().parameter_count()  # as trained
         runs.append(Run(label, seed, parameters, losses, judge(task.folder.name, denoiser, weights, clips, folder)))
     if ablation.timed:
@@ -141,7 +145,13 @@ def ablate(what: str, data: Path, runs: Path, profile: str, seeds: int = 1) -> s
     title += f"profile {profile}, {epochs} epochs ({SHARE:.0%} of its own), seeds: {seeds}, judged on {clips}"
     save_figure(folder / PLOT, draw(ablation, results, title))
     write_file(folder / TABLE, f"{title}\n\n{report(ablation, results, 'github')}\n".encode())
-    facts = {"schema": 1, "what": what, "dataset": str(data), "device": device(), "versions": versions()}
+    facts = {
+        "schema": 1,
+        "what": what,
+        "dataset": str(data),
+        "device": device_in_words(),
+        "versions": versions(DENOISING),
+    }
     budget = {"profile": profile, "epochs": epochs, "share_of_epochs": SHARE, "seeds": seeds}
     found = {"rows": [vars(run) for run in results], "findings": verdicts(ablation, results)}
     write_json(folder / RESULTS, facts | budget | found)

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from tabulate import tabulate
 
 from eval.ablation.definitions import CUMULATIVE, SINGLE, Ablation, Finding, label_of
-from eval.metrics import METRICS, Metric
+from eval.metrics import METRICS, Quantity
 from plotting import DPI, plt
 
 MEASURED = METRICS | {
-    "train_loss": Metric("training loss", "{:.4f}"),  # of the last epoch
-    "fusion_ms": Metric("fusion ms", "{:.3f}"),
+    "train_loss": Quantity("training loss", "{:.4f}"),  # of the last epoch
+    "fusion_ms": Quantity("fusion ms", "{:.3f}"),
 }
 
 

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from eval.bench.denoisers import thread_count
 from eval.bench.memory import alone, growth_mb
 from files import write_json
 from models import compiled
 from models.fusion import fuse
 from models.parameters import WINDOWS
+from timing import thread_count
 
 UNFOLD, PYTORCH, COMPILED = "unfold and softmax", "onespp, PyTorch", "onespp, compiled"
 REPEATS = {UNFOLD: 3, PYTORCH: 15, COMPILED: 15}

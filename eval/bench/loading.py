@@ -15,12 +15,14 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.inspect import size_of
+from datasets.info import size_of
 from files import write_json
 from models.registry import create
 from train.data import Items, items, loader, micro_batches
-from train.loop import Training, task_for
-from train.recipes import Recipe, recipe_for
+from train.recipe import Recipe
+from train.recipes import recipe_for
+from train.registry import task_for
+from train.training import Training
 
 FASTEST = "rae"  # the network whose training consumes the most pixels a second
 WORKERS = (0, 1, 2)

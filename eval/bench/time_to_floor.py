@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.backend import dr, mi
-from render.shot import Image, Shot, finite
+from render.shot import FloatImage, Shot, finite_or_zero
 from render.stage import Stage
 from scenes.camera import View
 from scenes.registry import build_scene
 
-Display = Callable[[Image], Image]  # radiance to what is shown, in [0, 1]
-Render = Callable[[int, int], Image]  # (seed, spp) to radiance (H, W, 3)
+Display = Callable[[FloatImage], FloatImage]  # radiance to what is shown, in [0, 1]
+Render = Callable[[int, int], FloatImage]  # (seed, spp) to radiance (H, W, 3)
 
 SIZE, FRAMES, FRAME = 96, 24, 8
 FIRST_SPP, MOST_SPP, REPEATS = 32, 512, 3
@@ -49,9 +49,11 @@ def stock(shot: Shot) -> Render:
     integrator = mi.load_dict({"type": "path", "max_depth": shot.stage.scene.max_depth})
     sensor = perspective(shot.stage, shot.view)
 
-    def render(seed: int, spp: int) -> Image:
+    def render(seed: int, spp: int) -> FloatImage:
         scene = shot.stage.mitsuba_scene
-        return finite(np.array(mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)))
+        return finite_or_zero(
+            np.array(mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp))
+        )
 
     return render
 
@@ -76,7 +78,7 @@ def enough(render: Render, target: float, display: Display) -> tuple[int, float]
     return spp, floor
 
 
-def seconds_to_floor(names: Iterable[str], target: float, display_of: Callable[[Image], Display]) -> Iterator[Row]:
+def seconds_to_floor(names: Iterable[str], target: float, display_of: Callable[[FloatImage], Display]) -> Iterator[Row]:
     """Rows for both renderers on one frame of each scene, `target` an MSE.
 
     `display_of` makes the display transform from radiance (H, W, 3); both renderers share the one of ours.

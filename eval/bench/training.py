@@ -16,10 +16,12 @@ from tqdm import tqdm
 
 from files import write_json
 from train.data import in_parts, loader, micro_batches
-from train.loop import Training, task_for
+from train.precision import BFLOAT16, FLOAT32
 from train.recipes import DEFAULT
+from train.registry import task_for
+from train.training import Training
 
-PRECISIONS = ("32-true", "bf16-mixed")
+PRECISIONS = (FLOAT32, BFLOAT16)
 REPEATS = 5  # steps of each, in turns, besides a first one that warms up; the median counts
 CONVOLUTIONS, NETWORK, LOSS, OPTIMISER, LOADING, REST = (
     "convolutions",
@@ -44,7 +46,7 @@ def bench_training(data: Path, runs: Path, profile_name: str, names: Sequence[st
             times = step_times(trainings)
             fastest = min(times, key=lambda precision: times[precision])
             row = {f"{precision} ms": ms for precision, ms in times.items()}
-            speeds.append({"network": name, **row, "times faster": times["32-true"] / times["bf16-mixed"]})
+            speeds.append({"network": name, **row, "times faster": times["float32"] / times["bfloat16"]})
             shares.append({"network": name, "precision": fastest, **step_shares(trainings[fastest])})
     (runs / "bench").mkdir(parents=True, exist_ok=True)
     device = f"{'cuda' if torch.cuda.is_available() else 'cpu'}, {torch.get_num_threads()} threads"
@@ -67,7 +69,7 @@ def step_times(trainings: dict[str, Training]) -> dict[str, float]:
 
 
 def one_step(training: Training, number: int) -> dict[str, float]:
-    batches = micro_batches(number, number + 1, training.recipe.batch, training.at_once)
+    batches = micro_batches(number, number + 1, training.recipe.batch, training.micro_batch)
     return training.step(next(in_parts(loader(training.items, batches), training.parts)))
 
 

@@ -1,5 +1,6 @@
 """A contact sheet of scenes, to look at before rendering hours of them."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,11 +14,16 @@ from render.shot import Shot
 from render.stage import Stage
 from scenes.registry import build_scene
 
-CAPTION = 0.2  # inches
+TITLE_INCHES = 0.2  # height of the line above each picture
 
 
-def picture(name: str, seed: int, frame: int, frames: int, height: int, width: int, spp: int) -> NDArray[np.float64]:
-    """One frame of a scene as displayed, (H, W, 3) in [0, 1]; its own exposure."""
+def displayed_frame(
+    name: str, seed: int, frame: int, frames: int, height: int, width: int, spp: int
+) -> NDArray[np.float64]:
+    """One frame of a scene as displayed, (H, W, 3) in [0, 1], with an exposure of its own.
+
+    Raises BadInput for an unknown scene.
+    """
     shot = Shot(Stage(build_scene(name, seed, frames), height, width), frame)
     reflected = shot.reflected(seed, spp)
     return display(reflected + shot.emission, clip_exposure(luminance(reflected)))
@@ -26,20 +32,27 @@ def picture(name: str, seed: int, frame: int, frames: int, height: int, width: i
 def contact_sheet(
     path: Path, names: Sequence[str], seed: int = 0, frames: int = 24, size: tuple[int, int] = (192, 256), spp: int = 64
 ) -> None:
-    """Write a PNG with the middle frame of each scene in `names`, `size` = (height, width) each.
+    """Write a PNG with the middle frame of each scene in `names`, each of `size` (height, width) in pixels.
 
     Raises BadInput for an unknown scene.
     """
     height, width = size
-    columns = int(np.ceil(np.sqrt(len(names))))
-    rows = -(-len(names) // columns)
-    sheet = (columns * width / DPI, rows * (height / DPI + CAPTION))
-    figure, axes = plt.subplots(rows, columns, figsize=sheet, dpi=DPI, squeeze=False)
+    columns = math.ceil(math.sqrt(len(names)))
+    rows = math.ceil(len(names) / columns)
+    sheet_width = columns * width / DPI
+    sheet_height = rows * (height / DPI + TITLE_INCHES)
+    figure, axes = plt.subplots(rows, columns, figsize=(sheet_width, sheet_height), dpi=DPI, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, name in zip(axes.flat, tqdm(names, "scenes", unit="scene"), strict=False):
-        axis.imshow(picture(name, seed, frames // 2, frames, height, width, spp), interpolation="nearest")
+        axis.imshow(displayed_frame(name, seed, frames // 2, frames, height, width, spp), interpolation="nearest")
         axis.set_title(name, fontsize=8, pad=2)
-    top = 1 - CAPTION / sheet[1]
-    figure.subplots_adjust(left=0, right=1, bottom=0, top=top, wspace=0.01, hspace=CAPTION * DPI / height)
+    figure.subplots_adjust(
+        left=0,
+        right=1,
+        bottom=0,
+        top=1 - TITLE_INCHES / sheet_height,
+        wspace=0.01,
+        hspace=TITLE_INCHES * DPI / height,
+    )
     save_figure(path, figure)

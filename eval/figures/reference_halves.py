@@ -11,12 +11,15 @@ from render.stage import Stage
 from scenes.registry import build_scene
 
 
-def references(name: str, size: tuple[int, int], spps: Sequence[int], seed: int = 0) -> Iterator[NDArray[np.float64]]:
-    """Yields, for each of `spps`, two halves (2, H, W, 3) of the radiance of the first frame of a scene.
+def reference_halves(
+    name: str, size: tuple[int, int], spps: Sequence[int], seed: int = 0
+) -> Iterator[NDArray[np.float64]]:
+    """Yields two halves (2, H, W, 3) of the radiance of a scene's first frame, for each of `spps`.
 
-    Each half has spp/2 samples and a seed of its own, as in a data set; `size` is (height, width).
+    Both have spp / 2 samples a pixel and a seed of their own, as in a data set; `size` is (height, width) in pixels.
     Raises BadInput for an unknown scene.
     """
-    shot = Shot(Stage(build_scene(name, seed, 1), *size), 0)
+    height, width = size
+    shot = Shot(Stage(build_scene(name, seed, frames=1), height, width), 0)
     for index, spp in enumerate(tqdm(spps, "references", leave=False)):
         yield np.stack([shot.radiance(2 * index + half, spp // 2) for half in (0, 1)])

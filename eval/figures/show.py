@@ -16,7 +16,7 @@ from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, Signal, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.harness import ready_denoisers
+from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.registry import create
@@ -115,7 +115,9 @@ def runnable(clip: Clip, runs: Path, profile: str, names: Sequence[str]) -> dict
     Raises BadInput where a named one is unknown, cannot run or has no weights.
     """
     ready = {"noisy": create("noisy")}
-    for name, (denoiser, _) in ready_denoisers(list(names) or None, runs, profile).items():
+    for spec in evaluated(names, runs, profile):
+        name = spec.name
+        denoiser = spec.build()
         missing = [channel for channel in denoiser.reads if channel not in clip.channels]
         if missing and not names:
             print(f"{name}: skipped, the clip holds no {' and no '.join(missing)}")

@@ -12,9 +12,10 @@ from torch.nn.functional import avg_pool2d
 
 from datasets.frame import to_tensor
 from datasets.tonemap import clip_exposure, luminance
-from eval.figures.reference_halves import references
-from eval.metrics import METRICS, image_metrics
-from eval.noise_floor import noise_floor
+from eval.comparison import Comparison
+from eval.figures.reference_halves import reference_halves
+from eval.metrics import METRICS, noise_floors
+from eval.metrics import measure as measure_frame
 from plotting import DPI, plt, save_figure
 
 SCENE, SIZE = "cornell_box", (64, 64)
@@ -43,16 +44,17 @@ def tensor(radiance: NDArray[np.float64]) -> Tensor:
 def measure(repeats: Mapping[int, int] = REPEATS, truth_spp: int = TRUTH_SPP) -> tuple[float, list[Measured]]:
     """The MSE of a fixed image to a reference of very many samples, and what noisy references say of it."""
     spps = [spp for spp, count in repeats.items() for _ in range(count)]
-    rendered = references(SCENE, SIZE, [truth_spp, *spps])
+    rendered = reference_halves(SCENE, SIZE, [truth_spp, *spps])
     truth = next(rendered).mean(axis=0)
-    exposure, perfect, still = clip_exposure(luminance(truth)), tensor(truth), torch.zeros(1, 2, *SIZE)
+    exposure = clip_exposure(luminance(truth))
+    perfect = tensor(truth)
     image = torch.lerp(perfect, avg_pool2d(perfect, 3, 1, 1, count_include_pad=False), BLUR)
     measured = []
     for spp, halves in zip(spps, rendered, strict=True):
         pair = torch.cat([tensor(half) for half in halves])
-        metrics, best = (image_metrics(x, pair, exposure) for x in (image, perfect))
+        metrics, best = (measure_frame(Comparison(x, pair, exposure)) for x in (image, perfect))
         plain = (exposure * (image - pair.mean(dim=0))).square().mean().item()
-        floors = noise_floor(pair, exposure, still, still)
+        floors = noise_floors(Comparison(image, pair, exposure))
         values = ({key: float(found[key] or 0) for key in FLOORS} for found in (floors, best))
         measured.append(Measured(spp, plain, float(metrics["mse_unbiased"] or 0), *values))
     return (exposure * (image - perfect)).square().mean().item(), measured

@@ -9,19 +9,19 @@ from typing import NamedTuple
 from tabulate import tabulate
 
 from eval.ablation.summary import Run, over_seeds
-from eval.metrics import METRICS, Metric
-from eval.noise_floor import within_floor
+from eval.means import joint_floor
+from eval.metrics import METRICS, Quantity, within_floor
 from eval.papers.tables import TABLES, PaperTable
 from eval.report.table_rows import mean_of, of, one_spp
 from eval.results import read_results
-from eval.text_table import LEGEND, NEAR, joint_floor
+from eval.text_table import LEGEND, NEAR
 from files import read_json
 from train.recipes import TRAINABLE
 
 TITLES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {
-    "ms": Metric("ms", "{:.4g}"),
-    "prediction": Metric("prediction ms", "{:.4g}"),
-    "reconstruction": Metric("reconstruction ms", "{:.4g}"),
+    "ms": Quantity("ms", "{:.4g}"),
+    "prediction": Quantity("prediction ms", "{:.4g}"),
+    "reconstruction": Quantity("reconstruction ms", "{:.4g}"),
 }
 SIZE = (720, 1280)  # of WSKP's Table 3
 HEADER = """\

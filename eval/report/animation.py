@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from eval.results import ClipResults, folders_of, label, load_picture
+from eval.results import ClipResults, folders_of, load_picture, signal_label
 from files import replacing
 
 BEST = 2  # denoisers that are shown
@@ -17,8 +17,8 @@ CAPTION = 22  # px
 
 def shown(clip: ClipResults) -> list[str]:
     """What stands side by side: the noisy frame, the best denoisers by FLIP, the reference."""
-    flips = {track.denoiser: track.metrics["flip"] or 0.0 for track in clip.tracks if track.denoiser != "noisy"}
-    noisy = [track.denoiser for track in clip.tracks if track.denoiser == "noisy"]
+    flips = {track.denoiser: track.metrics["flip"] or 0.0 for track in clip.results if track.denoiser != "noisy"}
+    noisy = [track.denoiser for track in clip.results if track.denoiser == "noisy"]
     return [*noisy, *sorted(flips, key=flips.__getitem__)[:BEST], clip.reference.denoiser]
 
 
@@ -40,7 +40,7 @@ def save_animation(runs: Path, clip: ClipResults) -> Path:
     folders = [folders_of(runs, clip)[name] for name in names]
     count = min(FRAMES, len(clip.reference.frames))
     frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in range(count))
-    path = runs / "report" / f"{label(f'{clip.scene}-{clip.clip}', clip.signal)}.webp"
+    path = runs / "report" / f"{signal_label(f'{clip.scene}-{clip.clip}', clip.signal)}.webp"
     first = next(frames)
     with replacing(path) as temporary:
         first.save(

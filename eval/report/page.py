@@ -39,7 +39,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
     pictures = [clip_data(runs, clip, step) for clip in tqdm(clips, "report", unit="clip")]
     rows = table_rows(clips)
     measured = [key for key in METRICS if any(row.values.get(key) is not None for row in rows)]
-    denoisers = list(dict.fromkeys(track.denoiser for clip in clips for track in clip.tracks))
+    denoisers = list(dict.fromkeys(track.denoiser for clip in clips for track in clip.results))
     data = {
         "metrics": {key: {"title": METRICS[key].title, "more": METRICS[key].more_is_better} for key in measured},
         "denoisers": denoisers,

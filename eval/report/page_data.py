@@ -13,7 +13,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from eval.metrics import METRICS, flip_map
-from eval.results import ClipResults, folders_of, load_picture, picture
+from eval.results import ClipResults, folders_of, load_picture, picture_path
 
 MAPS = 1.4  # bytes of images and their FLIP maps over those of images
 BASE64 = 4 / 3
@@ -53,14 +53,14 @@ def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int
 
 def clip_data(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
     """What the page needs of a clip: pictures as data URIs, errors frame by frame, crops."""
-    everyone, folders, count = [*clip.tracks, clip.reference], folders_of(runs, clip), len(clip.reference.frames)
+    everyone, folders, count = [*clip.results, clip.reference], folders_of(runs, clip), len(clip.reference.frames)
     frames = range(0, count, step)
     images: dict[str, list[str]] = {name: [] for name in folders}
-    flips: dict[str, list[str]] = {track.denoiser: [] for track in clip.tracks}
+    flips: dict[str, list[str]] = {track.denoiser: [] for track in clip.results}
     for index in tqdm(frames, clip.name, unit="frame", leave=False):
         shown = {name: load_picture(folder, index) for name, folder in folders.items()}
         for name, image in shown.items():
-            images[name].append(data_uri(picture(folders[name], index).read_bytes(), "webp"))
+            images[name].append(data_uri(picture_path(folders[name], index).read_bytes(), "webp"))
             if name in flips:
                 errors = flip_map(image / 255, shown[clip.reference.denoiser] / 255)
                 flips[name].append(encoded((255 * errors + 0.5).astype(np.uint8)))
@@ -68,7 +68,7 @@ def clip_data(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
     curves = {
         metric: {r.denoiser: [rounded(values.get(metric)) for values in r.frames] for r in everyone}
         for metric in METRICS
-        if any(values.get(metric) is not None for track in clip.tracks for values in track.frames)
+        if any(values.get(metric) is not None for track in clip.results for values in track.frames)
     }
     facts = {"name": clip.name, "count": count, "frames": [*frames], "height": height, "width": width}
     return facts | {"images": images, "flips": flips, "curves": curves, "crops": chosen_crops(clip, frames)}

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from eval.noise_floor import within_floor
-from eval.results import FLOOR, ClipResults, Result, Values, mean_floor, means
-from eval.text_table import cell, floor_cell, joint_floor
+from eval.means import joint_floor, mean_floor, means
+from eval.metrics import Values, within_floor
+from eval.results import FLOOR, ClipResults, Result
+from eval.text_table import cell, floor_cell
 
 ALL = "mean of clips of 1 spp"
 
@@ -40,7 +41,7 @@ def rows_of(clip: str, signal: str, tracks: Sequence[Result], floors: Values) ->
 
 def mean_rows(signal: str, clips: Sequence[ClipResults]) -> list[Row]:
     floors, rows = [clip.reference.metrics for clip in clips], []
-    for name in (track.denoiser for track in clips[0].tracks):
+    for name in (track.denoiser for track in clips[0].results):
         metrics = [result.metrics for result in of(clips, name)]
         rows.append(Row(ALL, name, signal, means(metrics), joint_floor(metrics, floors), nonfinite_of(clips, name)))
     floor = mean_floor(floors)
@@ -51,7 +52,7 @@ def table_rows(clips: Sequence[ClipResults]) -> list[Row]:
     """Means over the clips of one sample a pixel, if there are several, and then clip by clip."""
     rows = []
     for clip in clips:
-        rows += rows_of(f"{clip.scene}/{clip.clip}", clip.signal, clip.tracks, clip.reference.metrics)
+        rows += rows_of(f"{clip.scene}/{clip.clip}", clip.signal, clip.results, clip.reference.metrics)
     together = []
     for signal, ours in by_signal(one_spp(clips)).items():
         if len(ours) > 1:
@@ -70,7 +71,7 @@ def by_signal(clips: Sequence[ClipResults]) -> dict[str, list[ClipResults]]:
 
 
 def of(clips: Sequence[ClipResults], name: str) -> list[Result]:
-    return [track for clip in clips for track in clip.tracks if track.denoiser == name]
+    return [track for clip in clips for track in clip.results if track.denoiser == name]
 
 
 def mean_of(clips: Sequence[ClipResults], name: str) -> Values:

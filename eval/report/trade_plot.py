@@ -4,24 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eval.means import compared_mean
 from eval.metrics import METRICS
 from eval.report.table_rows import by_signal, mean_of, of, one_spp
 from eval.results import ClipResults
-from eval.sizes import timed_as
-from eval.text_table import compared
 from eval.tradeoff.pareto import Point, dominators
+from eval.tradeoff.times import median_ms, timed_as
 from files import read_json
 
 TRADED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
-
-
-def median_ms(bench: dict[str, Any], size: tuple[int, int], threads: int) -> dict[tuple[str, str], float]:
-    """Milliseconds by (denoiser, dtype) in the bench's results, at a size (height, width) and a number of threads."""
-    return {
-        (row["denoiser"], row["dtype"]): row["ms_median"]
-        for row in bench["rows"]
-        if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, threads)
-    }
 
 
 def trades(runs: Path, clips: Sequence[ClipResults]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -48,13 +39,13 @@ def trade(
     """A point for each denoiser that was timed in the precision in which it was evaluated."""
     floors = [clip.reference.metrics for clip in clips]
     points, values = dict[str, Point](), dict[str, float]()
-    for track in clips[0].tracks:
+    for track in clips[0].results:
         ms = times.get((timed_as(track.denoiser, signal), track.precision))
         quality = mean_of(clips, track.denoiser)[metric]
-        seen = compared(metric, [result.metrics for result in of(clips, track.denoiser)], floors)
+        seen = compared_mean(metric, [result.metrics for result in of(clips, track.denoiser)], floors)
         if ms is not None and quality is not None and seen is not None:
             points[track.denoiser], values[track.denoiser] = Point(ms, seen), quality
     by = dominators(points, METRICS[metric].more_is_better)
-    missing = [track.denoiser for track in clips[0].tracks if track.denoiser not in points]
+    missing = [track.denoiser for track in clips[0].results if track.denoiser not in points]
     shown = [{"name": name, "ms": points[name].ms, "quality": values[name], "by": by[name]} for name in points]
     return {"signal": signal, "metric": metric, "points": shown, "missing": missing}

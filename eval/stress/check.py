@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.bench.denoisers import network_of
+from eval.bench.race import network_of
 from eval.stress.cases import PERIOD, RECOVERY_LIMIT, SPOILED, Extreme, Pixel, unchanged
 from models.denoiser import Denoiser
 from models.operators import finite

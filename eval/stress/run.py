@@ -13,14 +13,15 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from errors import BadInput
-from eval.bench.denoisers import PRECISIONS, thread_count
+from eval.spec import PRECISIONS
 from eval.stress.cases import EXTREMES, LONG, RECOVERY_LIMIT, Extreme
 from eval.stress.check import REQUIREMENTS, Outcome, Trial, heads
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS, create, load, unavailable, without_taa
 from plotting import plt, save_figure
-from train.loop import WEIGHTS, run_folder
+from timing import thread_count
+from train.task import WEIGHTS_FILE, run_folder
 
 FRESH = "fresh"
 
@@ -61,7 +62,7 @@ def contestants(names: Sequence[str], runs: Path, profile: str) -> list[Contesta
                 raise BadInput(reason)
             print(f"{name}: skipped, {reason}")
             continue
-        file = run_folder(runs, without_taa(name), profile) / WEIGHTS
+        file = run_folder(runs, without_taa(name), profile) / WEIGHTS_FILE
         found.append(Contestant(name, file if create(name).parameter_count() and file.exists() else None))
     return found
 

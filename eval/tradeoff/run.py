@@ -7,18 +7,23 @@ from typing import Any
 from tabulate import tabulate
 
 from datasets.clip import Dataset
-from eval.bench.denoisers import parse_size
-from eval.harness import clips_of_one_spp, evaluate_clip, tracks_of
-from eval.metrics import METRICS
-from eval.results import REFERENCE, Result, Values, device, means, versions
-from eval.text_table import LEGEND, NEAR, cell, compared, joint_floor
-from eval.tradeoff.candidates import Candidate, Times, candidates, ready
+from eval.bench.sizes import parse_size
+from eval.harness import clips_of_one_spp, entrant, evaluate_clip
+from eval.means import compared_mean, joint_floor, means
+from eval.metrics import METRICS, Values
+from eval.results import REFERENCE, Result
+from eval.selection import with_indirect_baselines
+from eval.spec import DenoiserSpec
+from eval.text_table import LEGEND, NEAR, cell
+from eval.tradeoff.candidates import candidates, trained_epochs
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.sample_cost import RENDERER
 from eval.tradeoff.samples import LEVELS, by_samples, check_levels, generalisation, sampled, samples_table
+from eval.tradeoff.times import Times
 from files import write_json
 from plotting import save_figure
+from provenance import DENOISING, device_in_words, versions
 
 TRADED = ("psnr", "ssim", "rmse")
 FRONTS = (
@@ -35,7 +40,7 @@ def by_label(results: Sequence[Result]) -> Found:
     return found
 
 
-def rows_of(chosen: Sequence[Candidate], quality: Found, times: Times) -> list[dict[str, Any]]:
+def rows_of(chosen: Sequence[DenoiserSpec], quality: Found, times: Times) -> list[dict[str, Any]]:
     """A row a candidate and signal: milliseconds, metrics, and by whom it is beaten in each metric."""
     candidates_by_label = {candidate.label: candidate for candidate in chosen}
     rows: list[dict[str, Any]] = []
@@ -44,10 +49,12 @@ def rows_of(chosen: Sequence[Candidate], quality: Found, times: Times) -> list[d
             candidate, floors = candidates_by_label[label], quality[signal, REFERENCE]
             rows.append(
                 {
-                    **candidate.facts(),
-                    **{"signal": signal, "epochs": candidate.epochs(), "ms": times.of(candidate, signal)},
+                    "label": candidate.label,
+                    "denoiser": candidate.name,
+                    "dtype": candidate.precision,
+                    **{"signal": signal, "epochs": trained_epochs(candidate), "ms": times.of(candidate, signal)},
                     **{"metrics": means(clips), "floors": joint_floor(clips, floors)},
-                    "compared": {metric: compared(metric, clips, floors) for metric in TRADED},
+                    "compared": {metric: compared_mean(metric, clips, floors) for metric in TRADED},
                 }
             )
     for signal in {row["signal"] for row in rows}:
@@ -106,10 +113,11 @@ def trade(
     """
     check_levels(levels)
     dataset, times = Dataset(data), Times(runs, parse_size(size), threads, RENDERER)
-    clips, chosen = clips_of_one_spp(dataset), candidates(names, runs, profile)
+    clips = clips_of_one_spp(dataset)
+    chosen = candidates(names, runs, profile)
 
-    entrants = ready(chosen)
-    results = [result for clip in clips for result in evaluate_clip(clip, tracks_of(entrants), runs / "trade")]
+    entrants = [entrant(spec, spec.label) for spec in with_indirect_baselines(chosen)]
+    results = [result for clip in clips for result in evaluate_clip(clip, entrants, runs / "trade")]
     rows = rows_of(chosen, by_label(results), times)
     few = sampled(chosen, bool(names))
     samples = by_samples(few, clips, dataset, levels, times, runs / "trade")
@@ -120,7 +128,13 @@ def trade(
     for metric in TRADED:
         save_figure(figures / f"trade-{metric}.png", draw_front(rows, metric, title))
     save_figure(figures / "trade-samples.png", draw_samples(samples["rows"], title))
-    facts = {"schema": 1, "dataset": str(data), "device": device(), "versions": versions(), "profile": profile}
+    facts = {
+        "schema": 1,
+        "dataset": str(data),
+        "device": device_in_words(),
+        "versions": versions(DENOISING),
+        "profile": profile,
+    }
     facts |= {"clips": [f"{clip.scene}/{clip.name}" for clip in clips], "size": times.name, "threads": times.threads}
     write_json(runs / "report" / "trade.json", facts | {"rows": rows, "samples": samples})
     return tables(rows, samples, title, times)

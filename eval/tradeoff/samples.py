@@ -11,16 +11,17 @@ from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.bench.denoisers import PRECISIONS
-from eval.harness import evaluate_clip, tracks_of
-from eval.metrics import METRICS
-from eval.results import REFERENCE, Values, means
-from eval.text_table import cell, compared, joint_floor
-from eval.tradeoff.candidates import Candidate, Times, ready
+from eval.harness import entrant, evaluate_clip
+from eval.means import compared_mean, joint_floor, means
+from eval.metrics import METRICS, Values
+from eval.results import REFERENCE
+from eval.selection import with_indirect_baselines
+from eval.spec import DenoiserSpec, precision_in_use
+from eval.text_table import cell
 from eval.tradeoff.clips import scene_of, source, with_samples
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.sample_cost import Cost, sample_cost
-from models.registry import inference_precision
+from eval.tradeoff.times import Times
 from render.clip import Options
 
 LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -36,28 +37,28 @@ def check_levels(levels: Sequence[int]) -> None:
         raise BadInput(f"{' '.join(map(str, levels))} are no samples a pixel to compare: name rising numbers from 1")
 
 
-def sampled(chosen: Sequence[Candidate], named: bool) -> list[Candidate]:
+def sampled(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
     """A few of the candidates, or all that were named, each in the precision that `onespp eval` takes here."""
     return [
         candidate
         for candidate in chosen
-        if (named or candidate.variant.label in SAMPLED)
-        and PRECISIONS[candidate.variant.dtype] == inference_precision(type(candidate.variant.build()))
+        if (named or candidate.name in SAMPLED) and candidate.precision == precision_in_use(candidate.name)
     ]
 
 
 def judge(
-    chosen: Sequence[Candidate], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
+    chosen: Sequence[DenoiserSpec], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
 ) -> dict[tuple[str, str, int], list[Values]]:
     """Metrics of (signal, label, samples a pixel), clip by clip. What is rendered and judged is kept in `folder`.
 
     Noise floors are those of the label REFERENCE.
     """
-    entrants, found = ready(chosen), dict[tuple[str, str, int], list[Values]]()
+    entrants = [entrant(spec, spec.label) for spec in with_indirect_baselines(chosen)]
+    found = dict[tuple[str, str, int], list[Values]]()
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
         fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data")
-        for result in evaluate_clip(fed, tracks_of(entrants), folder):
+        for result in evaluate_clip(fed, entrants, folder):
             found.setdefault((result.signal, result.denoiser, spp), []).append(result.metrics)
     return found
 
@@ -72,7 +73,7 @@ def costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[str, Co
 
 
 def by_samples(
-    chosen: Sequence[Candidate],
+    chosen: Sequence[DenoiserSpec],
     clips: Sequence[Clip],
     dataset: Dataset,
     levels: Sequence[int],
@@ -92,10 +93,12 @@ def by_samples(
         total = None if filter_ms is None else render_ms + filter_ms
         rows.append(
             {
-                **candidate.facts(),
+                "label": candidate.label,
+                "denoiser": candidate.name,
+                "dtype": candidate.precision,
                 **{"signal": signal, "spp": spp, "render_ms": render_ms, "filter_ms": filter_ms, "ms": total},
                 **{"metrics": means(judged), "floors": joint_floor(judged, floors)},
-                "compared": {"psnr": compared("psnr", judged, floors)},
+                "compared": {"psnr": compared_mean("psnr", judged, floors)},
             }
         )
     for signal in {row["signal"] for row in rows}:

@@ -8,17 +8,16 @@ import pytest
 from datasets.adaptive_spp import noise_of_reference, reference_spp
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
+from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
-from datasets.generate import generate, render_to
-from datasets.inspect import info, size_in_full
-from datasets.profiles import DataProfile, Quality, clips_of, plan, profile_of, rendered_channels
+from datasets.generate import Share, generate
+from datasets.info import AUXILIARY_CHANNELS, size_in_full, stored_size, summarise
+from datasets.profiles import DataProfile, SamplingQuality, clips_of, plan, profile_of, rendered_channels
 from errors import BadInput
 from models.registry import channels_read, create
-from render.clip import PLAIN
+from render.clip import NO_OPTIONS
 from render.stage import Stage
 from scenes.registry import build_scene
-
-AUXILIARY = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
 
 
 def test_release_has_rooms_enough_and_tests_on_others():
@@ -51,30 +50,36 @@ def test_other_clip_names_are_refused():
         ClipKind.of("moving")
 
 
+def small_profile(size: int, frames: int, quality: SamplingQuality) -> DataProfile:
+    """For test clips of `size` x `size` pixels."""
+    return DataProfile(size, size, frames, boxes={}, rooms={}, quality={"test": quality})
+
+
 @pytest.fixture(scope="module")
-def variants(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Clip]:
+def moving_boxes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Clip]:
     """One moving box as it is, standing still, and with 16 spp as noisy input."""
-    quality = Quality(realisations=4, reference_spp=64)
-    profile = DataProfile(24, 24, 5, boxes={}, rooms={}, quality={"test": quality})
-    root, clips = tmp_path_factory.mktemp("variants"), {}
+    profile = small_profile(24, 5, SamplingQuality(realisations=4, reference_spp=64))
+    root = tmp_path_factory.mktemp("variants")
+    clips = {}
     for name in ("000", "still", "000-16spp"):
         path = root / "test" / "cornell_box_moving" / name
-        render_to(path, profile, 0, tuple(CHANNELS))
+        render_to_folder(path, profile, 0, tuple(CHANNELS))
         clips[name] = Clip(path)
     return clips
 
 
-def test_in_a_still_clip_only_the_noise_changes(variants):
-    clip = variants["still"]
+def test_in_a_still_clip_only_the_noise_changes(moving_boxes):
+    clip = moving_boxes["still"]
     for name in ("albedo", "normal", "depth", "emission", "mesh_id"):
         assert all(np.array_equal(clip.read(name, 0), clip.read(name, frame)) for frame in range(1, clip.frames))
     assert all((clip.read("motion", frame) == 0).all() for frame in range(clip.frames))
     assert not np.array_equal(clip.read("direct", 0), clip.read("direct", 1))
-    assert not np.array_equal(variants["000"].read("depth", 0), variants["000"].read("depth", 4))
+    assert not np.array_equal(moving_boxes["000"].read("depth", 0), moving_boxes["000"].read("depth", 4))
 
 
-def test_more_samples_as_input_have_less_noise_and_the_same_reference(variants):
-    one, many = variants["000"], variants["000-16spp"]
+def test_more_samples_as_input_have_less_noise_and_the_same_reference(moving_boxes):
+    one = moving_boxes["000"]
+    many = moving_boxes["000-16spp"]
     assert many.facts["noisy_spp"] == 16
     for name in ("direct_reference", "indirect_reference", "albedo", "motion", "dual_motion"):
         assert all(np.array_equal(one.read(name, frame), many.read(name, frame)) for frame in range(one.frames))
@@ -88,10 +93,9 @@ def test_more_samples_as_input_have_less_noise_and_the_same_reference(variants):
 
 @pytest.mark.parametrize("floor", [34.0, 40.0])
 def test_references_get_down_to_their_floor(floor, tmp_path):
-    quality = Quality(realisations=1, reference_spp=16, floor=floor)
-    profile = DataProfile(32, 32, 4, boxes={}, rooms={}, quality={"test": quality})
+    profile = small_profile(32, 4, SamplingQuality(realisations=1, reference_spp=16, floor=floor))
     path = tmp_path / "test" / "cornell_box" / "000"
-    render_to(path, profile, 0, tuple(CHANNELS))
+    render_to_folder(path, profile, 0, tuple(CHANNELS))
     clip = Clip(path)
     assert -10 * np.log10(clip.facts["floor_mse"]) > floor - 0.5
     spp = clip.facts["reference_spp"]
@@ -100,18 +104,20 @@ def test_references_get_down_to_their_floor(floor, tmp_path):
 
 def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
     scene = build_scene("room-5", 0, 2)  # in which few samples see little of the noise that many have
-    quality = Quality(1, 16, floor=26.0, most_spp=1024)
+    quality = SamplingQuality(realisations=1, reference_spp=16, floor=26.0, most_spp=1024)
     stage = Stage(scene, 24, 24)
-    few = noise_of_reference(stage, 2, 16, 1, PLAIN)
-    spp = reference_spp(scene, 2, 24, 24, quality, 1)
-    assert spp > 16 * few / 10**-2.6
-    assert spp == 1024 or noise_of_reference(stage, 2, spp, 1, PLAIN) <= 10**-2.6
+    wanted = 10**-2.6
+    predicted = 16 * 2 ** np.ceil(np.log2(noise_of_reference(stage, 1, 16, 2, NO_OPTIONS) / wanted))
+    spp = reference_spp(scene, 1, 24, 24, quality, 2)
+    assert spp > predicted
+    assert spp == 1024 or noise_of_reference(stage, 1, spp, 2, NO_OPTIONS) <= wanted
 
 
 def test_references_stop_at_the_most():
     scene = build_scene("cornell_box", 0, 2)
-    assert reference_spp(scene, 2, 16, 16, Quality(1, 8, floor=90.0, most_spp=64), 1) == 64
-    assert reference_spp(scene, 2, 16, 16, Quality(1, 8), 1) == 8
+    unbounded = SamplingQuality(realisations=1, reference_spp=8)
+    assert reference_spp(scene, 2, 16, 16, unbounded._replace(floor=90.0, most_spp=64), 1) == 64
+    assert reference_spp(scene, 2, 16, 16, unbounded, 1) == 8
 
 
 READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot be derived
@@ -119,19 +125,22 @@ READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot b
 
 @pytest.fixture(scope="module")
 def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny data set as made for denoisers that do not read all channels."""
+    """Every other clip of the tiny data set, the box of each split, for denoisers that do not read all channels."""
     root = tmp_path_factory.mktemp("lean")
-    generate(root, "tiny", seed=0, reads=READS)
+    assert generate(root, "tiny", seed=0, reads=READS, share=Share(1, 2)) == 3
     return root
 
 
+def static_box(root: Path, split: str) -> Clip:
+    return Clip(root / split / "cornell_box" / "000")
+
+
 def test_what_nobody_reads_is_not_rendered(lean):
-    clip = Dataset(lean).clips("train")[0]
+    clip = static_box(lean, "train")
     assert set(clip.channels) == set(rendered_channels(READS)) < set(CHANNELS)
     with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
         clip.read("dual_motion", 1)
-    test = Dataset(lean).clips("test")[0]
-    assert set(test.channels) == set(CHANNELS)
+    assert set(static_box(lean, "test").channels) == set(CHANNELS)
 
 
 def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
@@ -141,15 +150,16 @@ def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
 
 
 def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
-    clip = Dataset(lean).clips("train")[0]
-    assert clip.scene == "cornell_box"
-    files = [clip.path / entry["file"] for n, entry in clip.channels.items() if n in AUXILIARY and "file" in entry]
-    stored, full = sum(file.stat().st_size for file in files), sum(size_in_full(clip, name) for name in AUXILIARY)
+    clip = static_box(lean, "train")
+    names = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+    assert set(AUXILIARY_CHANNELS) == set(names)
+    stored = sum(stored_size(clip, name) for name in names)
+    full = sum(size_in_full(clip, name) for name in names)
     assert 0.2 < stored / full <= 0.6
 
 
 def test_info_shows_what_is_saved(lean):
-    text = info(lean)
+    text = summarise(lean)
     channel, step = (line.split() for line in text.splitlines() if line.startswith("dual_motion"))
     assert "not rendered" in " ".join(channel)
     assert "% of full" in next(line for line in text.splitlines() if line.startswith("auxiliary channels"))
@@ -158,4 +168,4 @@ def test_info_shows_what_is_saved(lean):
 
 def test_no_clip_of_another_scene_is_left_unrendered(tmp_path):
     with pytest.raises(BadInput, match="room-N"):
-        render_to(Path(tmp_path / "test" / "castle" / "000"), profile_of("tiny"), 0, ())
+        render_to_folder(tmp_path / "test" / "castle" / "000", profile_of("tiny"), 0, ())

@@ -14,13 +14,14 @@ from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from errors import BadInput
 
-ALL = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name != "dual_motion")
+# Dual motion exists for forward playback only.
+IMAGE_CHANNELS = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name != "dual_motion")
 AUGMENTATIONS = {
     "none": Augmentation(),
     "reverse": Augmentation(reverse=True),
     "stop": Augmentation(stop=True),
     "rotate": Augmentation(rotate=True),
-    "all": Augmentation(True, True, True, True),
+    "all": Augmentation(reverse=True, stop=True, rotate=True, gain=True),
 }
 
 
@@ -30,11 +31,11 @@ def clips(tiny):
 
 
 def sequences(clips, augmentation=AUGMENTATIONS["none"], crop=32, length=5, seed=0) -> TrainingSequences:
-    return TrainingSequences(clips, ALL, length, crop, augmentation, seed)
+    return TrainingSequences(clips, IMAGE_CHANNELS, length, crop, augmentation, seed)
 
 
-def positions(frame: Frame) -> torch.Tensor:
-    """Pixel centres (2, H, W)."""
+def pixel_positions(frame: Frame) -> torch.Tensor:
+    """Centres (2, H, W) of all pixels, (x, y)."""
     height, width = frame.size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     return torch.stack([x, y]).double()
@@ -42,19 +43,20 @@ def positions(frame: Frame) -> torch.Tensor:
 
 def surface(frame: Frame, cameras: Cameras) -> torch.Tensor:
     """World points (3, N) of all pixels by the inverse of K, in homogeneous coordinates."""
-    pixels = positions(frame).flatten(1)
+    pixels = pixel_positions(frame).flatten(1)
     depth = frame.depth[0, 0].flatten().double()
     local = torch.linalg.inv(cameras.K[0]) @ torch.cat([pixels, torch.ones_like(pixels[:1])]) * depth
     return (cameras.camera_to_world[0] @ torch.cat([local, torch.ones_like(local[:1])]))[:3]
 
 
-def project(points: torch.Tensor, cameras: Cameras) -> torch.Tensor:
+def projected(points: torch.Tensor, cameras: Cameras) -> torch.Tensor:
+    """Pixel positions (2, N) of world points (3, N)."""
     local = torch.linalg.inv(cameras.camera_to_world[0]) @ torch.cat([points, torch.ones_like(points[:1])])
     homogeneous = cameras.K[0] @ local[:3]
     return homogeneous[:2] / homogeneous[2:]
 
 
-def carried(frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
+def carried_back(frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
     """World points (3, N) of all pixels, carried by their meshes to the previous frame, and the rotations (N, 3, 3)."""
     mesh = frame.mesh_id[0, 0].long().flatten()
     relative = frame.previous.object_to_world[0] @ torch.linalg.inv(frame.now.object_to_world[0])
@@ -66,11 +68,12 @@ def carried(frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("kind", AUGMENTATIONS)
 def test_augmented_motion_and_cameras_agree(clips, kind):
     """Reproject after augmentation: every surface point lands where the augmented motion vector says."""
-    checked = moved = 0
+    checked = 0
+    moved = 0
     for index in range(12):
         for frame in sequences(clips, AUGMENTATIONS[kind])[index]:
-            expected = project(carried(frame)[0], frame.previous)
-            target = (positions(frame) + frame.motion[0]).flatten(1)
+            expected = projected(carried_back(frame)[0], frame.previous)
+            target = (pixel_positions(frame) + frame.motion[0]).flatten(1)
             hit = (frame.mesh_id[0, 0].flatten() > 0) & (target.abs().amax(dim=0) < 1e4)
             assert (target - expected)[:, hit].abs().max() < 0.01
             checked += 1
@@ -84,8 +87,8 @@ def test_augmented_images_agree_along_motion(clips, kind):
     compared = 0
     for index in range(8):
         for before, frame in pairwise(sequences(clips, AUGMENTATIONS[kind])[index]):
-            x, y = (positions(frame) + frame.motion[0]).floor().long().flatten(1)
-            points, rotations = carried(frame)
+            x, y = (pixel_positions(frame) + frame.motion[0]).floor().long().flatten(1)
+            points, rotations = carried_back(frame)
             world_to_camera = torch.linalg.inv(frame.previous.camera_to_world[0])
             depth = world_to_camera[2, :3] @ points + world_to_camera[2, 3]
             now = ((frame.mesh_id[0, 0].flatten() > 0) & (x >= 0) & (x < 32) & (y >= 0) & (y < 32)).nonzero()[:, 0]
@@ -93,7 +96,7 @@ def test_augmented_images_agree_along_motion(clips, kind):
             then = y[now] * 32 + x[now]
 
             new, old = (
-                {name: f.channels[name][0].flatten(-2)[..., where] for name in ALL}
+                {name: f.channels[name][0].flatten(-2)[..., where] for name in IMAGE_CHANNELS}
                 for f, where in ((frame, now), (before, then))
             )
             assert (new["mesh_id"] == old["mesh_id"]).float().mean() > 0.97
@@ -107,32 +110,32 @@ def test_augmented_images_agree_along_motion(clips, kind):
 
 
 def test_rotation_turns_images_normals_and_cameras_alike(clips):
-    frame = read_frame(clips[1], 4, ALL, window=(slice(8, 40), slice(20, 52)))
+    frame = read_frame(clips[1], 4, IMAGE_CHANNELS, window=(slice(8, 40), slice(20, 52)))
     turned = frame.rot90()
-    for name in set(ALL) - {"motion"}:
+    for name in set(IMAGE_CHANNELS) - {"motion"}:
         images = [f.channels[name].numpy() for f in (turned, frame)]
         np.testing.assert_array_equal(images[0], np.rot90(images[1], axes=(-2, -1)), name)
     # The same world points, only at other pixels.
     points, same = (surface(f, f.now).reshape(3, 32, 32) for f in (frame, turned))
     torch.testing.assert_close(same, torch.rot90(points, dims=(1, 2)))
     # A view-space normal that pointed right points up after a counter-clockwise turn.
-    before, after = frame.view_normal()[0], turned.view_normal()[0]
-    before = torch.rot90(before, dims=(1, 2))
+    before = torch.rot90(frame.view_normal()[0], dims=(1, 2))
+    after = turned.view_normal()[0]
     torch.testing.assert_close(after, torch.stack([-before[1], before[0], before[2]]), atol=2e-3, rtol=0)
     assert (before[2][frame.rot90().mesh_id[0, 0] > 0] > -0.01).all()  # toward the viewer
-    four = frame
+    full_turn = frame
     for _ in range(4):
-        four = four.rot90()
-    for name in ALL:
-        torch.testing.assert_close(four.channels[name], frame.channels[name], rtol=0, atol=0)
-    torch.testing.assert_close(four.now.K, frame.now.K)
-    torch.testing.assert_close(four.now.camera_to_world, frame.now.camera_to_world)
+        full_turn = full_turn.rot90()
+    for name in IMAGE_CHANNELS:
+        torch.testing.assert_close(full_turn.channels[name], frame.channels[name], rtol=0, atol=0)
+    torch.testing.assert_close(full_turn.now.K, frame.now.K)
+    torch.testing.assert_close(full_turn.now.camera_to_world, frame.now.camera_to_world)
 
 
-def same(a: Frame, b: Frame) -> bool:
+def are_equal(a: Frame, b: Frame) -> bool:
     cameras = [(getattr(a, when), getattr(b, when)) for when in ("now", "previous")]
     return (
-        all(torch.equal(a.channels[name], b.channels[name]) for name in ALL)
+        all(torch.equal(a.channels[name], b.channels[name]) for name in IMAGE_CHANNELS)
         and all(torch.equal(vars(one)[key], vars(two)[key]) for one, two in cameras for key in vars(one))
         and torch.equal(a.gain, b.gain)
     )
@@ -144,17 +147,18 @@ def test_batches_are_the_same_whatever_the_number_of_workers(clips):
     alone, shared = (list(DataLoader(data, 2, collate_fn=collate, num_workers=workers)) for workers in (0, 2))
     assert len(alone) == len(shared) > 1
     for a, b in zip(alone, shared, strict=True):
-        assert all(same(x, y) for x, y in zip(a.frames, b.frames, strict=True))
+        assert all(are_equal(x, y) for x, y in zip(a.frames, b.frames, strict=True))
 
 
 def test_an_item_depends_on_seed_epoch_and_index_only(clips):
-    a, b = sequences(clips, AUGMENTATIONS["all"]), sequences(clips, AUGMENTATIONS["all"])
+    a = sequences(clips, AUGMENTATIONS["all"])
+    b = sequences(clips, AUGMENTATIONS["all"])
     for epoch in (3, 0):
         a.set_epoch(epoch)
         b.set_epoch(epoch)
         a[5]  # reading another item in between changes nothing
         for x, y in zip(a[2], b[2], strict=True):
-            assert same(x, y)
+            assert are_equal(x, y)
     first = a[0][0].direct
     a.set_epoch(1)
     assert not torch.equal(first, a[0][0].direct)
@@ -217,7 +221,8 @@ def test_batches_stack_sequences_and_pad_meshes(clips):
     assert len(batch.frames) == 5 and batch.frames[0].direct.shape == (2, 3, 32, 32)
     assert batch.frames[0].direct_reference.shape == (2, 2, 3, 32, 32)
     torch.testing.assert_close(batch.frames[2].albedo[1:], data[1][2].albedo)
-    small, large = data[0][0], data[1][0]
+    small = data[0][0]
+    large = data[1][0]
     fewer = replace(small.now, object_to_world=small.now.object_to_world[:, :3])
     mixed = Frame.stack([replace(small, now=fewer, previous=fewer), large])
     meshes = large.now.object_to_world.shape[1]

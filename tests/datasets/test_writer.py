@@ -11,18 +11,17 @@ from datasets.clip import Clip
 from datasets.tonemap import clip_exposure, display
 from datasets.writer import ClipWriter
 
-HEIGHT, WIDTH, FRAMES, NOISES, MESHES = 3, 5, 4, 2, 2
-SIZES = {"F": FRAMES, "S": NOISES, "H": HEIGHT, "W": WIDTH, "M": MESHES}
+LENGTHS = {"F": 4, "S": 2, "H": 3, "W": 5, "M": 2}  # of the axes of the channel table
 
 
 def random_frames(seed: int = 0) -> list[dict[str, np.ndarray]]:
     """Arrays of every channel, of plausible size; colours between 0.1 and 2."""
     rng = np.random.default_rng(seed)
     frames = []
-    for _ in range(FRAMES):
+    for _ in range(LENGTHS["F"]):
         frame = {}
         for name, channel in CHANNELS.items():
-            shape = channel.shape(**SIZES)[1:]
+            shape = channel.shape(**LENGTHS)[1:]
             frame[name] = rng.uniform(0.1, 2, shape) if channel.dtype != "<u2" else rng.integers(0, 9, shape)
         frames.append(frame)
     return frames
@@ -41,13 +40,13 @@ def test_round_trip_of_every_channel(tmp_path):
     clip = write(tmp_path / "clip", frames)
     for name, channel in CHANNELS.items():
         entry = clip.channels[name]
-        assert entry["dtype"] == channel.dtype and entry["shape"] == channel.shape(**SIZES)
+        assert entry["dtype"] == channel.dtype and entry["shape"] == channel.shape(**LENGTHS)
         raw = np.load(tmp_path / "clip" / f"{name}.npy")
         assert raw.dtype == np.dtype(channel.dtype)
         expected = np.stack([frame[name] for frame in frames]).astype(channel.dtype)
         np.testing.assert_array_equal(raw, expected)
         if channel.is_image:
-            for realisation in range(NOISES if "S" in channel.axes else 1):
+            for realisation in range(LENGTHS["S"] if "S" in channel.axes else 1):
                 got = clip.read(name, 2, realisation=realisation)
                 want = expected[2, realisation] if "S" in channel.axes else expected[2]
                 np.testing.assert_array_equal(got, want)
@@ -71,12 +70,12 @@ def test_constant_channels_are_one_value(tmp_path):
     frames = random_frames()
     for frame in frames:
         frame["albedo"][:] = [0.1, 0.2, 0.3]
-    frames[3]["roughness"][:] = frames[2]["roughness"][:] = 1
+    for frame in frames[2:]:
+        frame["roughness"][:] = 1
     clip = write(tmp_path / "clip", frames)
     assert clip.channels["albedo"] == {"value": [float(np.float16(x)) for x in (0.1, 0.2, 0.3)]}
-    np.testing.assert_array_equal(
-        clip.read("albedo", 1), np.broadcast_to(np.float16([0.1, 0.2, 0.3]), (HEIGHT, WIDTH, 3))
-    )
+    everywhere = np.broadcast_to(np.float16([0.1, 0.2, 0.3]), (LENGTHS["H"], LENGTHS["W"], 3))
+    np.testing.assert_array_equal(clip.read("albedo", 1), everywhere)
     assert "file" in clip.channels["roughness"]  # constant in two frames is not constant
 
 

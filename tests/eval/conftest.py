@@ -11,7 +11,7 @@ from eval.harness import evaluate
 from eval.report.page import report
 from models.registry import create
 from models.weights import save_weights
-from train.loop import run_folder
+from train.task import run_folder
 
 TIMES = {"noisy": 1.0, "accumulated": 2.0, "eaw": 5.0, "ntd": 50.0}
 INDIRECT = {"noisy (indirect)": 0.8, "accumulated (indirect)": 1.2}

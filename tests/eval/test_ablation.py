@@ -25,10 +25,10 @@ from models.rae import RAE
 from models.weights import load_weights
 from models.wskp import WSKP
 from plotting import plt
-from train import loop
-from train.loop import Training
-from train.losses import RAELoss, loss_for
-from train.recipes import PAPER, RAETerms, recipe_for
+from train import training
+from train.losses.rae import RAELoss, RAETerms
+from train.recipes import recipe_for
+from train.training import Training
 
 
 def frames_of(tiny, reads, count: int = 2) -> list[Frame]:
@@ -53,7 +53,7 @@ def made_up(what: str, value, seeds: int = 2) -> list[Run]:
 def test_an_unknown_ablation_or_profile_is_refused(tiny, tmp_path):
     with pytest.raises(BadInput, match=r"'widths'.*rae-inputs, rae-loss, wskp-windows"):
         ablate("widths", tiny, tmp_path, "tiny")
-    with pytest.raises(BadInput, match="unknown profile 'huge'"):
+    with pytest.raises(BadInput, match="unknown budget 'huge'"):
         ablate("ntd", tiny, tmp_path, "huge")
     with pytest.raises(BadInput, match="0 seeds"):
         ablate("ntd", tiny, tmp_path, "tiny", seeds=0)
@@ -76,7 +76,7 @@ def test_every_ablation_can_be_trained_and_run(tiny, what):
         assert recipe == replace(whole, epochs=whole.epochs // 4, loss=recipe.loss)
         torch.manual_seed(0)
         denoiser, state = variant.create(), None
-        assert loss_for(denoiser, recipe).terms == recipe.loss
+        assert recipe.loss.around(denoiser).terms == recipe.loss
         denoiser.prepare()
         for frame in frames_of(tiny, denoiser.reads):
             output, state = denoiser(frame, state)
@@ -133,8 +133,8 @@ def test_textured_rae_denoises_radiance(tiny):
 def test_terms_of_raes_loss_are_added_one_by_one():
     terms = [variant.recipe("quick").loss for variant in ablation_for("rae-loss").variants]
     assert [(t.spatial, t.gradient, t.temporal) for t in terms] == [(0.8, 0, 0), (0.8, 0.1, 0), (0.8, 0.1, 0.1)]
-    assert isinstance(loss_for(RAE(), ablation_for("rae-loss").variants[0].recipe("quick")), RAELoss)
-    assert terms[2] == PAPER["rae"].loss == RAETerms()
+    assert isinstance(ablation_for("rae-loss").variants[0].recipe("quick").loss.around(RAE()), RAELoss)
+    assert terms[2] == recipe_for("rae", "paper").loss == RAETerms()
 
 
 def test_windows_stand_alone_and_together():
@@ -224,7 +224,7 @@ def test_an_ablation_from_training_to_plot(tiny, tmp_path, monkeypatch):
     monkeypatch.setitem(ABLATIONS, "wskp-repvgg", lambda: small)
     monkeypatch.setattr(definitions, "recipe_for", small_recipe)
     measured: list[str] = []
-    monkeypatch.setattr(loop, "fastest_precision", lambda *_: measured.append("once") or "32-true")
+    monkeypatch.setattr(training, "fastest_precision", lambda *_: measured.append("once") or "float32")
     trained: list[str] = []
     genuine = Training.step
 

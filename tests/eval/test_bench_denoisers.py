@@ -5,16 +5,16 @@ import json
 import numpy as np
 import pytest
 import torch
+from eval.sizes import SIZES
 
 import eval.bench.denoisers
 from errors import BadInput
 from eval.bench.denoisers import Variant, bench_denoisers, macs_per_pixel, parse_size, race, thread_counts, variants
 from eval.bench.scaling import exponent, in_use
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.results import device
-from eval.sizes import SIZES
-from models.registry import inference_precision
+from models.registry import create, inference_precision
 from onespp import main
+from provenance import device_in_words
 
 KEYS = {
     *("denoiser", "height", "width", "dtype", "ms_median", "ms_p10", "ms_p90", "peak_mb"),
@@ -29,7 +29,7 @@ def test_results_have_the_agreed_form(tmp_path, monkeypatch, capsys):
     table = capsys.readouterr().out
     assert "times oidn" in table and "reconstruction" in table and "accumulated (PyTorch)" in table
     results = json.loads((tmp_path / "bench" / "results.json").read_text())
-    assert (results["schema"], results["device"], results["threads"]) == (1, device(threads=1), 1)
+    assert (results["schema"], results["device"], results["threads"]) == (1, device_in_words(threads=1), 1)
     rows = results["rows"]
     assert all(row.keys() == KEYS and (row["width"], row["height"]) == (64, 32) for row in rows)
     labels = [(row["denoiser"], row["dtype"]) for row in rows]
@@ -100,7 +100,7 @@ def test_scaling(tmp_path, monkeypatch, capsys):
     rows = json.loads((tmp_path / "bench" / "scaling.json").read_text())["rows"]
     names = ["noisy", "wskp3", *([] if eval.bench.denoisers.unavailable("oidn") else ["oidn", "oidn (fast)"])]
     assert [(row["denoiser"], row["width"]) for row in rows] == [(name, w) for w in (16, 32) for name in names]
-    used = str(inference_precision("wskp3")).removeprefix("torch.")
+    used = str(inference_precision(create("wskp3"))).removeprefix("torch.")
     assert [row["dtype"] for row in rows if row["denoiser"] == "wskp3"] == [used, used]
     assert (tmp_path / "report" / "figures" / "scaling.png").exists()
 

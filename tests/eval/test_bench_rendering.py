@@ -1,18 +1,14 @@
-"""The bench compares like with like, and the pictures of data sets are drawn."""
+"""The bench compares like with like."""
 
 import json
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import eval.bench.rendering
 import eval.bench.time_to_floor
-from datasets.inspect import info
-from errors import BadInput
 from eval.bench.rendering import bench_rendering
 from eval.bench.time_to_floor import stock
-from eval.figures.contact_sheet import contact_sheet
 from render.shot import Shot
 from render.stage import Stage
 from scenes.registry import build_scene
@@ -43,17 +39,3 @@ def test_bench_of_references(tmp_path, monkeypatch):
     for row in facts["rows"]:
         seconds = row["seconds"] * 10 ** ((row["floor"] - 40) / 10)  # of the samples that were timed
         assert row["samples_per_second"] * seconds == pytest.approx(24 * 24 * row["spp"])
-
-
-def test_contact_sheet_shows_every_scene(tmp_path):
-    contact_sheet(tmp_path / "sheet.png", ["cornell_box", "extremes-sky", "room-7"], size=(24, 32), spp=2)
-    image = plt.imread(tmp_path / "sheet.png")[..., :3]
-    assert image.shape[0] > 48 and image.shape[1] >= 64
-    assert np.std(image[: len(image) // 2], axis=(0, 1)).min() > 0.05
-    with pytest.raises(BadInput, match="unknown scene 'castle'"):
-        contact_sheet(tmp_path / "sheet.png", ["castle"])
-
-
-def test_histogram_of_difficulty(tiny, tmp_path):
-    info(tiny, tmp_path / "difficulty.png")
-    assert plt.imread(tmp_path / "difficulty.png").std() > 0.05

@@ -14,7 +14,7 @@ def test_bench_training(tiny, tmp_path, monkeypatch, capsys):
     assert "times faster" in capsys.readouterr().out
     results = json.loads((tmp_path / "bench" / "training.json").read_text())
     (step,), (shares,) = results["steps"], results["shares"]
-    assert step["32-true ms"] > 0 and step["bf16-mixed ms"] > 0
+    assert step["float32 ms"] > 0 and step["bfloat16 ms"] > 0
     parts = [value for value in shares.values() if isinstance(value, float)]
     assert sum(parts) == pytest.approx(1)
     assert shares["convolutions"] > 0.1 and shares["loss"] > 0 and 0 < shares["loading"] < 0.5

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from eval.comparison import Comparison
 from eval.figures.unbiased import measure, spread
-from eval.metrics import METRICS, image_metrics
-from eval.noise_floor import noise_floor, within_floor
+from eval.metrics import METRICS, noise_floors, within_floor
+from eval.metrics import measure as measure_frame
 
-STILL = torch.zeros(1, 2, 48, 64)
-MOVED = torch.zeros(1, 2, 48, 64).index_fill(3, torch.arange(8), 1.0)
+HIDDEN = torch.zeros(1, 1, 48, 64, dtype=torch.bool).index_fill(3, torch.arange(8), True)
+
+
+def floors_of(halves: torch.Tensor, disoccluded: torch.Tensor | None = None) -> dict[str, float | None]:
+    return noise_floors(Comparison(halves[:1], halves, 1.0, disoccluded))
 
 
 def scene(deviation: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -27,8 +31,8 @@ def test_floors_are_what_the_truth_scores(deviation):
     found, scored = [], []
     for seed in range(6):
         truth, halves = scene(deviation, seed)
-        found.append(noise_floor(halves, 1.0, STILL, MOVED))
-        scored.append(image_metrics(truth, halves, 1.0))
+        found.append(floors_of(halves, HIDDEN))
+        scored.append(measure_frame(Comparison(truth, halves, 1.0)))
     for metric in ("mse", "rmse", "l1", "ssim", "flip", "smape", "rel_mse"):
         lacking = 1.0 if metric == "ssim" else 0.0  # SSIM errs in what it lacks of 1
         estimate, truth = (abs(lacking - np.mean([row[metric] for row in rows])) for rows in (found, scored))
@@ -42,9 +46,9 @@ def test_halves_or_one_against_the_mean_would_take_noise_for_structure():
     rng = np.random.default_rng(0)
     truth = torch.full((1, 3, 48, 64), 0.4, dtype=torch.float64)
     halves = truth + torch.from_numpy(rng.normal(0, 0.1, (2, 3, 48, 64)))
-    floor = noise_floor(halves, 1.0, STILL, STILL)["ssim"]
-    naive = image_metrics(halves[:1], halves.mean(dim=0, keepdim=True).expand(2, -1, -1, -1), 1.0)["ssim"]
-    assert floor == pytest.approx(image_metrics(truth, halves, 1.0)["ssim"], abs=0.1)
+    floor = floors_of(halves)["ssim"]
+    naive = measure_frame(Comparison(halves[:1], halves.mean(dim=0, keepdim=True).expand(2, -1, -1, -1), 1.0))["ssim"]
+    assert floor == pytest.approx(measure_frame(Comparison(truth, halves, 1.0))["ssim"], abs=0.1)
     assert naive > floor + 0.2
 
 
@@ -57,8 +61,8 @@ def test_error_of_the_unbiased_mse(correlated):
     for _ in range(400):
         noise = torch.from_numpy(rng.normal(0, 0.1, (2, 1 if correlated else 3, 24, 24))).expand(2, 3, -1, -1)
         halves = truth + noise
-        values.append(image_metrics(truth, halves, 1.0)["mse_unbiased"])
-        errors.append(noise_floor(halves, 1.0, STILL[..., :24, :24], STILL[..., :24, :24])["mse_unbiased"])
+        values.append(measure_frame(Comparison(truth, halves, 1.0))["mse_unbiased"])
+        errors.append(floors_of(halves)["mse_unbiased"])
     ratio = np.mean(errors) / np.std(values)
     assert 0.9 < ratio < 1.1 if correlated else 1 < ratio < 2.5
     assert abs(np.mean(values)) < 4 * np.std(values) / math.sqrt(len(values))
@@ -66,13 +70,14 @@ def test_error_of_the_unbiased_mse(correlated):
 
 def test_floors_at_the_extremes():
     black = torch.zeros(2, 3, 16, 16)
-    still = torch.zeros(1, 2, 16, 16)
-    floors = noise_floor(black, 1.0, still, still)
+    floors = floors_of(black)
     assert floors.pop("psnr") == 100 and floors.pop("ssim") == pytest.approx(1)
-    assert floors.pop("disocclusion_l1") is None and set(floors.values()) == {0.0}
-    one = noise_floor(torch.tensor([0.2, 0.4])[:, None, None, None].expand(2, 3, 1, 1), 1.0, *[still[..., :1, :1]] * 2)
+    assert (
+        floors.pop("disocclusion_l1") is None and floors.pop("temporal_error") is None and set(floors.values()) == {0.0}
+    )
+    one = floors_of(torch.tensor([0.2, 0.4])[:, None, None, None].expand(2, 3, 1, 1))
     assert one["ssim"] is None and one["rel_mse"] == pytest.approx(0.1**2 / (0.3**2 + 0.01))
-    bright = noise_floor(torch.full((2, 3, 16, 16), 6e4), 1.0, still, still)
+    bright = floors_of(torch.full((2, 3, 16, 16), 6e4))
     assert all(value is None or math.isfinite(value) for value in bright.values())
 
 

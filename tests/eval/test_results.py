@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from datasets.clip import Dataset
-from eval import harness
+from eval import clip_run, harness
 from eval.harness import evaluate
 from eval.metrics import METRICS
 from eval.results import FLOOR, folder_of, load_picture, read_results
 from models.registry import create
 from models.weights import save_weights
-from train.loop import run_folder
+from train.task import run_folder
 
 NAMES = ["noisy", "accumulated", "rae"]
 
@@ -133,7 +133,7 @@ def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
 @pytest.mark.parametrize("frame", [0, 5, 11])
 def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch, frame):
     """`frame` of the 16 of both clips is the one in which it is killed."""
-    seen, save = [], harness.save_picture
+    seen, save = [], clip_run.save_picture
 
     def killed(folder, index, image):
         seen.append(index)
@@ -143,12 +143,12 @@ def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, m
 
     runs = tmp_path / "runs"
     shutil.copytree(once / "train", runs / "train")
-    monkeypatch.setattr(harness, "save_picture", killed)
+    monkeypatch.setattr(clip_run, "save_picture", killed)
     with pytest.raises(KeyboardInterrupt):
         evaluate(tiny, runs, "tiny", NAMES)
     assert not (runs / "eval" / "results.json").exists()
     assert len(list(runs.glob("eval/clips/*/*/result.json"))) == (len(NAMES) + 1) * (frame // 8)
-    monkeypatch.setattr(harness, "save_picture", save)
+    monkeypatch.setattr(clip_run, "save_picture", save)
     evaluate(tiny, runs, "tiny", NAMES)
     assert content(runs) == content(once)
 
@@ -160,7 +160,7 @@ def test_side_by_side_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch):
     shutil.copytree(once / "train", runs / "train")
     evaluate(tiny, runs, "tiny", NAMES, processes=2)
     for a, b in zip(read_results(runs)[1], read_results(once)[1], strict=True):
-        for ours, theirs in zip([*a.tracks, a.reference], [*b.tracks, b.reference], strict=True):
+        for ours, theirs in zip([*a.results, a.reference], [*b.results, b.reference], strict=True):
             assert ours.key == theirs.key and ours.frames == [
                 {k: v if v is None else pytest.approx(v, rel=1e-3) for k, v in frame.items()} for frame in theirs.frames
             ]

@@ -5,14 +5,14 @@ import shutil
 
 import numpy as np
 import pytest
+from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.denoisers import Variant
 from eval.harness import clips_of_one_spp
-from eval.sizes import SIZES, WHOLE, create_any, timed_as, trained_as
-from eval.text_table import compared, joint_floor
+from eval.means import compared_mean, joint_floor
 from eval.tradeoff.candidates import Candidate, Times, candidates
 from eval.tradeoff.clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import beaten_by, trade
@@ -21,8 +21,8 @@ from eval.tradeoff.samples import check_levels, generalisation, mark_beaten
 from files import read_json, write_json
 from models.parameters import WINDOWS
 from models.weights import save_weights
-from render.clip import PLAIN
-from train.loop import WEIGHTS, run_folder
+from render.clip import NO_OPTIONS
+from train.task import WEIGHTS_FILE, run_folder
 
 SIZE = (32, 48)
 
@@ -68,15 +68,20 @@ def test_fronts_by_brute_force(metric, sign):
 
 
 def test_digits_that_nobody_sees_do_not_make_a_front():
-    seen = [compared("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    seen = [compared_mean("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
     assert seen == [30.0, 30.0, 30.01]
 
 
 def test_what_is_within_the_noise_floor_is_on_a_par():
     floor = [{"psnr": 40.0}]
-    assert [compared("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [30, 36, 36.99, 36.99]
-    assert compared("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
-    assert compared("ssim", [{"ssim": None}], floor) is None
+    assert [compared_mean("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [
+        30,
+        36,
+        36.99,
+        36.99,
+    ]
+    assert compared_mean("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
+    assert compared_mean("ssim", [{"ssim": None}], floor) is None
 
 
 def test_a_hard_clips_floor_hides_no_error_of_another():
@@ -84,7 +89,7 @@ def test_a_hard_clips_floor_hides_no_error_of_another():
     floors = [{"ssim": 0.1, "mse_unbiased": 1e-6}, {"ssim": 1.0, "mse_unbiased": 1e-6}]
     a, b = ([{"ssim": 0.3, "mse_unbiased": 0.0}, {"ssim": s, "mse_unbiased": 0.0}] for s in (0.8, 0.95))
     assert joint_floor(a, floors) == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
-    assert compared("ssim", a, floors) < compared("ssim", b, floors)
+    assert compared_mean("ssim", a, floors) < compared_mean("ssim", b, floors)
     both = [{"ssim": 0.1, "mse_unbiased": 1e-6}] * 2
     assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
 
@@ -177,7 +182,7 @@ def test_samples_that_cannot_be_had(tiny, tmp_path):
 def test_cost_of_samples(tiny):
     cost = line([1, 2, 4, 8], [3 + 2 * spp for spp in (1, 2, 4, 8)])
     assert cost == pytest.approx((3, 2)) and cost.of(100) == pytest.approx(203)
-    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=PLAIN)
+    measured = sample_cost(scene_of(a_clip(tiny), Dataset(tiny))[0], 48, 64, threads=1, options=NO_OPTIONS)
     assert measured.sample_ms > 0 and measured.frame_ms >= 0
 
 
@@ -240,7 +245,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else trained_as(name)
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")

@@ -1,4 +1,4 @@
-"""The G-buffer on scenes whose answer is known, and that nothing is recompiled from frame to frame."""
+"""The G-buffer of scenes whose answer is known, and the proof that no frame compiles a kernel anew."""
 
 import os
 import subprocess
@@ -115,7 +115,7 @@ def test_mesh_ids_are_scene_order():
 
 
 def test_every_frame_is_posed_for_itself():
-    """Radiance and G-buffer of the last frame are those that it has in a longer clip: meshes and lights stand right."""
+    """Frames have the same bytes in a longer clip: meshes and lights stand where they should, in the last one too."""
     scene = build_scene("cornell_box_moving", 3, 24)
     short, long = ([arrays for arrays, _ in render_clip(scene, n, 24, 24, Sampling(1, 1, 8), 0)] for n in (3, 5))
     for a, b in zip(short, long, strict=False):

@@ -1,4 +1,4 @@
-"""What the G-buffer says of materials, held to Mitsuba's own sampling of the same BSDFs."""
+"""What the G-buffer says of materials, compared with Mitsuba's own sampling of the same BSDFs."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import trimesh
 from errors import BadInput
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
-from render.materials import MaterialTable, describe
+from render.materials import MaterialTable, material_of
 from render.stage import Stage, to_mitsuba
 from scenes.animation import Camera, Scene, Shape, Track
 
@@ -16,7 +16,7 @@ def rgb(*value: float) -> dict:
     return {"type": "rgb", "value": list(value)}
 
 
-def square(bsdf: dict) -> Scene:
+def textured_square(bsdf: dict) -> Scene:
     """A unit square seen head-on, with texture coordinates from 0 to 1, v up."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     mesh = trimesh.Trimesh(np.c_[corners - 0.5, np.zeros(4)], [[0, 1, 2], [0, 2, 3]], process=False)
@@ -30,7 +30,8 @@ def reflected(bsdf: dict, count: int = 1 << 17) -> np.ndarray:
     """Share (3,) of light from straight above that Mitsuba's sampling sends back into mirror-like lobes."""
     plugin = mi.load_dict(to_mitsuba(bsdf))
     si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi, si.t = mi.Vector3f(0, 0, 1), mi.Float(1)
+    si.wi = mi.Vector3f(0, 0, 1)
+    si.t = mi.Float(1)
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.n = mi.Normal3f(0, 0, 1)
     random = mi.PCG32(count)
@@ -42,7 +43,7 @@ def reflected(bsdf: dict, count: int = 1 << 17) -> np.ndarray:
 
 
 TINTED = rgb(0.9, 0.5, 0.2)
-METALS = [
+METAL_BSDFS = [
     {"type": "conductor", "material": "Cu"},
     {"type": "conductor", "material": "none"},
     {"type": "conductor", "eta": rgb(0.2, 0.9, 1.4), "k": rgb(3.0, 2.5, 1.0), "specular_reflectance": TINTED},
@@ -52,9 +53,9 @@ METALS = [
 ]
 
 
-@pytest.mark.parametrize("bsdf", METALS)
+@pytest.mark.parametrize("bsdf", METAL_BSDFS)
 def test_albedo_of_metals_is_what_they_reflect(bsdf):
-    stage = Stage(square(bsdf), 4, 4)
+    stage = Stage(textured_square(bsdf), 4, 4)
     albedo = render_gbuffer(stage, stage.view(0))["albedo"]
     np.testing.assert_allclose(albedo, np.broadcast_to(reflected(bsdf), albedo.shape), rtol=0.02)
 
@@ -63,7 +64,7 @@ def test_albedo_of_metals_is_what_they_reflect(bsdf):
 @pytest.mark.parametrize("eta", [1.3, 1.9])
 def test_albedo_of_plastics_is_diffuse_plus_specular(bsdf, eta):
     bsdf = {**bsdf, "int_ior": eta, "ext_ior": 1.0, "diffuse_reflectance": rgb(0.1, 0.4, 0.7)}
-    stage = Stage(square(bsdf), 4, 4)
+    stage = Stage(textured_square(bsdf), 4, 4)
     albedo = render_gbuffer(stage, stage.view(0))["albedo"][0, 0]
     coat = reflected({**bsdf, "diffuse_reflectance": rgb(0, 0, 0)})
     np.testing.assert_allclose(albedo, np.array([0.1, 0.4, 0.7]) + coat, rtol=0.02)
@@ -71,7 +72,7 @@ def test_albedo_of_plastics_is_diffuse_plus_specular(bsdf, eta):
 
 def test_principled_mixes_by_metallic():
     bsdf = {"type": "principled", "base_color": rgb(0.2, 0.4, 0.6), "metallic": 0.25, "specular": 0.5, "roughness": 0.3}
-    stage = Stage(square({"type": "twosided", "bsdf": bsdf}), 4, 4)
+    stage = Stage(textured_square({"type": "twosided", "bsdf": bsdf}), 4, 4)
     buffer = render_gbuffer(stage, stage.view(0))
     base = np.array([0.2, 0.4, 0.6])
     expected = base * 0.75 + (0.08 * 0.5 * 0.75 + base * 0.25)
@@ -81,14 +82,14 @@ def test_principled_mixes_by_metallic():
 
 @pytest.mark.parametrize("kind", ["dielectric", "thindielectric", "roughdielectric"])
 def test_what_only_transmits_is_white(kind):
-    stage = Stage(square({"type": kind}), 4, 4)
+    stage = Stage(textured_square({"type": kind}), 4, 4)
     buffer = render_gbuffer(stage, stage.view(0))
     assert (buffer["albedo"] == 1).all()
     np.testing.assert_allclose(buffer["roughness"], 0.1 if kind == "roughdielectric" else 0)
 
 
 def test_textures_are_read_where_they_are_seen():
-    """2 x 2 texels: the first row of a bitmap is v = 0..., the image's row 0 the top."""
+    """4 x 4 texels: the first row of a bitmap lies at v = 0, which is the bottom row of the image."""
     ramp = np.linspace(0.1, 0.5, 16).reshape(4, 4, 1)
     colour = np.concatenate([ramp, 2 * ramp * 0.9, 0.6 - ramp], axis=-1)
 
@@ -96,7 +97,7 @@ def test_textures_are_read_where_they_are_seen():
         return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest"}
 
     bsdf = {"type": "roughconductor", "alpha": bitmap(ramp), "specular_reflectance": bitmap(colour)}
-    stage = Stage(square(bsdf), 4, 4)
+    stage = Stage(textured_square(bsdf), 4, 4)
     buffer = render_gbuffer(stage, stage.view(0))
     np.testing.assert_allclose(buffer["roughness"], ramp[::-1], rtol=1e-5)
     np.testing.assert_allclose(buffer["albedo"], colour[::-1], rtol=1e-5)
@@ -110,9 +111,9 @@ def test_every_shape_has_its_own_material():
         {"type": "roughplastic", "alpha": 0.25, "diffuse_reflectance": rgb(0.5, 0.5, 0.5)},
         {"type": "diffuse", "reflectance": rgb(0.9, 0.8, 0.7)},
     ]
-    table = MaterialTable(Stage(square(kinds[0]), 2, 2).mitsuba_scene.shapes())
+    table = MaterialTable(Stage(textured_square(kinds[0]), 2, 2).mitsuba_scene.shapes())
     assert len(table.materials) == 1
-    base = square(kinds[0])
+    base = textured_square(kinds[0])
     shapes = []
     for i, bsdf in enumerate(kinds):
         mesh = base.shapes[0].mesh.copy()
@@ -126,6 +127,6 @@ def test_every_shape_has_its_own_material():
 
 def test_unsupported_material_names_the_shape():
     with pytest.raises(BadInput, match=r"'square'.*RoughConductor"):
-        Stage(square({"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.2}), 2, 2)
+        Stage(textured_square({"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.2}), 2, 2)
     with pytest.raises(BadInput, match=r"'x'.*not supported"):
-        describe(mi.load_dict({"type": "hair"}), "x")
+        material_of(mi.load_dict({"type": "hair"}), "x")

@@ -5,7 +5,7 @@ import pytest
 
 from render.backend import mi
 from render.gbuffer import render_gbuffer
-from render.motion import dual_motion
+from render.motion import dual_motion_vectors
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Track
 from scenes.camera import FAR_OUTSIDE, View, intrinsics, look_at, motion_vectors, pixel_centres, project
@@ -19,16 +19,16 @@ def homogeneous_projection(points: np.ndarray, view: View) -> np.ndarray:
     return p[..., :2] / p[..., 2:]
 
 
-def primary_hits(stage, view):
-    """World positions (H, W, 3) that Mitsuba reports, and mesh ids."""
+def primary_hits(stage: Stage, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """World positions (H, W, 3) that Mitsuba reports, and mesh ids (H, W)."""
     si = stage.mitsuba_scene.ray_intersect(stage.rays(view))
     shape = (stage.height, stage.width, -1)
     mesh_id = np.array(stage.mesh_id(si)).reshape(shape)[..., 0]
     return np.array(si.p, dtype=np.float64).T.reshape(shape), mesh_id
 
 
-def carry(points, mesh_id, source: View, target: View):
-    """Rigid motion of points with their meshes, by plain matrix inversion."""
+def carry(points: np.ndarray, mesh_id: np.ndarray, source: View, target: View) -> np.ndarray:
+    """Points (..., 3) moved with their meshes from `source`'s frame to `target`'s, by plain matrix inversion."""
     moved = points.copy()
     for m in np.unique(mesh_id[mesh_id > 0]):
         matrix = target.object_to_world[m - 1] @ np.linalg.inv(source.object_to_world[m - 1])
@@ -38,7 +38,11 @@ def carry(points, mesh_id, source: View, target: View):
 
 
 def test_rays_are_those_of_mitsubas_perspective_camera():
-    eye, target, fov, height, width = [0.3, -0.2, 2.0], [0.1, 0.4, -1.0], 55.0, 24, 40
+    eye = [0.3, -0.2, 2.0]
+    target = [0.1, 0.4, -1.0]
+    fov = 55.0
+    height = 24
+    width = 40
     sensor = mi.load_dict(
         {
             "type": "perspective",
@@ -61,39 +65,40 @@ def test_rays_are_those_of_mitsubas_perspective_camera():
 
 @pytest.mark.parametrize("frame", [1, 9, 17])
 def test_hits_project_to_their_pixel_and_to_where_motion_points(stage, frame):
-    now, previous = stage.view(frame), stage.view(frame - 1)
+    now = stage.view(frame)
+    previous = stage.view(frame - 1)
     stage.pose(frame)
     points, mesh_id = primary_hits(stage, now)
     depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
-    centres, hit = pixel_centres(stage.height, stage.width), mesh_id > 0
+    centres = pixel_centres(stage.height, stage.width)
+    hit = mesh_id > 0
     assert np.abs(homogeneous_projection(points, now) - centres)[hit].max() < 0.01
     motion = motion_vectors(centres, depth, mesh_id, now, previous)
-    expected = homogeneous_projection(carry(points, mesh_id, now, previous), previous)
-    in_front = (carry(points, mesh_id, now, previous) - previous.camera_to_world[:3, 3]) @ previous.camera_to_world[
-        :3, 2
-    ] > 0
+    carried = carry(points, mesh_id, now, previous)
+    expected = homogeneous_projection(carried, previous)
+    in_front = (carried - previous.camera_to_world[:3, 3]) @ previous.camera_to_world[:3, 2] > 0
     assert np.abs(centres + motion - expected)[hit & in_front].max() < 0.01
 
 
-def trace_pixels(stage, view, pixels):
-    """Mesh id and world position of what is seen through arbitrary pixel positions, as posed."""
+def trace_pixels(stage: Stage, view: View, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mesh id (...) and world position (..., 3) of what is seen through pixel positions (..., 2), as posed."""
     si = stage.mitsuba_scene.ray_intersect(stage.rays(view, pixels.reshape(-1, 2)))
     shape = pixels.shape[:-1]
     return np.array(stage.mesh_id(si)).reshape(shape), np.array(si.p, dtype=np.float64).T.reshape(*shape, 3)
 
 
-def seen_from(stage, view, points):
-    """Whether nothing stands between a camera and each world point: Mitsuba's shadow test, as posed."""
+def seen_from(stage: Stage, view: View, points: np.ndarray) -> np.ndarray:
+    """Whether nothing stands between the camera and world points (..., 3), as posed, by Mitsuba's shadow test."""
     eye = view.camera_to_world[:3, 3]
-    ray = mi.Ray3f(
-        mi.Point3f(*map(float, eye)), mi.Vector3f(np.float32((points - eye).reshape(-1, 3).T)), 0.9999, 0.0, []
-    )
+    origin = mi.Point3f(*map(float, eye))
+    ray = mi.Ray3f(origin, mi.Vector3f(np.float32((points - eye).reshape(-1, 3).T)), 0.9999, 0.0, [])
     return ~np.array(stage.mitsuba_scene.ray_test(ray)).reshape(points.shape[:-1])
 
 
 @pytest.mark.parametrize("frame", range(1, 24, 4))
 def test_following_motion_meets_the_same_surface_point(stage, frame):
-    now, previous = stage.view(frame), stage.view(frame - 1)
+    now = stage.view(frame)
+    previous = stage.view(frame - 1)
     stage.pose(frame)
     points, mesh_id = primary_hits(stage, now)
     depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
@@ -124,13 +129,15 @@ def test_dual_motion_finds_the_background_where_motion_finds_the_occluder():
     for seed in range(6):
         stage = Stage(build_scene("cornell_box_moving", seed, frames=24), size, size)
         for frame in range(1, 24, 2):
-            now, previous = stage.view(frame), stage.view(frame - 1)
+            now = stage.view(frame)
+            previous = stage.view(frame - 1)
             stage.pose(frame)
             buffer = render_gbuffer(stage, now)
-            depth, mesh_id = buffer["depth"][..., 0].astype(np.float64), buffer["mesh_id"][..., 0]
+            depth = buffer["depth"][..., 0].astype(np.float64)
+            mesh_id = buffer["mesh_id"][..., 0]
             motion = motion_vectors(centres, depth, mesh_id, now, previous)
             stage.pose(frame - 1)
-            dual = dual_motion(stage, depth, mesh_id, motion, now, previous)
+            dual = dual_motion_vectors(stage, depth, mesh_id, motion, now, previous)
             mask = np.abs(dual - motion).max(axis=-1) > 1 / 64
             target = (centres + dual)[mask]
             assert ((target >= 0) & (target <= size)).all()
@@ -146,14 +153,15 @@ def test_dual_motion_finds_the_background_where_motion_finds_the_occluder():
 
 def test_dual_motion_equals_motion_exactly_where_visible(stage):
     frame = 9
-    now, previous = stage.view(frame), stage.view(frame - 1)
+    now = stage.view(frame)
+    previous = stage.view(frame - 1)
     stage.pose(frame)
     points, mesh_id = primary_hits(stage, now)
     depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
     centres = pixel_centres(stage.height, stage.width)
     motion = motion_vectors(centres, depth, mesh_id, now, previous)
     stage.pose(frame - 1)
-    dual = dual_motion(stage, depth, mesh_id, motion, now, previous)
+    dual = dual_motion_vectors(stage, depth, mesh_id, motion, now, previous)
     target = centres + motion
     inside = ((target > 0) & (target < (stage.width, stage.height))).all(axis=-1)
     visible = inside & (mesh_id > 0) & seen_from(stage, previous, carry(points, mesh_id, now, previous))
@@ -163,7 +171,8 @@ def test_dual_motion_equals_motion_exactly_where_visible(stage):
 
 def test_background_moves_with_its_direction():
     """A camera that turns by half its field of view about the vertical axis moves the sky's centre to the border."""
-    fov, size = 40.0, 100
+    fov = 40.0
+    size = 100
     K = intrinsics(fov, size, size)
     eye = np.zeros(3)
     a = np.radians(fov / 2)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from render.backend import dr, mi
-from render.sampler import Halton, Sampler, hash32
+from render.sampler import HaltonSampler, Sampler, hash32, sobol_second_reversed
 
 
-def points(key: int, count: int, skip: int = 0) -> np.ndarray:
+def sampler_points(key: int, count: int, skip: int = 0) -> np.ndarray:
+    """The first `count` points (N, 2) of the sequence after `skip` others that `key` names."""
     sampler = Sampler(mi.UInt32(key), dr.arange(mi.UInt32, count), mi.UInt32(1))
     for _ in range(skip):
         sampler.next_2d()
@@ -17,7 +18,7 @@ def points(key: int, count: int, skip: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("key", [0, 1, 0xFFFFFFFF, 123456789])
 @pytest.mark.parametrize("bits", [0, 1, 4, 7])
 def test_every_elementary_interval_holds_one_point(key, bits):
-    p = points(key, 2**bits, skip=key % 3)
+    p = sampler_points(key, 2**bits, skip=key % 3)
     for k in range(bits + 1):
         cells = (p * [2**k, 2 ** (bits - k)]).astype(int)
         assert len({tuple(cell) for cell in cells}) == 2**bits
@@ -25,8 +26,6 @@ def test_every_elementary_interval_holds_one_point(key, bits):
 
 def test_second_dimension_is_sobol():
     """Unscrambled, the construction gives Sobol's second dimension, whose direction numbers follow a recurrence."""
-    from render.sampler import sobol_second_reversed
-
     count = 256
     ours = np.array(dr.brev(sobol_second_reversed(dr.arange(mi.UInt32, count))), dtype=np.uint64)
     directions = [1 << 31]
@@ -55,7 +54,7 @@ def test_integrates_better_than_random():
     """A smooth integrand: the error of 256 samples over many seeds is far below that of independent samples."""
     estimates = []
     for key in range(200):
-        p = points(key * 7919, 256)
+        p = sampler_points(key * 7919, 256)
         estimates.append((np.sin(np.pi * p[:, 0]) * p[:, 1] ** 2).mean())
     errors = np.array(estimates) - 2 / np.pi / 3
     variance = 0.5 * 0.2 - (2 / np.pi / 3) ** 2
@@ -64,21 +63,21 @@ def test_integrates_better_than_random():
 
 
 def test_halton_is_the_halton_sequence_shifted():
-    """Against SciPy's, unscrambled; the shift is one number for a dimension and pixel."""
+    """Against SciPy's, unscrambled: the difference is one number for each dimension and pixel."""
     from scipy.stats import qmc
 
     count = 16
-    sampler = Halton(mi.UInt32(77), dr.arange(mi.UInt32, count), mi.UInt32(1))
+    sampler = HaltonSampler(mi.UInt32(77), dr.arange(mi.UInt32, count), mi.UInt32(1))
     ours = np.stack([np.array(sampler.next_1d()) for _ in range(6)], axis=1).astype(float)
     shift = np.mod(ours - qmc.Halton(6, scramble=False).random(count), 1)
     np.testing.assert_allclose(np.mod(shift - shift[0] + 0.5, 1), 0.5, atol=1e-6)
     assert len(np.unique(shift[0].round(6))) == 6
-    again = Halton(mi.UInt32(77), dr.arange(mi.UInt32, count) + 16, mi.UInt32(1))
+    again = HaltonSampler(mi.UInt32(77), dr.arange(mi.UInt32, count) + 16, mi.UInt32(1))
     assert np.array_equal(np.array(again.next_1d()), ours[:, 0].astype(np.float32))  # a cycle
 
 
 def test_halton_is_uniform_over_pixels():
-    sampler = Halton(hash32(dr.arange(mi.UInt32, 1 << 16)), mi.UInt32(3), mi.UInt32(2))
+    sampler = HaltonSampler(hash32(dr.arange(mi.UInt32, 1 << 16)), mi.UInt32(3), mi.UInt32(2))
     values = np.array([np.array(sampler.next_1d()) for _ in range(6)])
     assert (values >= 0).all() and (values < 1).all()
     np.testing.assert_allclose(values.mean(axis=1), 0.5, atol=0.01)

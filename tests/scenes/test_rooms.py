@@ -1,4 +1,4 @@
-"""Rooms: deterministic, full, free of collisions; flights through free space; light that is neither night nor glare."""
+"""Rooms are deterministic, full and free of collisions; flights cross free space; frames are no night and no glare."""
 
 from functools import cache
 
@@ -13,13 +13,14 @@ from render.stage import Stage
 from scenes.animation import Scene, Shape
 from scenes.camera import motion_vectors, pixel_centres
 from scenes.registry import build_scene
+from tests.helpers.scenes import FRAMES
 
-FRAMES = 24
-FEW, MANY = range(8), range(1000, 1100)
+FEW = range(8)
+MANY = range(1000, 1100)
 
 
 @cache
-def room(number: int) -> Scene:
+def build_room(number: int) -> Scene:
     return build_scene(f"room-{number}", 0, FRAMES)
 
 
@@ -30,6 +31,7 @@ def owner(name: str) -> str:
 
 
 def things(scene: Scene) -> dict[str, list[Shape]]:
+    """The shapes of every thing, by its number."""
     owned: dict[str, list[Shape]] = {}
     for shape in scene.shapes:
         if owner(shape.name).isdigit():
@@ -50,7 +52,7 @@ def world(scene: Scene, frame: int) -> trimesh.collision.CollisionManager:
 
 
 def check(number: int) -> None:
-    scene = room(number)
+    scene = build_room(number)
     assert 15 <= len(things(scene)) <= 60
     assert 1 <= len(lights(scene)) + (scene.sky is not None) <= 5
     assert len({shape.name for shape in scene.shapes}) == len(scene.shapes)
@@ -87,7 +89,8 @@ def test_many_rooms(number):
 
 
 def test_same_number_same_room_whatever_the_seed():
-    a, b = room(3), build_scene("room-3", 77, FRAMES)
+    a = build_room(3)
+    b = build_scene("room-3", 77, FRAMES)
     for x, y in zip(a.shapes, b.shapes, strict=True):
         assert x.name == y.name and np.array_equal(x.mesh.vertices, y.mesh.vertices)
         assert np.array_equal(x.motion.matrix(5), y.motion.matrix(5))
@@ -96,15 +99,15 @@ def test_same_number_same_room_whatever_the_seed():
 
 
 def test_rooms_differ():
-    sizes = {tuple(room(number).shapes[0].mesh.bounds.ravel()) for number in FEW}
+    sizes = {tuple(build_room(number).shapes[0].mesh.bounds.ravel()) for number in FEW}
     assert len(sizes) == len(FEW)
-    kinds = {shape.bsdf["type"] for number in FEW for shape in room(number).shapes}
+    kinds = {shape.bsdf["type"] for number in FEW for shape in build_room(number).shapes}
     assert {"diffuse", "twosided", "roughplastic", "principled", "roughconductor"} <= kinds
 
 
 def share_of_kinds(numbers: range) -> dict[str, float]:
-    """Shares of rooms in which something moves, lights change, the camera stops, the sky is seen, glass stands."""
-    rooms = [room(number) for number in numbers]
+    """Shares of rooms in which two things move, lights change, the camera stops, the sky is seen or glass is."""
+    rooms = [build_room(number) for number in numbers]
     facts = {
         "two things move": [sum(parts[0].motion.varies() for parts in things(s).values()) >= 2 for s in rooms],
         "lights change": [any(light.radiance.varies() or light.motion.varies() for light in lights(s)) for s in rooms],
@@ -126,8 +129,10 @@ def test_half_of_the_rooms_move():
 @pytest.mark.parametrize("number", [0, 3, 5])
 def test_frames_are_neither_night_nor_glare(number):
     size = 48
-    stage = Stage(room(number), size, size)
-    tracer, images, emissions = PathTracer(stage), [], []
+    stage = Stage(build_room(number), size, size)
+    tracer = PathTracer(stage)
+    images = []
+    emissions = []
     for frame in (0, FRAMES - 1):
         stage.pose(frame)
         view = stage.view(frame)
@@ -142,13 +147,15 @@ def test_frames_are_neither_night_nor_glare(number):
 
 @pytest.mark.parametrize("number", FEW[:4])
 def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
-    """Motion of what is seen, bar a margin for what comes nearer than the centres of things, which were aimed at."""
-    size, scene = 64, room(number)
-    stage = Stage(scene, size, size)
+    """Motion of what is seen, with a margin for what comes nearer than the centres of things, which were aimed at."""
+    size = 64
+    stage = Stage(build_room(number), size, size)
     for frame in (1, FRAMES // 2, FRAMES - 1):
         stage.pose(frame)
-        now, before = stage.view(frame), stage.view(frame - 1)
+        now = stage.view(frame)
+        before = stage.view(frame - 1)
         buffer = render_gbuffer(stage, now)
-        depth, mesh_id = buffer["depth"][..., 0].astype(float), buffer["mesh_id"][..., 0]
+        depth = buffer["depth"][..., 0].astype(float)
+        mesh_id = buffer["mesh_id"][..., 0]
         motion = motion_vectors(pixel_centres(size, size), depth, mesh_id, now, before)
         assert np.percentile(np.abs(motion).max(axis=-1), 95) < 1.5 * 20 / 256 * size

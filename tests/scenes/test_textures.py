@@ -1,13 +1,13 @@
-"""Textures and colours are deterministic, within reflectances that exist, and repeat without a seam."""
+"""Textures and colours are deterministic, their reflectances exist, and textures repeat without a seam."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scenes.textures import BRIGHTEST, COLOURS, DARKEST, PATTERNS, SIZE, colour, gray_texture, palette, texture
-
-SEEDS = st.integers(0, 2**63)
+from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, colour, palette
+from scenes.textures import PALETTE_SIZE, PATTERNS, TEXTURE_SIZE, gray_texture, texture
+from tests.helpers.scenes import SEEDS
 
 
 def within(values, low, high):
@@ -17,16 +17,20 @@ def within(values, low, high):
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS)
 def test_texture(seed):
-    a, b, other = (texture(np.random.default_rng(s)) for s in (seed, seed, seed + 1))
-    assert a.shape == (SIZE, SIZE, 3) and a.dtype == np.float32 and within(a, DARKEST, BRIGHTEST)
+    a = texture(np.random.default_rng(seed))
+    b = texture(np.random.default_rng(seed))
+    other = texture(np.random.default_rng(seed + 1))
+    assert a.shape == (TEXTURE_SIZE, TEXTURE_SIZE, 3) and a.dtype == np.float32
+    assert within(a, MIN_REFLECTANCE, MAX_REFLECTANCE)
     assert np.array_equal(a, b) and not np.array_equal(a, other)
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS, low=st.floats(0, 0.5), span=st.floats(0.01, 0.5))
 def test_gray_texture_spans_its_range(seed, low, span):
-    a, b = (gray_texture(np.random.default_rng(seed), low, low + span) for _ in range(2))
-    assert a.shape == (SIZE, SIZE, 1) and a.dtype == np.float32 and np.array_equal(a, b)
+    a = gray_texture(np.random.default_rng(seed), low, low + span)
+    b = gray_texture(np.random.default_rng(seed), low, low + span)
+    assert a.shape == (TEXTURE_SIZE, TEXTURE_SIZE, 1) and a.dtype == np.float32 and np.array_equal(a, b)
     assert a.min() == pytest.approx(low, abs=1e-6) and a.max() == pytest.approx(low + span, abs=1e-6)
 
 
@@ -35,16 +39,17 @@ def test_gray_texture_spans_its_range(seed, low, span):
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_patterns_stay_in_the_palette_and_show_something(pattern, seed):
     tone, shade = pattern(np.random.default_rng(seed))
-    assert tone.shape == shade.shape == (SIZE, SIZE)
-    assert within(tone, 0, COLOURS - 1) and np.isfinite(shade).all()
+    assert tone.shape == shade.shape == (TEXTURE_SIZE, TEXTURE_SIZE)
+    assert within(tone, 0, PALETTE_SIZE - 1) and np.isfinite(shade).all()
     assert 0.5 < shade.mean() < 1.5
     assert np.ptp(tone * shade) > 0.01
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_patterns_repeat_seamlessly(pattern):
-    """Neighbours across the border differ no more than elsewhere, over many drawings."""
-    inside, across = [], []
+    """Neighbours across the border differ about as much as elsewhere at most, over many drawings."""
+    inside = []
+    across = []
     for seed in range(20):
         tone = pattern(np.random.default_rng(seed)).tone
         for field in (tone, tone.T):
@@ -58,11 +63,11 @@ def test_patterns_repeat_seamlessly(pattern):
 @given(seed=SEEDS, count=st.integers(1, 8))
 def test_colours(seed, count):
     colours = palette(np.random.default_rng(seed), count)
-    assert colours.shape == (count, 3) and within(colours, DARKEST, BRIGHTEST)
+    assert colours.shape == (count, 3) and within(colours, MIN_REFLECTANCE, MAX_REFLECTANCE)
     assert np.array_equal(colours, palette(np.random.default_rng(seed), count))
     single = colour(np.random.default_rng(seed))
     assert len(single) == 3 and all(type(value) is float for value in single)
-    assert within(np.array(single), DARKEST, BRIGHTEST)
+    assert within(np.array(single), MIN_REFLECTANCE, MAX_REFLECTANCE)
 
 
 def test_colours_are_varied():

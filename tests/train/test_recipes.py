@@ -1,4 +1,4 @@
-"""The paper recipes are the papers', and profiles change nothing but the budget."""
+"""The paper recipes are the papers', and budgets change the effort, never the method."""
 
 from dataclasses import fields, replace
 
@@ -7,9 +7,12 @@ import pytest
 from datasets.sequences import Augmentation
 from errors import BadInput
 from models.registry import DENOISERS, create
-from train.recipes import DEFAULT, RECIPES, TRAINABLE, NTDTerms, RAETerms, SMAPETerms, recipe_for
+from train.losses.ntd import NTDTerms
+from train.losses.rae import RAETerms
+from train.losses.wskp import SMAPETerms
+from train.recipes import DEFAULT, RECIPES, TRAINABLE, recipe_for
 
-BUDGET = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
+EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
 
 
 def test_rae_is_the_paper_s():
@@ -39,24 +42,24 @@ def test_ntd_is_the_paper_s(name, occlusion):
     assert recipe.learning_rate(0) == recipe.learning_rate(199) == 1e-4 and recipe.augmentation == Augmentation()
 
 
-def test_profiles_scale_the_budget_never_the_method():
-    for (name, profile), recipe in RECIPES.items():
+def test_budgets_scale_the_effort_never_the_method():
+    for (name, budget), recipe in RECIPES.items():
         paper = RECIPES[name, "paper"]
-        same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in BUDGET}
-        assert replace(paper, **same) == recipe, (name, profile)
+        same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in EFFORT}
+        assert replace(paper, **same) == recipe, (name, budget)
         assert (
             recipe.epochs <= paper.epochs and recipe.crop and recipe.crop <= (paper.crop or recipe.crop)
         ) or paper == recipe
 
 
-def test_every_network_has_recipes_for_all_profiles():
+def test_every_network_has_recipes_for_all_budgets():
     networks = {name for name in DENOISERS if create(name).parameter_count()}
     assert set(TRAINABLE) == networks and set(DEFAULT) <= networks
-    assert set(RECIPES) == {(name, profile) for name in networks for profile in ("tiny", "quick", "release", "paper")}
+    assert set(RECIPES) == {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")}
 
 
 def test_unknown_names_are_told_apart():
     with pytest.raises(BadInput, match="'accumulated' is not a network"):
         recipe_for("accumulated", "tiny")
-    with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
+    with pytest.raises(BadInput, match=r"unknown budget 'huge'; the budgets of 'rae' are tiny, quick, release, paper"):
         recipe_for("rae", "huge")

@@ -1,7 +1,5 @@
-"""Training crops of accumulated frames: what WSKP learns from (§5.1). Accumulated once a clip, then memory-mapped."""
+"""Training crops of accumulated frames, memory-mapped."""
 
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,11 +14,9 @@ from datasets.channels import REFERENCES
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from datasets.sequences import check_fits, random_window
-from models.denoiser import State
 from models.running_scale import RunningMean, RunningScale
 from models.wskp import KernelPredictor
-
-IRRADIANCE, SCALE = "irradiance.npy", "scale.npy"
+from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
 
 
 class Crops:
@@ -30,7 +26,9 @@ class Crops:
     """
 
     def __init__(self, frame: Frame, irradiance: Tensor, scale: RunningScale):
-        self.frame, self.irradiance, self.scale = frame, irradiance, scale
+        self.frame = frame
+        self.irradiance = irradiance
+        self.scale = scale
 
     def to(self, device: torch.device | str) -> "Crops":
         means = (RunningMean(m.value.to(device), m.count.to(device)) for m in vars(self.scale).values())
@@ -48,43 +46,11 @@ class Crops:
         return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, RunningScale(*means))
 
 
-@torch.no_grad()
-def accumulate_clip(clip: Clip, denoiser: KernelPredictor, cache: Path) -> Path:
-    """Accumulate all realisations of a clip, unless `cache` holds that already. Returns the folder with the result.
-
-    It holds irradiance.npy (F, S, H, W, 3) and scale.npy (F, S, 2), logarithms of luminance and depth; float32.
-    """
-    folder = cache / clip.fingerprint
-    if folder.exists():
-        return folder
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    temporary.mkdir(parents=True, exist_ok=True)
-    try:
-        shape = (clip.frames, clip.realisations, clip.height, clip.width, 3)
-        scale = np.zeros((*shape[:2], 2), np.float32)
-        states: list[State | None] = [None] * clip.realisations
-        # Written, not mapped: on a full disk a map ends the process, and a write says why.
-        with (temporary / IRRADIANCE).open("wb") as file:
-            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(file, header)
-            for index, realisation in np.ndindex(shape[:2]):
-                frame = read_frame(clip, index, denoiser.reads, realisation)
-                states[realisation] = after = denoiser.accumulate(frame, states[realisation])
-                file.write(after.history.irradiance[0].permute(1, 2, 0).numpy().tobytes())
-                scale[index, realisation] = [mean.value.item() for mean in vars(after.scale).values()]
-        np.save(temporary / SCALE, scale)
-        if not folder.exists():  # another process may have been as busy
-            temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return folder
-
-
 class AccumulatedCrops(TorchDataset[Crops]):
     """Crops of `crop` x `crop` pixels (None: whole frames); item i of epoch e depends on (seed, e, i) only.
 
-    An epoch holds `count` crops for every frame of the clips, at random places. Raises BadInput where a clip is
-    smaller than a crop.
+    An epoch holds `count` crops for every frame of the clips, at random places. Accumulated frames are kept in the
+    folder `cache`. Raises BadInput where a clip is smaller than a crop.
     """
 
     def __init__(
@@ -93,9 +59,12 @@ class AccumulatedCrops(TorchDataset[Crops]):
         check_fits(clips, 1, crop)
         cache.mkdir(parents=True, exist_ok=True)
         folders = [accumulate_clip(clip, denoiser, cache) for clip in tqdm(clips, "accumulating", leave=False)]
-        self.accumulated: list[NDArray[np.float32]] = [np.load(f / IRRADIANCE, mmap_mode="r") for f in folders]
-        self.scales: list[NDArray[np.float32]] = [np.load(folder / SCALE) for folder in folders]
-        self.clips, self.crop, self.seed, self.epoch = clips, crop, seed, 0
+        self.irradiance: list[NDArray[np.float32]] = [np.load(f / IRRADIANCE_FILE, mmap_mode="r") for f in folders]
+        self.scales: list[NDArray[np.float32]] = [np.load(folder / SCALE_FILE) for folder in folders]
+        self.clips = clips
+        self.crop = crop
+        self.seed = seed
+        self.epoch = 0
         self.channels = (*denoiser.filter_reads, *REFERENCES)
         frames = np.array([clip.frames for clip in clips])
         self.share = frames / frames.sum()
@@ -112,9 +81,10 @@ class AccumulatedCrops(TorchDataset[Crops]):
         rng = np.random.default_rng([self.seed, self.epoch, index])
         item = rng.choice(len(self.clips), p=self.share)
         clip = self.clips[item]
-        position, realisation = int(rng.integers(clip.frames)), int(rng.integers(clip.realisations))
+        position = int(rng.integers(clip.frames))
+        realisation = int(rng.integers(clip.realisations))
         window = random_window(clip, self.crop, rng)
-        irradiance = to_tensor(self.accumulated[item][position, realisation][window])
+        irradiance = to_tensor(self.irradiance[item][position, realisation][window])
         scales = torch.from_numpy(self.scales[item][position, realisation])
         means = (RunningMean(value[None], torch.ones(1)) for value in scales)
         return Crops(read_frame(clip, position, self.channels, window=window), irradiance, RunningScale(*means))

@@ -1,0 +1,86 @@
+"""Rendering one clip into its folder: the unit of work that processes and machines share out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from tqdm import tqdm
+
+from datasets.adaptive_spp import reference_spp
+from datasets.clip import is_clip
+from datasets.clip_kind import ClipKind
+from datasets.profiles import DataProfile, clip_seed, profile_of
+from datasets.writer import ClipWriter
+from files import locked
+from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
+from scenes.registry import build_scene
+
+
+class ClipJob(NamedTuple):
+    """One clip to render, and everything that its bytes follow from."""
+
+    path: Path  # DATA/SPLIT/SCENE/CLIP
+    profile: str
+    seed: int  # of the data set
+    channels: tuple[str, ...]
+    options: Options
+
+
+class ClipOutcome(NamedTuple):
+    """How a clip's job ended, with the reason where it did not render the clip."""
+
+    path: Path
+    ending: Literal["rendered", "left", "failed"]
+    reason: str = ""
+
+
+def run_clip_job(job: ClipJob) -> ClipOutcome:
+    """Render a clip unless another process is rendering it or has done so.
+
+    A failure of the renderer is an outcome. OSError is raised instead: a full disk is full for all clips.
+    """
+    job.path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(job.path.with_name(f".{job.path.name}.lock")) as ours:
+        if not ours:
+            return ClipOutcome(job.path, "left", "left to another process, which is rendering it")
+        if is_clip(job.path):
+            return ClipOutcome(job.path, "left", "another process has rendered it")
+        try:
+            render_to_folder(job.path, profile_of(job.profile), job.seed, job.channels, job.options)
+        except (RuntimeError, ValueError) as error:
+            return ClipOutcome(job.path, "failed", str(error))
+    return ClipOutcome(job.path, "rendered")
+
+
+def render_to_folder(
+    folder: Path, profile: DataProfile, dataset_seed: int, channels: Sequence[str], options: Options = NO_OPTIONS
+) -> None:
+    """Render the named channels of the clip whose folder is DATA/SPLIT/SCENE/CLIP, whole or not at all.
+
+    The clip is a function of the arguments alone. Raises BadInput for an unknown scene or clip name.
+    """
+    split, scene_name, clip_name = folder.parts[-3:]
+    kind = ClipKind.of(clip_name)
+    quality = profile.quality[split]
+    seed = clip_seed(dataset_seed, scene_name, split, kind.number)
+    scene = build_scene(scene_name, seed, profile.frames)
+    if kind.still:
+        scene = scene.still()
+    clock = StepTimer()
+    spp = reference_spp(scene, profile.frames, profile.height, profile.width, quality, seed, options)
+    clock.lap("pilot")
+    sampling = Sampling(quality.realisations, kind.noisy_spp, spp, options)
+    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed, channels)
+    # While only the camera moves, motion follows from depth.
+    derived = {} if scene.moves() or "motion" not in channels else {"motion": "camera"}
+    with ClipWriter(folder) as writer:
+        writer.timing = clock.read()
+        progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", profile.frames, leave=False, unit="frame")
+        for arrays, seconds in progress:
+            writer.add(arrays, seconds)
+        facts = {
+            "noisy_spp": kind.noisy_spp,
+            "reference_spp": spp // 2 * 2,
+            "meshes": [shape.name for shape in scene.shapes],
+        }
+        writer.finish(facts, derived)

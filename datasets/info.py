@@ -1,0 +1,166 @@
+"""What is in a data set: its clips and how hard they are, how channels are stored, where the time went."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from tabulate import tabulate
+from tqdm import tqdm
+
+from datasets.channels import CHANNELS
+from datasets.clip import Clip, Dataset, is_clip
+from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
+from datasets.tonemap import psnr
+from errors import BadInput
+from files import read_json
+
+# Whatever helps to denoise the noisy channels.
+AUXILIARY_CHANNELS = tuple(
+    name for name, channel in CHANNELS.items() if channel.is_image and (not channel.radiance or name == "emission")
+)
+CLIP_HEAD = (
+    "clip",
+    "frames",
+    "size",
+    "noisy",
+    "reference spp",
+    "floor dB",
+    "exposure",
+    "bad values",
+    *(measure.head for measure in MEASURES.values()),
+    "MB",
+    "seconds",
+)
+
+Timing = dict[str, float]  # seconds by step
+
+
+def summarise(root: Path, plot: Path | None = None) -> str:
+    """Tables of clips (size, noise floor, difficulty, render time), of channels (storage, savings) and of steps.
+
+    With `plot`, histograms of the clips' difficulty are written there as a PNG.
+    Raises BadInput where there is no data set at `root`, or no clip to plot.
+    """
+    dataset = Dataset(root)
+    rows: list[list[object]] = []
+    clips: list[Clip] = []
+    difficulties: list[Difficulty] = []
+    timings: list[Timing] = []
+    for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
+        label = str(path.relative_to(root))
+        if not is_clip(path):
+            rows.append([label, "missing"])
+            continue
+        clip = Clip(path)
+        difficulty = difficulty_of_clip(clip)
+        timing = read_json(path / "timing.json")
+        rows.append(clip_row(label, clip, difficulty, sum(timing.values())))
+        clips.append(clip)
+        difficulties.append(difficulty)
+        timings.append(timing)
+    if plot:
+        plot_difficulties(root, difficulties, plot)
+    facts = dataset.facts
+    title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {megabytes(size_of(root))} MB"
+    parts = [title, tabulate(rows, CLIP_HEAD)]
+    if clips:
+        parts += [channel_table(clips), step_table(clips, timings)]
+    return "\n\n".join(parts)
+
+
+def plot_difficulties(root: Path, difficulties: list[Difficulty], path: Path) -> None:
+    """Write the histograms to a PNG. Raises BadInput where there are no clips."""
+    if not difficulties:
+        raise BadInput(f"{root} has no clips yet: render some with `onespp dataset`")
+    from datasets.histogram import difficulty_histograms  # takes matplotlib, which nothing else here needs
+    from plotting import save_figure
+
+    save_figure(path, difficulty_histograms(difficulties))
+
+
+def clip_row(label: str, clip: Clip, difficulty: Difficulty, seconds: float) -> list[object]:
+    """The row of a clip under CLIP_HEAD."""
+    bad_values = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
+    return [
+        label,
+        clip.frames,
+        f"{clip.height}x{clip.width}",
+        clip.realisations,
+        clip.facts["reference_spp"],
+        f"{psnr(clip.facts['floor_mse']):.1f}",
+        f"{clip.exposure:.3g}",
+        bad_values,
+        *(f"{getattr(difficulty, field):.3g}" for field in MEASURES),
+        megabytes(size_of(clip.path)),
+        f"{seconds:.1f}",
+    ]
+
+
+def channel_table(clips: list[Clip]) -> str:
+    """How channels are stored, and what that saves."""
+    rows: list[list[str]] = []
+    stored: dict[str, int] = {}
+    full: dict[str, int] = {}
+    for name in CHANNELS:
+        stored[name] = sum(stored_size(clip, name) for clip in clips)
+        full[name] = sum(size_in_full(clip, name) for clip in clips)
+        kinds = sorted({stored_as(clip, name) for clip in clips})
+        rows.append([name, ", ".join(kinds), megabytes(stored[name]), megabytes(full[name])])
+    for label, names in (("auxiliary channels", AUXILIARY_CHANNELS), ("all", tuple(CHANNELS))):
+        total_stored = sum(stored[name] for name in names)
+        total_full = sum(full[name] for name in names)
+        share = f"{total_stored / total_full:.0%} of full"
+        rows.append([label, share, megabytes(total_stored), megabytes(total_full)])
+    return tabulate(rows, ["channel", "stored as", "MB", "in full"], disable_numparse=True)
+
+
+def step_table(clips: list[Clip], timings: list[Timing]) -> str:
+    """Seconds by step, and what was saved where dual motion was not rendered.
+
+    The saving is estimated by the mean time per pixel in the clips that have dual motion.
+    """
+    seconds: Timing = {}
+    for timing in timings:
+        for step, spent in timing.items():
+            seconds[step] = seconds.get(step, 0.0) + spent
+    pixels = [clip.frames * clip.height * clip.width for clip in clips]
+    rendered = sum(count for clip, count in zip(clips, pixels, strict=True) if "dual_motion" in clip.channels)
+    saved: dict[str, str] = {}
+    if rendered and "dual_motion" in seconds:
+        saved["dual_motion"] = f"{seconds['dual_motion'] * (sum(pixels) - rendered) / rendered:.2f}"
+    rows = [[step, f"{spent:.2f}", saved.get(step, "")] for step, spent in seconds.items()]
+    return tabulate(rows, ["step", "seconds", "saved"], disable_numparse=True)
+
+
+def stored_as(clip: Clip, channel: str) -> str:
+    """The data type of a channel that has a file, or else why it has none."""
+    entry = clip.channels.get(channel, {})
+    if "file" in entry:
+        return str(entry["dtype"])
+    return next((kind for kind in ("value", "derived") if kind in entry), "not rendered")
+
+
+def stored_size(clip: Clip, channel: str) -> int:
+    """Bytes of a channel's file; 0 where it has none."""
+    entry = clip.channels.get(channel, {})
+    return (clip.path / entry["file"]).stat().st_size if "file" in entry else 0
+
+
+def size_in_full(clip: Clip, channel: str) -> int:
+    """Bytes that a channel would take with all its numbers written out."""
+    entry = clip.channels.get(channel, {})
+    if "file" in entry:
+        return math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize
+    meshes = len(clip.facts["meshes"])
+    shape = CHANNELS[channel].shape(F=clip.frames, S=clip.realisations, H=clip.height, W=clip.width, M=meshes)
+    return math.prod(shape) * np.dtype(CHANNELS[channel].dtype).itemsize
+
+
+def size_of(path: Path) -> int:
+    """Bytes of all files below a folder."""
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+
+
+def megabytes(count: int) -> str:
+    """A number of bytes in MB, with one decimal."""
+    return f"{count / 1e6:.1f}"

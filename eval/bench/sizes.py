@@ -1,0 +1,35 @@
+"""Sizes of images and numbers of threads, as they are named on the command line."""
+
+import re
+from collections.abc import Sequence
+
+import torch
+
+from errors import BadInput
+
+Size = tuple[int, int]  # height, width
+
+
+def parse_size(text: str) -> Size:
+    """(height, width) of "1280x720". Raises BadInput."""
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if not match:
+        raise BadInput(f"'{text}' is not a size such as 1280x720")
+    return int(match[2]), int(match[1])
+
+
+def size_name(size: Size) -> str:
+    """The inverse."""
+    height, width = size
+    return f"{width}x{height}"
+
+
+def thread_counts(threads: Sequence[int]) -> list[int]:
+    """The numbers of threads to measure with, rising; by default one, and as many as PyTorch takes.
+
+    Raises BadInput for a number that cannot work.
+    """
+    for count in threads:
+        if count < 1:
+            raise BadInput(f"{count} threads cannot work: name at least 1")
+    return sorted({*threads} or {1, torch.get_num_threads()})

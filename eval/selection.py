@@ -1,0 +1,78 @@
+"""Who can run, and why not: the one way in which commands choose denoisers."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from errors import BadInput
+from eval.extra_denoisers import WINDOW_SETS, windows_label
+from eval.spec import DenoiserSpec, denoiser_class, precision_in_use
+from models.registry import DENOISERS, without_taa
+from train.recipes import TRAINABLE
+from train.task import WEIGHTS_FILE, run_folder
+
+BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
+
+Obstacle = Callable[[str], str | None]  # why the denoiser of a name cannot run, and the remedy
+
+
+def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) -> list[str]:
+    """The named denoisers, or all of `everyone` in whose way nothing stands; says who is left out, and why.
+
+    Raises BadInput where a named one is unknown or cannot run.
+    """
+    chosen = []
+    for name in dict.fromkeys(names or everyone):
+        reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
+        if reason and names:
+            raise BadInput(f"{name}: {reason}")
+        if reason:
+            print(f"{name}: skipped, {reason}")
+        else:
+            chosen.append(name)
+    return chosen
+
+
+def unavailable(name: str) -> str | None:
+    """Why a denoiser cannot run on this machine. Raises BadInput for an unknown name."""
+    return denoiser_class(name).unavailable()
+
+
+def weights_file(name: str, runs: Path, budget: str) -> Path | None:
+    """Where the weights of a network belong; None for a denoiser without."""
+    if not denoiser_class(name).is_network:
+        return None
+    if name in WINDOW_SETS:
+        return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS_FILE
+    return run_folder(runs, without_taa(name), budget) / WEIGHTS_FILE
+
+
+def untrained(runs: Path, budget: str, name: str) -> str | None:
+    """Why a network has no weights yet, and the command that trains them."""
+    path = weights_file(name, runs, budget)
+    if path is None or path.exists():
+        return None
+    training = "ablate wskp-windows" if name in WINDOW_SETS else f"train {without_taa(name)}"
+    trainable = name in WINDOW_SETS or without_taa(name) in TRAINABLE
+    remedy = f": train them with `onespp {training} --budget {budget} --runs {runs}`" if trainable else ""
+    return f"it has no weights at {path}{remedy}"
+
+
+def evaluated(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
+    """The named denoisers, or all that can run and are trained, as `onespp eval` runs them.
+
+    Raises BadInput where a named one is unknown, cannot run or is not trained.
+    """
+    chosen = choose(names, DENOISERS, unavailable, partial(untrained, runs, budget))
+    return [
+        DenoiserSpec(name, precision=precision_in_use(name), weights=weights_file(name, runs, budget))
+        for name in chosen
+    ]
+
+
+def with_indirect_baselines(specs: Sequence[DenoiserSpec]) -> list[DenoiserSpec]:
+    """The specs, and beside one that returns indirect light alone the baselines among them on that, too."""
+    if all(spec.returns == "total" for spec in specs):
+        return [*specs]
+    return [*specs, *(replace(spec, signal="indirect") for name in BASELINES for spec in specs if spec.name == name)]

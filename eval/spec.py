@@ -1,0 +1,100 @@
+"""A denoiser to run, described before anything is built: which, with what weights, and how it computes."""
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from datasets.frame import Signal
+from eval.extra_denoisers import EXTRA, WINDOW_SETS, windows_label
+from models import compiled, registry
+from models.denoiser import Denoiser
+from models.taa import inner_denoiser
+from models.weights import load_weights
+
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+def denoiser_class(name: str) -> type[Denoiser]:
+    """The class of a denoiser, which knows all that can be asked of it. Raises BadInput for an unknown name."""
+    return EXTRA[name].kind if name in EXTRA else registry.denoiser_class(name)
+
+
+def create(name: str, signal: Signal | None = None) -> Denoiser:
+    """A denoiser of the registry or of EXTRA, with fresh weights. Raises BadInput for an unknown name."""
+    if name in EXTRA:
+        return EXTRA[name].kind(signal=signal, **EXTRA[name].arguments)
+    return registry.create(name, signal)
+
+
+def precisions_of(name: str) -> list[str]:
+    """The precisions that a denoiser computes in, keys of PRECISIONS."""
+    return [precision for precision, dtype in PRECISIONS.items() if dtype not in denoiser_class(name).refuses]
+
+
+def precision_in_use(name: str) -> str:
+    """The fastest precision here of those that the denoiser computes in, a key of PRECISIONS."""
+    fastest = registry.inference_precision(denoiser_class(name))
+    return next(precision for precision, dtype in PRECISIONS.items() if dtype == fastest)
+
+
+@dataclass(frozen=True)
+class DenoiserSpec:
+    """One way to run a denoiser.
+
+    Attributes:
+        signal: what it returns; None for what it usually does.
+        precision: of its network, a key of PRECISIONS.
+        weights: the file of a network's weights; without one they are fresh, and always the same.
+        compiled: by compiled kernels where there are any, or all in PyTorch.
+        device: "cpu" or "cuda".
+    """
+
+    name: str
+    signal: Signal | None = None
+    precision: str = "float32"
+    weights: Path | None = None
+    compiled: bool = True
+    device: str = "cpu"
+
+    @property
+    def kind(self) -> type[Denoiser]:
+        return denoiser_class(self.name)
+
+    @property
+    def returns(self) -> Signal:
+        """The signal that it returns."""
+        return self.signal or self.kind.signal
+
+    @property
+    def way(self) -> str:
+        """Its name in the bench's tables, which tell precisions apart by a column of their own: svgf (PyTorch)."""
+        signal = f" ({self.returns})" if self.returns != self.kind.signal else ""
+        return f"{self.name}{signal}" + ("" if self.compiled else " (PyTorch)")
+
+    @property
+    def label(self) -> str:
+        """Its name in the trade, and of the folder of its results there: rae-bfloat16."""
+        return self.name if self.precision == "float32" else f"{self.name}-{self.precision}"
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Those of onespp in which the denoiser is defined."""
+        plain = registry.without_taa(self.name)
+        antialiasing = ("models.taa",) if plain != self.name else ()
+        return (denoiser_class(plain).__module__, *antialiasing)
+
+    def build(self) -> Denoiser:
+        """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
+        torch.manual_seed(0)
+        denoiser = create(self.name, self.signal)
+        if self.weights:
+            name = windows_label(WINDOW_SETS[self.name]) if self.name in WINDOW_SETS else self.name
+            load_weights(inner_denoiser(denoiser), registry.without_taa(name), self.weights)
+        denoiser.prepare(PRECISIONS[self.precision])
+        return denoiser.to(self.device)
+
+    def running(self) -> AbstractContextManager[None]:
+        """The context in which it computes as described."""
+        return nullcontext() if self.compiled else compiled.disabled()

@@ -1,0 +1,43 @@
+"""Axis-aligned boxes, as arrays (2, 3) of their lowest and highest x, y, z."""
+
+import numpy as np
+
+from scenes.camera import Array
+
+
+def enclosing_box(boxes: Array) -> Array:
+    """The smallest box (2, 3) around `boxes` (N, 2, 3), N > 0."""
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def transformed_box(box: Array, matrix: Array) -> Array:
+    """The smallest box (2, 3) around `box` (2, 3) transformed by `matrix` (4, 4)."""
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
+    transformed = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.stack([transformed.min(axis=0), transformed.max(axis=0)])
+
+
+def overlaps(box: Array, boxes: Array) -> bool:
+    """Whether `box` (2, 3) overlaps any of `boxes` (N, 2, 3)."""
+    return bool(((box[0] < boxes[:, 1]) & (box[1] > boxes[:, 0])).all(axis=1).any())
+
+
+def keeps_clearance(points: Array, boxes: Array, clearance: float) -> bool:
+    """Whether all `points` (N, 3) are `clearance` away from all `boxes` (M, 2, 3) along at least one axis."""
+    inside = (points[:, None] > boxes[:, 0] - clearance) & (points[:, None] < boxes[:, 1] + clearance)
+    return not bool(inside.all(axis=2).any())
+
+
+def first_hit(origin: Array, targets: Array, boxes: Array) -> Array:
+    """At which share (N,) of the ways from `origin` (3,) to `targets` (N, 3) the first of `boxes` (M, 2, 3) begins.
+
+    Negative inside a box, above 1 behind the target, infinite where no box is met. The slab method of Kay and Kajiya
+    1986, "Ray tracing complex scenes".
+    """
+    ways = (targets - origin)[:, None, None]
+    ways = np.where(np.abs(ways) < 1e-9, 1e-9, ways)
+    near, far = np.sort((boxes[None] - origin) / ways, axis=2).transpose(2, 0, 1, 3)
+    enter = near.max(axis=-1)
+    leave = far.min(axis=-1)
+    met = (enter < leave) & (leave > 0)
+    return np.asarray(np.where(met, enter, np.inf).min(axis=1, initial=np.inf))

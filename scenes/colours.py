@@ -1,0 +1,70 @@
+"""Random colours for interiors: linear reflectances of surfaces, and the light of lamps."""
+
+import colorsys
+
+import numpy as np
+
+from scenes.camera import Array
+from scenes.draws import Rng
+
+MIN_REFLECTANCE = 0.02  # linear
+MAX_REFLECTANCE = 0.9
+
+# From candle light to daylight in the shade.
+LIGHT_COLOURS = np.array([[1.0, 0.55, 0.25], [1.0, 0.75, 0.5], [1.0, 0.95, 0.85], [0.8, 0.9, 1.0]])
+
+
+def hsv(hue: float, saturation: float, value: float) -> Array:
+    """Linear reflectance (3,) of a displayed colour (gamma 2.2); the hue wraps around, the rest is clipped to 0..1."""
+    rgb = colorsys.hsv_to_rgb(hue % 1, float(np.clip(saturation, 0, 1)), float(np.clip(value, 0, 1)))
+    return np.clip(np.array(rgb) ** 2.2, MIN_REFLECTANCE, MAX_REFLECTANCE)
+
+
+def hue_saturation_value(rng: Rng) -> tuple[float, float, float]:
+    """A displayed colour as interiors have them: white, grey, dark, of wood, muted or saturated."""
+    hue = rng.uniform()
+    earth = rng.normal(0.08, 0.025)
+    kinds = (  # share, hue, saturation, value
+        (0.22, earth, rng.uniform(0, 0.12), rng.uniform(0.8, 0.96)),
+        (0.13, hue, rng.uniform(0, 0.08), rng.uniform(0.3, 0.8)),
+        (0.10, hue, rng.uniform(0, 0.4), rng.uniform(0.05, 0.25)),
+        (0.20, earth, rng.uniform(0.25, 0.7), rng.uniform(0.25, 0.8)),
+        (0.25, hue, rng.uniform(0.1, 0.4), rng.uniform(0.35, 0.85)),
+        (0.10, hue, rng.uniform(0.55, 0.95), rng.uniform(0.4, 0.95)),
+    )
+    _, hue, saturation, value = kinds[rng.choice(len(kinds), p=[kind[0] for kind in kinds])]
+    return hue, saturation, value
+
+
+def colour(rng: Rng) -> tuple[float, float, float]:
+    """A plausible reflectance, linear RGB."""
+    r, g, b = hsv(*hue_saturation_value(rng))
+    return float(r), float(g), float(b)
+
+
+def palette(rng: Rng, count: int) -> Array:
+    """Linear reflectances (count, 3): unrelated ones, tones of one hue, or such tones with an accent."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return np.array([colour(rng) for _ in range(count)])
+    hue, saturation, value = hue_saturation_value(rng)
+    values = value + rng.uniform(0.03, 0.4) * rng.permutation(np.linspace(-1, 1, count))
+    shades = zip(
+        hue + rng.normal(0, 0.04, count),
+        saturation * rng.uniform(0.7, 1.3, count),
+        np.clip(values, 0.08, 1),
+        strict=True,
+    )
+    colours = np.array([hsv(*shade) for shade in shades])
+    if kind == 1:
+        colours[rng.integers(count)] = hsv(rng.uniform(), rng.uniform(0.5, 1), rng.uniform(0.4, 0.95))
+    return colours
+
+
+def light_colour(rng: Rng) -> Array:
+    """A lamp's colour (3,) whose largest component is 1 or little less: as of common lamps, sometimes of any hue."""
+    if rng.random() < 0.15:
+        hue = rng.dirichlet(np.ones(3))
+        return np.asarray(hue / hue.max())
+    position = rng.uniform(0, len(LIGHT_COLOURS) - 1)
+    return np.stack([np.interp(position, range(len(LIGHT_COLOURS)), channel) for channel in LIGHT_COLOURS.T])

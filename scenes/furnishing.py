@@ -1,0 +1,126 @@
+"""Furniture, decor and pictures for a room, at rest or moving."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scenes.animation import RigidMotion, Track, still
+from scenes.draws import one_of
+from scenes.layout import GAP, Group, Layout, laden
+from scenes.objects.catalogue import DECOR, FURNITURE
+from scenes.objects.furniture import make_table
+from scenes.objects.pictures import make_picture
+from scenes.objects.seating import make_chair
+from scenes.objects.thing import Maker
+from scenes.shell import wall_pose, wall_width
+
+MIN_THINGS = 15
+AGAINST_WALLS = ("sofa", "armchair", "bed", "shelf", "cabinet", "desk", "bench", "screen")
+
+
+def against_walls(layout: Layout, count: int) -> None:
+    """Up to `count` pieces of furniture with their backs to a wall."""
+    rng = layout.rng
+    for name in rng.choice(AGAINST_WALLS, count):
+        group = laden(rng, FURNITURE[str(name)](rng))
+        bounds = group.bounds
+        for _ in range(8):
+            wall = int(rng.integers(4))
+            free = wall_width(wall, layout.size) / 2 - bounds[1, 0]
+            if free <= 0:
+                continue
+            place = [rng.uniform(-free, free), GAP, rng.uniform(0.03, 0.12) - bounds[0, 2], 1]
+            motion = still((wall_pose(wall, layout.size) @ place)[:3], wall * np.pi / 2)
+            if layout.try_add(group, motion):
+                layout.backs.append((motion, bounds))
+                break
+
+
+def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
+    """A slow turn, a slide or hops that start at a place on the floor."""
+    rng = layout.rng
+    last = layout.last_frame
+    angle = rng.uniform(-np.pi, np.pi)
+    start = np.array([x, GAP, z])
+    turn = rng.uniform(0.01, 0.06) * layout.frames
+    slide = rng.uniform(0.005, 0.03) * layout.frames
+    kind = rng.integers(3)
+    if kind == 0:
+        return RigidMotion(Track.constant(start), Track(np.array([angle, angle + turn * rng.choice([-1, 1])]), 0, last))
+    heading = rng.uniform(-np.pi, np.pi)
+    end = start + min(slide, 1.5) * np.array([np.cos(heading), 0, np.sin(heading)])
+    if kind == 1:
+        return RigidMotion(Track(np.stack([start, end]), 0, last), Track(np.array([angle, angle + turn / 2]), 0, last))
+    up = np.array([0, rng.uniform(0.1, 0.5), 0])
+    keys = np.stack([start, (start + end) / 2 + up, end, (start + end) / 2 + up, start])
+    return RigidMotion(Track(np.maximum(keys, [-np.inf, GAP, -np.inf]), 0, 2 * last), Track.constant(angle))
+
+
+def movers(layout: Layout, count: int) -> None:
+    """Up to `count` things that move rigidly, each in space of its own."""
+    rng = layout.rng
+    makers = [*FURNITURE.values(), *DECOR.values()]
+    goal = layout.moving + count
+    for _ in range(12 * count):
+        if layout.moving >= goal:
+            return
+        group = laden(rng, one_of(rng, makers)(rng))
+        half = layout.size[[0, 2]] / 2 - 0.2
+        x, z = rng.uniform(-half, half)
+        layout.try_add(group, random_motion(layout, x, z))
+
+
+def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
+    """Up to `count` things anywhere on the floor, turned any way."""
+    rng = layout.rng
+    half = layout.size[[0, 2]] / 2 - 0.15
+    for _ in range(count):
+        group = laden(rng, one_of(rng, makers)(rng))
+        for _ in range(4):
+            x, z = rng.uniform(-half, half)
+            if layout.try_add(group, still((x, GAP, z), rng.uniform(-np.pi, np.pi))):
+                break
+
+
+def dining(layout: Layout) -> None:
+    """A table with chairs that face it."""
+    rng = layout.rng
+    group = laden(rng, make_table(rng))
+    half = np.maximum(layout.size[[0, 2]] / 2 - 1.0, 0.1)
+    x, z = rng.uniform(-half, half)
+    if not layout.try_add(group, still((x, GAP, z), rng.choice([0, np.pi / 2]))):
+        return
+    low, high = layout.boxes[-1]
+    chair = make_chair(rng)
+    for side in rng.permutation(4)[: rng.integers(1, 5)]:
+        outward = np.array([np.sin(side * np.pi / 2), 0, np.cos(side * np.pi / 2)])
+        reach = (high - low) / 2 + chair.bounds[1, 2] + rng.uniform(0.03, 0.25)
+        place = np.array([(low[0] + high[0]) / 2, GAP, (low[2] + high[2]) / 2]) + outward * reach
+        layout.try_add(Group.of(chair), still(place, side * np.pi / 2 + np.pi))
+
+
+def pictures(layout: Layout, count: int) -> None:
+    """Up to `count` pictures on walls without openings."""
+    rng = layout.rng
+    for _ in range(count):
+        wall = int(rng.integers(4))
+        picture = make_picture(rng)
+        half = wall_width(wall, layout.size) / 2 + picture.bounds[0, 0]
+        top = layout.size[1] - picture.bounds[1, 1] - 0.1
+        if half > 0 and top > 0.8 and wall not in layout.openings:
+            layout.hang(picture, wall, rng.uniform(-half, half), rng.uniform(0.8, top), 0.004)
+
+
+def furnish(layout: Layout) -> None:
+    """Furniture, decor and pictures anywhere in the room, some of it moving."""
+    rng = layout.rng
+    if rng.random() < 0.5:
+        movers(layout, int(rng.integers(2, 5)))
+    if rng.random() < 0.6:
+        dining(layout)
+    scattered(layout, list(FURNITURE.values()), int(rng.integers(2, 8)))
+    pictures(layout, int(rng.integers(0, 6)))
+    decor = list(DECOR.values())
+    scattered(layout, decor, int(rng.integers(0, 8)))
+    while layout.things < MIN_THINGS:
+        scattered(layout, decor, MIN_THINGS - layout.things)

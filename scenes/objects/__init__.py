@@ -1,0 +1,1 @@
+"""Random things for interiors. Metres, y up, fronts towards +z."""

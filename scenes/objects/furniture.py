@@ -1,0 +1,125 @@
+"""Furniture that carries and parts: tables, desks, shelves, cabinets, columns and screens."""
+
+import math
+
+import numpy as np
+
+from scenes.draws import Rng, one_of
+from scenes.meshes import disc, join, lathe, silhouette, slab, solid
+from scenes.objects.furniture_parts import fronts, legs, pedestal, rim
+from scenes.objects.thing import SurfacesBySlot, Thing, evenly, merged, shifted, standing, top_support
+
+
+def make_table(rng: Rng) -> Thing:
+    """A round or rectangular table, from a couch table's height to a bar table's."""
+    height = rng.choice([0.42, 0.75, 0.9]) * rng.uniform(0.92, 1.08)
+    thickness = rng.uniform(0.015, 0.05)
+    if rng.random() < 0.4:
+        radius = rng.uniform(0.28, 0.65)
+        side = radius * math.sqrt(2)
+        frame = pedestal(rng, radius, height) if rng.random() < 0.5 else legs(rng, side, side, height)
+        board = disc(radius, thickness)
+        width = side
+        depth = side
+    else:
+        width = rng.uniform(0.5, 1.9)
+        depth = rng.uniform(0.45, 0.95)
+        frame = legs(rng, width, depth, height)
+        board = slab(width, thickness, depth)
+    slot = one_of(rng, ("wood", "wood", "wood", "stone", "glass"))
+    surfaces = merged({slot: [board.at(0, height)]}, frame)
+    return standing("table", surfaces, [top_support(width, depth, height + thickness)])
+
+
+def make_desk(rng: Rng) -> Thing:
+    """A desk with a block of drawers at one side."""
+    width = rng.uniform(1.0, 1.7)
+    depth = rng.uniform(0.55, 0.8)
+    height = rng.uniform(0.7, 0.78)
+    thickness = rng.uniform(0.02, 0.04)
+    block = rng.uniform(0.35, 0.45)
+    side = one_of(rng, (-1, 1))
+    rows = int(rng.integers(2, 5))
+    x = side * (width - block) / 2
+    tall = height - 0.08
+    drawers = shifted(fronts(rng, block - 0.01, tall - 0.01, 1, rows), x, 0.085, depth / 2 - 0.08)
+    body = {"wood": [slab(block, tall, depth - 0.1).at(x, 0.08, -0.03), slab(width, thickness, depth).at(0, height)]}
+    surfaces = merged(body, drawers, legs(rng, width, depth, height))
+    return standing("desk", surfaces, [top_support(width, depth, height + thickness)])
+
+
+def make_shelf(rng: Rng) -> Thing:
+    """An open bookcase with supports on every board."""
+    width = rng.uniform(0.5, 1.4)
+    height = rng.uniform(0.7, 2.1)
+    depth = rng.uniform(0.24, 0.4)
+    board = rng.uniform(0.015, 0.035)
+    rows = max(2, round(height / rng.uniform(0.28, 0.45)))
+    columns = int(rng.integers(1, 3)) if width > 0.8 else 1
+    inner = width - 2 * board
+    levels = np.linspace(rng.uniform(0, 0.1), height - board, rows + 1)
+    wood = [slab(inner, board, depth).at(0, y) for y in levels]
+    wood += [slab(board, height, depth).at(x) for x in (board / 2 - width / 2, width / 2 - board / 2)]
+    between = np.linspace(-inner / 2, inner / 2, columns + 1)[1:-1]
+    wood += [slab(board, levels[-1] - levels[0], depth).at(x, levels[0]) for x in between]
+    surfaces: SurfacesBySlot = {"wood": wood}
+    if rng.random() < 0.6:
+        surfaces["front"] = [slab(width - 0.01, height - 0.01, 0.008).at(0, 0.005, -depth / 2)]
+    supports = [top_support(width, depth, height)]
+    cell = inner / columns
+    clearance = levels[1] - levels[0] - board
+    for y in levels[:-1]:
+        supports += [top_support(cell, depth, y + board, clearance, 0.03).at(x, 0, 0) for x in evenly(inner, columns)]
+    return standing("shelf", surfaces, supports)
+
+
+def make_cabinet(rng: Rng) -> Thing:
+    """A cabinet with doors or drawers."""
+    width = rng.uniform(0.4, 1.6)
+    height = rng.uniform(0.45, 1.1)
+    depth = rng.uniform(0.35, 0.55)
+    foot = rng.uniform(0.03, 0.2)
+    rows = int(rng.integers(1, 5))
+    columns = max(1, round(width / rng.uniform(0.4, 0.6)))
+    body = slab(width, height, depth).at(0, foot)
+    doors = shifted(fronts(rng, width - 0.02, height - 0.02, columns, rows), 0, foot + 0.01, depth / 2)
+    lid = slab(width + 0.03, 0.02, depth + 0.04).at(0, foot + height, 0.01)
+    surfaces = merged({"wood": [body, lid]}, doors, legs(rng, width, depth, foot + 0.001))
+    return standing("cabinet", surfaces, [top_support(width, depth, foot + height + 0.02)])
+
+
+def make_column(rng: Rng) -> Thing:
+    """A plinth, or a turned column between two plates; both carry things."""
+    width = rng.uniform(0.22, 0.42)
+    height = rng.uniform(0.5, 1.3)
+    plate = slab(width, 0.05, width)
+    if rng.random() < 0.5:
+        body = slab(width - 0.04, height - 0.1, width - 0.04).at(0, 0.05)
+    else:
+        outer = silhouette(rng.uniform(0.28, 0.46, 7) * width, height - 0.1, 28)
+        body = lathe(solid(outer)).at(0, 0.05)
+    surfaces = {one_of(rng, ("stone", "wood")): [plate, body, plate.at(0, height - 0.05)]}
+    return standing("column", surfaces, [top_support(width, width, height)])
+
+
+def make_screen(rng: Rng) -> Thing:
+    """A folding screen: frames filled with a thin grid, bars or louvres."""
+    width = rng.uniform(0.4, 0.6)
+    height = rng.uniform(1.3, 1.9)
+    bar = rng.uniform(0.006, 0.018)
+    kind = rng.integers(3)
+    fold = rng.uniform(0.2, 0.6)
+    count = int(rng.integers(2, 5))
+    columns = int(rng.integers(4, 9))
+    rows = int(rng.integers(10, 22))
+    panel = rim(width, height, 0.03, 0.03)
+    if kind < 2:
+        panel += [slab(bar, height - 0.03, bar).at(x, 0.015) for x in evenly(width - 0.06, columns)]
+    if kind == 0:
+        panel += [slab(width - 0.03, bar, bar).at(0, y) for y in evenly(height - 0.06, rows) + height / 2]
+    if kind == 2:
+        louvre = slab(width - 0.05, 0.004, 0.04).turned(rng.uniform(-0.9, 0.9), axis=0)
+        panel += [louvre.at(0, y) for y in evenly(height - 0.08, rows * 2) + height / 2]
+    step = width * math.cos(fold)
+    folded = [join(panel).turned(fold * (-1) ** k).at(k * step) for k in range(count)]
+    return standing("screen", {one_of(rng, ("wood", "metal")): folded})

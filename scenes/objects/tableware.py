@@ -1,0 +1,97 @@
+"""Vases, bowls, bottles, cups, glasses, baskets and candles."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scenes.draws import Rng, one_of
+from scenes.meshes import circle, hollow, lathe, silhouette, solid, tube
+from scenes.objects.thing import Thing, evenly, standing
+
+
+def vessel(rng: Rng, name: str, radii: ArrayLike, radius: float, height: float, slots: tuple[str, ...]) -> Thing:
+    """A hollow body of revolution whose side passes through `radii` * `radius`, of one of the `slots`."""
+    wall = radius * rng.uniform(0.04, 0.1)
+    outer = silhouette(np.asarray(radii) * radius, height, 24)
+    return standing(name, {one_of(rng, slots): [lathe(hollow(outer, wall, 2 * wall), 40)]})
+
+
+def make_vase(rng: Rng) -> Thing:
+    """A vase of any outline."""
+    radii = rng.uniform(0.35, 1.0, 5)
+    radius = rng.uniform(0.05, 0.13)
+    height = rng.uniform(0.12, 0.42)
+    return vessel(rng, "vase", radii, radius, height, ("ceramic", "glass", "metal"))
+
+
+def make_bowl(rng: Rng) -> Thing:
+    """A bowl that widens upwards."""
+    radii = np.linspace(rng.uniform(0.05, 0.2), 1, 6) ** rng.uniform(0.3, 0.7)
+    radius = rng.uniform(0.07, 0.2)
+    height = rng.uniform(0.05, 0.12)
+    return vessel(rng, "bowl", radii, radius, height, ("ceramic", "wood", "metal", "glass"))
+
+
+def make_bottle(rng: Rng) -> Thing:
+    """A bottle with shoulder and neck."""
+    neck = rng.uniform(0.28, 0.45)
+    shoulder = rng.uniform(0.85, 1.0)
+    radii = (0.95, 1, 1, shoulder, neck, neck, neck * 1.1)
+    radius = rng.uniform(0.03, 0.06)
+    height = rng.uniform(0.18, 0.34)
+    return vessel(rng, "bottle", radii, radius, height, ("glass", "glass", "ceramic"))
+
+
+def make_cup(rng: Rng) -> Thing:
+    """A cup with a handle, with or without a saucer."""
+    radius = rng.uniform(0.035, 0.05)
+    height = rng.uniform(0.06, 0.11)
+    outer = silhouette(radius * np.array([0.8, 0.95, 1, rng.uniform(0.9, 1.1)]), height, 12)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 10)
+    out = np.cos(angle) * height * 0.3 + radius * 0.92
+    up = height * (0.5 + 0.3 * np.sin(angle))
+    handle = tube(np.stack([out, up, 0 * angle], axis=1), height * 0.05)
+    surfaces = [lathe(hollow(outer, 0.004, 0.006), 32).at(0, 0.004), handle.at(0, 0.004)]
+    if rng.random() < 0.5:
+        saucer = silhouette(radius * np.array([0.9, 1.5, 1.8]), 0.015, 8)
+        surfaces.append(lathe(hollow(saucer, 0.004, 0.004), 32))
+    return standing("cup", {"ceramic": surfaces})
+
+
+def make_glass(rng: Rng) -> Thing:
+    """A tumbler or a goblet: one thin-walled closed surface."""
+    radius = rng.uniform(0.03, 0.045)
+    if rng.random() < 0.5:
+        height = rng.uniform(0.08, 0.15)
+        outer = silhouette([radius * rng.uniform(0.75, 1.0), radius, radius], height, 10)
+        base = 0.008
+    else:
+        height = rng.uniform(0.14, 0.22)
+        bulge = rng.uniform(0.9, 1.1)
+        mouth = rng.uniform(0.75, 1.0)
+        outer = silhouette(radius * np.array([0.85, 0.1, 0.1, 0.12, 0.9 * bulge, bulge, mouth]), height, 36)
+        base = height * 0.53
+    return standing("glass", {"glass": [lathe(hollow(outer, 0.0015, base), 40)]})
+
+
+def make_basket(rng: Rng) -> Thing:
+    """A basket of thin wires."""
+    radius = rng.uniform(0.07, 0.16)
+    height = rng.uniform(0.08, 0.25)
+    wire = rng.uniform(0.0015, 0.0035)
+    radii = radius * np.array([rng.uniform(0.6, 0.95), rng.uniform(0.8, 1.1), 1])
+    outer = silhouette(radii, height, 7)
+    hoops = [lathe(circle(r, wire, 5), 28).at(0, y) for r, y in outer]
+    side = np.concatenate([[(0, 0)], outer])
+    upright = tube(np.stack([side[:, 0], side[:, 1], np.zeros(len(side))], axis=1), wire, 4)
+    return standing("basket", {"metal": hoops + [upright.turned(angle) for angle in evenly(2 * np.pi, 20)]})
+
+
+def make_candle(rng: Rng) -> Thing:
+    """A candle in its holder."""
+    height = rng.uniform(0.05, 0.28)
+    radius = rng.uniform(0.04, 0.07)
+    wax = rng.uniform(0.008, 0.02)
+    holder = silhouette(radius * np.array([1, *rng.uniform(0.2, 0.6, 4), 0.8]), height, 24)
+    stick = lathe(solid([(wax, 0), (wax * 0.95, rng.uniform(0.06, 0.18))]), 20).at(0, height)
+    slot = one_of(rng, ("metal", "ceramic", "wood"))
+    return standing("candle", {slot: [lathe(solid(holder))], "wax": [stick]})

@@ -1,0 +1,37 @@
+"""Skies and the sun, seen from everywhere outside a scene."""
+
+import numpy as np
+
+from scenes.camera import Array
+from scenes.colours import light_colour
+from scenes.draws import Rng, log_uniform
+from scenes.shell import wall_pose
+
+
+def sky(rng: Rng, sun: Array | None, height: int = 64) -> Array:
+    """Radiance (height, 2 * height, 3) of a sky over dark ground: latitude-longitude, y up.
+
+    `sun` is the direction to the sun, (3,) with y up, or None under clouds. A clear day's sun gives a few times the
+    light of its sky (0.3 to 30 times here).
+    """
+    rows = (np.arange(height) + 0.5) / height
+    up = np.cos(np.pi * rows)[:, None, None]
+    zenith = rng.uniform(0.3, 1.0, 3) * [0.4, 0.6, 1.0]
+    horizon = rng.uniform(0.3, 1.0, 3) * [0.9, 0.95, 1.0]
+    ground = rng.uniform(0.3, 1.0, 3) * 0.2
+    blend = np.clip(up, 0, 1) ** 0.5
+    image = np.where(up > 0, zenith * blend + horizon * (1 - blend), ground)
+    image = np.repeat(image, 2 * height, axis=1)
+    if sun is not None:
+        x, y, z = sun / np.linalg.norm(sun)
+        row = np.arccos(y) / np.pi * height
+        column = np.arctan2(x, -z) / np.pi % 2 * height
+        image[int(row), int(column)] += light_colour(rng) * log_uniform(rng, 300, 20000)
+    return np.asarray(image)
+
+
+def sun_through(rng: Rng, wall: int, size: Array) -> Array:
+    """A direction (3,) from which the sun shines in through openings of wall 0 to 3 of a room of `size` (3,)."""
+    aside = rng.uniform(-1, 1)
+    elevation = rng.uniform(0.2, 1.0)
+    return np.asarray(wall_pose(wall, size)[:3, :3] @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])

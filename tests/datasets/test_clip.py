@@ -1,0 +1,115 @@
+"""Reading clips and data sets: what was rendered comes back, and what is missing or damaged is named."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from datasets.clip import Clip, Dataset
+from datasets.profiles import clip_seed, profile_of
+from errors import BadInput
+from render.clip import Sampling, render_clip
+from scenes.registry import build_scene
+
+
+def test_plan_and_layout(tiny):
+    facts = json.loads((tiny / "dataset.json").read_text())
+    assert facts["schema"] == 1 and facts["profile"] == "tiny" and facts["seed"] == 0
+    assert set(facts) == {
+        "schema",
+        "profile",
+        "generator",
+        "versions",
+        "seed",
+        "scenes",
+        "options",
+        "channels",
+        "splits",
+    }
+    for path in Dataset(tiny).planned():
+        names = {file.name for file in path.iterdir()}
+        assert {"clip.json", "timing.json", "direct.npy", "depth.npy"} <= names
+        assert set(Clip(path).channels) == set(facts["channels"][path.parts[-3]])
+        assert not any(name.endswith(".raw") for name in names)
+
+
+def test_stored_arrays_are_what_was_rendered(tiny):
+    """Render one clip again, in this process, and compare with the disk."""
+    clip = Dataset(tiny).clips("test")[1]
+    profile = profile_of("tiny")
+    seed = clip_seed(0, clip.scene, "test", 0)
+    scene = build_scene(clip.scene, seed, profile.frames)
+    sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
+    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
+    for index, (channels, _) in enumerate(frames):
+        for name in ("direct", "depth", "motion", "dual_motion", "normal", "mesh_id"):
+            rendered = channels[name][0] if name == "direct" else channels[name]
+            stored = clip.read(name, index)
+            np.testing.assert_array_equal(stored, rendered.astype(stored.dtype))
+        np.testing.assert_array_equal(clip.view(index).camera_to_world, channels["camera_to_world"])
+
+
+def test_derived_motion_equals_rendered_motion(tiny):
+    clip = Dataset(tiny).clips("test")[0]
+    assert clip.scene == "cornell_box" and clip.channels["motion"] == {"derived": "camera"}
+    assert clip.channels["roughness"] == {"value": [1.0]}
+    equal = []  # share of the pixels of each frame
+    largest = []  # motion in each frame, in pixels
+    for index in range(1, clip.frames):
+        # Both are the renderer's, and equal where nothing was disoccluded.
+        motion = clip.read("motion", index)
+        equal.append((motion == clip.read("dual_motion", index)).all(axis=-1).mean())
+        largest.append(np.abs(motion).max())
+        window = (slice(10, 20), slice(5, 60))
+        np.testing.assert_array_equal(clip.read("motion", index, window), motion[window])
+    assert np.mean(equal) > 0.9 and max(largest) > 0.5
+    assert (clip.read("motion", 0) == 0).all() and (clip.read("dual_motion", 0) == 0).all()
+
+
+def test_absent_channel_is_a_clear_error(tiny_copy):
+    path = Dataset(tiny_copy).planned(["test"])[0]
+    facts = json.loads((path / "clip.json").read_text())
+    del facts["channels"]["dual_motion"]
+    (path / "clip.json").write_text(json.dumps(facts))
+    with pytest.raises(BadInput, match=r"'dual_motion'.*not rendered"):
+        Clip(path).read("dual_motion", 0)
+
+
+def test_json_of_another_form_is_bad_input(tiny_copy):
+    path = tiny_copy / "test" / "cornell_box" / "000"
+    for content in ("[]", "3", '{"complete": true}'):
+        (path / "clip.json").write_text(content)
+        with pytest.raises(BadInput, match=r"clip.json is damaged"):
+            Clip(path)
+    (tiny_copy / "dataset.json").write_text("[]")
+    with pytest.raises(BadInput, match=r"dataset.json is damaged"):
+        Dataset(tiny_copy)
+
+
+def test_missing_clip_and_other_schema(tiny_copy):
+    shutil.rmtree(tiny_copy / "train" / "cornell_box" / "000")
+    with pytest.raises(BadInput, match=r"train/cornell_box/000.*onespp dataset"):
+        Dataset(tiny_copy).clips("train")
+    facts = json.loads((tiny_copy / "dataset.json").read_text())
+    (tiny_copy / "dataset.json").write_text(json.dumps(facts | {"schema": 99}))
+    with pytest.raises(BadInput, match="schema version 99"):
+        Dataset(tiny_copy)
+    with pytest.raises(BadInput, match="there is no data set"):
+        Dataset(tiny_copy / "nowhere")
+
+
+def test_more_memory_maps_than_files_may_be_open(tiny):
+    """Every map holds a file descriptor, a dozen a clip, and the usual limit is 1024."""
+    script = f"""
+import resource
+from pathlib import Path
+from datasets.clip import Dataset
+resource.setrlimit(resource.RLIMIT_NOFILE, (16, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+clips = Dataset(Path({str(tiny)!r})).clips("train")
+maps = [clip.map(name) for clip in clips for name, entry in clip.channels.items() if "file" in entry]
+assert len(maps) > 16, len(maps)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)

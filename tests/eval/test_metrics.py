@@ -1,0 +1,146 @@
+"""Metrics against independent implementations and by hand."""
+
+import math
+
+import flip_evaluator
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torchmetrics.functional.image import peak_signal_noise_ratio as torch_psnr
+from torchmetrics.functional.image import structural_similarity_index_measure as torch_ssim
+
+from datasets.frame import disoccluded
+from datasets.tonemap import display
+from eval.comparison import Comparison
+from eval.metrics import METRICS, measure, temporal_error_floor
+from models.operators import luminance
+
+
+def pair(seed: int = 0, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0, 0.6, (1, 3, *size))
+    output = torch.from_numpy(truth + rng.normal(0, 0.05, truth.shape)).float()
+    return output, torch.from_numpy(np.concatenate([truth, truth])).float()
+
+
+def shown(x: torch.Tensor, exposure: float) -> np.ndarray:
+    return (np.clip(exposure * x.double().numpy(), 0, 1) ** (1 / 2.2))[0].transpose(1, 2, 0)
+
+
+def test_metrics_equal_independent_implementations():
+    output, halves = pair()
+    exposure = 1.3
+    metrics = measure(Comparison(output, halves, exposure))
+    a, b = shown(output, exposure), shown(halves[:1], exposure)
+    assert metrics["mse"] == pytest.approx(((a - b) ** 2).mean())
+    assert metrics["rmse"] == pytest.approx(math.sqrt(metrics["mse"]))
+    assert metrics["l1"] == pytest.approx(np.abs(a - b).mean())
+    assert metrics["psnr"] == pytest.approx(peak_signal_noise_ratio(b, a, data_range=1))
+    assert metrics["psnr"] == pytest.approx(torch_psnr(torch.from_numpy(a), torch.from_numpy(b), data_range=1.0).item())
+    # scikit-image truncates its Gaussian at 3.5 sigma, which is 11 pixels, and crops to valid windows.
+    options = {
+        "gaussian_weights": True,
+        "sigma": 1.5,
+        "use_sample_covariance": False,
+        "data_range": 1,
+        "channel_axis": 2,
+    }
+    _, full = structural_similarity(b, a, full=True, **options)
+    assert metrics["ssim"] == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
+    both = (torch.from_numpy(image.transpose(2, 0, 1).copy())[None] for image in (a, b))
+    _, full = torch_ssim(*both, sigma=1.5, data_range=1.0, return_full_image=True)
+    assert metrics["ssim"] == pytest.approx(full[..., 5:-5, 5:-5].mean().item(), abs=1e-9)
+    _, mean, _ = flip_evaluator.evaluate(b.astype(np.float32), a.astype(np.float32), "LDR")
+    assert metrics["flip"] == pytest.approx(mean, abs=1e-6)
+    x, r = exposure * output.double().numpy(), exposure * halves[:1].double().numpy()
+    assert metrics["smape"] == pytest.approx((np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)).mean())
+    assert metrics["rel_mse"] == pytest.approx(((x - r) ** 2 / (r**2 + 0.01)).mean())
+
+
+def test_identical_constant_and_one_pixel_images():
+    _, halves = pair()
+    same = measure(Comparison(halves[:1], halves, 1.0))
+    assert (same["mse"], same["psnr"], same["mse_unbiased"]) == (0, 100, 0) and same["ssim"] == pytest.approx(1)
+    black, white = torch.zeros(1, 3, 16, 16), torch.ones(2, 3, 16, 16)
+    opposite = measure(Comparison(black, white, 1.0))
+    assert opposite["psnr"] == 0 and opposite["rmse"] == 1 and 0 <= opposite["ssim"] < 0.01
+    assert measure(Comparison(black, torch.zeros(2, 3, 16, 16), 1.0))["psnr"] == 100
+    assert same["flip"] == 0 and opposite["flip"] > 0.9
+    one = measure(Comparison(torch.full((1, 3, 1, 1), 0.5), torch.full((2, 3, 1, 1), 0.25), 1.0))
+    assert one["ssim"] is None and one["mse_unbiased"] == pytest.approx(0.0625)
+    assert 0 < one["flip"] < 1 and one["rel_mse"] == pytest.approx(0.0625 / 0.0725)
+    assert one["smape"] == pytest.approx(0.25 / 0.76) and one["l1"] == pytest.approx(one["rmse"])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (10, 11), (11, 11), (13, 17)])
+@pytest.mark.parametrize(("level", "other"), [(0.0, 0.0), (0.0, 6e4), (6e4, 1e-7), (0.3, 0.5)])
+def test_metrics_are_finite_and_bounded_on_constant_images(size, level, other):
+    found = measure(Comparison(torch.full((1, 3, *size), level), torch.full((2, 3, *size), other), 1.0))
+    assert (found["ssim"] is None) == (min(size) < 11)
+    assert all(math.isfinite(value) for value in found.values() if value is not None)
+    for metric in ("mse", "rmse", "l1", "flip", "smape"):
+        assert 0 <= found[metric] <= 1
+    if found["ssim"] is not None:  # of constants, its first factor alone
+        a, b = (min(1.0, value) ** (1 / 2.2) for value in (level, other))
+        assert found["ssim"] == pytest.approx((2 * a * b + 1e-4) / (a**2 + b**2 + 1e-4), abs=1e-6)
+
+
+def test_non_finite_output_counts_as_zero():
+    output, halves = pair()
+    zeroed = output.clone()
+    output[0, :, 3, 4] = torch.tensor([math.nan, math.inf, -math.inf])
+    zeroed[0, :, 3, 4] = 0
+    assert measure(Comparison(output, halves, 1.0)) == measure(Comparison(zeroed, halves, 1.0))
+
+
+def test_unbiased_mse_estimates_the_error_to_the_truth():
+    """Closed form: truth t, output t + d, halves t + noise of variance v. E = d^2; the plain MSE is biased by v / 2."""
+    truth, offset, deviation = 0.4, 0.05, 0.2
+    rng = np.random.default_rng(0)
+    unbiased, plain = [], []
+    for _ in range(200):
+        halves = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
+        output = torch.full((1, 3, 32, 32), truth + offset)
+        unbiased.append(measure(Comparison(output, halves, 1.0))["mse_unbiased"])
+        plain.append(float((output - halves.mean(0)).square().mean()))
+    error = np.std(unbiased) / np.sqrt(len(unbiased))
+    assert abs(np.mean(unbiased) - offset**2) < 4 * error < 0.1 * offset**2
+    assert np.mean(plain) == pytest.approx(offset**2 + deviation**2 / 2, rel=0.02)
+
+
+def flat(*displayed: float) -> torch.Tensor:
+    """Images (N, 3, 4, 4) of one colour each, of radiance that is displayed as given."""
+    return torch.stack([torch.full((3, 4, 4), level**2.2) for level in displayed])
+
+
+def test_temporal_metrics_by_hand():
+    first = Comparison(flat(0.2), flat(0.3, 0.3), 1.0, still=True)
+    assert all(METRICS[name].of(first) is None for name in ("temporal_error", "flicker"))
+    assert temporal_error_floor(first) is None
+    second = Comparison(flat(0.5), flat(0.4, 0.4), 1.0, before=first.luminances, still=True)
+    assert METRICS["temporal_error"].of(second) == pytest.approx(0.2, abs=1e-6)  # 0.3 of change against 0.1
+    assert METRICS["flicker"].of(second) == pytest.approx(0.3, abs=1e-6)
+    assert temporal_error_floor(second) == pytest.approx(0, abs=1e-7)
+    third = Comparison(flat(0.5), flat(0.5, 0.3), 1.0, before=second.luminances, still=False)
+    assert temporal_error_floor(third) == pytest.approx(0.1, abs=1e-6)
+    assert METRICS["flicker"].of(third) is None
+
+
+def test_disocclusion_counts_only_where_vectors_differ():
+    output = torch.full((1, 3, 2, 2), 1.0)
+    halves = torch.zeros(2, 3, 2, 2)
+    halves[:, :, 0, 0] = 1
+    motion = torch.zeros(1, 2, 2, 2)
+    dual = torch.zeros(1, 2, 2, 2)
+    l1 = METRICS["disocclusion_l1"].of
+    assert l1(Comparison(output, halves, 1.0, disoccluded(motion, dual))) is None
+    dual[0, 0, 0] = 0.5
+    dual[0, 1, 1, 1] = 0.015  # less than 1/64
+    assert l1(Comparison(output, halves, 1.0, disoccluded(motion, dual))) == pytest.approx(0.5)
+
+
+def test_display_and_luminance():
+    x = torch.tensor([0.0, 0.25, 2.0])[None, :, None, None]
+    torch.testing.assert_close(display(x, 2.0).flatten(), torch.tensor([0.0, 0.5 ** (1 / 2.2), 1.0]))
+    assert luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)

@@ -1,0 +1,43 @@
+"""Mitsuba's stock path integrator on our primary rays, and a test of whether two sets of images have the same mean."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from render.backend import dr, mi
+from render.stage import Stage
+
+POSED_FRAME = 5  # where tests of radiance pose their stages
+BLOCK_SIZE = 4  # px
+
+
+def stock_radiance(stage: Stage, max_depth: int, spp: int, seed: int) -> NDArray[np.float32]:
+    """Mean radiance (H, W, 3), emission included, by Mitsuba's own path tracer through our pixel-centre rays.
+
+    The stage must be posed for POSED_FRAME.
+    """
+    count = stage.height * stage.width
+    sampler = mi.load_dict({"type": "independent", "sample_count": spp})
+    sampler.seed(seed, count * spp)
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
+    ray = stage.rays(stage.view(POSED_FRAME))
+    pixel = dr.arange(mi.UInt32, count * spp) // spp
+    ray = mi.RayDifferential3f(mi.Ray3f(ray.o, dr.gather(mi.Vector3f, ray.d, pixel)))
+    colour, _, _ = integrator.sample(stage.mitsuba_scene, sampler, ray)
+    return np.array(colour).T.reshape(stage.height, stage.width, spp, 3).mean(axis=2)
+
+
+def block_means(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Means (N, H / BLOCK_SIZE, W / BLOCK_SIZE) over square blocks of pixels and the colours of images (N, H, W, 3)."""
+    n, height, width, _ = images.shape
+    blocks = images.reshape(n, height // BLOCK_SIZE, BLOCK_SIZE, width // BLOCK_SIZE, BLOCK_SIZE, 3)
+    return blocks.mean(axis=(2, 4, 5))
+
+
+def assert_same_mean(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> None:
+    """Blocks of pixels of many independent images (N, H, W, 3) agree: 98 % within 3 standard errors, all within 5."""
+    a = block_means(ours)
+    b = block_means(theirs)
+    error = np.sqrt(a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b))
+    z = np.abs(a.mean(axis=0) - b.mean(axis=0)) / np.maximum(error, 1e-9)
+    assert (z < 3).mean() >= 0.98
+    assert z.max() < 5

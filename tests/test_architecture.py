@@ -1,0 +1,89 @@
+"""What docs/architecture.md says is true: who imports whom, which files there are, and that its examples work."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from eval.bench.synthetic_frames import synthetic_frame
+from eval.comparison import Comparison
+from eval.metrics import METRICS, measure
+from models.registry import DENOISERS, create
+from provenance import FOLDERS, ROOT, imported_by, source_of
+from scenes.registry import SCENES, build_scene
+from tests.helpers.architecture import HEADING, PAGE, SHARED, drawn_map, modules
+
+MAY_IMPORT = {
+    "scenes": {"scenes"},
+    "render": {"render", "scenes"},
+    "datasets": {"datasets", "scenes.camera"},
+    "models": {"models", "datasets.frame", "datasets.channels"},
+    "train": {"train", "models", "datasets"},
+    "eval": {"eval", "train", "models", "datasets"},
+}
+GENERATION_JOB = {"adaptive_spp.py", "clip_job.py", "cluster.py", "generate.py", "profiles.py"}
+RENDERING_ROOMS = {"bench", "figures", "tradeoff"}
+
+
+def allowed_for(file: Path) -> set[str]:
+    """Modules and folders that a file may import."""
+    renders = file.parts[0] == "datasets" and file.name in GENERATION_JOB
+    renders |= file.parts[0] == "eval" and file.parts[1] in RENDERING_ROOMS
+    return MAY_IMPORT[file.parts[0]] | ({"render", "scenes"} if renders else set())
+
+
+@pytest.mark.parametrize("file", modules(), ids=str)
+def test_arrows_point_one_way(file):
+    imported = {name for name in imported_by(ROOT / file) if name.split(".")[0] in FOLDERS and source_of(name)}
+    folders = {name for name in imported if name in FOLDERS}
+    prefixes = allowed_for(file)
+    strangers = {name for name in imported - folders if not any(f"{name}.".startswith(f"{p}.") for p in prefixes)}
+    assert not strangers, f"{file} may not import {strangers}"
+
+
+def test_the_map_is_that_of_the_files():
+    assert {file.name for file in ROOT.glob("*.py")} == set(SHARED)
+    text = PAGE.read_text()
+    assert text[text.index(HEADING) :] == f"{HEADING}\n{drawn_map()}", "run `python -m tests.helpers.architecture`"
+
+
+@pytest.fixture
+def examples(monkeypatch):
+    """The page's Python, run; what it adds to tables is taken out again."""
+    for table in (DENOISERS, SCENES, METRICS):
+        for name in list(table):
+            monkeypatch.setitem(table, name, table[name])
+    before = [(table, set(table)) for table in (DENOISERS, SCENES, METRICS)]
+    names: dict[str, object] = {}
+    for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
+        exec(compile(code, str(PAGE), "exec"), names)
+    yield
+    for table, names in before:
+        for name in set(table) - names:
+            del table[name]
+
+
+def test_its_denoiser_denoises(examples):
+    frame = synthetic_frame(0, 24, 32)
+    output, state = create("box")(frame, None)
+    assert output.shape == (1, 3, 24, 32) and torch.isfinite(output).all()
+    again, _ = create("box+taa")(synthetic_frame(1, 24, 32), None)
+    assert again.shape == output.shape and state.moment.shape == (1, 24, 32)
+    spread = [(image - frame.emission).div(frame.divisor).std() for image in (output, frame.radiance("total"))]
+    assert spread[0] < spread[1] / 2
+
+
+def test_its_scene_is_darker(examples):
+    night, day = (build_scene(name, 0, 8) for name in ("cornell_box_at_night", "cornell_box"))
+    assert [shape.name for shape in night.shapes] == [shape.name for shape in day.shapes]
+    assert (night.shapes[-1].radiance.at(0) < 0.02 * day.shapes[-1].radiance.at(0)).all()
+    np.testing.assert_array_equal(night.view(3, 8, 8).camera_to_world, day.view(3, 8, 8).camera_to_world)
+
+
+def test_its_metric_is_measured(examples):
+    halves = torch.zeros(2, 3, 4, 4)
+    output = torch.zeros(1, 3, 4, 4)
+    output[0, 0, 1, 2] = 0.5
+    assert measure(Comparison(output, halves, 1.0))["largest_error"] == pytest.approx(0.5 ** (1 / 2.2))

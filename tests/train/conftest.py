@@ -1,0 +1,24 @@
+"""A finished training, for tests that look at what it left or damage a copy of it."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.training import folder_of, short_task
+from train.loop import train_network
+from train.precision import BFLOAT16
+
+
+@pytest.fixture(scope="session")
+def trained_runs(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a short training of rae in bfloat16 is kept. Read only."""
+    runs = tmp_path_factory.mktemp("trained")
+    train_network(short_task("rae", tiny, runs, precision=BFLOAT16))
+    return runs
+
+
+@pytest.fixture
+def trained_copy(trained_runs: Path, tmp_path: Path) -> Path:
+    """A copy of the training's own folder, in tmp_path."""
+    return Path(shutil.copytree(folder_of(trained_runs, "rae"), folder_of(tmp_path, "rae")))

@@ -1,0 +1,126 @@
+"""Accumulated frames: computed once a clip and by the present code; and crops of them."""
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.clip import Dataset
+from datasets.frame import read_frame
+from errors import BadInput
+from models.registry import create
+from provenance import sources
+from tests.helpers.training import full_disk
+from train import accumulation
+from train.accumulation import accumulate_clip, accumulation_digest
+from train.crops import AccumulatedCrops
+from train.data import in_parts, loader, micro_batches
+
+
+@pytest.fixture(scope="module")
+def clips(tiny):
+    return Dataset(tiny).clips("train")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("accumulated")
+
+
+def crops(clips, cache, crop=32, count=3, seed=0) -> AccumulatedCrops:
+    return AccumulatedCrops(clips, create("wskp3"), count, crop, seed, cache)
+
+
+def test_crops_hold_what_the_network_meets_in_use(clips, cache):
+    """A whole frame's input is that of the denoiser, run frame by frame over the clip."""
+    wskp = create("wskp3")
+    clip = clips[1]
+    folder = accumulate_clip(clip, wskp, cache)
+    irradiance = np.load(folder / "irradiance.npy")
+    scale = np.load(folder / "scale.npy")
+    state = None
+    for index in range(clip.frames):
+        frame = read_frame(clip, index, wskp.reads, 1)
+        _, state = wskp(frame, state)
+        torch.testing.assert_close(
+            torch.from_numpy(irradiance[index, 1]).permute(2, 0, 1)[None], state.history.irradiance
+        )
+        expected = [state.scale.log_luminance.value.item(), state.scale.log_depth.value.item()]
+        assert scale[index, 1].tolist() == pytest.approx(expected)
+    whole = crops(clips, cache, crop=None)[0]
+    assert whole.irradiance.shape == (1, 3, clip.height, clip.width)
+
+
+def test_a_crop_depends_on_seed_epoch_and_index_only(clips, cache):
+    a = crops(clips, cache)
+    b = crops(clips, cache)
+    _ = b[0], b[1]  # whatever was read before
+    assert torch.equal(a[5].irradiance, b[5].irradiance)
+    assert not torch.equal(a[5].irradiance, a[6].irradiance)
+    b.set_epoch(1)
+    assert not torch.equal(a[5].irradiance, b[5].irradiance)
+    assert not torch.equal(a[5].irradiance, crops(clips, cache, seed=1)[5].irradiance)
+    assert len(a) == 3 * sum(clip.frames for clip in clips)
+
+
+def test_accumulating_is_done_once_and_whole(clips, cache, tmp_path, monkeypatch):
+    """A second training finds what the first has accumulated; an interrupted one leaves nothing that looks whole."""
+    wskp = create("wskp6")
+    accumulate_clip(clips[0], wskp, cache)
+    monkeypatch.setattr(type(wskp), "accumulate", lambda *_: pytest.fail("accumulated again"))
+    accumulate_clip(clips[0], wskp, cache)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(type(wskp), "accumulate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        accumulate_clip(clips[0], wskp, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkeypatch):
+    wskp = create("wskp3")
+    with monkeypatch.context() as patched:
+        patched.setattr(accumulation, "accumulation_digest", lambda: "other")
+        stale = accumulate_clip(clips[0], wskp, tmp_path)
+    another_clip = accumulate_clip(clips[1], wskp, tmp_path)
+    by_fingerprint_alone = tmp_path / clips[0].fingerprint  # as earlier versions named it
+    by_fingerprint_alone.mkdir()
+    (stale / "irradiance.npy").write_bytes(b"stale")
+    fresh = accumulate_clip(clips[0], wskp, tmp_path)
+    assert np.load(fresh / "irradiance.npy").shape[0] == clips[0].frames
+    assert set(tmp_path.iterdir()) == {fresh, another_clip}
+
+
+def test_the_key_follows_code_and_packages(monkeypatch):
+    accumulating = sources("train.accumulation")
+    assert accumulating.keys() >= {"models.operators", "models.compiled.reproject", "datasets.frame", "scenes.camera"}
+    assert not accumulating.keys() & {"train.crops", "train.training", "models.rae", "models.ntd", "models.registry"}
+    here = accumulation_digest()
+    assert len(here) == 16 and here == accumulation_digest()
+    with monkeypatch.context() as patched:
+        patched.setattr(accumulation, "versions", lambda packages: dict.fromkeys(packages, "0"))
+        assert accumulation_digest() != here
+    monkeypatch.setattr(accumulation, "code_digest", lambda *modules: "other")
+    assert accumulation_digest() != here
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(clips, tmp_path):
+    with full_disk(100_000), pytest.raises(OSError, match="File too large"):
+        accumulate_clip(clips[0], create("wskp3"), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_crops_stack_and_come_in_parts(clips, cache):
+    data = crops(clips, cache)
+    steps = list(map(list, in_parts(loader(data, micro_batches(0, 2, 4, 2)), 2)))
+    assert [[len(part.irradiance) for part in step] for step in steps] == [[2, 2], [2, 2]]
+    batch = steps[1][0]
+    assert torch.equal(batch.irradiance[1:], data[5].irradiance)
+    assert torch.equal(batch.frame.albedo[1:], data[5].frame.albedo)
+    assert torch.equal(batch.scale.exposure()[1:], data[5].scale.exposure())
+
+
+def test_too_small_clips_are_refused(clips, cache):
+    with pytest.raises(BadInput, match="too few or too small to train on"):
+        crops(clips, cache, crop=65)

@@ -1,0 +1,238 @@
+"""The loop: it resumes to the same bits, trains alone in its folder, and shows what it does."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import imread
+
+from errors import BadInput
+from files import locked
+from tests.helpers.training import as_command, folder_of, metadata, same_weights, short_task, start_training, tensors
+from timing import thread_count
+from train.checkpoint import CHECKPOINT_FILE
+from train.log import METRICS_CSV, read_metrics
+from train.loop import alone_in, train_network
+from train.precision import FLOAT32
+from train.task import WEIGHTS_FILE
+from train.training import Training
+
+# --- Interrupted, killed and finished ---------------------------------------------------------------------------------
+
+
+def interrupt_after(monkeypatch, count: int) -> None:
+    genuine = Training.steps
+
+    def steps(self: Training) -> Iterator[dict[str, float]]:
+        for number, step in enumerate(genuine(self)):
+            if number == count:
+                raise KeyboardInterrupt
+            yield step
+
+    monkeypatch.setattr(Training, "steps", steps)
+
+
+@pytest.mark.parametrize("name", ["wskp6", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rae", "ntd"))])
+def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, monkeypatch, name):
+    """Interrupted in the middle of an epoch; the weights equal those of an undisturbed run bit for bit."""
+    recipe = {"epochs": 2, "crops": (2, 1)} if name == "wskp6" else {"epochs": 4}
+    whole = train_network(short_task(name, tiny, tmp_path / "whole", **recipe)).parent
+    task = short_task(name, tiny, tmp_path / "resumed", **recipe)
+    with monkeypatch.context() as patched:
+        interrupt_after(patched, 5)
+        with pytest.raises(KeyboardInterrupt):
+            train_network(task, save_seconds=0.0)
+    assert not (task.folder / WEIGHTS_FILE).exists()
+    train_network(task)
+    assert same_weights(whole, task.folder)
+    rows = [read_metrics(folder / METRICS_CSV) for folder in (whole, task.folder)]
+    assert [r["loss"] for r in rows[0]] == [r["loss"] for r in rows[1]]
+    assert [r["step"] for r in rows[0]] == list(range(1, len(rows[0]) + 1)) and len(rows[0]) > 6
+
+
+def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, trained_copy):
+    weights = trained_copy / WEIGHTS_FILE
+    before = {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()}
+    assert train_network(short_task("rae", tiny, tmp_path, precision=None)) == weights
+    assert {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()} == before
+    with pytest.raises(BadInput, match="another recipe, seed or data set"):
+        train_network(short_task("rae", tiny, tmp_path, seed=1, precision=None))
+    with pytest.raises(BadInput, match="a training in bfloat16"):
+        train_network(short_task("rae", tiny, tmp_path, precision=FLOAT32))
+    weights.unlink()
+    with pytest.raises(BadInput, match="no weights"):
+        train_network(short_task("rae", tiny, tmp_path, precision=None))
+    checkpoint = trained_copy / CHECKPOINT_FILE
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(BadInput, match=r"checkpoint.pt is damaged"):
+        train_network(short_task("rae", tiny, tmp_path, precision=None))
+
+
+def kill_once(name: str, data: Path, runs: Path, row: int, epochs: int) -> bool:
+    """Start a training and SIGKILL it once its log has `row` rows. Returns whether it was still at work."""
+    process = start_training(name, data, runs, epochs=epochs)
+    metrics = folder_of(runs, name) / METRICS_CSV
+    while process.poll() is None and (not metrics.exists() or metrics.read_text().count("\n") < row):
+        time.sleep(0.002)
+    process.kill()
+    return process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    "name, epochs, rows",
+    [
+        ("ntd", 1, (4,)),
+        *(
+            pytest.param(name, epochs, range(3, 24, 2), marks=pytest.mark.slow)
+            for name, epochs in (("rae", 15), ("wskp6", 2), ("ntd", 3))
+        ),
+    ],
+)
+def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, epochs, rows):
+    """Begun and killed in processes of their own, ended in this one, where the undisturbed one ran as well."""
+    kills = [kill_once(name, tiny, tmp_path / "killed", row, epochs) for row in rows]
+    assert any(kills)
+    killed = train_network(short_task(name, tiny, tmp_path / "killed", epochs=epochs)).parent
+    whole = train_network(short_task(name, tiny, tmp_path / "whole", epochs=epochs)).parent
+    assert same_weights(whole, killed)
+    assert not [path for path in killed.iterdir() if path.suffix == ".tmp"]
+
+
+# --- Alone in a folder ------------------------------------------------------------------------------------------------
+
+
+def test_the_checkpoint_of_a_training_at_work_is_not_read(tiny, tmp_path, trained_copy):
+    """It may be half of one training and half of another; here it is damaged, which only a reader would notice."""
+    (trained_copy / CHECKPOINT_FILE).write_bytes(b"being written")
+    task = short_task("rae", tiny, tmp_path, precision=None)
+    with locked(trained_copy / ".lock") as ours:
+        assert ours
+        with pytest.raises(BadInput, match="another process is training in"):
+            train_network(task)
+    with pytest.raises(BadInput, match=r"checkpoint.pt is damaged"):
+        train_network(task)
+    assert not (trained_copy / ".lock").exists()
+
+
+def two_processes() -> tuple[SimpleNamespace, SimpleNamespace]:
+    """Stand-ins for Fabric in two processes, which are threads here."""
+    told: Queue[bool] = Queue()
+
+    def tell(value: bool) -> bool:
+        told.put(value)
+        return value
+
+    first = SimpleNamespace(is_global_zero=True, broadcast=tell)
+    second = SimpleNamespace(is_global_zero=False, broadcast=lambda _: told.get(timeout=60))
+    return first, second
+
+
+def test_the_first_process_locks_and_the_others_wait_for_it(tmp_path):
+    first, second = two_processes()
+    entered = threading.Event()
+    leave = threading.Event()
+
+    def work() -> None:
+        with alone_in(tmp_path, second):
+            entered.set()
+            assert leave.wait(timeout=60)
+
+    with ThreadPoolExecutor(1) as thread:
+        other = thread.submit(work)
+        assert not entered.wait(timeout=0.1)
+        with alone_in(tmp_path, first):
+            assert entered.wait(timeout=60)
+            with locked(tmp_path / ".lock") as ours:
+                assert not ours
+        with locked(tmp_path / ".lock") as ours:  # the second process, which is still at work, holds none
+            assert ours
+        leave.set()
+        other.result()
+
+
+def test_where_another_training_has_the_lock_all_processes_are_refused(tmp_path):
+    first, second = two_processes()
+    with locked(tmp_path / ".lock"):
+        for fabric in (first, second):
+            with pytest.raises(BadInput, match="another process is training in"), alone_in(tmp_path, fabric):
+                pytest.fail("entered")
+
+
+# --- What is seen of it -----------------------------------------------------------------------------------------------
+
+
+def test_training_shows_what_it_does(trained_runs):
+    folder = folder_of(trained_runs, "rae")
+    weights = folder / WEIGHTS_FILE
+    facts = metadata(weights)
+    assert facts["denoiser"] == "rae" and '"epochs": 1' in facts["recipe"] and '"crop": 32' in facts["recipe"]
+    assert all(t.dtype == torch.float32 and torch.isfinite(t).all() for t in tensors(weights).values())
+    assert list(folder.glob("events.out.tfevents.*"))
+    with (folder / METRICS_CSV).open() as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) == {
+        "step",
+        "learning_rate",
+        "loss",
+        "spatial",
+        "gradient",
+        "temporal",
+        "skipped",
+        "step_ms",
+        "loading_ms",
+        "val_loss",
+    }
+    assert rows[-1]["val_loss"]
+    assert imread(folder / "sample.png").shape[:2] == (64, 4 * 64)
+    assert imread(folder / "loss.png").ndim == 3
+    assert not (folder / ".lock").exists()
+
+
+# --- In several processes ---------------------------------------------------------------------------------------------
+
+
+def torchrun(processes: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("name, epochs", [("wskp6", 1), pytest.param("rae", 15, marks=pytest.mark.slow)])
+def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name, epochs):
+    """The same global batch, shared: the losses of the first steps agree to rounding, and one of them writes.
+
+    Each process computes with one thread, for the number of threads decides in which order is summed. And only the
+    first steps are compared one by one: where a gradient is zero but for rounding, its sign is chance, and Adam makes
+    a whole step of it. The curves of equal trainings so part by a factor of two to ten in every step.
+    """
+    result = torchrun(2, *as_command(name, tiny, tmp_path / "two", epochs=epochs))
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.stdout.count("trained") == 1
+    two = folder_of(tmp_path / "two", name)
+    with thread_count(1):
+        one = train_network(short_task(name, tiny, tmp_path / "one", epochs=epochs)).parent
+    curves = [[row["loss"] for row in read_metrics(folder / METRICS_CSV)] for folder in (one, two)]
+    assert len(curves[0]) == len(curves[1])
+    assert curves[1][:5] == pytest.approx(curves[0][:5], rel=1e-4)
+    assert np.mean(curves[1][-10:]) == pytest.approx(np.mean(curves[0][-10:]), rel=0.1)
+    assert tensors(two / WEIGHTS_FILE).keys() == tensors(one / WEIGHTS_FILE).keys()
+
+
+@pytest.mark.slow
+def test_a_batch_that_cannot_be_shared_is_refused(tiny, tmp_path):
+    data_and_runs = ("--data", str(tiny), "--profile", "tiny", "--runs", str(tmp_path))
+    result = torchrun(2, "-m", "onespp", "train", "ntd", *data_and_runs)
+    assert result.returncode != 0 and "a batch of 1 cannot be shared by 2 processes" in result.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,47 @@
+"""The loss of WSKP."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from models.denoiser import Denoiser
+from models.wskp import KernelPredictor
+from train.crops import Crops
+from train.losses.network_loss import LossTerms, NetworkLoss, Parts
+
+
+def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
+    """Mean of |x - r| / (|x| + |r| + epsilon) over all pixels and channels (WSKP Eq. 6), in [0, 1)."""
+    return ((x - reference).abs() / (x.abs() + reference.abs() + epsilon)).mean()
+
+
+@dataclass(frozen=True)
+class SMAPETerms(LossTerms):
+    """The loss of WSKP §5.2, Eq. 6."""
+
+    epsilon: float = 0.01
+
+    def around(self, denoiser: Denoiser) -> "SMAPELoss":
+        assert isinstance(denoiser, KernelPredictor)
+        return SMAPELoss(denoiser, self)
+
+
+class SMAPELoss(NetworkLoss):
+    """SMAPE of HDR radiance (WSKP §5.2), emission included.
+
+    Radiance is scaled by the causal exposure, so that epsilon means the same in whatever units a scene is lit.
+    """
+
+    def __init__(self, denoiser: KernelPredictor, terms: SMAPETerms | None = None):
+        super().__init__()
+        self.denoiser: KernelPredictor = denoiser
+        self.terms = terms or SMAPETerms()
+
+    def forward(self, batch: Crops) -> tuple[Tensor, Parts]:
+        signal = self.denoiser.signal
+        frame = batch.frame
+        filtered, _ = self.denoiser.filter(frame, batch.irradiance, batch.scale)
+        exposure = batch.scale.exposure()
+        images = (filtered, frame.reference_irradiance(signal))
+        output, reference = (exposure * frame.remodulate(image, signal) for image in images)
+        return smape(output, reference, self.terms.epsilon), {}

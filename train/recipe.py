@@ -1,0 +1,33 @@
+"""A recipe: how one network is trained."""
+
+from dataclasses import dataclass, field
+
+from datasets.sequences import Augmentation
+from train.losses.network_loss import LossTerms
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one network is trained."""
+
+    loss: LossTerms
+    rate: float  # Adam's learning rate, at the end of the ramp if there is one
+    batch: int  # sequences a step
+    crop: int | None  # pixels; None: whole frames
+    length: int  # frames a sequence
+    epochs: int
+    betas: tuple[float, float] = (0.9, 0.999)  # of Adam; these are its authors' and PyTorch's
+    ramp: int = 0  # epochs of a geometric ramp from rate / 10; then rate * sqrt(ramp / e). 0: a constant rate
+    trained: int | None = None  # frames of a sequence that are trained on; the rest is for validation
+    crops: tuple[int, int] | None = None  # of each accumulated frame, for training and validation; None: sequences
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def frames(self, training: bool) -> int:
+        """Frames of a sequence, in training or in validation."""
+        return self.trained or self.length if training else self.length
+
+    def learning_rate(self, epoch: float) -> float:
+        """Learning rate after `epoch` epochs, fractions included."""
+        if epoch < self.ramp:
+            return self.rate * 10 ** (epoch / self.ramp - 1)
+        return self.rate * (self.ramp / epoch) ** 0.5 if self.ramp else self.rate

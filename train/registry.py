@@ -1,0 +1,33 @@
+"""The trainings that have names."""
+
+from functools import partial
+from pathlib import Path
+
+from datasets.clip import Dataset
+from models.registry import create
+from train.recipes import recipe_for
+from train.task import Task, run_folder
+
+
+def task_for(
+    name: str,
+    data: Path,
+    runs: Path,
+    budget: str,
+    seed: int = 0,
+    precision: str | None = None,
+    micro_batch: int | None = None,
+) -> Task:
+    """The training of a denoiser in a budget. Raises BadInput for an unknown name or budget, or no data set."""
+    return Task(
+        name=name,
+        create=partial(create, name),
+        recipe=recipe_for(name, budget),
+        budget=budget,
+        data=Dataset(data),
+        folder=run_folder(runs, name, budget),
+        cache=runs / "accumulated",
+        seed=seed,
+        precision=precision,
+        micro_batch=micro_batch,
+    )

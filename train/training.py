@@ -1,0 +1,214 @@
+"""A training: a network, its optimiser and data, and how to take its steps."""
+
+import math
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor
+
+from errors import BadInput
+from models.weights import save_weights
+from train.checkpoint import Checkpoint, save_checkpoint
+from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
+from train.fabric import fabric_here
+from train.losses.network_loss import NetworkLoss
+from train.made_by import UNKNOWN, maker_here
+from train.precision import fastest_precision
+from train.task import Task
+
+BEST_FILE = "best.safetensors"
+VALIDATIONS = 10  # in a training
+MOST_SKIPPED_IN_A_ROW = 20
+
+
+@dataclass
+class Position:
+    """Where a training stands."""
+
+    done: int = 0  # steps
+    best: float = math.inf  # mean loss over the validation clips
+    skipped: int = 0  # steps whose loss or gradient was not finite
+    skipped_in_a_row: int = 0
+
+
+class Training:
+    """One run: network, optimiser, data, and where it stands. Everything random follows from (seed, epoch, item).
+
+    Goes on from the checkpoint `saved`, if there is one. Raises BadInput where that is of another training, or for
+    unusable data.
+    """
+
+    def __init__(self, task: Task, saved: Checkpoint | None = None):
+        self.task = task
+        self.recipe = task.recipe
+        torch.backends.mkldnn.deterministic = True  # type: ignore[assignment]
+        torch.manual_seed(task.seed)
+        denoiser = task.create()
+        loss = self.recipe.loss.around(denoiser)
+        fabric = fabric_here()
+        with fabric.rank_zero_first():  # the others find the accumulated frames that the first has cached
+            self.clips = {split: task.data.clips(split) for split in ("train", "val")}
+            make = partial(items, recipe=self.recipe, denoiser=denoiser, seed=task.seed, cache=task.cache)
+            self.items = make(self.clips["train"], training=True)
+            self.val_items = make(self.clips["val"], training=False)
+        self.micro_batch = task.micro_batch or largest_micro_batch(self.recipe, self.clips["train"][0])
+        self.parts = len(equal_parts(self.recipe.batch // fabric.world_size, self.micro_batch))
+        self.per_epoch = max(1, round(len(self.items) / self.recipe.batch))
+        self.total = self.recipe.epochs * self.per_epoch
+        self.position = Position()
+
+        self.precision: str = fabric.broadcast(self.choose_precision(loss, saved, fabric))
+        self.fabric = fabric_here(self.precision)
+        rate = self.recipe.learning_rate(0)
+        optimiser = torch.optim.Adam(denoiser.parameters(), lr=rate, betas=self.recipe.betas)
+        self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
+        self.facts = {
+            "profile": task.budget,  # the name that it has in checkpoints
+            "seed": task.seed,
+            "data": {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")},
+            **asdict(self.recipe),
+            "parameters": denoiser.parameter_count(),
+        }
+        self.maker = maker_here(loss)
+        self.makers = saved.get("made_by", [UNKNOWN]) if saved else []
+        if saved:
+            self.resume(saved)
+        if not self.finished and self.maker not in self.makers:
+            self.makers = [*self.makers, self.maker]
+
+    @property
+    def finished(self) -> bool:
+        return self.position.done >= self.total
+
+    @property
+    def validates(self) -> bool:
+        """Whether validation follows the step just taken."""
+        return self.finished or self.position.done % max(1, self.total // VALIDATIONS) == 0
+
+    def choose_precision(self, loss: NetworkLoss, saved: Checkpoint | None, fabric: Fabric) -> str:
+        """A resumed run keeps its precision, however the measurement would turn out this time."""
+        wanted = self.task.precision
+        if saved:
+            kept: str = saved["precision"]
+            if wanted and kept != wanted:
+                raise BadInput(f"{self.task.folder} holds a training in {kept}: delete it or use another --runs")
+            return kept
+        if wanted:
+            return wanted
+        first = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)[:1]
+        return fastest_precision(loss, next(iter(loader(self.items, first))), fabric.device.type)
+
+    def resume(self, saved: Checkpoint) -> None:
+        if saved.get("facts") != self.facts:
+            raise BadInput(
+                f"{self.task.folder} holds a training with another recipe, seed or data set: delete it or use another "
+                "--runs"
+            )
+        self.loss.load_state_dict(saved["loss"])
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.position = Position(**{field.name: saved[field.name] for field in fields(Position)})
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        content = {
+            "facts": self.facts,
+            "precision": self.precision,
+            "made_by": self.makers,
+            "loss": self.loss.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            **asdict(self.position),
+        }
+        save_checkpoint(self.task.folder, content)
+
+    def steps(self) -> Iterator[dict[str, float]]:
+        """Update the weights step by step until the last epoch's end; yields what is worth noting of each step."""
+        rank = self.fabric.global_rank
+        world = self.fabric.world_size
+        while not self.finished:
+            epoch, first = divmod(self.position.done, self.per_epoch)
+            self.items.set_epoch(epoch)
+            batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.micro_batch, rank, world)
+            for batch in in_parts(loader(self.items, batches), self.parts):
+                noted = self.step(batch)
+                self.position.done += 1
+                yield noted
+
+    def step(self, batch: Iterable[Any]) -> dict[str, float]:
+        """Update the weights once, from the parts of a batch. Returns its loss, its terms, rate and milliseconds."""
+        start = time.perf_counter()
+        ready = start
+        loading = 0.0
+        rate = self.recipe.learning_rate(self.position.done / self.per_epoch)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.loss.module.progress = self.position.done / self.total
+        sums: dict[str, Tensor] = {}
+        for index, part in enumerate(batch):
+            loading += time.perf_counter() - ready
+            with self.fabric.no_backward_sync(self.loss, enabled=index + 1 < self.parts):
+                loss, terms = self.loss(part.to(self.fabric.device))
+                self.fabric.backward(loss / self.parts)
+            for name, term in {"loss": loss.detach(), **terms}.items():
+                sums[name] = sums.get(name, torch.zeros_like(term)) + term / self.parts
+            ready = time.perf_counter()
+        values = {name: float(self.reduce(term, "mean")) for name, term in sums.items()}
+        self.update(values["loss"])
+        times = {"step_ms": 1e3 * (time.perf_counter() - start), "loading_ms": 1e3 * loading}
+        return {"learning_rate": rate, **values, **times}
+
+    def reduce(self, value: Tensor, how: str) -> Tensor:
+        """The mean or sum of every process's `value`."""
+        reduced = self.fabric.all_reduce(value, reduce_op=how)
+        assert isinstance(reduced, Tensor)
+        return reduced
+
+    def update(self, loss: float) -> None:
+        """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision."""
+        gradients = [parameter.grad for parameter in self.loss.parameters() if parameter.grad is not None]
+        if math.isfinite(loss) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
+            self.position.skipped_in_a_row = 0
+            self.optimiser.step()
+        else:
+            self.skip_step()
+        self.optimiser.zero_grad()
+
+    def skip_step(self) -> None:
+        """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""
+        self.position.skipped += 1
+        self.position.skipped_in_a_row += 1
+        if self.position.skipped_in_a_row >= MOST_SKIPPED_IN_A_ROW:
+            raise BadInput(
+                f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the data "
+                f"with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
+                "--precision float32"
+            )
+
+    @torch.no_grad()
+    def validate(self) -> float:
+        """Mean loss over the validation clips, always the same crops."""
+        numbers = range(len(self.val_items))
+        batches = [list(numbers[i : i + self.micro_batch]) for i in range(0, len(numbers), self.micro_batch)]
+        batches = batches[self.fabric.global_rank :: self.fabric.world_size]
+        network: NetworkLoss = self.loss.module.eval()  # not through DDP: processes may differ in how much they have
+        total = torch.zeros(2, device=self.fabric.device)
+        for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
+            with self.fabric.autocast():
+                loss, _ = network(batch.to(self.fabric.device))
+            total += len(chosen) * torch.stack([loss, torch.ones_like(loss)])
+        network.train()
+        total = self.reduce(total, "sum")
+        return float(total[0] / total[1])
+
+    def keep_best(self, validation: float) -> None:
+        """Write the weights if their loss over the validation clips is the lowest so far."""
+        if validation < self.position.best:  # never true of NaN
+            self.position.best = validation
+            facts = {**self.facts, "step": self.position.done, "validation": validation}
+            save_weights(
+                self.loss.module.denoiser, self.task.name, facts, self.task.folder / BEST_FILE, made_by=self.makers
+            )
