@@ -11,7 +11,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
-from models.parameters import FEATURES, GAMMA
+from models.parameters import FEATURE_CHANNELS, GAMMA
 from models.running_scale import RunningScale
 
 LEAST_ALBEDO = np.float32(ALBEDO_FLOOR)
@@ -45,7 +45,7 @@ def network_features(frame: Frame, irradiance: Tensor, scale: RunningScale) -> T
     """See models.features.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
-    out = torch.empty(len(irradiance), *frame.size, FEATURES)
+    out = torch.empty(len(irradiance), *frame.size, FEATURE_CHANNELS)
     for item in range(len(out)):
         feature_image(
             out[item].numpy(),

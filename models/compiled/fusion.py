@@ -183,8 +183,8 @@ def fuse_strips(
 ) -> None:
     """fused (3, H, W) += image (3, H, W) filtered, strips in parallel.
 
-    weighted (threads, 5, rows, W) and shares (threads, M, THREAD_ROWS, W) are scratch of the threads' own: memory that is
-    allocated within the loop would be cleared anew for every strip.
+    weighted (threads, 5, rows, W) and shares (threads, M, THREAD_ROWS, W) are scratch of the threads' own: memory that
+    is allocated within the loop would be cleared anew for every strip.
     """
     height = image.shape[1]
     for strip in numba.prange((height + THREAD_ROWS - 1) // THREAD_ROWS):

@@ -14,7 +14,7 @@ from datasets.frame import disoccluded
 from datasets.tonemap import display
 from eval.comparison import Comparison
 from eval.metrics import METRICS, measure, temporal_error_floor
-from models.operators import luminance
+from models.operators import image_luminance
 
 
 def pair(seed: int = 0, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -143,4 +143,4 @@ def test_disocclusion_counts_only_where_vectors_differ():
 def test_display_and_luminance():
     x = torch.tensor([0.0, 0.25, 2.0])[None, :, None, None]
     torch.testing.assert_close(display(x, 2.0).flatten(), torch.tensor([0.0, 0.5 ** (1 / 2.2), 1.0]))
-    assert luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)
+    assert image_luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)
