@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval.comparison import Comparison
-from eval.figures.unbiased import measure, spread
+from eval.figures.unbiased import measure_references, spread
 from eval.metrics import METRICS, noise_floors, within_floor
 from eval.metrics import measure as measure_frame
 
@@ -106,7 +106,7 @@ def test_no_floor_no_mark():
 
 def test_unbiased_mse_on_rendered_references():
     """The figure in small: the plain MSE falls as references get better, the unbiased one stays, floors hold."""
-    true, measured = measure({16: 24, 64: 8}, truth_spp=8192)
+    true, measured = measure_references({16: 24, 64: 8}, truth_spp=8192)
     (plain, plain_error), (better, _) = (spread(measured, spp, "plain") for spp in (16, 64))
     assert plain > better + 4 * plain_error and plain > 2 * true
     for spp in (16, 64):
