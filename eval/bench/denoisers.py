@@ -19,11 +19,12 @@ from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
-from eval.selection import BASELINES, choose, unavailable
-from eval.spec import DenoiserSpec, create, precisions_of
+from eval.selection import BASELINES, cannot_run, choose
+from eval.spec import DenoiserSpec, create_any, precisions_of
 from files import read_json, write_json
 from models.oidn import OIDN
 from models.registry import DENOISERS
+from models.taa import inner_denoiser
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 
@@ -59,9 +60,9 @@ def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
     Raises BadInput where a named one is unknown or cannot run.
     """
     everyone = (*DENOISERS, *(name for name in EXTRA if name not in (ALL_WINDOWS, FAST_OIDN)))
-    baseline = [] if unavailable(BASELINE) else [BASELINE]
+    baseline = [] if cannot_run(BASELINE) else [BASELINE]
     found: list[DenoiserSpec] = []
-    for name in choose([*names, *baseline] if names else [], everyone, unavailable):
+    for name in choose([*names, *baseline] if names else [], everyone, cannot_run):
         found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
         if name in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(DenoiserSpec(name, compiled=False))
@@ -94,7 +95,7 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
 
 
 @torch.inference_mode()
-def peak_memory(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) -> float | None:
+def denoiser_peak_mb(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) -> float | None:
     """What two frames of a sequence add to resident memory, or to the GPU's, in MB, in a fresh process.
 
     That is the state and everything in between, without the frame itself, the weights and the code.
@@ -120,9 +121,9 @@ def peak_memory(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) -> fl
 
 
 def peaks(specs: Sequence[DenoiserSpec], size: Size, threads: int) -> list[float | None]:
-    """The peak memory of each spec, in MB, each in a process of its own."""
+    """What each spec adds to memory, in MB, each in a process of its own; None where the system does not tell."""
     frames = [synthetic_frame(index, *size) for index in range(2)]
-    return [alone(peak_memory, spec, frames, threads) for spec in tqdm(specs, "memory", leave=False)]
+    return [alone(denoiser_peak_mb, spec, frames, threads) for spec in tqdm(specs, "memory", leave=False)]
 
 
 def cost(contender: Contender, size: Size, peak_mb: float | None) -> DenoiserCost:
@@ -131,7 +132,9 @@ def cost(contender: Contender, size: Size, peak_mb: float | None) -> DenoiserCos
     return DenoiserCost(
         **asdict(contender.timing(size)),
         peak_mb=peak_mb,
-        parameters=None if issubclass(spec.kind, OIDN) else contender.denoiser.parameter_count(),
+        parameters=None
+        if isinstance(inner_denoiser(contender.denoiser), OIDN)
+        else contender.denoiser.parameter_count(),
         macs_per_pixel=macs_per_pixel(spec),
         prediction=contender.share_of_network(),
     )
@@ -232,6 +235,6 @@ def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
             "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": None if share is None else create(row.denoiser).parameter_count(),
+            "as trained": None if share is None else create_any(row.denoiser).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

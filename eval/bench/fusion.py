@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from eval.bench.memory import alone, growth_mb
 from eval.bench.output import bench_folder
-from eval.bench.sizes import Size, parse_size, thread_counts
+from eval.bench.sizes import Size, parse_size, threads_or_all
 from files import write_json
 from models import compiled
 from models.fusion import fuse
@@ -91,7 +91,7 @@ def random_inputs(size: Size) -> Inputs:
 
 
 @torch.inference_mode()
-def peak_memory(method: str, size: Size, threads: int) -> float | None:
+def method_peak_mb(method: str, size: Size, threads: int) -> float | None:
     """How far resident memory rises in one call, in MB; in a process of its own."""
     torch.set_num_threads(threads)
     inputs = random_inputs(size)
@@ -125,13 +125,13 @@ def bench_fusion(
 ) -> str:
     """Milliseconds, peak memory and error of each method, in turns: a table, and RUNS/bench/fusion.json.
 
-    With all `threads` that PyTorch takes by default. Raises BadInput for what is no size or number of threads.
+    With `threads`, by default as many as PyTorch takes. Raises BadInput for what is no size or number of threads.
     """
     pixels = parse_size(size)
-    count = thread_counts([threads] if threads is not None else [])[-1]
+    count = threads_or_all(threads)
     with thread_count(count):
         seconds, outputs = time_methods(pixels, rounds, unfold_rounds)
-    peaks = {method: alone(peak_memory, method, pixels, count) for method in tqdm(METHODS, "memory", leave=False)}
+    peaks = {method: alone(method_peak_mb, method, pixels, count) for method in tqdm(METHODS, "memory", leave=False)}
     baseline_mb = peaks[UNFOLD]
     rows = [
         FusionCost(

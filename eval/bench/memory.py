@@ -46,5 +46,6 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([function.__module__])  # imported once for all that follow
-    with ProcessPoolExecutor(1, mp_context=context) as process:
+    # What was imported stays: to go through all of it would take most of the time of a small measurement.
+    with ProcessPoolExecutor(1, mp_context=context, initializer=gc.freeze) as process:
         return process.submit(function, *arguments).result()

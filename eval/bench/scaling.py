@@ -9,14 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
+from eval.bench.denoisers import ways
 from eval.bench.output import bench_folder
 from eval.bench.race import TIMED_FRAMES, Timing, race
-from eval.bench.sizes import parse_size, size_name, thread_counts
-from eval.extra_denoisers import FAST_OIDN
-from eval.selection import choose, unavailable
+from eval.bench.sizes import parse_size, size_name, threads_or_all
+from eval.extra_denoisers import WINDOW_SETS
 from eval.spec import DenoiserSpec, precision_in_use
 from files import write_json
-from models.registry import DENOISERS
 from plotting import DPI, plt, save_figure
 from provenance import device_in_words
 from timing import thread_count
@@ -25,17 +24,23 @@ SCALING_SIZES = ("320x180", "480x270", "640x360", "960x540", "1280x720", "1920x1
 
 
 def in_use(names: Sequence[str]) -> list[DenoiserSpec]:
-    """The named denoisers and OIDN, or all that can run here, as evaluation runs them, with fresh weights.
+    """Of all ways to run the named denoisers and OIDN, or all that can run here, those that evaluation takes.
 
-    Raises BadInput where a named one is unknown or cannot run.
+    Without names they are those of the registry: no networks of other sizes. Raises BadInput where a named one is
+    unknown or cannot run.
     """
-    baselines = [] if unavailable("oidn") else ["oidn", FAST_OIDN]
-    chosen = choose([*names, *baselines] if names else [], (*DENOISERS, FAST_OIDN), unavailable)
-    return [DenoiserSpec(name, precision=precision_in_use(name)) for name in chosen]
+    return [
+        spec
+        for spec in ways(names)
+        if spec.compiled
+        and spec.signal is None
+        and spec.precision == precision_in_use(spec.name)
+        and (names or spec.name not in WINDOW_SETS)
+    ]
 
 
 def exponent(pixels: Sequence[int], ms: Sequence[float]) -> float | None:
-    """k of ms ~ pixels^k, by least squares of logarithms; None for fewer than two sizes."""
+    """k of ms ~ pixels^k, by least squares of the logarithms; None for fewer than two sizes."""
     return float(np.polyfit(np.log(pixels), np.log(ms), 1)[0]) if len(set(pixels)) > 1 else None
 
 
@@ -79,12 +84,12 @@ def bench_scaling(
 ) -> str:
     """Time the denoisers on the CPU at rising sizes: a table, RUNS/bench/scaling.json and a plot for the report.
 
-    At SCALING_SIZES by default, with `threads`, by default all. Raises BadInput for unknown
+    At SCALING_SIZES and with as many threads as PyTorch takes, unless others are given. Raises BadInput for unknown
     names, sizes and numbers of threads.
     """
     pixels = sorted({parse_size(size) for size in sizes or SCALING_SIZES}, key=lambda size: size[0] * size[1])
     specs = in_use(names)
-    count = thread_counts([threads] if threads is not None else [])[-1]
+    count = threads_or_all(threads)
     rows: list[Timing] = []
     with thread_count(count):
         for size in pixels:

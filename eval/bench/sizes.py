@@ -11,7 +11,7 @@ Size = tuple[int, int]  # height, width
 
 
 def parse_size(text: str) -> Size:
-    """(height, width) of "1280x720". Raises BadInput."""
+    """(height, width) in pixels of "1280x720". Raises BadInput for what is no such text."""
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if not match:
         raise BadInput(f"'{text}' is not a size such as 1280x720")
@@ -19,7 +19,7 @@ def parse_size(text: str) -> Size:
 
 
 def size_name(size: Size) -> str:
-    """The inverse."""
+    """The inverse of parse_size: "1280x720" of (720, 1280)."""
     height, width = size
     return f"{width}x{height}"
 
@@ -33,3 +33,11 @@ def thread_counts(threads: Sequence[int]) -> list[int]:
         if count < 1:
             raise BadInput(f"{count} threads cannot work: name at least 1")
     return sorted({*threads} or {1, torch.get_num_threads()})
+
+
+def threads_or_all(threads: int | None) -> int:
+    """The one number of threads to measure with, by default as many as PyTorch takes.
+
+    Raises BadInput for a number that cannot work.
+    """
+    return thread_counts(() if threads is None else (threads,))[-1]

@@ -14,7 +14,7 @@ from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
 from eval.results import REFERENCE, ClipResults, Result
-from eval.spec import DenoiserSpec, create
+from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.pareto import Offer, beaten_by
@@ -218,7 +218,7 @@ def test_sizes_are_the_networks_of_the_ablation():
     assert [windows_label(windows) for windows in WINDOW_SETS.values()][:2] == ["3", "3+5"]
     assert WINDOW_SETS[ALL_WINDOWS] == WINDOWS
     for name, windows in WINDOW_SETS.items():
-        assert create(name).windows == windows
+        assert create_any(name).windows == windows
     names = (ALL_WINDOWS, "wskp6-2w", "ntd", "ntd-b")
     assert [timed_as(DenoiserSpec(name)) for name in names] == ["wskp6", "wskp6-2w", "ntd", "ntd"]
     assert timed_as(DenoiserSpec("svgf", signal="indirect")) == "svgf (indirect)"
@@ -273,7 +273,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
-        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
