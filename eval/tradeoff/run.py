@@ -12,16 +12,9 @@ from eval.results import by_clip
 from eval.selection import with_indirect_baselines
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import TRADED, Trade, front_table, trades
+from eval.tradeoff.feeding import SPP_LEVELS, SampleTrades, by_samples, check_levels, sampled
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.samples import (
-    SPP_LEVELS,
-    SampleTrades,
-    by_samples,
-    check_levels,
-    generalisation,
-    sampled,
-    samples_table,
-)
+from eval.tradeoff.samples import generalisation, samples_table
 from eval.tradeoff.times import Times
 from files import write_json
 from plotting import save_figure

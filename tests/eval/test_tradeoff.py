@@ -17,11 +17,12 @@ from eval.results import REFERENCE, ClipResults, Result
 from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
+from eval.tradeoff.feeding import check_levels
 from eval.tradeoff.pareto import Offer, beaten_by
 from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import trade
-from eval.tradeoff.samples import SampleTrade, check_levels, generalisation, sample_trades
+from eval.tradeoff.samples import SampleTrade, generalisation, sample_trades
 from eval.tradeoff.times import Times, timed_as
 from files import read_json, write_json
 from models.parameters import WINDOWS
