@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from models import compiled
+from provenance import ROOT, sources
 
 
 def named(name: str):
@@ -52,3 +53,10 @@ def test_kernels_run_on_gpus_where_there_are_any(function):
     assert function(image, image) == "gpu"
     assert compiled.by(named("processor"))(named("pytorch"))(image, image) == "pytorch"
     assert function(image, IMAGE) == "pytorch"
+
+
+def test_results_follow_from_all_kernels():
+    """Whoever names the code that made a result finds them by their import statements."""
+    kernels = {f"models.compiled.{file.stem}" for file in (ROOT / "models" / "compiled").glob("[!_]*.py")}
+    assert kernels and kernels <= sources("models.registry").keys()
+    assert "models.compiled.svgf" in sources("models.svgf") and "models.compiled.svgf" not in sources("models.eaw")
