@@ -13,7 +13,6 @@ from matplotlib import pyplot as plt
 
 __all__ = [
     "DPI",
-    "ONE_LINE_CAPTION",
     "SMALLEST_PANEL",
     "TWO_LINE_CAPTION",
     "enlargement",
@@ -22,7 +21,6 @@ __all__ = [
 ]
 
 DPI = 100
-ONE_LINE_CAPTION = 0.2  # inches
 TWO_LINE_CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px, the longer side of an image
 

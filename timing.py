@@ -8,6 +8,8 @@ from math import inf
 import torch
 from tqdm import tqdm
 
+PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
+
 Clock = Callable[[], float]  # seconds
 
 
@@ -62,3 +64,8 @@ def thread_count(threads: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def threads_for(height: int, width: int) -> int:
+    """How many of PyTorch's threads are worth sharing an image among."""
+    return max(1, min(torch.get_num_threads(), height * width // PIXELS_A_THREAD))

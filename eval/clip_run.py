@@ -48,10 +48,18 @@ class Entrant:
     def denoiser(self) -> Denoiser:
         return self.build()
 
+    @cached_property
+    def weights_digest(self) -> str | None:
+        return file_digest(self.weights) if self.weights else None
+
     def key(self, clip: Clip) -> str:
         """A digest of all that its result on a clip follows from."""
-        weights = file_digest(self.weights) if self.weights else None
-        facts = {"name": self.name, "signal": self.signal, "precision": self.precision, "weights": weights}
+        facts = {
+            "name": self.name,
+            "signal": self.signal,
+            "precision": self.precision,
+            "weights": self.weights_digest,
+        }
         return result_key(clip, [__name__, *self.modules], facts)
 
 

@@ -35,9 +35,8 @@ from eval.spec import DenoiserSpec
 from eval.strip import save_strip
 from eval.text_table import results_table
 from provenance import device_in_words
-from timing import thread_count
+from timing import thread_count, threads_for
 
-PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
 SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
 
 
@@ -86,8 +85,7 @@ def evaluate_clip(clip: Clip, entrants: Sequence[Entrant], runs: Path, quiet: bo
         shutil.rmtree(one.folder, ignore_errors=True)
         one.folder.mkdir(parents=True)
     if waiting:
-        threads = max(1, min(torch.get_num_threads(), clip.height * clip.width // PIXELS_A_THREAD))
-        with thread_count(threads):
+        with thread_count(threads_for(clip.height, clip.width)):
             play(clip, [one.run for one in waiting], [one.folder for one in waiting], quiet)
     for one in waiting:
         one.run.result(clip).save(runs)

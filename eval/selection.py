@@ -7,7 +7,7 @@ from pathlib import Path
 
 from errors import BadInput
 from eval.extra_denoisers import WINDOW_SETS, windows_label
-from eval.spec import DenoiserSpec, denoiser_class, precision_in_use
+from eval.spec import DenoiserSpec, class_of, precision_in_use
 from models.registry import DENOISERS, without_taa
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
@@ -34,14 +34,14 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
     return chosen
 
 
-def unavailable(name: str) -> str | None:
+def cannot_run(name: str) -> str | None:
     """Why a denoiser cannot run on this machine. Raises BadInput for an unknown name."""
-    return denoiser_class(name).unavailable()
+    return class_of(name).unavailable()
 
 
 def weights_file(name: str, runs: Path, budget: str) -> Path | None:
     """Where the weights of a network belong; None for a denoiser without."""
-    if not denoiser_class(name).is_network:
+    if not class_of(name).is_network:
         return None
     if name in WINDOW_SETS:
         return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS_FILE
@@ -64,7 +64,7 @@ def evaluated(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpe
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
-    chosen = choose(names, DENOISERS, unavailable, partial(untrained, runs, budget))
+    chosen = choose(names, DENOISERS, cannot_run, partial(untrained, runs, budget))
     return [
         DenoiserSpec(name, precision=precision_in_use(name), weights=weights_file(name, runs, budget))
         for name in chosen

@@ -16,12 +16,12 @@ from models.weights import load_weights
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
-def denoiser_class(name: str) -> type[Denoiser]:
+def class_of(name: str) -> type[Denoiser]:
     """The class of a denoiser, which knows all that can be asked of it. Raises BadInput for an unknown name."""
     return EXTRA[name].kind if name in EXTRA else registry.denoiser_class(name)
 
 
-def create(name: str, signal: Signal | None = None) -> Denoiser:
+def create_any(name: str, signal: Signal | None = None) -> Denoiser:
     """A denoiser of the registry or of EXTRA, with fresh weights. Raises BadInput for an unknown name."""
     if name in EXTRA:
         return EXTRA[name].kind(signal=signal, **EXTRA[name].arguments)
@@ -30,12 +30,12 @@ def create(name: str, signal: Signal | None = None) -> Denoiser:
 
 def precisions_of(name: str) -> list[str]:
     """The precisions that a denoiser computes in, keys of PRECISIONS."""
-    return [precision for precision, dtype in PRECISIONS.items() if dtype not in denoiser_class(name).refuses]
+    return [precision for precision, dtype in PRECISIONS.items() if dtype not in class_of(name).refuses]
 
 
 def precision_in_use(name: str) -> str:
     """The fastest precision here of those that the denoiser computes in, a key of PRECISIONS."""
-    fastest = registry.inference_precision(denoiser_class(name))
+    fastest = registry.inference_precision(class_of(name))
     return next(precision for precision, dtype in PRECISIONS.items() if dtype == fastest)
 
 
@@ -60,7 +60,7 @@ class DenoiserSpec:
 
     @property
     def kind(self) -> type[Denoiser]:
-        return denoiser_class(self.name)
+        return class_of(self.name)
 
     @property
     def returns(self) -> Signal:
@@ -83,12 +83,12 @@ class DenoiserSpec:
         """Those of onespp in which the denoiser is defined."""
         plain = registry.without_taa(self.name)
         antialiasing = ("models.taa",) if plain != self.name else ()
-        return (denoiser_class(plain).__module__, *antialiasing)
+        return (class_of(plain).__module__, *antialiasing)
 
     def build(self) -> Denoiser:
         """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
         torch.manual_seed(0)
-        denoiser = create(self.name, self.signal)
+        denoiser = create_any(self.name, self.signal)
         if self.weights:
             name = windows_label(WINDOW_SETS[self.name]) if self.name in WINDOW_SETS else self.name
             load_weights(inner_denoiser(denoiser), registry.without_taa(name), self.weights)

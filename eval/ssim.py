@@ -3,8 +3,10 @@
 import torch
 from torch import Tensor
 
-WINDOW, SIGMA = 11, 1.5  # px
-C1, C2 = 0.01**2, 0.03**2  # for images in [0, 1]
+WINDOW = 11  # px
+SIGMA = 1.5  # px
+C1 = 0.01**2  # for images in [0, 1]
+C2 = 0.03**2
 
 
 def local_mean(images: Tensor) -> Tensor:
@@ -23,7 +25,8 @@ def ssim(x: Tensor, y: Tensor) -> float | None:
     if min(x.shape[-2:]) < WINDOW:
         return None
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (local_mean(image) for image in (x, y, x * x, y * y, x * y))
-    variances, covariance = mean_xx - mean_x**2 + mean_yy - mean_y**2, mean_xy - mean_x * mean_y
+    variances = mean_xx - mean_x**2 + mean_yy - mean_y**2
+    covariance = mean_xy - mean_x * mean_y
     brightness = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
     return float((brightness * (2 * covariance + C2) / (variances + C2)).mean())
 
@@ -36,9 +39,11 @@ def ssim_floor(a: Tensor, b: Tensor) -> float | None:
     """
     if min(a.shape[-2:]) < WINDOW:
         return None
-    mean_a, mean_b, noise = local_mean(a), local_mean(b), (a - b) / 2
+    mean_a = local_mean(a)
+    mean_b = local_mean(b)
     structure = (local_mean(a * b) - mean_a * mean_b).clamp(min=0)
-    brightness, shift = mean_a * mean_b, ((mean_a - mean_b) / 2).square()
-    spread = local_mean(noise.square()) - shift
+    brightness = mean_a * mean_b
+    shift = ((mean_a - mean_b) / 2).square()
+    spread = local_mean(((a - b) / 2).square()) - shift
     similar = (2 * structure + C2) / (2 * structure + spread + C2)
     return float((similar * (2 * brightness + C1) / (2 * brightness + shift + C1)).mean())

@@ -1,4 +1,4 @@
-"""A convolution and what follows it in one pass over memory, which on CPUs is most of the time of a wide image."""
+"""A convolution, a sum and ReLU in one pass over memory: on CPUs, passes are most of the time of a wide image."""
 
 import torch
 from torch import Tensor, nn
@@ -8,9 +8,9 @@ FUSED = "_convolution_pointwise"  # what PyTorch's compiler uses; it is not docu
 
 
 class ConvReLU(nn.Conv2d):
-    """relu(convolution(x) + other), size k x k, the image's size kept by zeros around it.
+    """relu(convolution(x) + other) with kernels of `size` x `size`; zeros around the image keep its size.
 
-    Inference on CPUs takes oneDNN's fused operator: PyTorch alone runs over the image up to three times.
+    Inference on CPUs takes oneDNN's fused operator: PyTorch's own walk over the image up to three times.
     """
 
     def __init__(self, inputs: int, outputs: int, size: int = 3):

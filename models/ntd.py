@@ -16,7 +16,7 @@ from models.pixel_kernels import apply_kernels
 from models.running_scale import RunningScale, running_scale
 
 NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
-WIDTHS = (32, 48, 64, 80, 96)  # the paper's are lost
+WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
 TAPS = 25  # of a 5 x 5 kernel
 MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
 
@@ -40,7 +40,7 @@ class Decode(nn.Module):
 class KernelNet(nn.Module):
     """A U-Net (Ronneberger et al. 2015) that predicts kernels and weights in its last three layers (Fig. 6).
 
-    What the paper does not say is ours: two 3 x 3 convolutions and ReLU a level, nearest upsampling, 1 x 1 heads.
+    Where the paper is silent we choose two 3 x 3 convolutions and ReLU a level, nearest upsampling, and 1 x 1 heads.
     """
 
     def __init__(self) -> None:

@@ -56,7 +56,7 @@ class RecurrentAutoencoder(nn.Module):
     """The network of Fig. 2: images whose sides are multiples of 32 in, images of the same size out.
 
     36 convolutions: 7 in the encoder, 3 in each of 6 recurrent blocks, 10 in the decoder, one linear output layer.
-    The paper's drawn widths are lost; `encoder` and `decoder` name ours.
+    The widths `encoder` and `decoder` are ours: those drawn in the paper are not known.
     """
 
     def __init__(self, inputs: int = 7, encoder: Sequence[int] = ENCODER, decoder: Sequence[tuple[int, int]] = DECODER):

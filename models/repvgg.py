@@ -43,7 +43,7 @@ class RepVGGBlock(nn.Module):
         return torch.stack(weights).sum(dim=0), torch.stack(biases).sum(dim=0)
 
     def merge(self) -> None:
-        """Replace the branches; there is no way back to training."""
+        """Replace the branches by their sum; there is no way back to training."""
         if self.merged is not None:
             return
         weight, bias = self.kernel()

@@ -20,6 +20,7 @@ RGB = ((1.0, 1.0, -1.0), (1.0, 0.0, 1.0), (1.0, -1.0, -1.0))  # from YCoCg
 
 
 def recolour(image: Tensor, matrix: tuple[tuple[float, ...], ...]) -> Tensor:
+    """The colours (B, 3, H, W) of an image in another space, by a 3 x 3 matrix."""
     return torch.einsum("ij,bjhw->bihw", torch.tensor(matrix).to(image), image)
 
 
@@ -35,12 +36,18 @@ def compress(radiance: Tensor) -> Tensor:
 
 
 def expand(compressed: Tensor) -> Tensor:
-    """The inverse; a box in YCoCg has corners outside of RGB, which are cut off."""
+    """Exposed radiance (B, 3, H, W): the inverse of `compress`.
+
+    A box in YCoCg has corners outside of RGB, which are cut off.
+    """
     return recolour(compressed[:, :3] / compressed[:, 3:], RGB).clamp(min=0)
 
 
 def fetch_bicubic(history: Tensor, motion: Tensor) -> Tensor:
-    """`history` (B, 3, H, W) where this frame's pixels were, bicubic, not below 0."""
+    """`history` (B, 3, H, W) at p + motion(p), bicubic, not below 0; beyond the border, that continues.
+
+    `motion` (B, 2, H, W) is in pixels.
+    """
     height, width = history.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height).to(motion), torch.arange(width).to(motion), indexing="ij")
     # Far outside the image an index would overflow; any place outside is as good.
@@ -61,7 +68,10 @@ def largest_around(image: Tensor) -> Tensor:
 
 
 def resolve(current: Tensor, history: Tensor, found: Tensor) -> Tensor:
-    """Blend compressed images (B, 4, H, W), the history within the range of the 3 x 3 pixels around each pixel."""
+    """Blend compressed images (B, 4, H, W), the history clamped to the range of the 3 x 3 pixels around each pixel.
+
+    Where no history is `found` (B, 1, H, W), the current image is left alone.
+    """
     low = -largest_around(-current)
     high = largest_around(current)
     return torch.lerp(torch.clamp(history, low, high), current, torch.where(found, NEWEST, 1))

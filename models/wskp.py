@@ -15,12 +15,12 @@ from models.denoiser import Denoiser, State, matching_state
 from models.features import network_features
 from models.fusion import fuse
 from models.operators import pad_to_multiple
-from models.parameters import FEATURES, WINDOWS
+from models.parameters import FEATURE_CHANNELS, WINDOWS
 from models.pixel_kernels import apply_kernels
 from models.repvgg import BRANCH_SIZES, merge, repvgg
 from models.running_scale import RunningScale, running_scale
 
-WIDTH = 24  # ours: the drawn widths are lost
+WIDTH = 24  # ours: the widths drawn in the paper are not known
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class KernelPredictor(Denoiser):
 
 def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
     """`layers` RepVGG blocks from the inputs to `outputs` channels."""
-    return repvgg([FEATURES, *[WIDTH] * (layers - 1), outputs], sizes)
+    return repvgg([FEATURE_CHANNELS, *[WIDTH] * (layers - 1), outputs], sizes)
 
 
 class WSKP(KernelPredictor):
@@ -127,7 +127,7 @@ def convolutions(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class MultiResolutionNet(nn.Module):
-    """A U-Net with an output for each of its three resolutions (§5.2). The paper's widths are lost; these are ours."""
+    """A U-Net with an output for each of its three resolutions (§5.2). The widths are ours, the paper's not known."""
 
     widths = (32, 48, 64)
 
@@ -168,7 +168,7 @@ class WSKPMR(KernelPredictor):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.network = MultiResolutionNet(FEATURES, 2 * len(self.windows) + 1)
+        self.network = MultiResolutionNet(FEATURE_CHANNELS, 2 * len(self.windows) + 1)
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)

@@ -15,14 +15,14 @@ from models.denoiser import State
 from models.wskp import KernelPredictor
 from provenance import code_digest, versions
 
-PACKAGES = ("torch", "numpy", "numba")  # that accumulation computes with
+ACCUMULATION_PACKAGES = ("torch", "numpy", "numba")  # that accumulation computes with
 IRRADIANCE_FILE = "irradiance.npy"
 SCALE_FILE = "scale.npy"
 
 
 def accumulation_digest() -> str:
     """16 hexadecimal digits that tell the code and the packages that accumulate."""
-    everything = [code_digest("train.accumulation"), versions(PACKAGES)]
+    everything = [code_digest("train.accumulation"), versions(ACCUMULATION_PACKAGES)]
     return hashlib.sha256(json.dumps(everything).encode()).hexdigest()[:16]
 
 

@@ -47,13 +47,11 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
     with alone_in(task.folder, fabric):  # before the checkpoint is read, which another process may be about to replace
         training = Training(task, load_checkpoint(task.folder))
         others = other_makers(training.makers, training.maker)
-        outcome = "trained"
-        if training.finished and others:
-            outcome = f"trained with {others} and kept, delete {task.folder} to train it again"
+        outcome = f"trained, {weights}"
+        if others and training.finished:
+            outcome = f"trained with {others}, kept at {weights}; delete {task.folder} to train again"
         elif others and fabric.is_global_zero:
-            print(
-                f"{task.name}: begun with {others}, goes on with the present code and packages; its weights name both"
-            )
+            print(f"{task.name}: begun with {others}, goes on with what is here; its weights name both")
         if fabric.is_global_zero:
             train_to_end(training, save_seconds)
         else:
@@ -62,7 +60,7 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
     if not weights.exists():
         raise BadInput(f"{task.folder} holds a finished training but no weights: delete it and train again")
     if fabric.is_global_zero:
-        print(f"{task.name}: {outcome}, {weights}")
+        print(f"{task.name}: {outcome}")
     return weights
 
 

@@ -9,7 +9,7 @@ from timing import take_turns
 from train.losses.network_loss import NetworkLoss
 
 FLOAT32 = "float32"
-BFLOAT16 = "bfloat16"  # of what autocast takes for safe; the weights are float32 all the same
+BFLOAT16 = "bfloat16"  # by autocast; the weights are float32 all the same
 
 WORTHWHILE = 1.1  # bfloat16 must be this many times faster to be used
 
@@ -24,7 +24,7 @@ def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: 
 
 
 def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
-    """bfloat16 where a step is enough faster in it, by the best of two measured rounds; else float32."""
+    """bfloat16 where that makes a step WORTHWHILE times faster, by the best of two measured rounds; else float32."""
     loss = loss.to(device)
     batch = batch.to(device)
     work = {

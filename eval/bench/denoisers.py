@@ -19,8 +19,8 @@ from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
-from eval.selection import BASELINES, choose, unavailable
-from eval.spec import DenoiserSpec, create, precisions_of
+from eval.selection import BASELINES, cannot_run, choose
+from eval.spec import DenoiserSpec, create_any, precisions_of
 from files import read_json, write_json
 from models.oidn import OIDN
 from models.registry import DENOISERS
@@ -60,9 +60,9 @@ def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
     Raises BadInput where a named one is unknown or cannot run.
     """
     everyone = (*DENOISERS, *(name for name in EXTRA if name not in (ALL_WINDOWS, FAST_OIDN)))
-    baseline = [] if unavailable(BASELINE) else [BASELINE]
+    baseline = [] if cannot_run(BASELINE) else [BASELINE]
     found: list[DenoiserSpec] = []
-    for name in choose([*names, *baseline] if names else [], everyone, unavailable):
+    for name in choose([*names, *baseline] if names else [], everyone, cannot_run):
         found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
         if name in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(DenoiserSpec(name, compiled=False))
@@ -235,6 +235,6 @@ def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
             "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": None if share is None else create(row.denoiser).parameter_count(),
+            "as trained": None if share is None else create_any(row.denoiser).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

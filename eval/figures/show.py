@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,57 +15,20 @@ from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, Signal, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
+from eval.figures.panel_grid import Column, Panel, draw_grid
 from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.registry import create
-from plotting import DPI, plt, save_figure
+from plotting import save_figure
 
-SHOWN = 4  # frames of the clip, the first and the last among them
-SMALLEST_PANEL, LARGEST_PANEL = 192, 480  # px, the longer side
-CAPTION, BAR = 0.45, 0.7  # inches
+SHOWN_FRAMES = 4  # the first and the last of the clip among them
 LARGEST_DIFFERENCE = 0.25  # as displayed; what is more looks the same
 
-Image = NDArray[np.floating]
 
-
-class Panel(NamedTuple):
-    """A picture with its caption: (H, W, 3) in [0, 1], or numbers (H, W), coloured from `low` to `high`."""
-
-    image: Image
-    caption: str
-    low: float = 0.0
-    high: float = 1.0
-
-
-Column = list[Panel]  # one panel a shown frame
-
-
-def save_grid(path: Path, columns: Sequence[Column], row_names: Sequence[str]) -> None:
-    """A PNG of panels; those of numbers have colour bars."""
-    height, width = columns[0][0].image.shape[:2]
-    longer = max(height, width)
-    zoom = min(LARGEST_PANEL / longer, max(1, -(-SMALLEST_PANEL // longer))) / DPI
-    bars = any(column[0].image.ndim == 2 for column in columns)
-    size = (len(columns) * (width * zoom + BAR * bars) + CAPTION, len(row_names) * (height * zoom + CAPTION))
-    figure, axes = plt.subplots(
-        len(row_names), len(columns), figsize=size, dpi=DPI, squeeze=False, layout="constrained"
-    )
-    for axis, panel in zip(axes.T.flat, (panel for column in columns for panel in column), strict=True):
-        drawn = axis.imshow(panel.image, cmap="viridis", vmin=panel.low, vmax=panel.high)
-        axis.set(xticks=[], yticks=[])
-        axis.set_title(panel.caption, fontsize=8, pad=2)
-        if panel.image.ndim == 2:
-            figure.colorbar(drawn, ax=axis, fraction=0.05, pad=0.02).ax.tick_params(labelsize=7)
-    figure.get_layout_engine().set(rect=(CAPTION / 2 / size[0], 0, 1 - CAPTION / 2 / size[0], 1))  # type: ignore
-    for axis, name in zip(axes[:, 0], row_names, strict=True):
-        axis.set_ylabel(name, fontsize=8)
-    save_figure(path, figure)
-
-
-def as_displayed(radiance: Tensor, exposure: float) -> Image:
+def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
     """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    image: Image = display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
+    image: NDArray[np.floating] = display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
     return image
 
 
@@ -76,76 +38,102 @@ def reference_of(frame: Frame, signal: Signal) -> Tensor:
 
 
 @dataclass
-class Track:
-    """One denoiser's way through the clip, and what is shown of it: a panel a shown frame."""
+class DenoiserView:
+    """One denoiser on its way through a clip, and what is shown of it.
+
+    Attributes:
+        images: what it makes of each shown frame.
+        differences: how far those are off the reference; empty where the clip has none.
+        pictures: those of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W).
+    """
 
     name: str
     denoiser: Denoiser
     state: State | None = None
     images: Column = field(default_factory=list)
     differences: Column = field(default_factory=list)
-    pictures: dict[str, list[Image]] = field(default_factory=dict)
+    pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
-    def show(self, output: Tensor, frame: Frame, exposure: float) -> None:
-        """Keep the panels of one frame: the image, its difference from the reference if there is one, the state."""
-        image, caption = as_displayed(output, exposure), self.name
-        if self.denoiser.signal != "total":
-            caption += f" ({self.denoiser.signal})"
+    def step(self, frame: Frame) -> Tensor:
+        """Denoise the next frame: radiance (1, 3, H, W)."""
+        output, self.state = self.denoiser(frame, self.state)
+        return output
+
+    def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
+        """Keep what is shown of the frame that was just denoised to `output`."""
+        image = as_displayed(output, exposure)
+        signal = self.denoiser.signal
+        caption = self.name if signal == "total" else f"{self.name} ({signal})"
         if frame.channels.keys() >= set(REFERENCES):
-            difference = image - as_displayed(reference_of(frame, self.denoiser.signal), exposure)
+            difference = image - as_displayed(reference_of(frame, signal), exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
             self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=LARGEST_DIFFERENCE))
         self.images.append(Panel(image, caption))
         assert self.state
         for name, picture in self.state.pictures().items():
-            colour = picture.shape[1] == 3
-            shown = as_displayed(picture.float(), exposure) if colour else finite(picture)[0, 0].float().numpy()
+            in_colour = picture.shape[1] == 3
+            shown = as_displayed(picture.float(), exposure) if in_colour else finite(picture)[0, 0].float().numpy()
             self.pictures.setdefault(name, []).append(shown)
 
     def state_columns(self) -> list[Column]:
         """A column for each of the state's pictures; numbers in the same colours in all frames."""
-        low, high = ({name: float(f(images)) for name, images in self.pictures.items()} for f in (np.min, np.max))
-        return [[Panel(i, name, low[name], high[name]) for i in images] for name, images in self.pictures.items()]
+        columns = []
+        for name, images in self.pictures.items():
+            low = float(np.min(images))
+            high = float(np.max(images))
+            columns.append([Panel(image, name, low, high) for image in images])
+        return columns
 
 
-def runnable(clip: Clip, runs: Path, profile: str, names: Sequence[str]) -> dict[str, Denoiser]:
+def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[str, Denoiser]:
     """The noisy frame, and the named denoisers or all that have weights and find what they read in the clip.
 
     Raises BadInput where a named one is unknown, cannot run or has no weights.
     """
     ready = {"noisy": create("noisy")}
-    for spec in evaluated(names, runs, profile):
-        name = spec.name
+    for spec in evaluated(names, runs, budget):
         denoiser = spec.build()
         missing = [channel for channel in denoiser.reads if channel not in clip.channels]
         if missing and not names:
-            print(f"{name}: skipped, the clip holds no {' and no '.join(missing)}")
+            print(f"{spec.name}: skipped, the clip holds no {' and no '.join(missing)}")
             continue
-        ready[name] = denoiser
+        ready[spec.name] = denoiser
     return ready
 
 
 @torch.inference_mode()
-def play(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int]) -> tuple[list[Track], Column]:
-    """Run the denoisers over the clip. Returns their tracks, and the shown frames' references if there are any."""
-    tracks = [Track(name, denoiser) for name, denoiser in denoisers.items()]
+def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int]) -> tuple[list[DenoiserView], Column]:
+    """Run the denoisers over the clip. Returns their views of the `shown` frames, and the references if there are any.
+
+    Raises BadInput where the clip lacks a channel that a denoiser reads.
+    """
+    views = [DenoiserView(name, denoiser) for name, denoiser in denoisers.items()]
     channels = {channel for denoiser in denoisers.values() for channel in denoiser.reads}
     has_reference = all(channel in clip.channels for channel in REFERENCES)
     references: Column = []
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         wanted = channels | {*REFERENCES, "albedo"} if has_reference and index in shown else channels
         frame = read_frame(clip, index, sorted(wanted))
-        for track in tracks:
-            output, track.state = track.denoiser(frame, track.state)
+        for view in views:
+            output = view.step(frame)
             if index in shown:
-                track.show(output, frame, clip.exposure)
+                view.keep(output, frame, clip.exposure)
         if has_reference and index in shown:
             references.append(Panel(as_displayed(reference_of(frame, "total"), clip.exposure), "reference"))
-    return tracks, references
+    return views, references
 
 
-def show(path: Path, out: Path, runs: Path, profile: str, names: Sequence[str] = ()) -> list[Path]:
+def grids_of(views: Sequence[DenoiserView], references: Column) -> dict[str, list[Column]]:
+    """The columns of each picture, by its name."""
+    grids = {"sheet": [view.images for view in views]}
+    if references:
+        grids["sheet"].append(references)
+        grids["differences"] = [view.differences for view in views]
+    return grids | {f"state-{view.name}": view.state_columns() for view in views if view.pictures}
+
+
+def show(path: Path, out: Path, runs: Path, budget: str, names: Sequence[str] = ()) -> list[Path]:
     """Write PNGs of a clip's denoised frames to the folder `out`; returns their paths.
 
     `sheet.png`: columns of denoisers between the noisy frames and the reference; `differences.png`: where each is off
@@ -155,15 +143,10 @@ def show(path: Path, out: Path, runs: Path, profile: str, names: Sequence[str] =
     if not is_clip(path):
         raise BadInput(f"there is no clip at {path}: name the folder of one, such as data/quick/test/cornell_box/000")
     clip = Clip(path)
-    denoisers = runnable(clip, runs, profile, names)
-    shown = sorted({round(index) for index in np.linspace(0, clip.frames - 1, SHOWN)})
+    denoisers = runnable(clip, runs, budget, names)
+    shown = sorted({round(index) for index in np.linspace(0, clip.frames - 1, SHOWN_FRAMES)})
     out.mkdir(parents=True, exist_ok=True)
-    tracks, references = play(clip, denoisers, shown)
-
-    grids = {"sheet": [*(track.images for track in tracks), *([references] if references else [])]}
-    if references:
-        grids["differences"] = [track.differences for track in tracks]
-    grids |= {f"state-{track.name}": track.state_columns() for track in tracks if track.pictures}
+    grids = grids_of(*view_clip(clip, denoisers, shown))
     for name, columns in tqdm(grids.items(), "pictures", leave=False):
-        save_grid(out / f"{name}.png", columns, [f"frame {index}" for index in shown])
+        save_figure(out / f"{name}.png", draw_grid(columns, [f"frame {index}" for index in shown]))
     return [out / f"{name}.png" for name in grids]

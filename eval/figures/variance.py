@@ -4,17 +4,20 @@ import math
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from datasets.frame import Cameras, Frame
 from datasets.tonemap import display
+from models.denoiser import State
 from models.svgf import SVGF
 from plotting import DPI, plt, save_figure
 
 TILE = 64  # px; every tile has the same structure, so that only the noise differs from left to right
-SIZE = 2 * TILE, 12 * TILE  # height, width
-VARIANCE = 1e-4, 50.0  # of f, at the left and at the right
-FRAMES = 32
+PATTERN_SIZE = (2 * TILE, 12 * TILE)  # height, width
+VARIANCES = (1e-4, 50.0)  # of f, at the left and at the right
+PLAYED_FRAMES = 32
+ROW_CAPTION = 24  # px
 
 
 def pattern(height: int, width: int) -> Tensor:
@@ -26,11 +29,11 @@ def pattern(height: int, width: int) -> Tensor:
 
 
 def alphas(width: int) -> Tensor:
-    """Eq. 6's alpha for every column: its variance alpha / (1 - alpha) grows by the same factor from each to the next.
+    """Eq. 6's alpha for every column (W): its variance alpha / (1 - alpha) grows by the same factor from each to next.
 
     Along a linear alpha, nearly all of the picture would be noisier than its contrast.
     """
-    low, high = (math.log10(v) for v in VARIANCE)
+    low, high = (math.log10(variance) for variance in VARIANCES)
     variance = torch.logspace(low, high, width)
     return variance / (1 + variance)
 
@@ -46,7 +49,7 @@ def wall(irradiance: Tensor) -> Frame:
     """A frame of a white wall, which faces a camera that stands still, with direct light (H, W) only."""
     height, width = irradiance.shape
     one = torch.ones(1, 1, height, width)
-    black, still = torch.zeros(1, 3, height, width), torch.zeros(1, 2, height, width)
+    black = torch.zeros(1, 3, height, width)
     channels = {
         "direct": irradiance.expand(1, 3, -1, -1),
         "indirect": black,
@@ -55,7 +58,7 @@ def wall(irradiance: Tensor) -> Frame:
         "normal": torch.tensor([0.0, 0.0, -1.0])[:, None, None].expand(1, 3, height, width),
         "depth": one,
         "mesh_id": one,
-        "motion": still,
+        "motion": torch.zeros(1, 2, height, width),
     }
     K = torch.tensor([[-width, 0, width / 2], [0, -width, height / 2], [0, 0, 1]], dtype=torch.float64)
     world = torch.eye(4, dtype=torch.float64)
@@ -64,11 +67,14 @@ def wall(irradiance: Tensor) -> Frame:
 
 
 @torch.no_grad()
-def reconstruct(size: tuple[int, int] = SIZE, frames: int = FRAMES, seed: int = 0) -> dict[str, Tensor]:
+def filtered_pattern(
+    size: tuple[int, int] = PATTERN_SIZE, frames: int = PLAYED_FRAMES, seed: int = 0
+) -> dict[str, Tensor]:
     """The rows of Fig. 9, (H, W) each: input, result of the first frame and of the last, reference."""
     generator = torch.Generator().manual_seed(seed)
     reference = pattern(*size)
-    svgf, state = SVGF(), None
+    svgf = SVGF()
+    state: State | None = None
     images: dict[str, Tensor] = {}
     for _ in range(frames):
         noisy = sample(reference, generator)
@@ -77,14 +83,19 @@ def reconstruct(size: tuple[int, int] = SIZE, frames: int = FRAMES, seed: int = 
     return {"input": noisy} | images | {"temporal variance estimate": output[0, 0], "reference": reference}
 
 
-def variance_figure(path: Path) -> None:
-    """Draw Fig. 9 as a PNG."""
-    images = reconstruct()
-    height, width = SIZE
-    figure, axes = plt.subplots(len(images), 1, figsize=(width / DPI, len(images) * (height + 24) / DPI))
+def draw_rows(images: dict[str, Tensor]) -> Figure:
+    """Images (H, W) of radiance one below the other, as displayed."""
+    height, width = next(iter(images.values())).shape
+    size = (width / DPI, len(images) * (height + ROW_CAPTION) / DPI)
+    figure, axes = plt.subplots(len(images), 1, figsize=size)
     for axis, (name, image) in zip(axes, images.items(), strict=True):
         axis.imshow(display(image, 1.0).numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axis.set_title(name, fontsize=8, pad=2, loc="left")
         axis.set_axis_off()
     figure.subplots_adjust(left=0, right=1, bottom=0, top=0.965, hspace=0.19)
-    save_figure(path, figure)
+    return figure
+
+
+def variance_figure(path: Path) -> None:
+    """Draw Fig. 9 as a PNG."""
+    save_figure(path, draw_rows(filtered_pattern()))

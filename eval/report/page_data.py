@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, folders_of, load_picture, picture_path
+from timing import thread_count, threads_for
 
 WITH_FLIP_MAPS = 1.4  # bytes of images and their FLIP maps over those of images
 BASE64 = 4 / 3  # bytes of text over those that it encodes
@@ -97,16 +98,18 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
     folders = folders_of(runs, clip)
     count = len(clip.reference.frames)
     frames = range(0, count, step)
-    images: dict[str, list[str]] = {name: [] for name in folders}
+    height, width = load_picture(folders[clip.reference.denoiser], 0).shape[:2]
+    images = {
+        name: [data_uri(picture_path(folder, index).read_bytes(), "webp") for index in frames]
+        for name, folder in folders.items()
+    }
     flips: dict[str, list[str]] = {result.denoiser: [] for result in clip.results}
-    for index in tqdm(frames, clip.name, unit="frame", leave=False):
-        pictures = {name: load_picture(folder, index) for name, folder in folders.items()}
-        for name, picture in pictures.items():
-            images[name].append(data_uri(picture_path(folders[name], index).read_bytes(), "webp"))
-            if name in flips:
-                errors = flip_map(picture / 255, pictures[clip.reference.denoiser] / 255)
-                flips[name].append(webp_uri((255 * errors + 0.5).astype(np.uint8)))
-    height, width = pictures[clip.reference.denoiser].shape[:2]
+    with thread_count(threads_for(height, width)):
+        for index in tqdm(frames, clip.name, unit="frame", leave=False):
+            reference = load_picture(folders[clip.reference.denoiser], index)
+            for name, maps in flips.items():
+                errors = flip_map(load_picture(folders[name], index) / 255, reference / 255)
+                maps.append(webp_uri((255 * errors + 0.5).astype(np.uint8)))
     return PageClip(
         name=clip.name,
         count=count,

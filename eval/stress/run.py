@@ -9,13 +9,13 @@ import torch
 from tqdm import tqdm
 
 from errors import BadInput
-from eval.selection import choose, unavailable, weights_file
-from eval.spec import DenoiserSpec, create, precisions_of
+from eval.selection import cannot_run, choose, weights_file
+from eval.spec import DenoiserSpec, create_any, precisions_of
 from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
 from eval.stress.check import StressCheck
 from eval.stress.logits import last_layers
 from eval.stress.outcome import FRESH, StressRow
-from eval.stress.tables import details, heat_map, overview, verdict_text
+from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS
@@ -30,7 +30,7 @@ def stressed(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec
     Raises BadInput where a named one is unknown or cannot run.
     """
     specs = []
-    for name in choose(names, DENOISERS, unavailable):
+    for name in choose(names, DENOISERS, cannot_run):
         file = weights_file(name, runs, budget)
         specs.append(DenoiserSpec(name, weights=file if file and file.exists() else None))
     return specs
@@ -45,7 +45,9 @@ def weights_label(spec: DenoiserSpec) -> str | None:
 
 def applies(case: StressCase, spec: DenoiserSpec) -> bool:
     """Whether the denoiser computes in the case's precision, and has logits where these are to be scaled."""
-    return case.precision in precisions_of(spec.name) and (case.logits is None or bool(last_layers(create(spec.name))))
+    return case.precision in precisions_of(spec.name) and (
+        case.logits is None or bool(last_layers(create_any(spec.name)))
+    )
 
 
 def cases_in(precision: str, long: bool) -> list[StressCase]:
@@ -101,6 +103,6 @@ def stress(
     write_json(folder / "results.json", results)
     write_file(folder / "table.md", (details(rows, cases, "pipe") + "\n").encode())
     save_figure(folder / "errors.png", heat_map(rows, cases))
-    print(overview(rows, cases))
+    print(error_table(rows, cases))
     print("\n" + verdict_text(rows, cases))
     return not any(row.outcome.broken for row in rows)

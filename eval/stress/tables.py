@@ -39,7 +39,7 @@ def weights_cell(weights: str | None) -> str:
     return FRESH if weights == FRESH else "trained"
 
 
-def overview(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
+def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
     """A column a denoiser: its error in each case, and the rest in few lines."""
     weights = {row.denoiser: row.weights for row in rows}
     found = {(row.denoiser, row.extreme): row for row in rows}

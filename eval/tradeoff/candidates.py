@@ -8,7 +8,7 @@ from pathlib import Path
 from safetensors import safe_open
 
 from eval.extra_denoisers import EXTRA, WINDOW_SETS
-from eval.selection import choose, unavailable, untrained, weights_file
+from eval.selection import cannot_run, choose, untrained, weights_file
 from eval.spec import DenoiserSpec, precisions_of
 from files import read_json
 from models.registry import DENOISERS
@@ -19,7 +19,7 @@ def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSp
 
     Raises BadInput for an unknown name and one that cannot run or is not trained.
     """
-    obstacles = (unavailable, partial(of_another_budget, runs, budget), partial(untrained, runs, budget))
+    obstacles = (cannot_run, partial(of_another_budget, runs, budget), partial(untrained, runs, budget))
     return [
         DenoiserSpec(name, precision=precision, weights=weights_file(name, runs, budget))
         for name in choose(names, (*DENOISERS, *EXTRA), *obstacles)

@@ -11,11 +11,11 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
-from models.parameters import FEATURES, GAMMA
+from models.parameters import FEATURE_CHANNELS, GAMMA
 from models.running_scale import RunningScale
 
 LEAST_ALBEDO = np.float32(ALBEDO_FLOOR)
-POWER = np.float32(1 / GAMMA)
+INVERSE_GAMMA = np.float32(1 / GAMMA)
 LEAST_EXPOSED = np.float32(1e-30)  # its power is 0 as far as a network can tell, and its logarithm is finite
 
 
@@ -26,7 +26,7 @@ def feature_row(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any,
     for c in range(3):
         for x in range(line.size):
             exposed = exposure[c] * irradiance[c, x] * max(albedo[c, x], LEAST_ALBEDO)
-            line[x] = exp(POWER * log(min(max(exposed, LEAST_EXPOSED), np.float32(1))))
+            line[x] = exp(INVERSE_GAMMA * log(min(max(exposed, LEAST_EXPOSED), np.float32(1))))
         for x in range(line.size):
             out[x, c] = line[x]
             out[x, 3 + c] = albedo[c, x]
@@ -45,7 +45,7 @@ def network_features(frame: Frame, irradiance: Tensor, scale: RunningScale) -> T
     """See models.features.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
-    out = torch.empty(len(irradiance), *frame.size, FEATURES)
+    out = torch.empty(len(irradiance), *frame.size, FEATURE_CHANNELS)
     for item in range(len(out)):
         feature_image(
             out[item].numpy(),

@@ -19,7 +19,7 @@ from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order
 from models.parameters import WINDOWS
 
-STRIP = 32  # rows that a thread fuses at once
+THREAD_ROWS = 32  # rows that a thread fuses at once
 SAFE_RANGE = np.float32(parameters.SAFE_RANGE)
 LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
 OUTSIDE = np.float32(parameters.OUTSIDE)
@@ -183,13 +183,13 @@ def fuse_strips(
 ) -> None:
     """fused (3, H, W) += image (3, H, W) filtered, strips in parallel.
 
-    weighted (threads, 5, rows, W) and shares (threads, M, STRIP, W) are scratch of the threads' own: memory that is
-    allocated within the loop would be cleared anew for every strip.
+    weighted (threads, 5, rows, W) and shares (threads, M, THREAD_ROWS, W) are scratch of the threads' own: memory that
+    is allocated within the loop would be cleared anew for every strip.
     """
     height = image.shape[1]
-    for strip in numba.prange((height + STRIP - 1) // STRIP):
-        start = strip * STRIP
-        stop = min((strip + 1) * STRIP, height)
+    for strip in numba.prange((height + THREAD_ROWS - 1) // THREAD_ROWS):
+        start = strip * THREAD_ROWS
+        stop = min((strip + 1) * THREAD_ROWS, height)
         my_weighted = weighted[get_thread_id()]
         my_shares = shares[get_thread_id()]
         for i in range(windows.size):
@@ -223,8 +223,8 @@ def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[i
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     threads = numba.get_num_threads()
     width = image.shape[-1]
-    weighted = np.empty((threads, 5, STRIP + max(windows), width), np.float32)
-    shares = np.empty((threads, len(windows), STRIP, width), np.float32)
+    weighted = np.empty((threads, 5, THREAD_ROWS + max(windows), width), np.float32)
+    shares = np.empty((threads, len(windows), THREAD_ROWS, width), np.float32)
     for item in range(len(image)):
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
         compiled_fuse_strips()(fused[item].numpy(), array(image[item]), *maps, np.array(windows), weighted, shares)

@@ -22,15 +22,13 @@ ONE = np.float32(1)
 PLANE_TOLERANCE = np.float32(parameters.PLANE_TOLERANCE)
 NORMAL_TOLERANCE = np.float32(parameters.NORMAL_TOLERANCE)
 
-Array = NDArray[np.float32]
-
 
 class Buffers(NamedTuple):
     """What one item of Surfaces holds."""
 
-    depth: Array  # (H, W)
-    normal: Array  # (3, H, W)
-    mesh_id: Array  # (H, W)
+    depth: NDArray[np.float32]  # (H, W)
+    normal: NDArray[np.float32]  # (3, H, W)
+    mesh_id: NDArray[np.float32]  # (H, W)
 
     @staticmethod
     def of(surfaces: Surfaces, item: int) -> "Buffers":
@@ -40,10 +38,10 @@ class Buffers(NamedTuple):
 class Views(NamedTuple):
     """Both cameras of a frame, as matrices."""
 
-    to_then: Array  # (M + 1, 3, 4), by mesh id: from this camera's frame to where the mesh was
-    turn: Array  # (M + 1, 3, 3), by mesh id: of world-space normals
-    slopes: Array  # (2, 2), of this camera's rays: slope and intercept over x and over y
-    axes: Array  # (3, 3), the previous camera's rays are x axes[0] + y axes[1] + axes[2]
+    to_then: NDArray[np.float32]  # (M + 1, 3, 4), by mesh id: from this camera's frame to where the mesh was
+    turn: NDArray[np.float32]  # (M + 1, 3, 3), by mesh id: of world-space normals
+    slopes: NDArray[np.float32]  # (2, 2), of this camera's rays: slope and intercept over x and over y
+    axes: NDArray[np.float32]  # (3, 3), the previous camera's rays are x axes[0] + y axes[1] + axes[2]
 
     @staticmethod
     def of(frame: Frame, item: int) -> "Views":

@@ -16,8 +16,8 @@ from eval.bench.scaling import exponent, in_use
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import WINDOW_SETS
-from eval.selection import unavailable
-from eval.spec import DenoiserSpec, create, precision_in_use
+from eval.selection import cannot_run
+from eval.spec import DenoiserSpec, create_any, precision_in_use
 from onespp import main
 from provenance import device_in_words
 
@@ -51,7 +51,7 @@ def test_results_have_the_agreed_form(tmp_path, capsys):
     labels = [(row["denoiser"], row["dtype"]) for row in rows]
     accumulated = ("accumulated", "accumulated (PyTorch)", "accumulated (indirect)")
     rae = [("rae", precision) for precision in ("float32", "bfloat16", "float16")]
-    oidn = [] if unavailable("oidn") else [("oidn", "float32"), ("oidn (fast)", "float32")]  # it comes by itself
+    oidn = [] if cannot_run("oidn") else [("oidn", "float32"), ("oidn (fast)", "float32")]  # it comes by itself
     assert labels == [*((way, "float32") for way in accumulated), *rae, *oidn]
     for row in rows:
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]
@@ -109,7 +109,7 @@ def test_a_bench_goes_on_where_the_same_call_was_interrupted(tmp_path):
 
 
 def test_oidn_has_no_parameters_to_count():
-    if unavailable("oidn"):
+    if cannot_run("oidn"):
         pytest.skip("there is no OIDN here")
     for name in ("oidn", "oidn+taa"):
         (contender,) = race([DenoiserSpec(name)], (8, 8), measured=1)
@@ -126,7 +126,7 @@ def test_scaling(tmp_path, capsys):
     main(["bench", "scaling", "noisy", "wskp3", "--size", "32x32", "16x16", "--threads", "1", "--runs", str(tmp_path)])
     assert "16x16" in capsys.readouterr().out
     rows = json.loads((tmp_path / "bench" / "scaling.json").read_text())["rows"]
-    names = ["noisy", "wskp3", *([] if unavailable("oidn") else ["oidn", "oidn (fast)"])]
+    names = ["noisy", "wskp3", *([] if cannot_run("oidn") else ["oidn", "oidn (fast)"])]
     assert [(row["denoiser"], row["width"]) for row in rows] == [(name, w) for w in (16, 32) for name in names]
     used = precision_in_use("wskp3")
     assert [row["dtype"] for row in rows if row["denoiser"] == "wskp3"] == [used, used]
@@ -166,7 +166,7 @@ def test_multiply_accumulates_by_hand():
 
 def test_repvgg_is_counted_as_it_runs():
     """One 5 x 5 convolution a block, not its branches; and parameters of both forms are reported."""
-    denoiser = create("wskp6")
+    denoiser = create_any("wskp6")
     trained = denoiser.parameter_count()
     denoiser.prepare()
     layers = [layer for layer in denoiser.network.modules() if isinstance(layer, torch.nn.Conv2d)]
@@ -177,14 +177,14 @@ def test_repvgg_is_counted_as_it_runs():
 
 def test_what_is_measured(monkeypatch, capsys):
     gone = "gone fishing"
-    monkeypatch.setattr(eval.bench.denoisers, "unavailable", lambda name: gone if name == "oidn" else None)
+    monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: gone if name == "oidn" else None)
     assert "oidn" not in {spec.name for spec in ways(())}
     assert f"oidn: skipped, {gone}" in capsys.readouterr().out
     assert "oidn" not in {spec.name for spec in ways(["noisy"])}
     with pytest.raises(BadInput, match=gone):
         ways(["oidn"])
     monkeypatch.undo()
-    if not unavailable("oidn"):
+    if not cannot_run("oidn"):
         assert [spec.way for spec in ways(["oidn"])] == ["oidn", "oidn (fast)"]
 
 

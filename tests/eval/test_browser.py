@@ -18,7 +18,8 @@ pytestmark = [
         not (BROWSER and DRIVER), reason="needs Chromium and its driver: `apt-get install chromium chromium-driver`"
     ),
 ]
-WIDTH, HEIGHT = 1366, 768
+WIDTH = 1366
+HEIGHT = 768
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from plotting import DPI
 def test_contact_sheet_shows_every_scene(tmp_path):
     """Two rows of two: each place shows its scene, and the last one, without a scene, is white."""
     names = ["cornell_box", "extremes-sky", "room-7"]
-    height, width = 24, 32
+    height = 24
+    width = 32
     contact_sheet(tmp_path / "sheet.png", names, size=(height, width), spp=2)
     image = plt.imread(tmp_path / "sheet.png")[..., :3]
     title = round(TITLE_INCHES * DPI)

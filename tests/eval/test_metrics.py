@@ -14,7 +14,7 @@ from datasets.frame import disoccluded
 from datasets.tonemap import display
 from eval.comparison import Comparison
 from eval.metrics import METRICS, measure, temporal_error_floor
-from models.operators import luminance
+from models.operators import image_luminance
 
 
 def pair(seed: int = 0, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -32,7 +32,8 @@ def test_metrics_equal_independent_implementations():
     output, halves = pair()
     exposure = 1.3
     metrics = measure(Comparison(output, halves, exposure))
-    a, b = shown(output, exposure), shown(halves[:1], exposure)
+    a = shown(output, exposure)
+    b = shown(halves[:1], exposure)
     assert metrics["mse"] == pytest.approx(((a - b) ** 2).mean())
     assert metrics["rmse"] == pytest.approx(math.sqrt(metrics["mse"]))
     assert metrics["l1"] == pytest.approx(np.abs(a - b).mean())
@@ -53,7 +54,8 @@ def test_metrics_equal_independent_implementations():
     assert metrics["ssim"] == pytest.approx(full[..., 5:-5, 5:-5].mean().item(), abs=1e-9)
     _, mean, _ = flip_evaluator.evaluate(b.astype(np.float32), a.astype(np.float32), "LDR")
     assert metrics["flip"] == pytest.approx(mean, abs=1e-6)
-    x, r = exposure * output.double().numpy(), exposure * halves[:1].double().numpy()
+    x = exposure * output.double().numpy()
+    r = exposure * halves[:1].double().numpy()
     assert metrics["smape"] == pytest.approx((np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)).mean())
     assert metrics["rel_mse"] == pytest.approx(((x - r) ** 2 / (r**2 + 0.01)).mean())
 
@@ -62,7 +64,8 @@ def test_identical_constant_and_one_pixel_images():
     _, halves = pair()
     same = measure(Comparison(halves[:1], halves, 1.0))
     assert (same["mse"], same["psnr"], same["mse_unbiased"]) == (0, 100, 0) and same["ssim"] == pytest.approx(1)
-    black, white = torch.zeros(1, 3, 16, 16), torch.ones(2, 3, 16, 16)
+    black = torch.zeros(1, 3, 16, 16)
+    white = torch.ones(2, 3, 16, 16)
     opposite = measure(Comparison(black, white, 1.0))
     assert opposite["psnr"] == 0 and opposite["rmse"] == 1 and 0 <= opposite["ssim"] < 0.01
     assert measure(Comparison(black, torch.zeros(2, 3, 16, 16), 1.0))["psnr"] == 100
@@ -96,9 +99,12 @@ def test_non_finite_output_counts_as_zero():
 
 def test_unbiased_mse_estimates_the_error_to_the_truth():
     """Closed form: truth t, output t + d, halves t + noise of variance v. E = d^2; the plain MSE is biased by v / 2."""
-    truth, offset, deviation = 0.4, 0.05, 0.2
+    truth = 0.4
+    offset = 0.05
+    deviation = 0.2
     rng = np.random.default_rng(0)
-    unbiased, plain = [], []
+    unbiased = []
+    plain = []
     for _ in range(200):
         halves = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
         output = torch.full((1, 3, 32, 32), truth + offset)
@@ -143,4 +149,4 @@ def test_disocclusion_counts_only_where_vectors_differ():
 def test_display_and_luminance():
     x = torch.tensor([0.0, 0.25, 2.0])[None, :, None, None]
     torch.testing.assert_close(display(x, 2.0).flatten(), torch.tensor([0.0, 0.5 ** (1 / 2.2), 1.0]))
-    assert luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)
+    assert image_luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)

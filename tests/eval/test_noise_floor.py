@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval.comparison import Comparison
-from eval.figures.unbiased import measure, spread
+from eval.figures.unbiased import measure_references, spread
 from eval.metrics import METRICS, noise_floors, within_floor
 from eval.metrics import measure as measure_frame
 
@@ -28,7 +28,8 @@ def scene(deviation: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("deviation", [0.005, 0.03])
 def test_floors_are_what_the_truth_scores(deviation):
-    found, scored = [], []
+    found = []
+    scored = []
     for seed in range(6):
         truth, halves = scene(deviation, seed)
         found.append(floors_of(halves, HIDDEN))
@@ -57,7 +58,8 @@ def test_error_of_the_unbiased_mse(correlated):
     """Its spread over references of a perfect image: met where channels share their noise, else bounded."""
     rng = np.random.default_rng(1)
     truth = torch.full((1, 3, 24, 24), 0.5, dtype=torch.float64)
-    values, errors = [], []
+    values = []
+    errors = []
     for _ in range(400):
         noise = torch.from_numpy(rng.normal(0, 0.1, (2, 1 if correlated else 3, 24, 24))).expand(2, 3, -1, -1)
         halves = truth + noise
@@ -104,7 +106,7 @@ def test_no_floor_no_mark():
 
 def test_unbiased_mse_on_rendered_references():
     """The figure in small: the plain MSE falls as references get better, the unbiased one stays, floors hold."""
-    true, measured = measure({16: 24, 64: 8}, truth_spp=8192)
+    true, measured = measure_references({16: 24, 64: 8}, truth_spp=8192)
     (plain, plain_error), (better, _) = (spread(measured, spp, "plain") for spp in (16, 64))
     assert plain > better + 4 * plain_error and plain > 2 * true
     for spp in (16, 64):

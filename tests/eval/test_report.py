@@ -160,6 +160,7 @@ def test_quality_against_time(page):
     plots = {(plot["signal"], plot["metric"]): plot for plot in page.data["trades"]}
     total = plots["total", "flip"]
     assert {point["name"]: point["ms"] for point in total["points"]} == {"noisy": 0.5, "accumulated": 1.0, "eaw": 2.5}
+    assert [point["name"] for point in total["points"]] == ["noisy", "accumulated", "eaw"]  # fastest first
     assert total["missing"] == [] and total["size"] == "1280 × 720"
     indirect = {point["name"]: point for point in plots["indirect", "ssim"]["points"]}
     assert indirect["noisy"]["by"] is None and "ntd" in indirect
@@ -213,7 +214,7 @@ def test_without_results_or_with_damaged_ones(evaluated, tmp_path, capsys):
 def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     runs = shutil.copytree(evaluated, tmp_path / "runs")
     shutil.rmtree(runs / "bench")
-    report(runs)
+    report(runs, megabytes=1e-6)  # one frame a clip
     assert Page(runs / "report" / "index.html").data["trades"] == []
     assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
 

@@ -133,7 +133,8 @@ def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
 @pytest.mark.parametrize("frame", [0, 5, 11])
 def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch, frame):
     """`frame` of the 16 of both clips is the one in which it is killed."""
-    seen, save = [], clip_run.save_picture
+    seen = []
+    save = clip_run.save_picture
 
     def killed(folder, index, image):
         seen.append(index)

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib import image
+from matplotlib import colormaps
+from matplotlib import image as png
 
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.figures.show import play, show
+from eval.figures.panel_grid import Panel, draw_grid
+from eval.figures.show import grids_of, show, view_clip
 from models.denoiser import Denoiser, State
 from models.registry import create
 from onespp import main
+from plotting import save_figure
 
 
 def clip_of(tiny: Path) -> Path:
@@ -25,15 +28,45 @@ def test_pictures_of_a_clip(tiny, tmp_path, capsys):
     paths = [Path(line) for line in capsys.readouterr().out.splitlines()]
     assert [path.name for path in paths] == ["sheet.png", "differences.png", "state-accumulated.png"]
     assert sorted((tmp_path / "s").iterdir()) == sorted(paths)
-    sheet, differences, state = (image.imread(path)[..., :3] for path in paths)
-    assert sheet.shape[1] > 3 * 192 and sheet.shape[0] > 4 * 192  # noisy, accumulated, reference; four frames
-    assert all(picture.std() > 0.05 for picture in (sheet, differences, state))
+    denoisers = {"noisy": create("noisy"), "accumulated": create("accumulated")}
+    grids = grids_of(*view_clip(Clip(clip_of(tiny)), denoisers, [0, 2, 5, 7]))
+    assert {name: len(columns) for name, columns in grids.items()} == {
+        "sheet": 3,  # noisy, accumulated, reference
+        "differences": 2,
+        "state-accumulated": 1,
+    }
+    save_figure(tmp_path / "sheet.png", draw_grid(grids["sheet"], ["frame 0", "frame 2", "frame 5", "frame 7"]))
+    assert np.array_equal(png.imread(paths[0]), png.imread(tmp_path / "sheet.png"))
+
+
+def test_panels_stand_where_they_belong(tmp_path):
+    """Columns from left to right, frames from top to bottom, each as large as it must be, numbers as colours."""
+    colours = {(0, 0): (1, 0, 0), (0, 1): (0, 1, 0), (1, 0): (0, 0, 1), (1, 1): (1, 0, 1)}
+    panels = {place: Panel(np.full((48, 64, 3), colour, float), str(place)) for place, colour in colours.items()}
+    numbers = [Panel(np.full((48, 64), value), "numbers", low=0, high=4) for value in (0.0, 4.0)]
+    columns = [[panels[0, 0], panels[0, 1]], [panels[1, 0], panels[1, 1]], numbers]
+    figure = draw_grid(columns, ["frame 0", "frame 7"])
+    assert [axis.get_ylabel() for axis in figure.axes if axis.get_ylabel()] == ["frame 0", "frame 7"]
+    save_figure(tmp_path / "grid.png", figure)
+    drawn = png.imread(tmp_path / "grid.png")[..., :3]
+    colours |= {(2, 0): colormaps["viridis"](0.0)[:3], (2, 1): colormaps["viridis"](1.0)[:3]}
+    left = {}
+    top = {}
+    for place, colour in colours.items():
+        y, x = np.nonzero(np.abs(drawn - colour).max(axis=2) < 1 / 255)
+        panel = x < np.median(x) + 110  # without the colour bar to the right of it, which ends in the same colour
+        width = np.ptp(x[panel]) + 1
+        assert width >= 192 and np.ptp(y[panel]) + 1 == pytest.approx(0.75 * width, abs=2), place
+        left[place] = x.min()
+        top[place] = y.min()
+    assert all(left[column, frame] + 192 < left[column + 1, frame] for column in (0, 1) for frame in (0, 1))
+    assert all(top[column, 0] + 0.75 * 192 < top[column, 1] for column in (0, 1, 2))
 
 
 def test_what_the_panels_hold(tiny):
     """Captions are measured against the reference; states are pictured in the same colours in all frames."""
     clip = Clip(clip_of(tiny))
-    (noisy, accumulated), references = play(
+    (noisy, accumulated), references = view_clip(
         clip, {"noisy": create("noisy"), "accumulated": create("accumulated")}, [0, 7]
     )
     truth = np.clip(clip.exposure * clip.reference(7).mean(axis=0), 0, 1) ** (1 / 2.2)
@@ -66,7 +99,7 @@ class Painter(Denoiser):
 
 def test_states_in_colour(tiny):
     clip = Clip(clip_of(tiny))
-    (track,), _ = play(clip, {"painter": Painter()}, [3])
+    (track,), _ = view_clip(clip, {"painter": Painter()}, [3])
     colour, number = track.state_columns()
     assert np.array_equal(colour[0].image, track.images[0].image) and colour[0].image.shape == (64, 64, 3)
     assert np.array_equal(number[0].image, np.zeros((64, 64)))

@@ -14,9 +14,11 @@ from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
 from eval.results import REFERENCE, ClipResults, Result
-from eval.spec import DenoiserSpec, create
+from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
+from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import trade
 from eval.tradeoff.samples import SampleTrade, check_levels, generalisation, sample_trades
@@ -53,7 +55,8 @@ def bench_of(runs, labels, ms=lambda index: 1.0 + index, threads=(1, 2)) -> None
 @pytest.mark.parametrize("metric, sign", [("psnr", 1), ("rmse", -1)])
 def test_fronts_by_brute_force(metric, sign):
     rng = np.random.default_rng(0)
-    ms, values = rng.integers(1, 9, 40), rng.integers(20, 30, 40)  # with ties
+    ms = rng.integers(1, 9, 40)  # with ties
+    values = rng.integers(20, 30, 40)
     offers = {
         str(i): Offer(float(a), ClipScores([{metric: float(b)}], [{}]))
         for i, (a, b) in enumerate(zip(ms, values, strict=True))
@@ -158,7 +161,8 @@ def test_the_renderer_goes_on_where_the_clip_began(tiny):
 
 
 def test_noise_falls_with_samples(tiny):
-    clip, errors = a_clip(tiny), []
+    clip = a_clip(tiny)
+    errors = []
     for spp in (1, 4, 16):
         frame = next(rendered(clip, Dataset(tiny), spp))
         truth = clip.read("direct_reference", 0).astype(np.float64).mean(axis=0)
@@ -168,7 +172,8 @@ def test_noise_falls_with_samples(tiny):
 
 def test_clips_are_kept_until_what_they_are_made_of_changes(tiny, tmp_path):
     copy = shutil.copytree(tiny, tmp_path / "data")
-    dataset, clip = Dataset(copy), a_clip(copy)
+    dataset = Dataset(copy)
+    clip = a_clip(copy)
     path = with_samples(clip, dataset, 2, "rendered", tmp_path / "more").path
     kept = (path / "direct.npy").stat().st_mtime_ns
     with_samples(clip, dataset, 2, "rendered", tmp_path / "more")
@@ -183,7 +188,8 @@ def test_clips_are_kept_until_what_they_are_made_of_changes(tiny, tmp_path):
 
 
 def test_samples_that_cannot_be_had(tiny, tmp_path):
-    clip, dataset = a_clip(tiny), Dataset(tiny)
+    clip = a_clip(tiny)
+    dataset = Dataset(tiny)
     four = with_samples(clip, dataset, 4, "rendered", tmp_path)
     dataset.facts["options"] = {"halton": True, "regularise": False}
     with pytest.raises(BadInput, match="16 different samples a pixel: 32 are too many"):
@@ -212,7 +218,7 @@ def test_sizes_are_the_networks_of_the_ablation():
     assert [windows_label(windows) for windows in WINDOW_SETS.values()][:2] == ["3", "3+5"]
     assert WINDOW_SETS[ALL_WINDOWS] == WINDOWS
     for name, windows in WINDOW_SETS.items():
-        assert create(name).windows == windows
+        assert create_any(name).windows == windows
     names = (ALL_WINDOWS, "wskp6-2w", "ntd", "ntd-b")
     assert [timed_as(DenoiserSpec(name)) for name in names] == ["wskp6", "wskp6-2w", "ntd", "ntd"]
     assert timed_as(DenoiserSpec("svgf", signal="indirect")) == "svgf (indirect)"
@@ -267,7 +273,7 @@ def traded(tiny, tmp_path_factory):
     ):
         folder.mkdir(parents=True)
         label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
-        save_weights(create(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
+        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
     names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
@@ -297,12 +303,36 @@ def test_more_samples_cost_more_and_show_more(traded):
     rows = {(row["denoiser"], row["spp"]): row for row in samples["rows"]}
     assert samples["sources"] == {"cornell_box/000": "rendered", "cornell_box_moving/000": "rendered"}
     for name in ("noisy", "accumulated", "svgf"):
-        one, four = rows[name, 1], rows[name, 4]
+        one = rows[name, 1]
+        four = rows[name, 4]
         assert four["metrics"]["psnr"] > one["metrics"]["psnr"] and four["render_ms"] >= one["render_ms"]
         assert four["ms"] == pytest.approx(four["render_ms"] + four["filter_ms"])
     quality = {row["label"]: row["metrics"]["psnr"] for row in read_json(traded[0] / "report" / "trade.json")["rows"]}
     assert rows["noisy", 1]["metrics"]["psnr"] == quality["noisy"]  # 1 spp is the clip itself
     assert all(math.isfinite(row["metrics"]["psnr"]) for row in samples["rows"])
+
+
+def test_the_plot_draws_the_front(traded):
+    rows = [Trade(**row) for row in read_json(traded[0] / "report" / "trade.json")["rows"]]
+    (axis,) = draw_front(rows, "psnr", "title").axes
+    line, *points = axis.lines
+    on_front = sorted((row.ms, row.metrics["psnr"]) for row in rows if row.dominated_by["psnr"] is None)
+    assert [*zip(*line.get_data(), strict=True)] == on_front
+    places = {(row.ms, row.metrics["psnr"]) for row in rows}
+    filled = {tuple(point.get_xydata()[0]) for point in points if point.get_markerfacecolor() == "C0"}
+    hollow = {tuple(point.get_xydata()[0]) for point in points if len(point.get_xydata())} - filled
+    assert filled == {*on_front} and hollow == places - filled
+
+
+def test_the_plot_of_samples(traded):
+    rows = [SampleTrade(**row) for row in read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]]
+    left, right = draw_samples(rows, "title").axes
+    labels = [line.get_label() for line in left.lines]
+    assert set(labels) == {row.label for row in rows}
+    for label, by_spp, by_ms in zip(labels, left.lines, right.lines, strict=True):
+        ours = [row for row in rows if row.label == label]
+        assert by_spp.get_xydata().tolist() == [[row.spp, row.metrics["psnr"]] for row in ours]
+        assert by_ms.get_xydata().tolist() == [[row.ms, row.metrics["psnr"]] for row in ours]
 
 
 def test_generalisation_shows_what_was_fed(traded):

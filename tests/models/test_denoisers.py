@@ -60,7 +60,8 @@ def test_any_size(denoisers, name, size):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_change_of_size_starts_anew(denoisers, name):
     """Also where both sizes are padded alike, and for another batch size."""
-    a, b = flat_frame(20, 20), flat_frame(30, 30, depth=50.0, irradiance=torch.full((1, 3, 30, 30), 1000.0))
+    a = flat_frame(20, 20)
+    b = flat_frame(30, 30, depth=50.0, irradiance=torch.full((1, 3, 30, 30), 1000.0))
     torch.testing.assert_close(run(denoisers[name], [a, a, b])[2], run(denoisers[name], [b])[0])
     two = Frame.stack([b, b])
     torch.testing.assert_close(run(denoisers[name], [b, two])[1], run(denoisers[name], [two])[0])
@@ -107,7 +108,8 @@ def test_a_poisoned_pixel_is_gone_from_the_next_frame(denoisers, name, poison):
     frames[0].direct[0, :, 5, 6] = poison
     assert all(torch.isfinite(output).all() for output in run(denoisers[name], frames))
     if name == "accumulated":
-        outputs, expected = run(denoisers[name], frames), run(denoisers[name], clean)
+        outputs = run(denoisers[name], frames)
+        expected = run(denoisers[name], clean)
         others = torch.ones(12, 12, dtype=torch.bool)
         others[5, 6] = False
         assert all(torch.equal(a[..., others], b[..., others]) for a, b in zip(outputs, expected, strict=True))
@@ -147,10 +149,12 @@ def test_rae_recurrence_is_the_paper_s_equation():
 
     torch.manual_seed(1)
     block = RecurrentBlock(2).double()
-    x, hidden = torch.rand(1, 2, 5, 6).double(), torch.rand(1, 2, 5, 6).double()
+    x = torch.rand(1, 2, 5, 6).double()
+    hidden = torch.rand(1, 2, 5, 6).double()
 
     def layer(conv, image):
-        weight, bias = conv.weight.detach().numpy(), conv.bias.detach().numpy()
+        weight = conv.weight.detach().numpy()
+        bias = conv.bias.detach().numpy()
         sums = [sum(correlate(c, k, mode="constant") for c, k in zip(image, w, strict=True)) for w in weight]
         value = np.stack(sums) + bias[:, None, None]
         return np.where(value > 0, value, 0.1 * value)

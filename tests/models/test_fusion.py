@@ -57,7 +57,8 @@ def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offs
 def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
     """Strips choose their path on their own: the boundary between the two must not show."""
     torch.manual_seed(1)
-    importance, mixture = torch.randn(1, 6, 200, 40), torch.randn(1, 6, 200, 40)
+    importance = torch.randn(1, 6, 200, 40)
+    mixture = torch.randn(1, 6, 200, 40)
     importance[..., 100, 3] = 5000
     image = torch.rand(1, 3, 200, 40)
     expected = unfold_fuse(image.double(), importance.double(), mixture.double())
@@ -98,7 +99,8 @@ def test_gradients_equal_plain_autograd_of_the_naive_version(scale):
 
 
 def test_relative_sums_are_sums():
-    logits, values = torch.tensor([[[[0.0, 500.0, -500.0]]]]), torch.tensor([[[[2.0, 3.0, 5.0]]]])
+    logits = torch.tensor([[[[0.0, 500.0, -500.0]]]])
+    values = torch.tensor([[[[2.0, 3.0, 5.0]]]])
     top, total = windowed_sums(logits, values, 3)
     np.testing.assert_array_equal(top[0, 0, 0], [500, 500, 500])
     np.testing.assert_allclose(total[0, 0, 0], [3, 3, 3], rtol=1e-6)

@@ -43,16 +43,20 @@ def copy(frame: Frame, **channels: Tensor) -> Frame:
 def naive_warp(image: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(C, H, W) fetched bilinearly at p + motion(p), pixel by pixel; taps outside are the nearest ones inside."""
     _, height, width = image.shape
-    out, inside = np.zeros_like(image), np.zeros((height, width), bool)
+    out = np.zeros_like(image)
+    inside = np.zeros((height, width), bool)
     for y in range(height):
         for x in range(width):
-            u, v = x + motion[0, y, x], y + motion[1, y, x]
+            u = x + motion[0, y, x]
+            v = y + motion[1, y, x]
             inside[y, x] = -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
-            left, top = int(np.floor(u)), int(np.floor(v))
+            left = int(np.floor(u))
+            top = int(np.floor(v))
             for j in (0, 1):
                 for i in (0, 1):
                     weight = (u - left if i else left + 1 - u) * (v - top if j else top + 1 - v)
-                    row, column = min(max(top + j, 0), height - 1), min(max(left + i, 0), width - 1)
+                    row = min(max(top + j, 0), height - 1)
+                    column = min(max(left + i, 0), width - 1)
                     out[:, y, x] += weight * image[:, row, column]
     return out, inside
 
@@ -60,7 +64,8 @@ def naive_warp(image: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.nd
 @pytest.mark.parametrize("size", [(7, 9), (1, 1), (1, 6), (5, 1)])
 def test_warp_equals_the_naive_version(size):
     rng = np.random.default_rng(0)
-    image, motion = rng.uniform(0, 1, (3, *size)), rng.uniform(-4, 4, (2, *size))
+    image = rng.uniform(0, 1, (3, *size))
+    motion = rng.uniform(-4, 4, (2, *size))
     warped, inside = warp(*(torch.from_numpy(a).float()[None] for a in (image, motion)))
     expected, expected_inside = naive_warp(image, motion)
     np.testing.assert_array_equal(inside[0, 0], expected_inside)
@@ -72,10 +77,12 @@ def naive_upsampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
     out = np.zeros((len(image), height, width))
     for y in range(height):
         for x in range(width):
-            v, u = (y + 0.5) / 2 - 0.5, (x + 0.5) / 2 - 0.5
+            v = (y + 0.5) / 2 - 0.5
+            u = (x + 0.5) / 2 - 0.5
             for j in (0, 1):
                 for i in (0, 1):
-                    top, left = int(np.floor(v)), int(np.floor(u))
+                    top = int(np.floor(v))
+                    left = int(np.floor(u))
                     weight = (v - top if j else top + 1 - v) * (u - left if i else left + 1 - u)
                     row, column = (
                         min(max(a, 0), n - 1) for a, n in zip((top + j, left + i), image.shape[1:], strict=True)
@@ -98,7 +105,9 @@ def naive_combine(fine: np.ndarray, coarse: np.ndarray, alpha: np.ndarray) -> np
 def test_combination_equals_eq_4(size):
     rng = np.random.default_rng(0)
     half = -(-size[0] // 2), -(-size[1] // 2)
-    fine, coarse, alpha = rng.uniform(0, 5, (3, *size)), rng.uniform(0, 5, (3, *half)), rng.uniform(0, 1, (1, *half))
+    fine = rng.uniform(0, 5, (3, *size))
+    coarse = rng.uniform(0, 5, (3, *half))
+    alpha = rng.uniform(0, 1, (1, *half))
     result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
     np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha), atol=1e-12)
 
@@ -118,7 +127,8 @@ def predictions(height: int, width: int, alpha: tuple[float, float, float], kern
 def test_the_pyramid_is_unbiased(size, monkeypatch):
     """Its pixels are means of 2 x 2 and 4 x 4 pixels, of fewer at odd borders; nothing changes a constant image."""
     height, width = size
-    noisy, ones = torch.rand(1, 3, height, width), torch.ones(1, 3, height, width)
+    noisy = torch.rand(1, 3, height, width)
+    ones = torch.ones(1, 3, height, width)
     seen: list[Tensor] = []
     monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
     reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
@@ -154,7 +164,8 @@ def test_reconstruction_equals_eq_4_at_both_levels():
 
 
 def test_alpha_t_is_the_weight_of_the_current_frame():
-    noisy, warped = torch.rand(1, 3, 9, 11), torch.rand(1, 3, 9, 11) + 10
+    noisy = torch.rand(1, 3, 9, 11)
+    warped = torch.rand(1, 3, 9, 11) + 10
     other = torch.rand(1, 3, 9, 11)
     now, then = (predictions(9, 11, (0, 0, logit)) for logit in (200.0, -200.0))
     assert torch.equal(reconstruct_image(noisy, warped, now)[0], reconstruct_image(noisy, other, now)[0])
@@ -188,7 +199,8 @@ def test_the_network_is_the_one_described(ntd, frames, monkeypatch):
     _, state = play(ntd, frames[:2])
     assert isinstance(state, NTDState)
     assert [tuple(p.shape[1:]) for p in genuine(seen[1])] == [(26, 16, 16), (26, 32, 32), (51, 64, 64)]
-    x, frame = seen[1], frames[1]
+    x = seen[1]
+    frame = frames[1]
     exposure = state.scale.exposure()
     assert x.shape == (1, 13, 64, 64)
     torch.testing.assert_close(x[:, :3], torch.log1p(exposure * frame.indirect / frame.divisor))
@@ -260,7 +272,8 @@ def test_state_carries_over(ntd, frames):
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_a_poisoned_pixel_does_not_persist(ntd, poison):
     for name in ("indirect", "albedo", "normal", "depth", "motion", "dual_motion"):
-        first, second = flat_frame(20, 24), flat_frame(20, 24)
+        first = flat_frame(20, 24)
+        second = flat_frame(20, 24)
         first.channels["indirect"] = second.channels["indirect"] = torch.rand(1, 3, 20, 24)
         first.channels[name] = first.channels[name].clone()
         first.channels[name][..., 7, 9] = poison

@@ -71,7 +71,8 @@ def test_brightness_scales(tiny):
 
 def test_emission_is_untouched():
     """Lamps are added after denoising: no light bleeds from them, and no noise of theirs is made."""
-    dark, lamp = flat_frame(16, 16), flat_frame(16, 16)
+    dark = flat_frame(16, 16)
+    lamp = flat_frame(16, 16)
     lamp.emission[..., 8:] = 50.0
     denoiser = OIDN()
     torch.testing.assert_close(denoiser(lamp, None)[0] - denoiser(dark, None)[0], lamp.emission)
@@ -80,7 +81,8 @@ def test_emission_is_untouched():
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf, -5.0])
 def test_unusable_pixels_count_as_black(poison):
-    black, poisoned = noisy_wall(20, 24), noisy_wall(20, 24)
+    black = noisy_wall(20, 24)
+    poisoned = noisy_wall(20, 24)
     black.direct[0, :, 5, 6] = 0
     poisoned.direct[0, :, 5, 6] = poison
     for denoiser in (OIDN(), OIDNAccumulated()):

@@ -1,178 +1,9 @@
-"""Shared operators against hand-computed images and slow, obvious versions in float64."""
+"""Small operators on images."""
 
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from datasets.clip import Dataset
-from datasets.frame import Frame, read_frame
-from models import compiled
-from models.accumulation import Accumulation, accumulate
-from models.operators import image_luminance
-from models.reprojection import reproject
-from models.running_scale import running_scale
-from models.surfaces import Surfaces
-from tests.helpers.frames import flat_frame
-
-
-def ramp(height: int, width: int) -> torch.Tensor:
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return (x + 10.0 * y)[None, None]
-
-
-@pytest.mark.parametrize("motion", [(0.0, 0.0), (1.0, 0.0), (-2.0, 1.0), (0.25, -0.5), (0.5, 0.75)])
-def test_bilinear_inside_a_plane_is_exact(motion):
-    """A linear ramp is reproduced exactly where all taps are inside the image."""
-    frame = flat_frame(6, 8, motion)
-    history, found = reproject(frame, ramp(6, 8), Surfaces.of(frame))
-    y, x = np.mgrid[0:6, 0:8].astype(float)
-    px, py = x + motion[0], y + motion[1]
-    inside = (px >= 0) & (px <= 7) & (py >= 0) & (py <= 5)
-    np.testing.assert_allclose(history[0, 0].numpy()[inside], (px + 10 * py)[inside], atol=1e-4)
-    assert found[0, 0].numpy()[inside].all()
-
-
-def naive_reproject(frame: Frame, history: np.ndarray, mesh_then: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SVGF §4.1's taps pixel by pixel in float64, on a wall where only mesh ids differ."""
-    height, width = frame.size
-    mesh, motion = frame.mesh_id[0, 0].numpy(), frame.motion[0].numpy().astype(float)
-    out, found = np.zeros((height, width)), np.zeros((height, width), bool)
-
-    def consistent(y, x, r, c):
-        return 0 <= r < height and 0 <= c < width and mesh_then[r, c] == mesh[y, x]
-
-    for y in range(height):
-        for x in range(width):
-            px, py = x + motion[0, y, x], y + motion[1, y, x]
-            c0, r0 = int(np.floor(px)), int(np.floor(py))
-            fx, fy = px - c0, py - r0
-            taps = [(r0 + j, c0 + i, (fy if j else 1 - fy) * (fx if i else 1 - fx)) for j in (0, 1) for i in (0, 1)]
-            good = [(r, c, w) for r, c, w in taps if consistent(y, x, r, c)]
-            lost = sum(w for r, c, w in taps if not consistent(y, x, r, c))
-            if good:
-                out[y, x] = sum((w + lost / len(good)) * history[r, c] for r, c, w in good)
-                found[y, x] = True
-                continue
-            row, column = int(np.floor(py + 0.5)), int(np.floor(px + 0.5))
-            box = [(row + j, column + i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
-            values = [history[r, c] for r, c in box if consistent(y, x, r, c)]
-            if values:
-                out[y, x], found[y, x] = np.mean(values), True
-    return out, found
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    height=st.integers(1, 7),
-    width=st.integers(1, 7),
-    dx=st.integers(-48, 48).map(lambda n: n / 16),
-    dy=st.integers(-48, 48).map(lambda n: n / 16),
-    seed=st.integers(0, 9999),
-)
-def test_reprojection_equals_the_naive_version(height, width, dx, dy, seed):
-    rng = np.random.default_rng(seed)
-    now, then = rng.integers(1, 3, (2, height, width))
-    frame = flat_frame(height, width, (dx, dy), mesh_id=torch.from_numpy(now)[None, None])
-    before = flat_frame(height, width, mesh_id=torch.from_numpy(then)[None, None])
-    values = rng.uniform(0, 1, (height, width))
-    history, found = reproject(frame, torch.from_numpy(values).float()[None, None], Surfaces.of(before))
-    expected, expected_found = naive_reproject(frame, values, then)
-    np.testing.assert_array_equal(found[0, 0].numpy(), expected_found)
-    np.testing.assert_allclose(history[0, 0].numpy(), expected, atol=1e-5)
-
-
-def test_taps_on_other_depth_or_normal_are_refused():
-    frame = flat_frame(5, 5)
-    nearer = flat_frame(5, 5, depth=1.9)
-    _, found = reproject(frame, ramp(5, 5), Surfaces.of(nearer))
-    assert not found.any()
-    turned = flat_frame(5, 5)
-    turned.channels["normal"] = turned.normal.roll(1, dims=1)
-    _, found = reproject(frame, ramp(5, 5), Surfaces.of(turned))
-    assert not found.any()
-
-
-def test_background_finds_background_only():
-    sky = flat_frame(4, 4, depth=0.0, mesh_id=torch.zeros(1, 1, 4, 4))
-    sky.channels["normal"] = torch.zeros(1, 3, 4, 4)
-    assert reproject(sky, ramp(4, 4), Surfaces.of(sky))[1].all()
-    assert not reproject(flat_frame(4, 4), ramp(4, 4), Surfaces.of(sky))[1].any()
-
-
-def test_reprojection_follows_a_mesh_that_moves(tiny):
-    """On the moving box: visible surfaces find their history, and nothing is ever fetched from another mesh."""
-    clip = Dataset(tiny).clips("test")[1]
-    names = ("normal", "depth", "mesh_id", "motion", "dual_motion")
-    for index in range(1, clip.frames):
-        frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
-        position = frame.motion + torch.stack(torch.meshgrid(torch.arange(64), torch.arange(64), indexing="xy"))[None]
-        inside = ((position >= 0) & (position <= 63)).all(dim=1, keepdim=True)
-        hidden = (frame.dual_motion - frame.motion).abs().amax(dim=1, keepdim=True) > 1 / 64
-        history, found = reproject(frame, before.mesh_id, Surfaces.of(before))
-        assert found[inside & ~hidden].float().mean() > 0.99
-        torch.testing.assert_close(history[found], frame.mesh_id[found])
-    # Seven frames at once: strips too wide for any tap to bridge come into view.
-    last, first = read_frame(clip, 7, names[:-1], previous=0), read_frame(clip, 0, names[:-1])
-    history, found = reproject(last, first.mesh_id, Surfaces.of(first))
-    torch.testing.assert_close(history[found], last.mesh_id[found])
-    assert 0.005 < (~found).float().mean() < 0.3
-
-
-def test_accumulation_averages_five_frames_then_moves_on():
-    """alpha = 1, 1/2, 1/3, 1/4, 1/5, 1/5, ...: on a still wall, an even mean of five and then an exponential one."""
-    history, values, expected = None, [3.0, 1.0, 4.0, 1.0, 5.0, 9.0, 2.0], None
-    for n, value in enumerate(values):
-        frame = flat_frame(4, 4, irradiance=torch.full((1, 3, 4, 4), value))
-        history = accumulate(frame, frame.irradiance("total"), history)
-        alpha = max(0.2, 1 / (n + 1))
-        expected = value if expected is None else (1 - alpha) * expected + alpha * value
-        torch.testing.assert_close(history.irradiance, torch.full((1, 3, 4, 4), expected))
-        assert (history.length == n + 1).all()
-        if n < 5:
-            assert expected == pytest.approx(np.mean(values[: n + 1]))
-
-
-def test_accumulation_starts_anew_where_disoccluded():
-    frame = flat_frame(4, 6, irradiance=torch.full((1, 3, 4, 6), 2.0))
-    mesh = torch.ones(1, 1, 4, 6)
-    mesh[..., 3:] = 2
-    before = Accumulation(
-        torch.zeros(1, 3, 4, 6), torch.full((1, 1, 4, 6), 7.0), Surfaces.of(flat_frame(4, 6, mesh_id=mesh))
-    )
-    history = accumulate(frame, frame.irradiance("total"), before)
-    assert (history.length[..., 4:] == 1).all() and (history.irradiance[..., 4:] == 2).all()
-    assert (history.length[..., :3] == 8).all()
-    torch.testing.assert_close(history.irradiance[..., :3], torch.full((1, 3, 4, 3), 0.4))
-
-
-def test_running_scale_by_hand():
-    """Constant luminance y: exposure 0.18 / y. The logarithm averages evenly at first. Black and sky change nothing."""
-    grey, depth = torch.full((1, 3, 32, 40), 0.5), torch.full((1, 1, 32, 40), 4.0)
-    first = running_scale(grey, depth, None)
-    assert first.exposure().item() == pytest.approx(0.36)
-    assert first.normalised_depth(depth)[0, 0, 0, 0].item() == pytest.approx(0.5)
-    second = running_scale(grey * 4, depth * 4, first)
-    assert second.exposure().item() == pytest.approx(0.18)  # sqrt(0.5 * 2) = 1
-    nothing = running_scale(grey * 0, depth * 0, second)
-    assert nothing.exposure().item() == second.exposure().item()
-    assert nothing.log_depth.value == second.log_depth.value and nothing.log_depth.count == 2
-    black = running_scale(grey * 0, depth * 0, None)
-    assert black.exposure().item() == pytest.approx(1)
-    assert (black.normalised_depth(depth * 0) == 1).all()
-    # A film that starts black: the first frame with light sets the exposure alone.
-    light = running_scale(grey, depth, black)
-    assert light.exposure().item() == pytest.approx(0.36)
-    assert light.normalised_depth(depth)[0, 0, 0, 0].item() == pytest.approx(0.5)
-
-
-def test_running_scale_of_sparse_noise_is_near_that_of_its_mean():
-    """One pixel in sixteen lit, as 1-spp images are: blocks keep the logarithm from collapsing."""
-    generator = torch.Generator().manual_seed(0)
-    lit = (torch.rand(1, 1, 128, 128, generator=generator) < 1 / 16).float() * 16 * 0.3
-    scale = running_scale(lit.repeat(1, 3, 1, 1), torch.ones(1, 1, 128, 128), None)
-    assert scale.exposure().item() == pytest.approx(0.18 / 0.3, rel=0.1)
+from models.operators import finite, image_luminance, pad_to_multiple
 
 
 def test_luminance_weights():
@@ -180,16 +11,16 @@ def test_luminance_weights():
     torch.testing.assert_close(image_luminance(rgb)[0, 0, :, 0], torch.tensor([0.2126, 0.7152, 0.0722]))
 
 
-def test_compiled_reprojection_equals_pytorch_s(tiny):
-    """On frames with moving meshes, moving cameras and disocclusions; a pixel in a thousand may sit on a limit."""
-    clip = Dataset(tiny).clips("test")[1]
-    names = ("direct", "indirect", "albedo", "normal", "depth", "mesh_id", "motion")
-    for index in range(1, clip.frames):
-        frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
-        history = torch.cat([before.irradiance("total"), before.depth], dim=1)
-        fast, found = reproject(frame, history, Surfaces.of(before))
-        with compiled.disabled():
-            slow, expected = reproject(frame, history, Surfaces.of(before))
-        assert (found != expected).float().mean() < 1e-3
-        close = torch.isclose(fast, slow, rtol=1e-3, atol=1e-3).all(dim=1)
-        assert close.float().mean() > 0.999
+@pytest.mark.parametrize("size", [(1, 1), (4, 6), (5, 8), (8, 8)])
+def test_padding_repeats_the_borders(size):
+    image = torch.rand(2, 3, *size)
+    padded = pad_to_multiple(image, 4)
+    height, width = padded.shape[-2:]
+    assert height % 4 == width % 4 == 0 and height - size[0] < 4 and width - size[1] < 4
+    rows = torch.arange(height).clamp(max=size[0] - 1)
+    columns = torch.arange(width).clamp(max=size[1] - 1)
+    assert torch.equal(padded, image[..., rows, :][..., columns])
+
+
+def test_what_is_not_finite_becomes_black():
+    assert finite(torch.tensor([1.0, torch.nan, torch.inf, -torch.inf, -2.0])).tolist() == [1.0, 0.0, 0.0, 0.0, -2.0]

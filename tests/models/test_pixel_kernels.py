@@ -13,8 +13,10 @@ from models.pixel_kernels import ApplyKernels, apply_kernels
 
 def naive(image: Tensor, logits: Tensor) -> Tensor:
     """All windows written out in float64, softmax over the taps inside the image."""
-    image, logits = image.double(), logits.double()
-    (batch, channels, height, width), taps = image.shape, logits.shape[1]
+    image = image.double()
+    logits = logits.double()
+    batch, channels, height, width = image.shape
+    taps = logits.shape[1]
     size = round(taps**0.5)
     windows = F.unfold(image, size, padding=size // 2).view(batch, channels, taps, height, width)
     inside = F.unfold(torch.ones_like(image[:, :1]), size, padding=size // 2).view(batch, taps, height, width)
@@ -104,7 +106,8 @@ def test_gradients_equal_those_of_plain_autograd(dtype):
 
 def test_gradients_of_extreme_logits_are_finite():
     image, logits = inputs(5, 6, 4, spread=1e4)
-    image, logits = image.requires_grad_(), logits.requires_grad_()
+    image = image.requires_grad_()
+    logits = logits.requires_grad_()
     apply_kernels(image, logits).sum().backward()
     assert torch.isfinite(image.grad).all() and torch.isfinite(logits.grad).all()
 

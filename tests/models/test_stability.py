@@ -48,8 +48,10 @@ MOTIONS = st.sampled_from([(0.0, 0.0), (0.4, -0.7), (3.0, 0.0), (1e5, -1e5), (-1
 @st.composite
 def frames_strategy(draw, longest=4, largest=19):
     """A sequence: any size, light from black to blinding, fireflies, surfaces near and far or none, any motion."""
-    height, width = draw(st.integers(1, largest)), draw(st.integers(1, largest))
-    depth, albedo = draw(DEPTHS), draw(st.sampled_from([0.0, 0.02, 0.5, 1.0]))
+    height = draw(st.integers(1, largest))
+    width = draw(st.integers(1, largest))
+    depth = draw(DEPTHS)
+    albedo = draw(st.sampled_from([0.0, 0.02, 0.5, 1.0]))
     roughness = draw(st.sampled_from([0.0, 1.0]))
     rng = np.random.default_rng(draw(st.integers(0, 2**31)))
     frames = []
@@ -101,7 +103,8 @@ def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
 )
 def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channel, place):
     """So it can spread no further than an ordinary pixel, in its frame or through the state; in any channel."""
-    y, x = place[0] % frames[0].size[0], place[1] % frames[0].size[1]
+    y = place[0] % frames[0].size[0]
+    x = place[1] % frames[0].size[1]
 
     def with_pixel(value):
         tensor = frames[0].channels[channel].clone()
@@ -178,7 +181,8 @@ def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, n
     clip = Dataset(tiny).clips("test")[1]
     frames = [read_frame(clip, index, (*full.reads, *REFERENCES)) for index in range(clip.frames)]
     truth = [frame.remodulate(frame.reference_irradiance(full.signal), full.signal) for frame in frames]
-    exact, rounded = run(full, frames), run(half, frames)
+    exact = run(full, frames)
+    rounded = run(half, frames)
     assert abs(shown_psnr(rounded, truth, clip.exposure) - shown_psnr(exact, truth, clip.exposure)) < 0.1
     assert shown_psnr(exact, rounded, clip.exposure) > 35
 

@@ -63,7 +63,8 @@ def naive_slope(depth, mesh, y, x, dy, dx):
     height, width = depth.shape
     found = []
     for sign in (1, -1):
-        r, c = y + sign * dy, x + sign * dx
+        r = y + sign * dy
+        c = x + sign * dx
         if 0 <= r < height and 0 <= c < width and mesh[r, c] == mesh[y, x]:
             found.append(sign * (depth[r, c] - depth[y, x]))
     return min(found, key=abs, default=0.0)
@@ -75,7 +76,8 @@ def naive_geometry_weight(depth, normal, mesh, p, q):
         return 0.0
     gradient = naive_slope(depth, mesh, *p, 0, 1) * (p[1] - q[1]) + naive_slope(depth, mesh, *p, 1, 0) * (p[0] - q[0])
     w_z = math.exp(-abs(depth[p] - depth[q]) / (abs(gradient) + 1e-3 * depth[p]))
-    a, b = normal[:, *p] / np.linalg.norm(normal[:, *p]), normal[:, *q] / np.linalg.norm(normal[:, *q])
+    a = normal[:, *p] / np.linalg.norm(normal[:, *p])
+    b = normal[:, *q] / np.linalg.norm(normal[:, *q])
     return w_z * max(0.0, a @ b) ** 128
 
 
@@ -97,9 +99,11 @@ def naive_edge_scale(variance, p):
 def naive_level(colour, variance, depth, normal, mesh, step):
     """Eq. 1 and the variance's: colour (3, H, W), variance (H, W)."""
     y = np.tensordot([0.2126, 0.7152, 0.0722], colour, 1)
-    out, spread = np.zeros_like(colour), np.zeros_like(variance)
+    out = np.zeros_like(colour)
+    spread = np.zeros_like(variance)
     for p in np.ndindex(variance.shape):
-        total, scale = 0.0, naive_edge_scale(variance, p)
+        total = 0.0
+        scale = naive_edge_scale(variance, p)
         for q, j, i in window(p, variance.shape, 2, step):
             w = H[j + 2] * H[i + 2]
             if q != p:
@@ -115,10 +119,14 @@ def naive_level(colour, variance, depth, normal, mesh, step):
 def naive_spatial_variance(moments, depth, normal, mesh):
     out = np.zeros(depth.shape)
     for p in np.ndindex(depth.shape):
-        total, mean, square = 0.0, 0.0, 0.0
+        total = 0.0
+        mean = 0.0
+        square = 0.0
         for q, _, _ in window(p, depth.shape, 3):
             w = 1.0 if q == p else naive_geometry_weight(depth, normal, mesh, p, q)
-            total, mean, square = total + w, mean + w * moments[0][q], square + w * moments[1][q]
+            total += w
+            mean += w * moments[0][q]
+            square += w * moments[1][q]
         out[p] = square / total - (mean / total) ** 2
     return out
 
@@ -139,7 +147,9 @@ def wall(direct, indirect, **kwargs):
 
 def test_samples_and_moments_are_integrated_with_alpha_a_fifth():
     """The first sample is taken as it is; then C' = 0.2 C + 0.8 C', for colour, luminance and its square alike."""
-    values, history, expected = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0)], None, None
+    values = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0)]
+    history = None
+    expected = None
     for n, both in enumerate(values):
         frame = wall(*both)
         history = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
@@ -198,7 +208,8 @@ def test_variance_of_a_flickering_wall(way):
     state = None
     for n, frame in enumerate(frames):
         _, state = SVGF()(frame, state)
-        direct, indirect = state.pictures()["variance direct"], state.pictures()["variance indirect"]
+        direct = state.pictures()["variance direct"]
+        indirect = state.pictures()["variance indirect"]
         assert indirect.max() < 1e-6 * 1e8
         assert direct.min() > 0.5 if n >= 8 else direct.min() >= 0
     assert direct.max() < 1.01
@@ -210,8 +221,9 @@ def test_variance_of_a_flickering_wall(way):
 
 def weight(geometry, p, dy, dx):
     """w_z · w_n between p and p + (dy, dx)."""
-    (y, x), (r, c) = p, (p[0] + dy, p[1] + dx)
-    here, there = geometry[..., y : y + 1, x : x + 1], geometry[..., r : r + 1, c : c + 1]
+    y, x = p
+    here = geometry[..., y : y + 1, x : x + 1]
+    there = geometry[..., y + dy : y + dy + 1, x + dx : x + dx + 1]
     return svgf.geometry_weight(here, there, dx, dy).item()
 
 
@@ -235,7 +247,8 @@ def test_a_wall_that_faces_the_camera_is_one_surface_and_a_step_in_depth_an_edge
     depth, normal, mesh = plane(5, 8)
     assert weight(packed(depth, normal, mesh), (2, 2), 2, -2) == pytest.approx(1, abs=1e-4)
     depth[:, 4:] += 2
-    same_mesh, other_mesh = packed(depth, normal, mesh), packed(depth, normal, mesh + (np.arange(8) > 3))
+    same_mesh = packed(depth, normal, mesh)
+    other_mesh = packed(depth, normal, mesh + (np.arange(8) > 3))
     for geometry in (same_mesh, other_mesh):  # of a pixel's two neighbours, the nearer in depth tells the slope
         for x, dx in [(3, 1), (4, -1), (2, 3)]:
             assert weight(geometry, (2, x), 0, dx) < 1e-10
@@ -267,7 +280,8 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
     difference = 0.2126 * 2 + 0.0722 * 1
     sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
     out, spread = svgf.svgf_level(colour, variance, geometry, 1)
-    centre, side = 9 / 64, 3 / 32
+    centre = 9 / 64
+    side = 3 / 32
     for x in range(2):
         w = side * math.exp(-difference / (4 * sigma[x]))
         red = (centre * colour[0, 0, 0, 0, x] + w * colour[0, 0, 0, 0, 1 - x]) / (centre + w)
@@ -289,7 +303,8 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
 def test_a_level_is_the_paper_s(name, size, step, seed):
     rng = np.random.default_rng(seed)
     depth, normal, mesh = surfaces(rng, *size)
-    colour, variance = np.float32(rng.random((2, 3, *size))), np.float32(rng.random((2, *size)) / 4)
+    colour = np.float32(rng.random((2, 3, *size)))
+    variance = np.float32(rng.random((2, *size)) / 4)
     with WAYS[name]():
         images = to_torch(colour, 1, 2, 3, *size), to_torch(variance, 1, 2, 1, *size)
         out, spread = svgf.svgf_level(*images, packed(depth, normal, mesh), step)
@@ -302,14 +317,16 @@ def test_a_level_is_the_paper_s(name, size, step, seed):
 def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
     """Far from the border and with all weights 1, a level multiplies the variance by (Σ h²)²."""
     geometry = packed(*plane(65, 65))
-    colour, variance = torch.ones(1, 1, 3, 65, 65), torch.full((1, 1, 1, 65, 65), 0.5)
+    colour = torch.ones(1, 1, 3, 65, 65)
+    variance = torch.full((1, 1, 1, 65, 65), 0.5)
     _, spread = svgf.svgf_level(colour, variance, geometry, 4)
     assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
 
 
 def test_five_levels_and_the_first_is_the_history(monkeypatch):
     frame = synthetic_frame(3, 24, 32)
-    seen, original = [], svgf.svgf_level
+    seen = []
+    original = svgf.svgf_level
     monkeypatch.setattr(
         svgf, "svgf_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
     )
@@ -362,7 +379,8 @@ def test_the_output_stays_in_the_range_of_the_input(name, denoiser, size, seed, 
         frame = flat_frame(*size, mesh_id=to_torch(mesh.astype(float)))
         light = level * to_torch(rng.choice([0.2, 0.9, 1.0], (3, *size)) * rng.random((3, *size)))
         frame.channels.update(indirect=light, depth=to_torch(depth), normal=to_torch(normal))
-        low, high = min(low, light.min().item()), max(high, light.max().item())
+        low = min(low, light.min().item())
+        high = max(high, light.max().item())
         with WAYS[name]():
             output, state = made(frame, state)
         assert output.min() >= low * (1 - 1e-5) and output.max() <= high * (1 + 1e-5)
@@ -404,14 +422,17 @@ def test_noise_on_a_wall_is_gone_and_the_sky_is_left_alone(denoiser):
 @pytest.mark.parametrize("name", WAYS)
 def test_a_level_of_eaw(name, size, step, seed):
     rng = np.random.default_rng(seed)
-    colour, features = np.float32(rng.random((3, *size))), np.float32(rng.random((9, *size)))
+    colour = np.float32(rng.random((3, *size)))
+    features = np.float32(rng.random((9, *size)))
     with WAYS[name]():
         out = eaw.eaw_level(to_torch(colour), to_torch(features), step)[0].numpy()
     for p in np.ndindex(size):
-        total, sums = 0.0, np.zeros(3)
+        total = 0.0
+        sums = np.zeros(3)
         for q, j, i in window(p, size, 2, step):
             w = H[j + 2] * H[i + 2] * math.exp(-np.square(features[:, *p] - features[:, *q]).sum())
-            total, sums = total + w, sums + w * colour[:, *q]
+            total += w
+            sums += w * colour[:, *q]
         np.testing.assert_allclose(out[:, *p], sums / total, rtol=1e-5)
 
 

@@ -36,14 +36,16 @@ def test_a_constant_stays_what_it_is(level, motion):
 
 def test_the_flicker_of_still_noise_falls():
     frames = noise(20)
-    raw, smooth = run_chained(Noisy(), frames), run_chained(antialiased(Noisy)(), frames)
+    raw = run_chained(Noisy(), frames)
+    smooth = run_chained(antialiased(Noisy)(), frames)
     flicker = [(a[-1] - a[-2]).abs().mean() for a in (raw, smooth)]
     assert flicker[1] < 0.3 * flicker[0]
     assert abs(smooth[-1].mean() - 1) < 0.05
 
 
 def test_a_first_frame_and_a_new_size_pass_unchanged():
-    small, large = noise(2), noise(1, size=31)
+    small = noise(2)
+    large = noise(1, size=31)
     outputs = run_chained(antialiased(Noisy)(), [*small, *large])
     torch.testing.assert_close(outputs[0], small[0].direct)
     torch.testing.assert_close(outputs[2], large[0].direct)
@@ -72,7 +74,8 @@ def test_history_follows_the_motion():
 def test_off_screen_and_disoccluded_pixels_start_anew():
     a, b = noise(2)
     frames = [a, lit(b.direct, motion=(6.0, 0.0))]
-    plain, output = frames[1].direct, run_chained(antialiased(Noisy)(), frames)[1]
+    plain = frames[1].direct
+    output = run_chained(antialiased(Noisy)(), frames)[1]
     torch.testing.assert_close(output[..., 19:], plain[..., 19:])
     assert (output[..., :18] != plain[..., :18]).float().mean() > 0.9
     mesh = torch.ones(1, 1, 24, 24)

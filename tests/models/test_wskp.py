@@ -72,7 +72,9 @@ def test_wskp_is_accumulation_network_fusion(tiny):
 
 def test_combination_of_resolutions_is_equation_7():
     rng = np.random.default_rng(0)
-    fine, coarse, alpha = rng.random((4, 6)), rng.random((2, 3)), rng.random((4, 6))
+    fine = rng.random((4, 6))
+    coarse = rng.random((2, 3))
+    alpha = rng.random((4, 6))
     expected = np.empty((4, 6))
     for y in range(4):
         for x in range(6):

@@ -94,7 +94,12 @@ def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkey
 
 def test_the_key_follows_code_and_packages(monkeypatch):
     accumulating = sources("train.accumulation")
-    assert accumulating.keys() >= {"models.operators", "models.compiled.reproject", "datasets.frame", "scenes.camera"}
+    assert accumulating.keys() >= {
+        "models.operators",
+        "models.compiled.reprojection",
+        "datasets.frame",
+        "scenes.camera",
+    }
     assert not accumulating.keys() & {"train.crops", "train.training", "models.rae", "models.ntd", "models.registry"}
     here = accumulation_digest()
     assert len(here) == 16 and here == accumulation_digest()

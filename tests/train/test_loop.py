@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,9 +81,9 @@ def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, t
         train_network(short_task("rae", tiny, tmp_path, precision=None))
 
 
-def kill_once(name: str, data: Path, runs: Path, row: int, epochs: int) -> bool:
-    """Start a training and SIGKILL it once its log has `row` rows. Returns whether it was still at work."""
-    process = start_training(name, data, runs, epochs=epochs)
+def kill_once(name: str, data: Path, runs: Path, row: int, recipe: dict[str, Any]) -> bool:
+    """Start a training and SIGKILL it once its log has `row` lines. Returns whether it was still at work."""
+    process = start_training(name, data, runs, **recipe)
     metrics = folder_of(runs, name) / METRICS_CSV
     while process.poll() is None and (not metrics.exists() or metrics.read_text().count("\n") < row):
         time.sleep(0.002)
@@ -90,22 +91,19 @@ def kill_once(name: str, data: Path, runs: Path, row: int, epochs: int) -> bool:
     return process.wait() == -signal.SIGKILL
 
 
-@pytest.mark.parametrize(
-    "name, epochs, rows",
-    [
-        ("ntd", 1, (4,)),
-        *(
-            pytest.param(name, epochs, range(3, 24, 2), marks=pytest.mark.slow)
-            for name, epochs in (("rae", 15), ("wskp6", 2), ("ntd", 3))
-        ),
-    ],
-)
-def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, epochs, rows):
-    """Begun and killed in processes of their own, ended in this one, where the undisturbed one ran as well."""
-    kills = [kill_once(name, tiny, tmp_path / "killed", row, epochs) for row in rows]
+SLOW_KILLS = [
+    pytest.param(name, {"epochs": epochs}, range(3, 24, 2), marks=pytest.mark.slow)
+    for name, epochs in (("rae", 15), ("wskp6", 2), ("ntd", 3))
+]
+
+
+@pytest.mark.parametrize("name, recipe, rows", [("ntd", {"epochs": 1, "crop": 48}, (3,)), *SLOW_KILLS])
+def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, recipe, rows):
+    """Begun and killed in processes of their own, ended in this one, where the undisturbed one runs as well."""
+    kills = [kill_once(name, tiny, tmp_path / "killed", row, recipe) for row in rows]
     assert any(kills)
-    killed = train_network(short_task(name, tiny, tmp_path / "killed", epochs=epochs)).parent
-    whole = train_network(short_task(name, tiny, tmp_path / "whole", epochs=epochs)).parent
+    killed = train_network(short_task(name, tiny, tmp_path / "killed", **recipe)).parent
+    whole = train_network(short_task(name, tiny, tmp_path / "whole", **recipe)).parent
     assert same_weights(whole, killed)
     assert not [path for path in killed.iterdir() if path.suffix == ".tmp"]
 
@@ -209,20 +207,26 @@ def torchrun(processes: int, *arguments: str) -> "subprocess.CompletedProcess[st
     return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("name, epochs", [("wskp6", 1), pytest.param("rae", 15, marks=pytest.mark.slow)])
-def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name, epochs):
+@pytest.mark.parametrize(
+    "name, recipe",
+    [
+        ("wskp6", {"epochs": 1, "crops": (10, 1)}),
+        pytest.param("rae", {"epochs": 15}, marks=pytest.mark.slow),
+    ],
+)
+def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name, recipe):
     """The same global batch, shared: the losses of the first steps agree to rounding, and one of them writes.
 
     Each process computes with one thread, for the number of threads decides in which order is summed. And only the
     first steps are compared one by one: where a gradient is zero but for rounding, its sign is chance, and Adam makes
     a whole step of it. The curves of equal trainings so part by a factor of two to ten in every step.
     """
-    result = torchrun(2, *as_command(name, tiny, tmp_path / "two", epochs=epochs))
+    result = torchrun(2, *as_command(name, tiny, tmp_path / "two", **recipe))
     assert result.returncode == 0, result.stderr[-2000:]
     assert result.stdout.count("trained") == 1
     two = folder_of(tmp_path / "two", name)
     with thread_count(1):
-        one = train_network(short_task(name, tiny, tmp_path / "one", epochs=epochs)).parent
+        one = train_network(short_task(name, tiny, tmp_path / "one", **recipe)).parent
     curves = [[row["loss"] for row in read_metrics(folder / METRICS_CSV)] for folder in (one, two)]
     assert len(curves[0]) == len(curves[1])
     assert curves[1][:5] == pytest.approx(curves[0][:5], rel=1e-4)

@@ -36,17 +36,24 @@ def change_makers(folder: Path, makers: list[dict] | None) -> None:
 def code_of(name: str) -> set[str]:
     """The modules whose code counts for a network."""
     loss = recipe_for(name, "tiny").loss.around(create(name))
-    return set(sources("train.training", type(loss).__module__, type(loss.denoiser).__module__))
+    return set(sources("train.loop", type(loss).__module__, type(loss.denoiser).__module__))
 
 
 @pytest.mark.parametrize("name", TRAINABLE)
 def test_the_code_that_counts_is_that_of_network_loss_loop_and_data(name):
-    """And not that of all networks, of pictures or of evaluation."""
+    """And not that of all networks and recipes, or of evaluation."""
     modules = code_of(name)
     assert modules >= {type(create(name)).__module__, type(recipe_for(name, "tiny").loss).__module__}
-    assert modules >= {"train.training", "train.data", "train.crops", "train.accumulation", "train.recipe"}
+    assert modules >= {
+        "train.loop",
+        "train.training",
+        "train.data",
+        "train.crops",
+        "train.accumulation",
+        "train.recipe",
+    }
     assert modules >= {"datasets.clip", "datasets.frame", "datasets.sequences", "datasets.channels", "scenes.camera"}
-    assert not modules & {"models.registry", "train.recipes", "train.log", "train.pictures", "plotting", "onespp"}
+    assert not modules & {"models.registry", "train.registry", "train.recipes", "onespp"}
     assert not {module for module in modules if module.startswith("eval")}
 
 
@@ -68,8 +75,10 @@ def test_what_differs_is_told_in_words():
     assert other_makers([], here) == other_makers([here], here) == ""
     assert other_makers([{**here, "code": "b"}], here) == "other code"
     older = {"versions": {"torch": "2.12.0", "numpy": "2.4.6"}, "code": "a"}
-    assert other_makers([older], here) == "torch 2.12.0"
-    assert other_makers([{**older, "code": "b"}, here, {**here, "code": "c"}], here) == "other code, torch 2.12.0"
+    assert other_makers([older], here) == "torch 2.12.0 (now 2.13.0)"
+    several = [{**older, "code": "b"}, here, {**here, "code": "c"}]
+    assert other_makers(several, here) == "other code, torch 2.12.0 (now 2.13.0)"
+    assert other_makers([{**here, "versions": {"torch": "2.13.0"}}], here) == "numpy none (now 2.4.6)"
     assert other_makers([UNKNOWN, here], here) == "older code"
 
 
@@ -85,28 +94,30 @@ def test_a_finished_training_by_other_code_says_so_and_is_kept(tiny, tmp_path, t
     here = load_checkpoint(trained_copy)["made_by"][0]
     older = {"versions": {**here["versions"], "torch": "2.0.0"}, "code": OTHER_CODE}
     change_makers(trained_copy, [older])
-    advice = f"and kept, delete {trained_copy} to train it again, {trained_copy / WEIGHTS_FILE}\n"
-    assert said() == f"rae: trained with other code, torch 2.0.0 {advice}"
+    advice = f"kept at {trained_copy / WEIGHTS_FILE}; delete {trained_copy} to train again\n"
+    now = version("torch")
+    assert said() == f"rae: trained with other code, torch 2.0.0 (now {now}), {advice}"
     change_makers(trained_copy, None)
-    assert said() == f"rae: trained with older code {advice}"
+    assert said() == f"rae: trained with older code, {advice}"
     assert (trained_copy / WEIGHTS_FILE).read_bytes() == before
 
 
-@pytest.mark.parametrize("older", [{"versions": {"torch": "2.0.0"}, "code": OTHER_CODE}, None])
-def test_a_training_begun_by_other_code_goes_on_and_names_both(tiny, tmp_path, capsys, older):
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_training_begun_by_other_code_goes_on_and_names_both(tiny, tmp_path, capsys, recorded):
     task = short_task("wskp6", tiny, tmp_path, epochs=1, crops=(1, 1))
     begun = Training(task)
     task.folder.mkdir(parents=True)
     begun.save()
-    change_makers(task.folder, older and [older])
+    older = {**begun.maker, "code": OTHER_CODE} if recorded else UNKNOWN
+    words = "other code" if recorded else "older code"
+    change_makers(task.folder, [older] if recorded else None)
     weights = train_network(task)
-    words = "other code, torch 2.0.0" if older else "older code"
     out = capsys.readouterr().out.splitlines()
-    assert out[0].startswith(f"wskp6: begun with {words}, goes on with the present code")
+    assert out[0].startswith(f"wskp6: begun with {words}, goes on with what is here")
     assert out[1:] == [f"wskp6: trained, {weights}"]
-    assert makers_of(weights) == load_checkpoint(task.folder)["made_by"] == [older or UNKNOWN, begun.maker]
+    assert makers_of(weights) == load_checkpoint(task.folder)["made_by"] == [older, begun.maker]
     train_network(task)
-    assert f"trained with {words} and kept" in capsys.readouterr().out
+    assert f"trained with {words}, kept at" in capsys.readouterr().out
 
 
 def test_precisions_of_earlier_checkpoints_are_known(trained_copy):

@@ -1,0 +1,54 @@
+"""Which of a kernel and its PyTorch function runs."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from models import compiled
+
+
+def named(name: str):
+    def function(image: Tensor, other: Tensor, scale: float = 1.0) -> str:
+        return name
+
+    return function
+
+
+@pytest.fixture
+def function():
+    """Says which of its versions ran."""
+    return compiled.by(named("processor"), gpu=named("gpu"))(named("pytorch"))
+
+
+IMAGE = torch.zeros(2, 2)
+
+
+def test_kernels_run_on_processors_in_float32(function):
+    assert function(IMAGE, IMAGE) == function(IMAGE, other=IMAGE, scale=2.0) == "processor"
+    assert function(IMAGE, IMAGE.bfloat16()) == function(IMAGE, IMAGE > 0) == "processor"  # the first is the image
+    for dtype in (torch.bfloat16, torch.float16, torch.float64):
+        assert function(IMAGE.to(dtype), IMAGE) == "pytorch"
+    assert function(IMAGE.to("meta"), IMAGE) == function(IMAGE.to("meta"), IMAGE.to("meta")) == "pytorch"
+
+
+def test_kernels_know_no_gradients(function):
+    weights = torch.zeros(2, 2, requires_grad=True)
+    assert function(IMAGE, weights) == function(weights, IMAGE) == "pytorch"
+    with torch.no_grad():
+        assert function(IMAGE, weights) == "processor"
+
+
+def test_kernels_can_be_disabled(function):
+    with compiled.disabled():
+        with compiled.disabled():
+            assert function(IMAGE, IMAGE) == "pytorch"
+        assert function(IMAGE, IMAGE) == "pytorch"
+    assert function(IMAGE, IMAGE) == "processor"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_kernels_run_on_gpus_where_there_are_any(function):
+    image = IMAGE.cuda()
+    assert function(image, image) == "gpu"
+    assert compiled.by(named("processor"))(named("pytorch"))(image, image) == "pytorch"
+    assert function(image, IMAGE) == "pytorch"
