@@ -1,4 +1,4 @@
-"""`onespp bench loading`: training sequences from disk: how fast, next to training on them, and in how much memory."""
+"""`onespp bench loading`: reading training sequences, next to training on them, and the memory that reading takes."""
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +28,7 @@ from train.training import Training
 
 FASTEST_NETWORK = "rae"  # the one whose training consumes the most pixels a second
 WORKERS = (0, 1, 2)  # processes that load
-TIMED_EPOCHS = 5  # and training steps, besides a first one that warms up; the median counts
+TIMED_ROUNDS = 5  # of epochs and a training step, besides a first one that warms up; the median counts
 EPOCH_SEQUENCES = 300  # a measured epoch has, at least
 DATASET_BYTES = (0.1e9, 5e9)  # of the data sets whose memory is compared
 TRAINING = "training"
@@ -68,13 +68,14 @@ def bench_loading(
     runs: Path,
     budget: str,
     workers: Sequence[int] = WORKERS,
-    measured: int = TIMED_EPOCHS,
+    measured: int = TIMED_ROUNDS,
     sequences: int = EPOCH_SEQUENCES,
     sizes: Sequence[float] = DATASET_BYTES,
 ) -> str:
-    """Measure on the training clips of `data`; returns tables and writes RUNS/bench/loading.json.
+    """Measure on the training clips of `data`: tables, and RUNS/bench/loading.json.
 
-    Needs 5 GB of room in `runs` while it works. Raises BadInput for unusable data or an unknown budget.
+    While it works it needs as much room in `runs` as the largest of `sizes`, in bytes: 5 GB.
+    Raises BadInput for unusable data or an unknown budget.
     """
     recipe = recipe_for(FASTEST_NETWORK, budget)
     clips = Dataset(data).clips("train")
@@ -94,9 +95,9 @@ def bench_loading(
 def measure_rates(
     training: Training, clips: list[Clip], workers: Sequence[int], measured: int, sequences: int
 ) -> list[Rate]:
-    """Augmented sequences a second, as the training loop gets them with so many workers, and as it takes them.
+    """Augmented sequences a second: as a training gets them, with each number of workers, and as it trains on them.
 
-    The start of the workers counts, and loading does not count as training.
+    The start of the workers counts as loading, and loading does not count as training.
     """
     recipe = training.recipe
     assert recipe.crop
@@ -136,7 +137,7 @@ def training_steps(training: Training) -> Callable[[], object]:
 
 
 def memory_of(clips: list[Clip], recipe: Recipe, folder: Path, size: float) -> EpochMemory:
-    """Of a process of its own, before and after an epoch over copies of the clips that make up `size` bytes."""
+    """Memory of a process of its own before and after an epoch over `size` bytes of copies of the clips."""
     with TemporaryDirectory(dir=folder) as temporary:
         copies = list(copy_clips(clips, Path(temporary), size))
         total = sum(size_of(copy) for copy in copies)
@@ -154,7 +155,7 @@ def copy_clips(clips: list[Clip], folder: Path, size: float) -> Iterator[Path]:
 
 
 def anonymous_memory(paths: list[Path], recipe: Recipe) -> tuple[float | None, float | None]:
-    """Megabytes before and after an epoch. Pages of memory-mapped files are not among them: they can go at any time."""
+    """Megabytes before and after an epoch, without the pages of mapped files, which the system can take back."""
     sequences = sequences_of([Clip(path) for path in paths], recipe)
     steps = max(1, len(sequences) // recipe.batch)
     batches = iter(loader(sequences, micro_batches(0, steps, recipe.batch, recipe.batch)))

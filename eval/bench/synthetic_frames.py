@@ -9,10 +9,10 @@ from datasets.frame import Cameras, Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
 # Normal n and offset d of each plane, n · p = d.
-FLOOR = ((0, 1, 0), -1.5)
+GROUND = ((0, 1, 0), -1.5)
 BACK_WALL = ((0, 0, 1), -6.0)
 SIDE_WALL = ((1, 0, 0), -4.0)
-PLANES = (FLOOR, BACK_WALL, SIDE_WALL)
+PLANES = (GROUND, BACK_WALL, SIDE_WALL)
 WALL_HEIGHT = 1.7  # y at which the walls end; above them is sky
 SPHERES = 10
 TO_LIGHT = np.array([0.5, 0.8, 0.33])  # nearly of length 1

@@ -79,7 +79,7 @@ class StepShares:
 
 
 def bench_training(data: Path, runs: Path, budget: str, names: Sequence[str] = (), measured: int = TIMED_STEPS) -> str:
-    """Measure steps of the named networks; returns tables and writes RUNS/bench/training.json.
+    """Measure steps of the named networks, by default one a paper: tables, and RUNS/bench/training.json.
 
     Raises BadInput for unusable data or an unknown name or budget.
     """
@@ -141,7 +141,7 @@ def named(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def step_shares(training: Training) -> dict[str, float]:
-    """Shares of the time of a step on the CPU: convolutions forward and back, the rest of the network, the loss, ..."""
+    """The share of each part in the time of a step on the CPU: what it does forward and what on the way back."""
     loss = training.loss.module
     with ExitStack() as stack:
         for method in ("predict", "filter"):
@@ -158,7 +158,7 @@ def step_shares(training: Training) -> dict[str, float]:
 
 
 def attribute(events: list[Any]) -> dict[str, float]:
-    """Microseconds by part of the step. What runs on the way back belongs where its forward operation did."""
+    """Microseconds by part of the step. A backward operation belongs to the part of its forward operation."""
     forward: dict[int, str] = {}
     for event in events:
         if event.sequence_nr >= 0 and (part := region(event, {})) in (NETWORK, LOSS):
@@ -173,7 +173,7 @@ def attribute(events: list[Any]) -> dict[str, float]:
 
 
 def region(event: Any, forward: dict[int, str]) -> str:
-    """The part of the step that an event lies in, by what called it."""
+    """The part of the step that an event belongs to, by what called it."""
     while event is not None:
         if event.name in (NETWORK, LOSS):
             return str(event.name)
