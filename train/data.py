@@ -72,6 +72,9 @@ def in_parts(loader: DataLoader[Any], parts: int) -> Iterator[Iterator[Any]]:
 
 def ahead(batches: Iterator[Any]) -> Iterator[Any]:
     """The same batches, each loaded by a thread while the one before it is worked on."""
+    # The number of threads that the loading thread sets is also what PyTorch gives to threads that have not asked for
+    # theirs yet. Ask now, or a training that has done no large operation so far goes on with one.
+    torch.get_num_threads()
     with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as thread:
         loading = thread.submit(next, batches, None)
         while (batch := loading.result()) is not None:

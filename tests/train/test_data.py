@@ -1,9 +1,13 @@
 """Who reads which items, in what parts."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.data import equal_parts, micro_batches
+from timing import thread_count
+from train.data import ahead, equal_parts, micro_batches
 
 
 @given(count=st.integers(1, 200), largest=st.integers(1, 250))
@@ -27,3 +31,15 @@ def test_processes_share_what_one_would_read(world, largest, first):
     for step, expected in enumerate(whole):
         seen = [i for share in shares for part in share[step * parts : (step + 1) * parts] for i in part]
         assert sorted(seen) == expected
+
+
+def test_loading_ahead_leaves_the_number_of_threads():
+    """That of a thread which has not computed before, as the one that resumes a training of a small network."""
+
+    def threads_after_loading() -> int:
+        torch.set_num_threads(3)
+        assert list(ahead(iter([1, 2]))) == [1, 2]
+        return torch.get_num_threads()
+
+    with thread_count(torch.get_num_threads()), ThreadPoolExecutor(1) as thread:
+        assert thread.submit(threads_after_loading).result() == 3
