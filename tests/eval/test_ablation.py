@@ -60,10 +60,10 @@ def made_up(what: str, value, seeds: int = 2) -> list[VariantRun]:
 # --- The variants -----------------------------------------------------------------------------------------------------
 
 
-def test_an_unknown_ablation_or_profile_is_refused(tiny, tmp_path):
+def test_an_unknown_ablation_or_budget_is_refused(tiny, tmp_path):
     with pytest.raises(BadInput, match=r"'widths'.*rae-inputs, rae-loss, wskp-windows"):
         ablate("widths", tiny, tmp_path, "tiny")
-    with pytest.raises(BadInput, match="unknown profile 'huge'"):
+    with pytest.raises(BadInput, match="unknown budget 'huge'"):
         ablate("ntd", tiny, tmp_path, "huge")
     with pytest.raises(BadInput, match="0 seeds"):
         ablate("ntd", tiny, tmp_path, "tiny", seeds=0)
