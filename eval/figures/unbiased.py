@@ -1,6 +1,6 @@
 """What noise of the reference does to an MSE, and how well noise floors tell it: `onespp figure unbiased`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from datasets.frame import to_tensor
 from datasets.tonemap import clip_exposure, luminance
 from eval.comparison import Comparison
 from eval.figures.reference_halves import reference_halves
-from eval.metrics import METRICS, measure, noise_floors
+from eval.metrics import METRICS, mse_unbiased
 from plotting import DPI, plt, save_figure
 
 SCENE = "cornell_box"
@@ -41,6 +41,13 @@ def tensor(radiance: NDArray[np.float64]) -> Tensor:
     return to_tensor(radiance).double()
 
 
+def value_of(measure: Callable[[Comparison], float | None] | None, comparison: Comparison) -> float:
+    """What a metric says that is defined."""
+    value = measure and measure(comparison)
+    assert value is not None
+    return value
+
+
 def measure_references(
     counts: Mapping[int, int] = REFERENCES_BY_SPP, truth_spp: int = TRUTH_SPP
 ) -> tuple[float, list[NoisyReference]]:
@@ -58,16 +65,15 @@ def measure_references(
     references = []
     for spp, halves in zip(spps, rendered, strict=True):
         pair = torch.cat([tensor(half) for half in halves])
-        comparison = Comparison(image, pair, exposure)
-        floors = noise_floors(comparison)
-        truths = measure(Comparison(perfect, pair, exposure))
+        judged = Comparison(image, pair, exposure)
+        perfectly = Comparison(perfect, pair, exposure)
         references.append(
             NoisyReference(
                 spp=spp,
                 plain=(exposure * (image - pair.mean(dim=0))).square().mean().item(),
-                unbiased=float(measure(comparison)["mse_unbiased"] or 0),
-                floors={key: float(floors[key] or 0) for key in FLOORS},
-                truths={key: float(truths[key] or 0) for key in FLOORS},
+                unbiased=mse_unbiased(judged),
+                floors={name: value_of(METRICS[name].floor, perfectly) for name in FLOORS},
+                truths={name: value_of(METRICS[name].of, perfectly) for name in FLOORS},
             )
         )
     return (exposure * (image - perfect)).square().mean().item(), references

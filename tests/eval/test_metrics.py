@@ -108,7 +108,7 @@ def test_unbiased_mse_estimates_the_error_to_the_truth():
     for _ in range(200):
         halves = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
         output = torch.full((1, 3, 32, 32), truth + offset)
-        unbiased.append(measure(Comparison(output, halves, 1.0))["mse_unbiased"])
+        unbiased.append(METRICS["mse_unbiased"].of(Comparison(output, halves, 1.0)))
         plain.append(float((output - halves.mean(0)).square().mean()))
     error = np.std(unbiased) / np.sqrt(len(unbiased))
     assert abs(np.mean(unbiased) - offset**2) < 4 * error < 0.1 * offset**2

@@ -63,8 +63,9 @@ def test_error_of_the_unbiased_mse(correlated):
     for _ in range(400):
         noise = torch.from_numpy(rng.normal(0, 0.1, (2, 1 if correlated else 3, 24, 24))).expand(2, 3, -1, -1)
         halves = truth + noise
-        values.append(measure_frame(Comparison(truth, halves, 1.0))["mse_unbiased"])
-        errors.append(floors_of(halves)["mse_unbiased"])
+        comparison = Comparison(truth, halves, 1.0)
+        values.append(METRICS["mse_unbiased"].of(comparison))
+        errors.append(METRICS["mse_unbiased"].floor(comparison))
     ratio = np.mean(errors) / np.std(values)
     assert 0.9 < ratio < 1.1 if correlated else 1 < ratio < 2.5
     assert abs(np.mean(values)) < 4 * np.std(values) / math.sqrt(len(values))
