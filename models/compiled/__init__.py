@@ -1,9 +1,8 @@
 """Kernels compiled at first use: the fast way of what models/ also says in PyTorch.
 
 `by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba makes the
-kernels for the processor without a compiler and keeps them on disk from run to run; it notices when the file of a
-kernel changes, but not when another does that the kernel takes functions or numbers from. Whatever has no kernel
-(gradients, half precision, most of all on GPUs) takes the PyTorch way, which the tests hold the kernels to.
+kernels for the processor without a compiler and keeps them on disk from run to run. Whatever has no kernel (gradients,
+half precision, most of all on GPUs) takes the PyTorch way, which the tests hold the kernels to.
 """
 
 import contextlib

@@ -1,12 +1,23 @@
 """How Numba compiles the kernels here, and on how many threads they run."""
 
 import functools
+import os
+from pathlib import Path
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from provenance import code_digest
+
+FOLDER = Path(__file__).parent
+# Numba notices when the file of a kernel changes, but not when another does that the kernel takes functions or numbers
+# from. So kernels are kept apart by all the code that any of them follows from.
+KERNELS = code_digest(*(f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "__pycache__" / f"kernels-{KERNELS[:16]}"))
+
+import numba  # noqa: E402 - must come after the choice of its folder
 
 # For functions that kernels call, by what LLVM may do to their roundings: "contract", round a product and a sum once;
 # "nsz", lose the sign of zero; "arcp", multiply by a reciprocal instead of dividing; "reassoc", add up in any order,
