@@ -48,7 +48,7 @@ def denoiser_class(name: str) -> type[Denoiser]:
     A name that ends in "+taa" means that denoiser with temporal antialiasing after it.
     """
     if name.endswith(TAA):
-        return antialiased(denoiser_class(without_taa(name)))
+        return antialiased(denoiser_class(without_taa(name)))  # type: ignore[arg-type]  # classes are hashable
     if name not in DENOISERS:
         raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}")
     return DENOISERS[name]

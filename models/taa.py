@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar
 
 import torch
@@ -130,6 +131,7 @@ class Antialiased(Denoiser):
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
 
 
+@cache
 def antialiased(kind: type[Denoiser]) -> type[Antialiased]:
     """The class of denoisers of `kind` with temporal antialiasing after them."""
 

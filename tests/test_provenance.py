@@ -1,0 +1,77 @@
+"""What results are said to follow from."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import provenance
+from models.compiled.jit import FOLDER, KERNELS
+from provenance import DENOISING, RENDERING, ROOT, code_digest, file_digest, imported_by, sources, versions
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project of three modules, of which models/a.py imports models/b.py within a function."""
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "a.py").write_text("import numpy\n\ndef f():\n    from models import b\n    return b\n")
+    (folder / "b.py").write_text("from models.nowhere import x\nVALUE = 1\n")
+    (folder / "c.py").write_text("VALUE = 2\n")
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    code_digest.cache_clear()
+    yield folder
+    code_digest.cache_clear()
+
+
+def test_sources_are_all_that_is_imported_directly_or_not(project):
+    assert set(sources("models.a")) == {"models", "models.a", "models.b"}
+    assert set(sources("models.c", "numpy", "models.nowhere")) == {"models", "models.c"}
+
+
+@pytest.mark.parametrize(("changed", "same"), [("a", False), ("b", False), ("__init__", False), ("c", True)])
+def test_a_digest_changes_with_what_is_imported_and_with_nothing_else(project, changed, same):
+    before = code_digest("models.a")
+    with (project / f"{changed}.py").open("a") as file:
+        file.write("MORE = 3\n")
+    code_digest.cache_clear()
+    assert (code_digest("models.a") == before) == same
+
+
+@pytest.mark.parametrize("module", ["eval.clip_run", "models.svgf", "train.loop"])
+def test_whatever_python_loads_is_among_the_sources(module):
+    code = f"import sys, {module}; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert {name for name in loaded.split() if provenance.source_of(name)} <= set(sources(module))
+
+
+def test_results_of_one_denoiser_do_not_follow_from_another():
+    assert "models.rae" not in sources("eval.clip_run", "models.svgf")
+    assert "models.svgf" not in sources("eval.clip_run", "models.rae")
+    assert {"eval.metrics", "eval.results", "datasets.frame"} <= set(sources("eval.clip_run"))
+
+
+def test_kernels_on_disk_follow_from_all_that_they_take():
+    modules = [f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))]
+    assert code_digest(*modules) == KERNELS
+    assert {"models.parameters", "models.compiled.exponential", "datasets.channels"} <= set(sources(*modules))
+
+
+def test_imports_are_found_in_both_forms(tmp_path):
+    file = tmp_path / "x.py"
+    file.write_text("import os.path\nfrom a.b import c, d as e\n")
+    assert list(imported_by(file)) == ["os.path", "a.b", "a.b.c", "a.b.d"]
+
+
+def test_versions_are_those_of_installed_packages():
+    assert versions(["numpy", "no-such-package"]).keys() == {"numpy"}
+    assert set(versions(RENDERING)) == set(RENDERING)
+    assert {"onespp", "torch"} <= set(versions(DENOISING))
+
+
+def test_file_digest(tmp_path):
+    file: Path = tmp_path / "file"
+    file.write_bytes(b"abc")
+    assert file_digest(file) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

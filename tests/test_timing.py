@@ -1,0 +1,56 @@
+"""The one timer, with a clock of its own: no test asserts real time."""
+
+import pytest
+import torch
+
+from timing import take_turns, thread_count
+
+
+class Clock:
+    """Seconds that pass only where `work` says so."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.calls: list[str] = []
+
+    def work(self, name: str, seconds: float):
+        def run() -> None:
+            self.calls.append(name)
+            self.now += seconds
+
+        return run
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_all_take_turns_and_the_first_rounds_do_not_count():
+    clock = Clock()
+    rounds = []
+    work = {"a": clock.work("a", 1.0), "b": clock.work("b", 2.0)}
+    seconds = take_turns(work, measured=3, warm_up=2, before_round=rounds.append, clock=clock)
+    assert clock.calls == ["a", "b"] * 5 and rounds == [0, 1, 2, 3, 4]
+    assert seconds == {"a": [1.0] * 3, "b": [2.0] * 3}
+
+
+def test_what_happens_before_a_round_does_not_count():
+    clock = Clock()
+    seconds = take_turns(
+        {"a": clock.work("a", 1.0)}, measured=2, before_round=lambda _: clock.work("-", 9.0)(), clock=clock
+    )
+    assert seconds == {"a": [1.0, 1.0]}
+
+
+@pytest.mark.parametrize(("patience", "rounds"), [(0.0, 2), (1e9, 10)])
+def test_patience_ends_it_after_the_fewest_rounds(patience, rounds):
+    clock = Clock()
+    seconds = take_turns({"a": clock.work("a", 1.0)}, measured=10, fewest=2, patience=patience, clock=clock)
+    assert len(seconds["a"]) == rounds
+
+
+def test_threads_are_given_back_even_after_an_error():
+    before = torch.get_num_threads()
+    with pytest.raises(KeyError), thread_count(1):
+        assert torch.get_num_threads() == 1
+        raise KeyError
+    assert torch.get_num_threads() == before
