@@ -14,6 +14,7 @@ from errors import BadInput
 from scenes.camera import View
 
 Signal = Literal["total", "indirect"]
+LARGEST = 1e35  # whose sum with another, divided by the smallest albedo, is still finite in float32
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
@@ -140,10 +141,14 @@ class Frame:
     def finite(self) -> "Frame":
         """The frame with 0 instead of NaN and infinities in all channels: one bad pixel must not poison a filter.
 
-        The sum of a channel tells whether it has any, at a fraction of the cost of looking at every pixel.
+        What is so large that demodulation would make it infinite is cut. The sum of a channel tells whether it has any
+        such number, at a fraction of the cost of looking at every pixel.
         """
-        bad = [name for name, tensor in self.channels.items() if not torch.isfinite(tensor.sum())]
-        mended = {name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0) for name in bad}
+        bad = [name for name, tensor in self.channels.items() if not tensor.sum().abs() < LARGEST]
+        mended = {
+            name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0).clamp(-LARGEST, LARGEST)
+            for name in bad
+        }
         return replace(self, channels=self.channels | mended) if bad else self
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":

@@ -79,6 +79,16 @@ def test_batch_items_do_not_mix(tiny, denoisers, name):
 EXTREMES = st.sampled_from([0.0, 1e-7, 1e-3, 1.0, 6e4, 65504.0])
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_radiance_that_demodulation_would_make_infinite(denoisers, name):
+    frames = [flat_frame(9, 11, irradiance=torch.full((1, 3, 9, 11), 0.5)) for _ in range(3)]
+    for frame in frames:
+        frame.channels["albedo"] = torch.zeros(1, 3, 9, 11)
+    frames[1].direct[0, :, 4, 5] = 3e38
+    for output in run(denoisers[name], frames):
+        assert torch.isfinite(output).all() and (output >= 0).all()
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     level=EXTREMES,
