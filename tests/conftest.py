@@ -1,7 +1,5 @@
 """What the tests share: a tiny data set rendered once, and a loaded moving scene."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import hypothesis
@@ -12,22 +10,14 @@ import trimesh
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
 from datasets.generate import generate
 from models.registry import channels_read
-from provenance import ROOT
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.registry import build_scene
-from tests.helpers import kernels
 
 # Of tests that do not say themselves how many examples to try; `make test-all` takes the thorough ones.
 hypothesis.settings.register_profile("quick", max_examples=10)
 hypothesis.settings.register_profile("thorough", max_examples=100)
 hypothesis.settings.load_profile("quick")
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Kernels that are not there yet take a minute: a process of its own compiles them while the first tests render."""
-    if not session.config.option.collectonly and not kernels.are_on_disk():
-        subprocess.Popen([sys.executable, "-m", kernels.__name__], cwd=ROOT, stdout=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="session")
