@@ -36,6 +36,7 @@ def kill_a_renderer(root: Path) -> Path:
             return clip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").exists(), reason="finds the worker through /proc")
 def test_a_killed_worker_costs_nothing_but_time(tiny, tiny_copy):
     for clip in ("val/cornell_box/000", "test/cornell_box_moving/000"):

@@ -207,11 +207,12 @@ def torchrun(processes: int, *arguments: str) -> "subprocess.CompletedProcess[st
     return subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, recipe",
     [
         ("wskp6", {"epochs": 1, "crops": (10, 1)}),
-        pytest.param("rae", {"epochs": 15}, marks=pytest.mark.slow),
+        ("rae", {"epochs": 15}),
     ],
 )
 def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name, recipe):
