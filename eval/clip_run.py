@@ -20,6 +20,7 @@ from eval.means import mean_floor, means
 from eval.metrics import Values, measure, noise_floors, temporal_error_floor
 from eval.results import REFERENCE, Result, result_key, save_picture
 from models.denoiser import Denoiser, State
+from models.operators import finite
 from provenance import file_digest
 
 METRICS_CHANNELS = ("motion", "dual_motion")
@@ -119,8 +120,9 @@ class ReferenceRun:
     def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
         """Measure one frame's reference. Returns the radiance (1, 3, H, W)."""
         reference = halves.mean(dim=0, keepdim=True)
-        comparison = Comparison(reference, halves, exposure, hidden(frame), self.before, still)
-        crop = densest_crop(hidden(frame)[0, 0])
+        disoccluded_pixels = hidden(frame)
+        comparison = Comparison(reference, halves, exposure, disoccluded_pixels, self.before, still)
+        crop = densest_crop(disoccluded_pixels[0, 0])
         if crop:
             self.crops.append({"frame": len(self.frames)} | crop._asdict())
         self.frames.append(noise_floors(comparison))
@@ -165,5 +167,5 @@ def play(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool =
         halves = {signal: to_tensor(clip.reference(index, signal), has_halves=True)[0] for signal in signals}
         for run, folder in zip(runs, folders, strict=True):
             output = run.step(frame, halves[run.signal], clip.exposure, still)
-            image = display(output.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0), clip.exposure)
+            image = display(finite(output), clip.exposure)
             save_picture(folder, index, image[0].permute(1, 2, 0).numpy())

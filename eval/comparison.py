@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from datasets.tonemap import display
-from models.operators import image_luminance
+from models.operators import finite, image_luminance
 
 
 class Luminances(NamedTuple):
@@ -41,7 +40,7 @@ class Comparison:
 
     @cached_property
     def output(self) -> Tensor:
-        return torch.nan_to_num(self.denoised, nan=0.0, posinf=0.0, neginf=0.0).double()
+        return finite(self.denoised).double()
 
     @cached_property
     def halves(self) -> Tensor:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from datasets.frame import Signal
 from eval.ablation.variant_run import VariantRun, over_seeds
+from eval.bench.denoisers import results_file
 from eval.bench.sizes import size_name
 from eval.means import scores_of
 from eval.metrics import within_floor
@@ -54,7 +55,7 @@ def from_evaluation(runs: Path, budget: str, signal: Signal) -> Measurements:
 
 def from_bench(runs: Path) -> Measurements:
     """Medians of RUNS/bench/results.json at the paper's size, each denoiser's in its fastest precision."""
-    path = runs / "bench" / "results.json"
+    path = results_file(runs)
     rows = read_json(path, ("rows",))["rows"] if path.exists() else []
 
     def value(denoiser: str, metric: str) -> float | None:
