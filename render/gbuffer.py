@@ -51,7 +51,7 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
         "normal": dr.select(hit, normal, 0),
         "albedo": albedo,
         "roughness": roughness,
-        "emission": si.emitter(stage.mitsuba_scene).eval(si),
+        "emission": stage.lights.at(si).eval(si),
         "mesh_id": stage.mesh_id(si),
     }
     dr.eval(channels, si.t)

@@ -163,6 +163,8 @@ class MaterialTable:
         self.scale = mi.Color3f(np.stack([material.scale for material in self.materials], axis=1))
         self.f0 = mi.Float(np.array([material.f0 for material in self.materials], np.float32))
         self.squared = mi.Bool([material.squared for material in self.materials])
+        # As data: what is not evaluated yet would be compiled into kernels, with the number of rows.
+        dr.make_opaque(self.base, self.roughness, self.metallic, self.scale, self.f0, self.squared, self.row)
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         """(albedo in [0, 1], GGX alpha in [0, 1]) at `si`; 1 and 1 where not `hit`."""

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
+from render.lights import Lights
+from render.palette import palette
 from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
@@ -25,7 +27,12 @@ def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
 
 
 def bounce(
-    scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, throughput: mi.Color3f, sampler: AnySampler
+    scene: mi.Scene,
+    lights: Lights,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    throughput: mi.Color3f,
+    sampler: AnySampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool]:
     """(radiance, si, throughput, active): light that reaches `si` straight from emitters, and the path's next vertex.
 
@@ -36,7 +43,7 @@ def bounce(
     u_direction = sampler.next_2d()
 
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, emitter_weight = scene.sample_emitter_direction(si, u_emitter, False, smooth)
+    light, emitter_weight = lights.sample_direction(si, u_emitter, smooth)
     value, bsdf_pdf, sample, bsdf_weight = bsdf.eval_pdf_sample(
         mi.BSDFContext(), si, si.to_local(light.d), u_lobe, u_direction
     )
@@ -48,10 +55,10 @@ def bounce(
     throughput = throughput * bsdf_weight
     active = dr.any(throughput != 0)
     following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
-    emitter = following.emitter(scene, active)
+    emitter = lights.at(following)
     towards = mi.DirectionSample3f(scene, following, si)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    emitter_pdf = scene.pdf_emitter_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
+    emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
     mis = mis_weight(sample.pdf, emitter_pdf)
     radiance += dr.select(active, throughput * emitter.eval(following, active) * mis, 0)
     return radiance, following, throughput, active & following.is_valid()
@@ -69,6 +76,7 @@ def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Flo
 @dr.syntax
 def sample_mean(
     scene: mi.Scene,
+    lights: Lights,
     ray: mi.Ray3f,
     seed: mi.UInt32,
     first: mi.UInt32,
@@ -96,7 +104,7 @@ def sample_mean(
     while primary.is_valid() & (index < spp):
         sampler = draw(key, first + index, depth)
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
-        radiance, si, throughput, active = bounce(scene, si, bsdf, throughput, sampler)
+        radiance, si, throughput, active = bounce(scene, lights, si, bsdf, throughput, sampler)
         direct += dr.select(depth == 1, radiance, 0)
         indirect += dr.select(depth == 1, 0, radiance)
         throughput, active = survive(throughput, depth, active, sampler.next_1d())
@@ -108,6 +116,11 @@ def sample_mean(
         index += dr.select(ended, 1, 0)
     count = mi.Color3f(spp)
     return direct / count, indirect / count
+
+
+def all_objects(*_: object, **__: object) -> list[object]:
+    """What Dr.Jit must know of beside the arguments of a frozen function: objects that kernels might call."""
+    return palette()
 
 
 class PathTracer:
@@ -137,10 +150,13 @@ class PathTracer:
         if self.frozen_pose != stage.poses:
             # Tracing the program in Python takes longer than running it at 1 spp: frozen, it is replayed. But a frozen
             # function does not notice all changes of meshes (seen with Dr.Jit 1.5), so it lasts as long as a pose.
-            self.sample_mean = dr.freeze(sample_mean) if self.freezes else sample_mean
+            self.sample_mean = (
+                dr.freeze(sample_mean, state_fn=lambda *_, **__: palette()) if self.freezes else sample_mean
+            )
             self.frozen_pose = stage.poses
         direct, indirect = self.sample_mean(
             stage.mitsuba_scene,
+            stage.lights,
             ray,
             seed=dr.opaque(mi.UInt32, seed),
             first=dr.opaque(mi.UInt32, first),

@@ -1,13 +1,18 @@
 """An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.visual import TextureVisuals
 
 from render.backend import dr, mi
+from render.lights import Lights
 from render.materials import MaterialTable, registry_index, registry_table
+from render.palette import palette
 from scenes.animation import Scene, Shape
+from scenes.bsdf import Bsdf
 from scenes.camera import Array, View, directions, pixel_centres
 
 
@@ -20,10 +25,42 @@ def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
         if key == "to_uv":
             return mi.ScalarTransform3f(value)
         if isinstance(value, np.ndarray):
-            return mi.TensorXf(np.ascontiguousarray(value, np.float32))
+            return mi.TensorXf(upload(np.float32(value).ravel()), value.shape)
         return value
 
     return {key: convert(key, value) for key, value in description.items()}
+
+
+def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
+    """The bitmaps in a material's dictionary, at any depth."""
+    nested = [value for value in bsdf.values() if isinstance(value, dict)]
+    own = [bsdf] if bsdf["type"] == "bitmap" else []
+    return own + [bitmap for value in nested for bitmap in bitmaps_of(value)]
+
+
+def without_placement(bsdf: Bsdf) -> Bsdf:
+    """The material with all its bitmaps where the texture coordinates put them."""
+    return {
+        key: without_placement(value) if isinstance(value, dict) else value
+        for key, value in bsdf.items()
+        if key != "to_uv"
+    }
+
+
+def with_placed_textures(shape: Shape) -> Shape:
+    """The same shape with its bitmaps' common placement in its texture coordinates.
+
+    Mitsuba compiles a bitmap's placement into kernels, while texture coordinates are data: so all textures share a
+    program. Bitmaps of one material that are placed differently stay as they are.
+    """
+    placements = [bitmap.get("to_uv", np.eye(3)) for bitmap in bitmaps_of(shape.bsdf)]
+    uv = getattr(shape.mesh.visual, "uv", None)
+    if uv is None or not placements or any((other != placements[0]).any() for other in placements):
+        return shape
+    mesh = shape.mesh.copy(include_cache=True)  # without it the authored normals are lost
+    assert isinstance(mesh.visual, TextureVisuals)
+    mesh.visual.uv = uv @ placements[0][:2, :2].T + placements[0][:2, 2]
+    return replace(shape, mesh=mesh, bsdf=without_placement(shape.bsdf))
 
 
 def load_mesh(shape: Shape) -> mi.Mesh:
@@ -44,16 +81,16 @@ def load_mesh(shape: Shape) -> mi.Mesh:
     )
     parameters = mi.traverse(mesh)
     parameters["faces"] = np.uint32(shape.mesh.faces).ravel()
-    parameters["vertex_positions"] = np.float32(shape.mesh.vertices).ravel()
+    parameters["vertex_positions"] = upload(shape.mesh.vertices.ravel())
     if shape.smooth:
-        parameters["vertex_normals"] = np.float32(shape.mesh.vertex_normals).ravel()
+        parameters["vertex_normals"] = upload(shape.mesh.vertex_normals.ravel())
     if uv is not None:
-        parameters["vertex_texcoords"] = np.float32(uv).ravel()
+        parameters["vertex_texcoords"] = upload(uv.ravel())
     parameters.update()
     return mesh
 
 
-def upload(values: Array) -> mi.Float:
+def upload(values: NDArray[np.floating]) -> mi.Float:
     """`values` (N,) as data for kernels: Python numbers would be compiled into them.
 
     On the CPU Dr.Jit borrows numpy's memory and compiles its alignment in as well, so it is always aligned here.
@@ -85,16 +122,18 @@ class Stage:
     """
 
     def __init__(self, scene: Scene, height: int, width: int):
-        self.scene = scene
+        self.scene = scene = replace(scene, shapes=tuple(map(with_placed_textures, scene.shapes)))
         self.height = height
         self.width = width
         self.unit = unit_of(scene)
+        palette()
         content: dict[str, object] = {"type": "scene"}
         content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
         if scene.sky is not None:
             content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
         self.mitsuba_scene = mi.load_dict(content, optimize=False)
+        self.lights = Lights(self.mitsuba_scene)
         self.parameters = mi.traverse(self.mitsuba_scene)
         loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
         self.shapes = [loaded[shape.name] for shape in scene.shapes]
@@ -127,7 +166,7 @@ class Stage:
             if name not in self.posed or not np.array_equal(value, self.posed[name])
         }
         for name, value in changes.items():
-            self.parameters[name] = mi.Color3f(*map(mi.Float, value[:, None])) if value.shape == (3,) else value
+            self.parameters[name] = mi.Color3f(*map(mi.Float, value[:, None])) if value.shape == (3,) else upload(value)
         if changes:
             self.parameters.update()  # once a pose: every update rebuilds the top level of the ray-tracing structure
             self.posed.update(changes)

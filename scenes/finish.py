@@ -10,6 +10,7 @@ from scenes.draws import Rng, log_uniform
 from scenes.textures import gray_texture, texture
 
 METALS = ("Al", "Ag", "Au", "Cu", "Cr")  # Mitsuba's names
+GLASS = 1.5  # index of refraction; Mitsuba compiles it into kernels, so that rooms share one
 SHEETS = ("leaf", "shade", "fabric", "print")  # thin, seen from both sides
 NEVER_GLOSSY = (*SHEETS, "stem", "paper", "cushion", "blanket", "soil", "wax")
 ALWAYS_GLOSSY = ("metal", "glass")
@@ -35,11 +36,12 @@ def paler(rng: Rng, base: Bsdf, white: float) -> Bsdf:
     return {**base, key: values if key == "data" else values.tolist()}
 
 
-def alpha(rng: Rng, low: float, high: float) -> Bsdf | float:
-    """GGX roughness from `low` to `high`, in one of three cases from a texture."""
+def alpha(rng: Rng, base: Bsdf, low: float, high: float) -> Bsdf | float:
+    """GGX roughness from `low` to `high`, in one of three cases from a texture that repeats as that of `base` does."""
     value = log_uniform(rng, low, high)
     if rng.random() < 1 / 3:
-        return bitmap(gray_texture(rng, max(low, value / 2), min(high, value * 2)), log_uniform(rng, 0.5, 3.0))
+        placed = {"to_uv": base["to_uv"]} if base["type"] == "bitmap" else {}
+        return bitmap(gray_texture(rng, max(low, value / 2), min(high, value * 2))) | placed
     return value
 
 
@@ -53,12 +55,12 @@ def plastic_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
 
 def principled_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
     metallic = float(rng.choice([0.0, rng.uniform(), 1.0]))
-    roughness = alpha(rng, 0.2, 0.8)  # GGX alpha is its square
+    roughness = alpha(rng, base, 0.2, 0.8)  # GGX alpha is its square
     return {"type": "principled", "base_color": base, "metallic": metallic, "roughness": roughness, "specular": 0.5}
 
 
 def rough_metal_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
-    return {"type": "roughconductor", "material": str(rng.choice(METALS)), "alpha": alpha(rng, 0.02, 0.5)}
+    return {"type": "roughconductor", "material": str(rng.choice(METALS)), "alpha": alpha(rng, base, 0.02, 0.5)}
 
 
 def mirror_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
@@ -67,8 +69,8 @@ def mirror_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
 
 def glass_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
     if rng.random() < 0.2:
-        return {"type": "roughdielectric", "alpha": log_uniform(rng, 0.02, 0.2), "int_ior": rng.uniform(1.3, 1.7)}
-    return {"type": "dielectric", "int_ior": rng.uniform(1.3, 1.7)}
+        return {"type": "roughdielectric", "alpha": log_uniform(rng, 0.02, 0.2), "int_ior": GLASS}
+    return {"type": "dielectric", "int_ior": GLASS}
 
 
 Finish = Callable[[Rng, Bsdf], Bsdf]

@@ -1,0 +1,53 @@
+"""Scenes with other things in them run the same kernels."""
+
+import gc
+
+import numpy as np
+import pytest
+
+from render.backend import VARIANT, dr
+from render.shot import Shot
+from render.stage import Stage
+from scenes.registry import build_scene
+
+LARGE = 3000  # operations; G-buffer and path tracing have several times as many, what prepares data has far fewer
+
+
+def large_kernels(scene: str) -> set[str]:
+    """The kernels of a frame's G-buffer and light, by their hashes."""
+    gc.collect()  # objects of other scenes count
+    stage = Stage(build_scene(scene, 0, 4), 8, 8)
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        Shot(stage, 0).reflected(1, 1)
+        history = dr.kernel_history()
+    return {
+        kernel["hash"]
+        for kernel in history
+        if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > LARGE
+    }
+
+
+@pytest.mark.skipif(VARIANT != "llvm_ad_rgb", reason="counts the kernels of the CPU variant")
+def test_scenes_share_their_kernels():
+    # Between them these have one to four lamps, and all kinds of materials with numbers and bitmaps.
+    kernels = {scene: large_kernels(scene) for scene in ("cornell_box", "room-0", "room-1", "room-3", "room-7")}
+    assert all(kernels.values())
+    assert len(set.union(*kernels.values())) == len(kernels["room-0"])
+
+
+def test_placement_of_textures_moves_into_texture_coordinates():
+    scene = build_scene("room-1", 0, 4)
+    placed = Stage(scene, 8, 8).scene
+    textured = [
+        (before, after)
+        for before, after in zip(scene.shapes, placed.shapes, strict=True)
+        if before.bsdf.get("reflectance", {}).get("type") == "bitmap"
+    ]
+    assert textured
+    for before, after in textured:
+        placement = before.bsdf["reflectance"]["to_uv"]
+        expected = before.mesh.visual.uv @ placement[:2, :2].T + placement[:2, 2]
+        np.testing.assert_allclose(after.mesh.visual.uv, expected)
+        assert "to_uv" not in after.bsdf["reflectance"]
+        assert (after.mesh.vertex_normals == before.mesh.vertex_normals).all()
