@@ -1,4 +1,4 @@
-"""How many samples a reference needs: a pilot renders a few frames and measures their noise."""
+"""How many samples a reference needs: a pilot renders a few small frames and measures their noise."""
 
 import numpy as np
 
@@ -9,12 +9,14 @@ from render.shot import Shot
 from render.stage import Stage
 from scenes.animation import Scene
 
+PILOT_STRIDE = 8  # every so many frames, one of half the height and width: a 32nd of a clip's pixels
+
 
 def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: Options) -> float:
-    """Mean squared error, as displayed, of references of `spp` samples for the first, middle and last frame."""
+    """Mean squared error, as displayed, of references of `spp` samples for every PILOT_STRIDE-th frame."""
     halves = []
     emissions = []
-    for frame in sorted({0, frames // 2, frames - 1}):
+    for frame in range(min(PILOT_STRIDE, frames) // 2, frames, PILOT_STRIDE):
         shot = Shot(stage, frame, options.regularise)
         halves.append([shot.reflected(seed % 2**32 ^ half, spp // 2) for half in (0, 1)])
         emissions.append(shot.emission)
@@ -23,7 +25,7 @@ def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: 
     return float(np.mean([noise_of_halves(a, b) for a, b in shown]))
 
 
-def reference_spp(
+def samples_needed(
     scene: Scene,
     frames: int,
     height: int,
@@ -34,7 +36,7 @@ def reference_spp(
 ) -> int:
     """Samples a pixel of both halves together that bring a clip's references down to the noise floor of `quality`.
 
-    They are a power of two times quality.reference_spp, and at most quality.most_spp.
+    They are a power of two times quality.reference_spp. More than quality.most_spp is a guess: so many are not tried.
 
     The noise of independent samples falls as 1 / spp, so one measurement predicts how many samples suffice. But few
     samples miss paths that are rare and bright, so the noise is measured again with the predicted number until it is
@@ -43,11 +45,11 @@ def reference_spp(
     spp = quality.reference_spp
     if quality.floor is None:
         return spp
-    stage = Stage(scene, height, width)
+    stage = Stage(scene, -(-height // 2), -(-width // 2))
     wanted_noise = 10 ** (-quality.floor / 10)
-    while spp < quality.most_spp:
+    while spp <= quality.most_spp:
         excess = noise_of_reference(stage, frames, spp, seed, options) / wanted_noise
         if excess <= 1:
             break
         spp <<= int(np.ceil(np.log2(excess)))
-    return min(spp, quality.most_spp)
+    return spp

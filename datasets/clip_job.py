@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from tqdm import tqdm
 
-from datasets.adaptive_spp import reference_spp
+from datasets.adaptive_spp import samples_needed
 from datasets.clip import is_clip
 from datasets.clip_kind import ClipKind
 from datasets.profiles import DataProfile, clip_seed, profile_of
@@ -24,6 +24,7 @@ class RenderJob(NamedTuple):
     seed: int  # of the data set
     channels: tuple[str, ...]
     options: Options
+    needed_spp: int | None = None  # by its references, where that is known
 
 
 class ClipOutcome(NamedTuple):
@@ -46,16 +47,23 @@ def run_clip_job(job: RenderJob) -> ClipOutcome:
         if is_clip(job.path):
             return ClipOutcome(job.path, "left", "another process has rendered it")
         try:
-            render_to_folder(job.path, profile_of(job.profile), job.seed, job.channels, job.options)
+            render_to_folder(job.path, profile_of(job.profile), job.seed, job.channels, job.options, job.needed_spp)
         except (RuntimeError, ValueError) as error:
             return ClipOutcome(job.path, "failed", str(error))
     return ClipOutcome(job.path, "rendered")
 
 
 def render_to_folder(
-    folder: Path, profile: DataProfile, dataset_seed: int, channels: Sequence[str], options: Options = NO_OPTIONS
+    folder: Path,
+    profile: DataProfile,
+    dataset_seed: int,
+    channels: Sequence[str],
+    options: Options = NO_OPTIONS,
+    needed_spp: int | None = None,
 ) -> None:
     """Render the named channels of the clip whose folder is DATA/SPLIT/SCENE/CLIP, whole or not at all.
+
+    Where `needed_spp` is not known yet, a pilot finds out how many samples a pixel the references need.
 
     The clip is a function of the arguments alone. Raises BadInput for an unknown scene or clip name.
     """
@@ -67,8 +75,10 @@ def render_to_folder(
     if kind.still:
         scene = scene.still()
     clock = StepTimer()
-    spp = reference_spp(scene, profile.frames, profile.height, profile.width, quality, seed, options)
-    clock.lap("pilot")
+    if needed_spp is None:
+        needed_spp = samples_needed(scene, profile.frames, profile.height, profile.width, quality, seed, options)
+        clock.lap("pilot")
+    spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     sampling = Sampling(quality.realisations, kind.noisy_spp, spp, options)
     frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed, channels)
     # While only the camera moves, motion follows from depth.

@@ -11,7 +11,8 @@ from tqdm import tqdm
 from datasets.channels import CHANNELS
 from datasets.clip import Dataset, is_clip
 from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
-from datasets.profiles import plan
+from datasets.pilots import choose_rooms
+from datasets.profiles import check_seed, plan, profile_of
 from errors import BadInput
 from files import read_json, write_json
 from provenance import RENDERING, versions
@@ -66,16 +67,21 @@ def generate(
 
     Raises BadInput at the end, naming the first clip that failed, and OSError at once: a full disk is full for all.
     """
-    wanted = plan(profile, seed, reads, options)
+    check_seed(seed)
     check_folder(root)
+    facts = root / "dataset.json"
+    known = read_json(facts).get("needed_spp", {}) if facts.exists() else {}
+    needed_spp = choose_rooms(profile_of(profile), seed, options, known)
+    wanted = plan(profile, seed, reads, options, needed_spp)
     root.mkdir(parents=True, exist_ok=True)
     write_or_check_plan(root, wanted)
     dataset = Dataset(root)
-    jobs = [
-        RenderJob(path, profile, seed, tuple(wanted["channels"][path.parts[-3]]), options)
-        for path in share.of(dataset.planned())
-        if not is_clip(path)
-    ]
+
+    def job(clip: Path) -> RenderJob:
+        channels = tuple(wanted["channels"][clip.parts[-3]])
+        return RenderJob(clip, profile, seed, channels, options, needed_spp.get("/".join(clip.parts[-3:])))
+
+    jobs = [job(clip) for clip in share.of(dataset.planned()) if not is_clip(clip)]
     if not jobs:
         return 0
     check_versions(dataset)

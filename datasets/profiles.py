@@ -1,8 +1,9 @@
 """Data profiles: which clips a data set has, and how well each is sampled."""
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from errors import BadInput
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 
-GENERATOR = 5  # raise it when the same seed renders different bytes
+GENERATOR = 6  # raise it when the same seed renders different bytes
 
 # Without these a clip has no picture, no reference or no geometry that other channels could be derived from.
 ESSENTIAL_CHANNELS = {"direct", "indirect", *REFERENCES, "emission", "albedo", "depth", "mesh_id", *CAMERA_CHANNELS}
@@ -26,6 +27,7 @@ class SamplingQuality(NamedTuple):
     reference_spp: int  # samples a pixel of references, at least
     floor: float | None = None  # PSNR in dB: references get more samples until their noise is down to this,
     most_spp: int = 4096  # but no more than these
+    passes_over: bool = False  # rooms that would need more; the next ones take their places
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class DataProfile:
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
 
 
+NeededSpp = Mapping[str, int]  # SPLIT/SCENE/CLIP: samples a pixel that its references need, where a pilot found out
+NO_PILOTS: NeededSpp = {}
 BOXES = ("cornell_box", "cornell_box_moving")
 FIRST_ROOM = {"train": 0, "val": 1000, "test": 2000}  # the number of a split's first room, for seed 0
 ROOMS_OF_A_SEED = 10_000
@@ -113,12 +117,21 @@ def profile_of(name: str) -> DataProfile:
     return DATA_PROFILES[name]
 
 
-def clips_of(profile: DataProfile, split: str, seed: int) -> list[str]:
-    """All clips of a split, each as SCENE/CLIP, of the data set with that seed."""
-    boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes[split])]
+def rooms_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp) -> list[str]:
+    """The rooms of a split, each as SCENE/CLIP: the first ones but those that are passed over."""
+    quality = profile.quality[split]
     first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split]
-    rooms = [f"room-{first + index}/000" for index in range(profile.rooms[split])]
-    return boxes + rooms + profile.special.get(split, [])
+    names = (f"room-{number}/000" for number in count(first))
+    suitable = (
+        name for name in names if not quality.passes_over or needed_spp.get(f"{split}/{name}", 0) <= quality.most_spp
+    )
+    return list(islice(suitable, profile.rooms[split]))
+
+
+def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp = NO_PILOTS) -> list[str]:
+    """All clips of a split, each as SCENE/CLIP, of the data set with that seed, by what pilots have found."""
+    boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes[split])]
+    return boxes + rooms_of(profile, split, seed, needed_spp) + profile.special.get(split, [])
 
 
 def rendered_channels(reads: Iterable[str]) -> list[str]:
@@ -127,17 +140,26 @@ def rendered_channels(reads: Iterable[str]) -> list[str]:
     return [name for name in CHANNELS if name in wanted]
 
 
+def check_seed(seed: int) -> None:
+    """Raise BadInput for a negative seed of a data set."""
+    if seed < 0:
+        raise BadInput(f"the seed {seed} is negative: use 0 or more")
+
+
 def plan(
-    profile: str, seed: int, reads: Sequence[str] = tuple(CHANNELS), options: Options = NO_OPTIONS
+    profile: str,
+    seed: int,
+    reads: Sequence[str] = tuple(CHANNELS),
+    options: Options = NO_OPTIONS,
+    needed_spp: NeededSpp = NO_PILOTS,
 ) -> dict[str, Any]:
     """The content of dataset.json.
 
     Clips for training and validation get the channels that can be derived from nothing else and those in `reads`;
     test clips get all, because metrics read them. Raises BadInput for an unknown profile or a negative seed.
     """
-    if seed < 0:
-        raise BadInput(f"the seed {seed} is negative: use 0 or more")
-    splits = {split: clips_of(profile_of(profile), split, seed) for split in SPLITS}
+    check_seed(seed)
+    splits = {split: clips_of(profile_of(profile), split, seed, needed_spp) for split in SPLITS}
     train = rendered_channels(reads)
     return {
         "schema": SCHEMA,
@@ -149,6 +171,7 @@ def plan(
         "options": options._asdict(),
         "channels": {"train": train, "val": train, "test": list(CHANNELS)},
         "splits": splits,
+        "needed_spp": dict(needed_spp),
     }
 
 

@@ -12,6 +12,7 @@ MAX_REFLECTANCE = 0.9
 
 # From candle light to daylight in the shade.
 LIGHT_COLOURS = np.array([[1.0, 0.55, 0.25], [1.0, 0.75, 0.5], [1.0, 0.95, 0.85], [0.8, 0.9, 1.0]])
+COLOURED_LAMPS = 0.03  # share of lamps of any hue
 
 
 def hsv(hue: float, saturation: float, value: float) -> Array:
@@ -62,9 +63,10 @@ def palette(rng: Rng, count: int) -> Array:
 
 
 def light_colour(rng: Rng) -> Array:
-    """A lamp's colour (3,) whose largest component is 1 or little less: as of common lamps, sometimes of any hue."""
-    if rng.random() < 0.15:
+    """A lamp's colour (3,) whose largest component is 1: nearly white, sometimes of candles, rarely of any hue."""
+    if rng.random() < COLOURED_LAMPS:
         hue = rng.dirichlet(np.ones(3))
         return np.asarray(hue / hue.max())
-    position = rng.uniform(0, len(LIGHT_COLOURS) - 1)
-    return np.stack([np.interp(position, range(len(LIGHT_COLOURS)), channel) for channel in LIGHT_COLOURS.T])
+    position = (len(LIGHT_COLOURS) - 1) * rng.beta(3, 2)
+    colour = np.stack([np.interp(position, range(len(LIGHT_COLOURS)), channel) for channel in LIGHT_COLOURS.T])
+    return np.asarray(colour / colour.max())

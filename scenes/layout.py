@@ -85,6 +85,7 @@ class Layout:
     moving: int = 0  # groups
     walls: int = 0  # inside the room; the first boxes are theirs
     openings: dict[int, list[Opening]] = field(default_factory=dict)  # of walls 0 to 3
+    missing_walls: set[int] = field(default_factory=set)  # these are openings all over
     backs: list[tuple[RigidMotion, Array]] = field(default_factory=list)  # of furniture before walls: pose, bounds
 
     @property

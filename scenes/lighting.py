@@ -59,11 +59,8 @@ def floor_position(layout: Layout, margin: float) -> tuple[float, float]:
     return float(x), float(z)
 
 
-def ceiling_panel(layout: Layout) -> list[Lamp]:
-    """A rectangle below the ceiling that shines down, as small as a spotlight or as large as a table."""
-    rng = layout.rng
-    width = log_uniform(rng, 0.2, 2.5)
-    depth = log_uniform(rng, 0.2, 2.5)
+def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Lamp]:
+    """A rectangle that shines down."""
     x, z = floor_position(layout, max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
@@ -71,6 +68,17 @@ def ceiling_panel(layout: Layout) -> list[Lamp]:
         return []
     layout.reserve(box)
     return [Lamp(rectangle(width, depth, turn_then_shift(0, np.pi, x, y, z)))]
+
+
+def ceiling_panel(layout: Layout) -> list[Lamp]:
+    """A panel as small as a spotlight or as large as a table."""
+    return panel_below_ceiling(layout, log_uniform(layout.rng, 0.2, 2.5), log_uniform(layout.rng, 0.2, 2.5))
+
+
+def luminous_panel(layout: Layout) -> list[Lamp]:
+    """A panel of up to half of the ceiling, as in offices and shops."""
+    share = layout.rng.uniform(0.25, 0.7, 2)
+    return panel_below_ceiling(layout, *(share * layout.size[[0, 2]]).tolist())
 
 
 def downlight(layout: Layout) -> list[Lamp]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from scenes.animation import Scene, Shape
 from scenes.bsdf import diffuse_bsdf, rgb
+from scenes.camera import Array
 from scenes.draws import Rng, one_of
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
@@ -18,6 +19,7 @@ from scenes.lighting import (
     Lamp,
     ceiling_panel,
     hanging,
+    luminous_panel,
     orb,
     shine,
     sky_panel,
@@ -37,14 +39,21 @@ class Style(NamedTuple):
     share: float  # of all rooms
     fixtures: tuple[Fixture, ...]
     lamps: tuple[int, int]  # how many are tried: from, to below
+    day: bool = False  # light comes in through windows, or where walls are missing
+    missing_walls: tuple[int, int] = (0, 1)  # how many: from, to below
 
 
+# Shares and fixtures are such that the light of rooms is as hard to denoise as that of real interiors (docs/data.md).
 STYLES = {
-    "open": Style(0.5, OPEN, (1, 4)),
-    "mixed": Style(0.15, (*OPEN, *HIDDEN), (1, 5)),
-    "hidden": Style(0.06, HIDDEN, (1, 3)),
-    "window": Style(0.29, (ceiling_panel, hanging, orb, standing_lamp), (0, 3)),
+    "open": Style(0.24, OPEN, (1, 4)),
+    "luminous": Style(0.24, (luminous_panel,), (1, 4)),
+    "terrace": Style(0.26, (luminous_panel, orb), (0, 2), day=True, missing_walls=(1, 4)),
+    "window": Style(0.16, (luminous_panel, ceiling_panel, hanging, orb, standing_lamp), (0, 3), day=True),
+    "mixed": Style(0.08, (*OPEN, *HIDDEN), (1, 5)),
+    "hidden": Style(0.02, HIDDEN, (1, 3)),
 }
+ROOFLESS = 0.6  # share of the rooms without some walls that have no ceiling either
+NIGHT = 0.25  # share of the rooms lit by lamps alone that have windows, black outside
 
 
 def windows(layout: Layout, count: int) -> None:
@@ -60,11 +69,19 @@ def windows(layout: Layout, count: int) -> None:
         layout.openings[wall] = [hole]
         layout.build("reveal", [reveal(hole, rng.uniform(0.08, 0.3))], wall_pose(wall, layout.size))
         dressing = rng.random()
-        if dressing < 0.35:
+        if dressing < 0.2:
             layout.hang(make_blind(rng, width - 0.02, height - 0.02), wall, hole.middle[0], y + 0.01, -0.05)
-        elif dressing < 0.6:
+        elif dressing < 0.45:
             cover = width * rng.uniform(0.3, 0.7)
             layout.hang(make_curtain(rng, cover, height + 0.2), wall, x + cover / 2, y - 0.1, 0.12)
+
+
+def without_walls(layout: Layout, count: int) -> None:
+    """Leave out `count` walls."""
+    for wall in map(int, layout.rng.permutation(4)[:count]):
+        span = wall_width(wall, layout.size)
+        layout.missing_walls.add(wall)
+        layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
 
 
 def partition(layout: Layout) -> None:
@@ -89,12 +106,13 @@ def shell(layout: Layout) -> list[Shape]:
     dark = rng.random() < 0.3  # shadows get their light from the walls: deep ones need dark walls
     slot = "dark wall" if dark else "wall"
     tone = rng.uniform(0.02, 0.2, 3) if dark else rng.uniform(0.4, 0.85, 3)
+    roofless = bool(layout.missing_walls) and rng.random() < ROOFLESS
     shapes = [
         Shape("floor", below, finish(rng, "floor", layout.gloss, 1.0)),
-        Shape("ceiling", above, diffuse_bsdf(rgb(tone.tolist()))),
+        *([] if roofless else [Shape("ceiling", above, diffuse_bsdf(rgb(tone.tolist())))]),
     ]
     paint = finish(rng, slot, layout.gloss / 3, 1.0)
-    for wall in range(4):
+    for wall in set(range(4)) - layout.missing_walls:
         mesh = wall_with_openings(wall_width(wall, layout.size) + 0.1, height, layout.openings.get(wall, []))
         mesh.apply_transform(wall_pose(wall, layout.size))
         own = finish(rng, slot, layout.gloss / 3, 1.0) if rng.random() < 0.25 else paint
@@ -114,31 +132,48 @@ def lamps_of(layout: Layout, style: Style) -> list[Lamp]:
     return lamps
 
 
+def holes(layout: Layout, style: Style) -> None:
+    """What is missing of the walls, or parts the room: openings to the day, windows at night, a partition."""
+    rng = layout.rng
+    if style.missing_walls[1] > 1:
+        without_walls(layout, int(rng.integers(*style.missing_walls)))
+    elif style.day or rng.random() < NIGHT:
+        windows(layout, int(rng.integers(1, 4)))
+    elif rng.random() < 0.15:
+        partition(layout)
+
+
+def outside(layout: Layout, style: Style) -> Array | None:
+    """The sky around the room, in half of the rooms with windows by day; always where walls are missing."""
+    rng = layout.rng
+    if not style.day or (not layout.missing_walls and rng.random() < 0.5):
+        return None
+    sunny = rng.random() < (0.3 if layout.missing_walls else 0.75)
+    sun = sun_through(rng, next(iter(layout.openings)), layout.size) if sunny else None
+    return sky(rng, sun)
+
+
 def room(rng: Rng, frames: int) -> Scene:
     """A random interior for a clip of `frames` frames, in metres: 15 to 60 things, 1 to 4 lamps or windows."""
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
     layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.3, 0.5))))
-    style = str(rng.choice(list(STYLES), p=[style.share for style in STYLES.values()]))
-    outside = style == "window" and rng.random() < 0.5
-    if style == "window":
-        windows(layout, int(rng.integers(1, 4)))
-    elif rng.random() < 0.15:
-        partition(layout)
+    style = STYLES[str(rng.choice(list(STYLES), p=[style.share for style in STYLES.values()]))]
+    holes(layout, style)
+    around = outside(layout, style)
     eye = flight_path(layout)
     way = len(layout.boxes)
     against_walls(layout, int(rng.integers(2, 8)))
-    lamps = lamps_of(layout, STYLES[style])
+    lamps = lamps_of(layout, style)
     furnish(layout)
-    if style == "window" and not outside:
+    if style.day and around is None:
         panels = [sky_panel(layout, wall, hole) for wall, holes in layout.openings.items() for hole in holes]
         lamps = (lamps + panels)[:MAX_LAMPS]
-    if not lamps and not outside:
+    if not lamps and around is None:
         lamps = ceiling_panel(layout) or orb(layout) or hanging(layout)
     surface = 2 * (size[0] * size[1] + size[1] * size[2] + size[0] * size[2])
     shapes = [*shell(layout), *layout.shapes, *shine(layout, lamps, surface * float(rng.uniform(0.5, 2)))]
     glassy = any("dielectric" in shape.bsdf["type"] for shape in shapes)
     camera = aim_camera(layout, eye, layout.boxes[way:])
-    sun = sun_through(rng, next(iter(layout.openings)), size) if rng.random() < 0.75 and layout.openings else None
     # The papers' one bounce after the first, or more, which fill shadows; light through solid glass takes two of them.
     depth = int(rng.choice([3, 4, 5], p=[0.5, 0.25, 0.25])) + 2 * glassy
-    return Scene(tuple(shapes), camera, depth, sky(rng, sun) if outside else None)
+    return Scene(tuple(shapes), camera, depth, around)

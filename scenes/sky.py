@@ -16,9 +16,9 @@ def sky(rng: Rng, sun: Array | None, height: int = 64) -> Array:
     """
     rows = (np.arange(height) + 0.5) / height
     up = np.cos(np.pi * rows)[:, None, None]
-    zenith = rng.uniform(0.3, 1.0, 3) * [0.4, 0.6, 1.0]
-    horizon = rng.uniform(0.3, 1.0, 3) * [0.9, 0.95, 1.0]
-    ground = rng.uniform(0.3, 1.0, 3) * 0.2
+    zenith = rng.uniform(0.6, 1.0, 3) * [0.4, 0.6, 1.0]
+    horizon = rng.uniform(0.6, 1.0, 3) * [0.9, 0.95, 1.0]
+    ground = rng.uniform(0.5, 1.0, 3) * 0.2
     blend = np.clip(up, 0, 1) ** 0.5
     image = np.where(up > 0, zenith * blend + horizon * (1 - blend), ground)
     image = np.repeat(image, 2 * height, axis=1)

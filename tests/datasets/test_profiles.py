@@ -5,14 +5,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets.adaptive_spp import noise_of_reference, reference_spp
+from datasets.adaptive_spp import noise_of_reference, samples_needed
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
 from datasets.generate import Share, generate
 from datasets.info import AUXILIARY_CHANNELS, size_in_full, stored_size, summarise
-from datasets.profiles import DataProfile, SamplingQuality, clips_of, plan, profile_of, rendered_channels
+from datasets.pilots import choose_rooms
+from datasets.profiles import (
+    DataProfile,
+    SamplingQuality,
+    clips_of,
+    plan,
+    profile_of,
+    rendered_channels,
+    rooms_of,
+)
 from errors import BadInput
 from models.registry import channels_read, create
 from render.clip import NO_OPTIONS
@@ -103,21 +112,37 @@ def test_references_get_down_to_their_floor(floor, tmp_path):
 
 
 def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
-    scene = build_scene("room-5", 0, 2)  # in which few samples see little of the noise that many have
+    scene = build_scene("room-3", 0, 2)  # in which few samples see little of the noise that many have
     quality = SamplingQuality(realisations=1, reference_spp=16, floor=26.0, most_spp=1024)
     stage = Stage(scene, 24, 24)
     wanted = 10**-2.6
     predicted = 16 * 2 ** np.ceil(np.log2(noise_of_reference(stage, 1, 16, 2, NO_OPTIONS) / wanted))
-    spp = reference_spp(scene, 1, 24, 24, quality, 2)
+    spp = samples_needed(scene, 1, 48, 48, quality, 2)
     assert spp > predicted
-    assert spp == 1024 or noise_of_reference(stage, 1, spp, 2, NO_OPTIONS) <= wanted
+    assert spp > 1024 or noise_of_reference(stage, 1, spp, 2, NO_OPTIONS) <= wanted
 
 
-def test_references_stop_at_the_most():
+def test_references_stop_at_the_most(tmp_path):
+    quality = SamplingQuality(realisations=1, reference_spp=8)
     scene = build_scene("cornell_box", 0, 2)
-    unbounded = SamplingQuality(realisations=1, reference_spp=8)
-    assert reference_spp(scene, 2, 16, 16, unbounded._replace(floor=90.0, most_spp=64), 1) == 64
-    assert reference_spp(scene, 2, 16, 16, unbounded, 1) == 8
+    assert samples_needed(scene, 2, 16, 16, quality, 1) == 8
+    hopeless = quality._replace(floor=90.0, most_spp=64)
+    assert samples_needed(scene, 2, 16, 16, hopeless, 1) > 64
+    path = tmp_path / "test" / "cornell_box" / "000"
+    render_to_folder(path, small_profile(16, 2, hopeless), 0, tuple(CHANNELS))
+    assert Clip(path).facts["reference_spp"] == 64
+
+
+def test_rooms_that_would_need_too_many_samples_are_passed_over():
+    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, passes_over=True)
+    profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 3}, quality={"test": bounded})
+    needed = choose_rooms(profile, 0, NO_OPTIONS, {})
+    chosen = [f"test/{room}" for room in rooms_of(profile, "test", 0, needed)]
+    assert len(chosen) == 3
+    assert all(needed[room] <= 128 for room in chosen)
+    passed_over = set(needed) - set(chosen)
+    assert passed_over and all(needed[room] > 128 for room in passed_over)
+    assert choose_rooms(profile, 0, NO_OPTIONS, needed) == needed  # nothing is rendered again
 
 
 READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot be derived
