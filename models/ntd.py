@@ -169,7 +169,7 @@ class NTD(Denoiser):
         """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state."""
         before = matching_state(state, NTDState, frame)
         noisy = frame.irradiance(self.signal).clamp(min=0)
-        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None)
+        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         warped = noisy
         if before:
             previous, inside = warp(before.irradiance, getattr(frame, self.vectors))
