@@ -166,11 +166,13 @@ class Frame:
         reflected = self.indirect if signal == "indirect" else self.direct + self.indirect
         return reflected / self.divisor
 
+    def reference_halves(self, signal: Signal) -> Tensor:
+        """Radiance without emission (B, 2, 3, H, W) of both halves of the reference, whose noise is independent."""
+        return self.indirect_reference if signal == "indirect" else self.direct_reference + self.indirect_reference
+
     def reference_irradiance(self, signal: Signal) -> Tensor:
         """Irradiance (B, 3, H, W) of the reference, the mean of its halves."""
-        indirect = self.indirect_reference.mean(dim=1)
-        reflected = indirect if signal == "indirect" else self.direct_reference.mean(dim=1) + indirect
-        return reflected / self.divisor
+        return self.reference_halves(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
         """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, plus the noise-free emission for "total"."""

@@ -10,7 +10,7 @@ from errors import BadInput
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
-from models.ntd import NTD, NTDTraditional
+from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.rae import RAE
 from models.svgf import SVGF
@@ -34,6 +34,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "ntd-a": NTDTraditional,
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,
+    "ntd-mean": NTDMean,
 }
 
 

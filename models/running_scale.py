@@ -78,7 +78,7 @@ def running_scale(
     The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
     """
     before = before or RunningScale.neutral(radiance)
-    new = measure(radiance, depth) if whole is None else whole
+    new = (measure(radiance, depth) if whole is None else whole).to(radiance)
     log_luminance, log_depth = new.unbind(dim=1)
     return RunningScale(
         before.log_luminance.update(log_luminance, ~log_luminance.isnan()),

@@ -75,6 +75,7 @@ PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
     "ntd-a": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd": (NTD_RECIPE, NTD_BUDGETS),
+    "ntd-mean": (NTD_RECIPE, NTD_BUDGETS),
 }
 
 RECIPES: dict[tuple[str, str], Recipe] = {

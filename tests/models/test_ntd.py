@@ -309,13 +309,16 @@ def test_outputs_of_both_signals(ntd, frames):
 
 
 def test_training_sees_what_inference_cuts_off(frames):
-    """`predict` returns values below 0 where Eq. 4 makes them, and gradients reach back through the warped output."""
+    """`predict` returns values below 0 where Eq. 4 makes them, but what is carried on is cut off as it is in use.
+
+    Gradients reach back through the warped output.
+    """
     torch.manual_seed(0)
     ntd = NTD()
     with torch.no_grad():  # pass single pixels through, and take the coarse image instead of their maxima
         ntd.network.heads[2].bias[12] = ntd.network.heads[2].bias[50] = ntd.network.heads[1].bias[25] = 9.0
     raw, state = ntd.predict(frames[0], None)
-    assert (raw < 0).any() and torch.equal(state.irradiance, raw)
+    assert (raw < 0).any() and torch.equal(state.irradiance, raw.clamp(min=0))
     output, after = ntd(frames[0], None)
     assert (output >= 0).all() and torch.equal(after.irradiance, raw.clamp(min=0))
     first = raw.detach().requires_grad_()
