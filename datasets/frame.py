@@ -90,7 +90,8 @@ class Frame:
 
     `direct_reference` and `indirect_reference` are (B, 2, 3, H, W). Using a channel that was not read raises BadInput.
     Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
-    networks multiply their exposure by it, while radiance stays as rendered.
+    networks multiply their exposure by it, while radiance stays as rendered. `whole` belongs to training crops: what
+    models.running_scale measures in the whole frame, (B, 2); None where this is the whole frame.
     """
 
     channels: dict[str, Tensor]
@@ -98,6 +99,7 @@ class Frame:
     previous: Cameras  # of the frame that motion vectors lead to
     gain: Tensor  # (B, 3, 1, 1)
     source: str = ""  # names the clip in messages
+    whole: Tensor | None = None
 
     def __getattr__(self, name: str) -> Tensor:
         if name not in CHANNELS:
@@ -164,11 +166,13 @@ class Frame:
         reflected = self.indirect if signal == "indirect" else self.direct + self.indirect
         return reflected / self.divisor
 
+    def reference_halves(self, signal: Signal) -> Tensor:
+        """Radiance without emission (B, 2, 3, H, W) of both halves of the reference, whose noise is independent."""
+        return self.indirect_reference if signal == "indirect" else self.direct_reference + self.indirect_reference
+
     def reference_irradiance(self, signal: Signal) -> Tensor:
         """Irradiance (B, 3, H, W) of the reference, the mean of its halves."""
-        indirect = self.indirect_reference.mean(dim=1)
-        reflected = indirect if signal == "indirect" else self.direct_reference.mean(dim=1) + indirect
-        return reflected / self.divisor
+        return self.reference_halves(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
         """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, plus the noise-free emission for "total"."""
@@ -197,17 +201,22 @@ class Frame:
             return tensor.to(device)
 
         moved = self.map(move)
-        return replace(moved, now=self.now.map(move), previous=self.previous.map(move), gain=move(self.gain))
+        whole = None if self.whole is None else move(self.whole)
+        return replace(
+            moved, now=self.now.map(move), previous=self.previous.map(move), gain=move(self.gain), whole=whole
+        )
 
     @staticmethod
     def stack(frames: Sequence["Frame"]) -> "Frame":
         """One frame of the batches of all `frames`, which have the same channels and size."""
+        wholes = [frame.whole for frame in frames if frame.whole is not None]
         return Frame(
             {name: torch.cat([frame.channels[name] for frame in frames]) for name in frames[0].channels},
             now=Cameras.stack([frame.now for frame in frames]),
             previous=Cameras.stack([frame.previous for frame in frames]),
             gain=torch.cat([frame.gain for frame in frames]),
             source=frames[0].source,
+            whole=torch.cat(wholes) if wholes else None,
         )
 
 

@@ -1,10 +1,11 @@
 """Training sequences: random crops of consecutive frames, augmented, read through memory maps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import REFERENCES
@@ -49,6 +50,8 @@ class TrainingSequences(TorchDataset[list[Frame]]):
     References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
     have together as many pixels as the clips. Raises BadInput where a clip is shorter than a sequence or smaller than a
     crop.
+
+    `measure` tells of a clip, the number of a frame and that of its realisation what Frame.whole holds, (1, N).
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         crop: int | None,
         augmentation: Augmentation,
         seed: int,
+        measure: Callable[[Clip, int, int], Tensor] | None = None,
     ):
         check_fits(clips, length, crop)
         self.clips = clips
@@ -67,6 +71,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         self.crop = crop
         self.augmentation = augmentation
         self.seed = seed
+        self.measure = measure
         self.epoch = 0
         pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
         self.probabilities = pixels / pixels.sum()
@@ -97,7 +102,11 @@ class TrainingSequences(TorchDataset[list[Frame]]):
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
             for _ in range(turns):
                 frame = frame.rot90()
-            frames.append(frame if gain is None else replace(frame, gain=gain))
+            if gain is not None:
+                frame = replace(frame, gain=gain)
+            if self.measure is not None:
+                frame = replace(frame, whole=self.measure(clip, position, realisation))
+            frames.append(frame)
         return frames
 
     def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:

@@ -1,7 +1,7 @@
 """NTD: neural temporal denoising for indirect illumination, Zeng et al. 2021."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
@@ -18,6 +18,7 @@ from models.running_scale import RunningScale, running_scale
 NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
 TAPS = 25  # of a 5 x 5 kernel
+Pool = Callable[[Tensor], Tensor]  # to half the size, rounded up
 MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
 
 
@@ -84,33 +85,46 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
 
-def combine_levels(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-    """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D takes the maximum of 2 x 2 pixels, U is bilinear.
+def maximum_pool(image: Tensor) -> Tensor:
+    """The maximum of 2 x 2 pixels: D of the paper's Eq. 4."""
+    return F.max_pool2d(image, 2, ceil_mode=True)
+
+
+def average_pool(image: Tensor) -> Tensor:
+    """The mean of 2 x 2 pixels, fewer at odd borders."""
+    return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)
+
+
+def combine_levels(fine: Tensor, coarse: Tensor, alpha: Tensor, pool: Pool = maximum_pool) -> Tensor:
+    """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D is `pool`, U is bilinear.
 
     U is linear and so applied once. `fine` (B, C, H, W); `coarse`, and `alpha` (B, 1, ·, ·), have half the size,
-    rounded up.
+    rounded up. With the paper's maximum, what is taken away is brighter than what is put in its place.
     """
     height, width = fine.shape[-2:]
-    change = alpha * (coarse - F.max_pool2d(fine, 2, ceil_mode=True))
+    change = alpha * (coarse - pool(fine))
     return fine + F.interpolate(change, scale_factor=2.0, mode="bilinear")[..., :height, :width]
 
 
-def reconstruct_image(noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def reconstruct_image(
+    noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor], pool: Pool = maximum_pool
+) -> tuple[Tensor, Tensor]:
     """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
 
     Args:
         noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
         predictions: of the network, coarse to fine, at least as large as the images.
+        pool: D of Eq. 4.
     """
     pyramid = [noisy]
     for _ in predictions[1:]:  # averages: maxima of noise would be biased
-        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
+        pyramid.append(average_pool(pyramid[-1]))
     output = pyramid[-1]
     alpha: Tensor | None = None
     for image, prediction in zip(pyramid[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
         filtered = apply_kernels(image, prediction[:, :TAPS])
-        output = filtered if alpha is None else combine_levels(filtered, output, alpha)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha, pool)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
     return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS]), output, alpha), alpha
@@ -160,16 +174,20 @@ class NTD(Denoiser):
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    def pool(self, image: Tensor) -> Tensor:
+        """D of Eq. 4: `image` (B, 3, H, W) in half the size, rounded up."""
+        return maximum_pool(image)
+
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
         x = irradiance * (scale.exposure() * frame.gain)
         return torch.log1p(x.abs()).copysign(x)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
-        """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state."""
+        """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state, in which it is not."""
         before = matching_state(state, NTDState, frame)
         noisy = frame.irradiance(self.signal).clamp(min=0)
-        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None)
+        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         warped = noisy
         if before:
             previous, inside = warp(before.irradiance, getattr(frame, self.vectors))
@@ -178,13 +196,13 @@ class NTD(Denoiser):
         x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
         predictions = self.network(pad_to_multiple(x, MULTIPLE))
-        irradiance, alpha = reconstruct_image(noisy, warped, predictions)
+        irradiance, alpha = reconstruct_image(noisy, warped, predictions, self.pool)
         dual = frame.dual_motion if self.vectors == "dual_motion" else None
-        return irradiance, NTDState(frame.moment, irradiance, scale, warped, alpha, frame.motion, dual)
+        after = NTDState(frame.moment, irradiance.clamp(min=0), scale, warped, alpha, frame.motion, dual)
+        return irradiance, after
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        irradiance, after = self.predict(frame, state)
-        after = replace(after, irradiance=irradiance.clamp(min=0))
+        _, after = self.predict(frame, state)
         return frame.remodulate(after.irradiance, self.signal), after
 
 
@@ -193,3 +211,14 @@ class NTDTraditional(NTD):
 
     vectors = "motion"
     reads = ("indirect", "albedo", "normal", "depth", "motion")
+
+
+class NTDMean(NTD):
+    """NTD with averages for the maxima in Eq. 4, so that combining levels keeps the light: ours.
+
+    Taking away the maximum of four noisy pixels and putting the coarser level's mean in its place darkens, which the
+    network must learn to make up for. Eq. 7 of WSKP (Fan et al. 2021), of the same form, averages as well.
+    """
+
+    def pool(self, image: Tensor) -> Tensor:
+        return average_pool(image)

@@ -120,7 +120,7 @@ class RAE(Denoiser):
         height, width = frame.size
         before = matching_state(state, RAEState, frame)
         irradiance = frame.irradiance(self.signal).clamp(min=0)
-        scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
+        scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         colour = self.compress(irradiance, scale, frame)
         auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.auxiliary)
         x = pad_to_multiple(torch.cat([colour, *auxiliary], dim=1), 32)

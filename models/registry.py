@@ -10,7 +10,8 @@ from errors import BadInput
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
-from models.ntd import NTD, NTDTraditional
+from models.fastest import bfloat16_pays
+from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.rae import RAE
 from models.svgf import SVGF
@@ -34,6 +35,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "ntd-a": NTDTraditional,
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,
+    "ntd-mean": NTDMean,
 }
 
 
@@ -90,11 +92,10 @@ def load(
 
 
 def inference_precision(denoiser: type[Denoiser] | str) -> torch.dtype:
-    """bfloat16 for networks that take it, where this processor has instructions for it, else float32.
+    """bfloat16 for networks that take it, where this processor is faster in it, else float32.
 
     `denoiser` is a class or a name. Raises BadInput for an unknown name.
     """
     kind = denoiser_class(denoiser) if isinstance(denoiser, str) else denoiser
     takes = kind.is_network and torch.bfloat16 not in kind.refuses
-    has = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-    return torch.bfloat16 if takes and has else torch.float32
+    return torch.bfloat16 if takes and bfloat16_pays() else torch.float32

@@ -52,12 +52,11 @@ class RunningScale:
         return torch.where(depth > 0, depth / (depth + scale), 1)
 
 
-def running_scale(radiance: Tensor, depth: Tensor, before: RunningScale | None) -> RunningScale:
-    """Update the estimates with one frame's noisy direct + indirect `radiance` (B, 3, H, W) and its `depth`.
+def measure(radiance: Tensor, depth: Tensor) -> Tensor:
+    """What one frame tells: the logarithms of its luminance and of its median depth, (B, 2).
 
-    The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
+    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is all black, or has no surface.
     """
-    before = before or RunningScale.neutral(radiance)
     luminance = image_luminance(radiance).clamp(min=0)
     blocks = F.avg_pool2d(luminance, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False)
     y = blocks.flatten(1).double()
@@ -68,4 +67,20 @@ def running_scale(radiance: Tensor, depth: Tensor, before: RunningScale | None) 
     median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
     hit = ~median.isnan()
     log_depth = torch.log(torch.where(hit, median, 1))
-    return RunningScale(before.log_luminance.update(log_y, mean > 0), before.log_depth.update(log_depth, hit))
+    return torch.stack([torch.where(mean > 0, log_y, torch.nan), torch.where(hit, log_depth, torch.nan)], dim=1)
+
+
+def running_scale(
+    radiance: Tensor, depth: Tensor, before: RunningScale | None, whole: Tensor | None = None
+) -> RunningScale:
+    """Update the estimates with what `measure` says of one frame, or `whole` of the frame that this one is a crop of.
+
+    The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
+    """
+    before = before or RunningScale.neutral(radiance)
+    new = (measure(radiance, depth) if whole is None else whole).to(radiance)
+    log_luminance, log_depth = new.unbind(dim=1)
+    return RunningScale(
+        before.log_luminance.update(log_luminance, ~log_luminance.isnan()),
+        before.log_depth.update(log_depth, ~log_depth.isnan()),
+    )

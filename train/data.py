@@ -14,6 +14,7 @@ from models.denoiser import Denoiser
 from models.wskp import KernelPredictor
 from train.crops import AccumulatedCrops, Crops
 from train.recipe import Recipe
+from train.whole_frames import WholeFrames
 
 Items = TrainingSequences | AccumulatedCrops
 
@@ -29,7 +30,8 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
         assert isinstance(denoiser, KernelPredictor)
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
     augmentation = recipe.augmentation if training else Augmentation()
-    return TrainingSequences(clips, denoiser.reads, recipe.frames(training), recipe.crop, augmentation, seed)
+    measure = WholeFrames(denoiser.signal)
+    return TrainingSequences(clips, denoiser.reads, recipe.frames(training), recipe.crop, augmentation, seed, measure)
 
 
 def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:

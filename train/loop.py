@@ -115,7 +115,6 @@ def validate_and_show(training: Training, log: Log) -> None:
     validation = training.validate()
     training.keep_best(validation)
     log.write(training.position.done, {"val_loss": validation})
-    denoiser = training.loss.module.denoiser
     with training.fabric.autocast():
-        picture = sample_picture(denoiser, training.clips["val"][0], training.fabric.device)
+        picture = sample_picture(training.judged.denoiser, training.clips["val"][0], training.fabric.device)
     log.picture(training.position.done, picture)

@@ -41,7 +41,7 @@ def loss_curve(folder: Path, title: str) -> None:
     """Draw loss.png from metrics.csv: the training loss and its parts, and the loss over the validation clips."""
     rows = read_metrics(folder / METRICS_CSV)
     figure, axis = plt.subplots(figsize=(7, 4.5), dpi=DPI, layout="constrained")
-    other = {"step", "learning_rate", "step_ms", "loading_ms", "skipped", "val_loss"}
+    other = {"step", "learning_rate", "gradient_norm", "step_ms", "loading_ms", "skipped", "val_loss"}
     for name in [name for name in rows[0] if name not in other]:
         points = smooth(np.array([(row["step"], row[name]) for row in rows if name in row]))
         axis.plot(*points.T, lw=1.8 if name == "loss" else 0.9, label=name)

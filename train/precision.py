@@ -1,17 +1,19 @@
 """Which floating-point precision to train in: measured on the step itself, not guessed."""
 
+import time
 from functools import partial
 from typing import Any
 
 import torch
 
-from timing import take_turns
+from models.fastest import WORTHWHILE
+from timing import device_clock, take_turns, thread_count
 from train.losses.network_loss import NetworkLoss
 
 FLOAT32 = "float32"
 BFLOAT16 = "bfloat16"  # by autocast; the weights are float32 all the same
 
-WORTHWHILE = 1.1  # bfloat16 must be this many times faster to be used
+TURNS = 3
 
 
 def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: str) -> None:
@@ -24,12 +26,18 @@ def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: 
 
 
 def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
-    """bfloat16 where that makes a step WORTHWHILE times faster, by the best of two measured rounds; else float32."""
+    """bfloat16 where that makes a step WORTHWHILE times faster, by the best of some turns; else float32.
+
+    On processors one thread computes, and only the time that it computes counts: a busy machine, on which each step
+    waits as it happens to, tells nothing by the clock on the wall.
+    """
     loss = loss.to(device)
     batch = batch.to(device)
     work = {
         FLOAT32: partial(forward_and_backward, loss, batch, device, FLOAT32),
         BFLOAT16: partial(forward_and_backward, loss, batch, device, BFLOAT16),
     }
-    seconds = take_turns(work, measured=2, label="measuring precisions")
+    clock = time.process_time if device == "cpu" else partial(device_clock, device)
+    with thread_count(1):
+        seconds = take_turns(work, TURNS, clock=clock, label="measuring precisions")
     return BFLOAT16 if min(seconds[FLOAT32]) > WORTHWHILE * min(seconds[BFLOAT16]) else FLOAT32

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterable, Iterator
+from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor
+from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
 from errors import BadInput
 from models.weights import save_weights
+from train.average import decay_after, join_average
 from train.checkpoint import Checkpoint, save_checkpoint
 from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
 from train.fabric import fabric_here
@@ -38,6 +41,8 @@ class Position:
 
 class Training:
     """One run: network, optimiser, data, and where it stands. Everything random follows from (seed, epoch, item).
+
+    `judged` is what is validated and saved: the average of the weights where the recipe has one, else the weights.
 
     Goes on from the checkpoint `saved`, if there is one. Raises BadInput where that is of another training, or for
     unusable data.
@@ -67,6 +72,9 @@ class Training:
         rate = self.recipe.learning_rate(0)
         optimiser = torch.optim.Adam(denoiser.parameters(), lr=rate, betas=self.recipe.betas)
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
+        self.judged: NetworkLoss = self.loss.module
+        if self.recipe.average:
+            self.judged = self.recipe.loss.around(deepcopy(denoiser)).to(self.fabric.device)
         self.facts = {
             "profile": task.budget,  # the name that it has in checkpoints
             "seed": task.seed,
@@ -110,6 +118,7 @@ class Training:
                 "--runs"
             )
         self.loss.load_state_dict(saved["loss"])
+        self.judged.load_state_dict(saved["judged"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.position = Position(**{field.name: saved[field.name] for field in fields(Position)})
 
@@ -120,6 +129,7 @@ class Training:
             "precision": self.precision,
             "made_by": self.makers,
             "loss": self.loss.state_dict(),
+            "judged": self.judged.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             **asdict(self.position),
         }
@@ -139,7 +149,10 @@ class Training:
                 yield noted
 
     def step(self, batch: Iterable[Any]) -> dict[str, float]:
-        """Update the weights once, from the parts of a batch. Returns its loss, its terms, rate and milliseconds."""
+        """Update the weights once, from the parts of a batch.
+
+        Returns its rate, loss, the loss's terms, the norm of the gradients and milliseconds.
+        """
         start = time.perf_counter()
         ready = start
         loading = 0.0
@@ -157,9 +170,9 @@ class Training:
                 sums[name] = sums.get(name, torch.zeros_like(term)) + term / self.parts
             ready = time.perf_counter()
         values = {name: float(self.reduce(term, "mean")) for name, term in sums.items()}
-        self.update(values["loss"])
+        norm = self.update(values["loss"])
         times = {"step_ms": 1e3 * (time.perf_counter() - start), "loading_ms": 1e3 * loading}
-        return {"learning_rate": rate, **values, **times}
+        return {"learning_rate": rate, **values, "gradient_norm": norm, **times}
 
     def reduce(self, value: Tensor, how: str) -> Tensor:
         """The mean or sum of every process's `value`."""
@@ -167,15 +180,26 @@ class Training:
         assert isinstance(reduced, Tensor)
         return reduced
 
-    def update(self, loss: float) -> None:
-        """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision."""
-        gradients = [parameter.grad for parameter in self.loss.parameters() if parameter.grad is not None]
-        if math.isfinite(loss) and torch.isfinite(torch.nn.utils.get_total_norm(gradients)):
+    def update(self, loss: float) -> float:
+        """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision.
+
+        Returns the norm of the gradients, before the recipe cuts it.
+        """
+        parameters = list(self.loss.parameters())
+        norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
+        if math.isfinite(loss) and torch.isfinite(norm):
+            if self.recipe.clip is not None:
+                clip_grads_with_norm_(parameters, self.recipe.clip, norm)
             self.position.skipped_in_a_row = 0
             self.optimiser.step()
+            if self.recipe.average:
+                updates = self.position.done - self.position.skipped + 1
+                decay = decay_after(updates, self.recipe.average * self.total)
+                join_average(self.judged, self.loss.module, decay)
         else:
             self.skip_step()
         self.optimiser.zero_grad()
+        return float(norm)
 
     def skip_step(self) -> None:
         """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""
@@ -194,7 +218,7 @@ class Training:
         numbers = range(len(self.val_items))
         batches = [list(numbers[i : i + self.micro_batch]) for i in range(0, len(numbers), self.micro_batch)]
         batches = batches[self.fabric.global_rank :: self.fabric.world_size]
-        network: NetworkLoss = self.loss.module.eval()  # not through DDP: processes may differ in how much they have
+        network = self.judged.eval()  # not through DDP: processes may differ in how much they have
         total = torch.zeros(2, device=self.fabric.device)
         for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
             with self.fabric.autocast():
@@ -209,6 +233,4 @@ class Training:
         if validation < self.position.best:  # never true of NaN
             self.position.best = validation
             facts = {**self.facts, "step": self.position.done, "validation": validation}
-            save_weights(
-                self.loss.module.denoiser, self.task.name, facts, self.task.folder / BEST_FILE, made_by=self.makers
-            )
+            save_weights(self.judged.denoiser, self.task.name, facts, self.task.folder / BEST_FILE, self.makers)

@@ -1,5 +1,6 @@
 """NTD: warping, the pyramid and Eq. 4 against slow versions in float64, blending, state, precision and invariances."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import ntd as ntd_module
 from models.convolution import ConvReLU
-from models.ntd import NTD, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
+from models.ntd import NTD, NTDMean, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
 from models.registry import create
 from tests.helpers.frames import flat_frame, play, run
 
@@ -91,25 +92,28 @@ def naive_upsampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return out
 
 
-def naive_combine(fine: np.ndarray, coarse: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Eq. 4 as the paper writes it."""
-    maxima = np.zeros_like(coarse)
-    for y in range(maxima.shape[1]):
-        for x in range(maxima.shape[2]):
-            maxima[:, y, x] = fine[:, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].max(axis=(1, 2))
+def naive_combine(
+    fine: np.ndarray, coarse: np.ndarray, alpha: np.ndarray, pool: Callable[..., np.ndarray] = np.max
+) -> np.ndarray:
+    """Eq. 4 as the paper writes it, D by its `pool`."""
+    pooled = np.zeros_like(coarse)
+    for y in range(pooled.shape[1]):
+        for x in range(pooled.shape[2]):
+            pooled[:, y, x] = pool(fine[:, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2], axis=(1, 2))
     size = fine.shape[1:]
-    return fine - naive_upsampled(alpha * maxima, *size) + naive_upsampled(alpha * coarse, *size)
+    return fine - naive_upsampled(alpha * pooled, *size) + naive_upsampled(alpha * coarse, *size)
 
 
+@pytest.mark.parametrize("kind, pool", [(NTD, np.max), (NTDMean, np.mean)])
 @pytest.mark.parametrize("size", [(8, 6), (7, 5), (1, 1), (1, 4), (3, 2)])
-def test_combination_equals_eq_4(size):
+def test_combination_equals_eq_4(size, kind, pool):
     rng = np.random.default_rng(0)
     half = -(-size[0] // 2), -(-size[1] // 2)
     fine = rng.uniform(0, 5, (3, *size))
     coarse = rng.uniform(0, 5, (3, *half))
     alpha = rng.uniform(0, 1, (1, *half))
-    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)))
-    np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha), atol=1e-12)
+    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)), kind().pool)
+    np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha, pool), atol=1e-12)
 
 
 def predictions(height: int, width: int, alpha: tuple[float, float, float], kernel: float = 0.0) -> list[Tensor]:
@@ -189,6 +193,16 @@ def test_fused_convolutions_equal_pytorch_s(dtype):
         torch.testing.assert_close(fused, expected, rtol=rounding, atol=rounding)
 
 
+@pytest.mark.parametrize("kind, kept", [(NTD, (0.7, 0.95)), (NTDMean, (0.99, 1.01))])
+def test_averaging_keeps_the_light_and_maxima_darken(kind, kept):
+    """Fresh networks, of kernels and shares near even, on sparse noise as of one sample a pixel."""
+    torch.manual_seed(0)
+    light = 8 * (torch.rand(1, 3, 64, 64) < 1 / 8).float()
+    frame = copy(flat_frame(64, 64), direct=torch.zeros_like(light), indirect=light)
+    brightness = run(kind().eval(), [frame])[0].mean() / light.mean()
+    assert kept[0] < brightness < kept[1]
+
+
 # --- The denoiser -----------------------------------------------------------------------------------------------------
 
 
@@ -217,6 +231,7 @@ def test_what_it_reads(ntd):
     assert set(NTDTraditional.reads) == {"indirect", "albedo", "normal", "depth", "motion"}
     assert {"direct", "emission"} <= set(NTD(signal="total").reads)
     assert [create(name).vectors for name in ("ntd-a", "ntd-b", "ntd")] == ["motion", "dual_motion", "dual_motion"]
+    assert create("ntd-mean").vectors == "dual_motion" and create("ntd-mean").signal == "indirect"
     assert {create(name).signal for name in ("ntd-a", "ntd-b", "ntd")} == {"indirect"}
 
 
@@ -309,13 +324,16 @@ def test_outputs_of_both_signals(ntd, frames):
 
 
 def test_training_sees_what_inference_cuts_off(frames):
-    """`predict` returns values below 0 where Eq. 4 makes them, and gradients reach back through the warped output."""
+    """`predict` returns values below 0 where Eq. 4 makes them, but what is carried on is cut off as it is in use.
+
+    Gradients reach back through the warped output.
+    """
     torch.manual_seed(0)
     ntd = NTD()
     with torch.no_grad():  # pass single pixels through, and take the coarse image instead of their maxima
         ntd.network.heads[2].bias[12] = ntd.network.heads[2].bias[50] = ntd.network.heads[1].bias[25] = 9.0
     raw, state = ntd.predict(frames[0], None)
-    assert (raw < 0).any() and torch.equal(state.irradiance, raw)
+    assert (raw < 0).any() and torch.equal(state.irradiance, raw.clamp(min=0))
     output, after = ntd(frames[0], None)
     assert (output >= 0).all() and torch.equal(after.irradiance, raw.clamp(min=0))
     first = raw.detach().requires_grad_()

@@ -49,6 +49,7 @@ def interrupt_after(monkeypatch, count: int) -> None:
 def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, monkeypatch, name):
     """Interrupted in the middle of an epoch; the weights equal those of an undisturbed run bit for bit."""
     recipe = {"epochs": 2, "crops": (2, 1)} if name == "wskp6" else {"epochs": 4}
+    recipe["average"] = 0.5
     whole = train_network(short_task(name, tiny, tmp_path / "whole", **recipe)).parent
     task = short_task(name, tiny, tmp_path / "resumed", **recipe)
     with monkeypatch.context() as patched:
@@ -187,6 +188,7 @@ def test_training_shows_what_it_does(trained_runs):
         "spatial",
         "gradient",
         "temporal",
+        "gradient_norm",
         "skipped",
         "step_ms",
         "loading_ms",

@@ -20,13 +20,16 @@ from models.registry import create
 from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
-from train.losses.ntd import NTDLoss, NTDTerms
+from train.losses.network_loss import surface_mean
+from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
 from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
+from train.losses.relative import RelativeTerms
 from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 
 LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss}
+LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
 
 
@@ -57,7 +60,14 @@ def test_log_kernel_is_that_of_scipy():
     assert abs(kernel.sum()) < 1e-12
     picture = np.random.default_rng(0).uniform(0, 1, (40, 50))
     ours = RAELoss(RAE()).edges(torch.from_numpy(picture).float().expand(2, 3, 40, 50))[1, 2].numpy()
-    np.testing.assert_allclose(ours, gaussian_laplace(picture, 1.5, mode="nearest"), atol=2e-3)
+    np.testing.assert_allclose(ours * LOG_NORM, gaussian_laplace(picture, 1.5, mode="nearest"), atol=2e-3)
+
+
+def test_the_terms_of_rae_have_one_scale():
+    """Errors of white noise: HFEN is as large as L1, the change between two frames sqrt(2) times as large."""
+    error = torch.randn(4, 3, 256, 256, generator=torch.Generator().manual_seed(0))
+    edges = RAELoss(RAE()).edges(error).abs().mean()
+    assert edges.item() == pytest.approx(error.abs().mean().item(), rel=0.01)
 
 
 def test_rae_loss_by_hand(batch_of, monkeypatch):
@@ -84,7 +94,7 @@ def test_rae_loss_by_hand(batch_of, monkeypatch):
     error = p - t
     spatial = sum(w * np.abs(e).mean() for w, e in zip(weights, error, strict=True))
     log = np.array([[[gaussian_laplace(c, 1.5, mode="nearest") for c in item] for item in e] for e in error])
-    gradient = sum(w * np.abs(e).mean() for w, e in zip(weights, log, strict=True))
+    gradient = sum(w * np.abs(e).mean() for w, e in zip(weights, log / LOG_NORM, strict=True))
     dp = np.diff(p, axis=0)
     dt = np.diff(t, axis=0)
     temporal = sum(w * np.abs(a - b).mean() for w, a, b in zip(weights[1:], dp, dt, strict=True))
@@ -110,9 +120,10 @@ def test_smape_is_that_of_the_paper_and_of_torchmetrics():
     by_hand = sum(abs(a - b) / (abs(a) + abs(b) + 0.01) for a, b in zip(r.flat, t.flat, strict=True)) / r.size
     r = torch.from_numpy(r)
     t = torch.from_numpy(t)
-    assert smape(r, t, 0.01).item() == pytest.approx(by_hand, rel=1e-12)
-    assert smape(r, t, 0.0).item() == pytest.approx(symmetric_mean_absolute_percentage_error(r, t).item() / 2, rel=1e-9)
-    assert smape(r, r, 0.01) == 0
+    assert smape(r, t, 0.01).mean().item() == pytest.approx(by_hand, rel=1e-12)
+    torchmetrics = symmetric_mean_absolute_percentage_error(r, t).item() / 2
+    assert smape(r, t, 0.0).mean().item() == pytest.approx(torchmetrics, rel=1e-9)
+    assert (smape(r, r, 0.01) == 0).all()
 
 
 def test_smape_loss_compares_radiance_as_exposed(batch_of, monkeypatch):
@@ -163,7 +174,22 @@ def test_ntd_loss_by_hand(batch_of, monkeypatch):
     assert parts["temporal"].item() == pytest.approx(np.abs(np.diff(error, axis=0)).mean(), rel=1e-5)
     m = np.array([(f.dual_motion != f.motion).any(dim=1, keepdim=True).numpy() for f in batch.frames])
     weight = [1.0 * m[i] + 0.8 * m[i - 1 if i >= 1 else i] + 0.6 * m[i - 2 if i >= 2 else i] for i in range(5)]
-    assert parts["occlusion"].item() == pytest.approx((np.abs(error) * np.array(weight)).mean(), rel=1e-5)
+    weight = np.broadcast_to(np.array(weight), error.shape)
+    means = [(np.abs(error) * weight)[:, item][weight[:, item] > 0].mean() for item in range(2)]
+    assert parts["occlusion"].item() == pytest.approx(np.mean(means), rel=1e-5)
+
+
+def test_occlusion_counts_like_the_other_terms_of_ntd():
+    """It is the mean error where masks are, whatever their area, times their weight; a lone pixel counts for less."""
+    values = torch.ones(2, 6, 50, 50)
+    masks = torch.zeros(2, 2, 50, 50)
+    assert masked_mean(values * 0, masks) == 0
+    masks[:, :, 10:20, 10:20] = 2.4
+    weighted = values * masks.repeat_interleave(3, dim=1)
+    assert masked_mean(weighted, masks).item() == pytest.approx(2.4)
+    masks[:] = 0
+    masks[:, 0, 0, 0] = 1.0  # one pixel of 5000, of which five would count fully
+    assert masked_mean(values * masks.repeat_interleave(3, dim=1), masks).item() == pytest.approx(1 / 5)
 
 
 @pytest.mark.parametrize("progress, training, counts", [(0.49, True, False), (0.5, True, True), (0.0, False, True)])
@@ -180,9 +206,44 @@ def test_occlusion_loss_joins_in_the_second_half(batch_of, progress, training, c
     assert ablated(batch)[0].item() == pytest.approx((parts["spatial"] + parts["temporal"]).item(), rel=1e-6)
 
 
+def test_mean_over_surfaces_by_hand():
+    """Of each item alone, then of all, so that parts of a batch have its mean; the background may hold anything."""
+    values = torch.rand(3, 2, 4, 5, generator=torch.Generator().manual_seed(0))
+    depth = torch.ones(3, 1, 4, 5)
+    depth[0, :, 2:] = 0
+    depth[1] = 0
+    expected = (values[0, :, :2].mean() + 0 + values[2].mean()) / 3
+    values[0, :, 3] = torch.nan
+    values[1] = torch.inf
+    assert surface_mean(values, depth).item() == pytest.approx(expected.item())
+    parts = [surface_mean(values[i : i + 1], depth[i : i + 1]) for i in range(3)]
+    assert torch.stack(parts).mean().item() == pytest.approx(expected.item())
+
+
+@pytest.mark.parametrize("terms", [None, RelativeTerms()], ids=["its own", "relative"])
+@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+def test_the_background_is_not_learnt_from(batch_of, name, terms):
+    """Whatever the reference holds there, the loss stays what it is."""
+    torch.manual_seed(0)
+    batch = batch_of(name, 2)
+    for frame in frames_of(batch):
+        frame.channels["depth"] = frame.depth.clone()
+        frame.channels["depth"][..., 20:, :] = 0
+    loss = (terms or recipe_for(name, "tiny").loss).around(create(name))
+    values = []
+    for sky in (0.0, 3.0, 1e4):
+        for frame in frames_of(batch):
+            for half in {"direct_reference", "indirect_reference"} & frame.channels.keys():
+                frame.channels[half] = frame.channels[half].clone()
+                frame.channels[half][..., 20:, :] = sky
+        values.append(loss(batch)[0].item())
+    assert values[0] == values[1] == values[2] and values[0] > 0
+
+
+@pytest.mark.parametrize("relative", [False, True])
 @pytest.mark.parametrize("name", TRAINABLE)
 @pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
-def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level):
+def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level, relative):
     torch.manual_seed(0)
     batch = batch_of(name)
     for frame in frames_of(batch):
@@ -191,7 +252,8 @@ def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level):
         )
     if isinstance(batch, Crops):
         batch.irradiance.fill_(level)
-    loss = recipe_for(name, "tiny").loss.around(create(name))
+    terms = RelativeTerms() if relative else recipe_for(name, "tiny").loss
+    loss = terms.around(create(name))
     value, _ = loss(batch)
     value.backward()
     assert torch.isfinite(value)

@@ -1,7 +1,8 @@
-"""The paper recipes are the papers', and budgets change the effort, never the method."""
+"""The paper recipes are the papers'; other budgets change the effort, and how a training ends."""
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
 from datasets.sequences import Augmentation
@@ -13,6 +14,7 @@ from train.losses.wskp import SMAPETerms
 from train.recipes import DEFAULT, RECIPES, TRAINABLE, recipe_for
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
+ENDS_WELL = {"anneal", "average"}
 
 
 def test_rae_is_the_paper_s():
@@ -42,14 +44,27 @@ def test_ntd_is_the_paper_s(name, occlusion):
     assert recipe.learning_rate(0) == recipe.learning_rate(199) == 1e-4 and recipe.augmentation == Augmentation()
 
 
-def test_budgets_scale_the_effort_never_the_method():
+def test_budgets_scale_the_effort_and_anneal():
     for (name, budget), recipe in RECIPES.items():
         paper = RECIPES[name, "paper"]
-        same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in EFFORT}
+        same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in EFFORT | ENDS_WELL}
         assert replace(paper, **same) == recipe, (name, budget)
         assert (
             recipe.epochs <= paper.epochs and recipe.crop and recipe.crop <= (paper.crop or recipe.crop)
         ) or paper == recipe
+        assert (recipe.anneal, recipe.average) == ((False, 0.0) if budget == "paper" else (True, 0.05))
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+def test_short_budgets_anneal_to_zero(name):
+    """Ramp, top and end by hand; never up again after the ramp."""
+    recipe = recipe_for(name, "quick")
+    rates = np.array([recipe.learning_rate(epoch) for epoch in np.linspace(recipe.ramp, recipe.epochs, 101)])
+    assert rates[0] == recipe.rate and rates[-1] == pytest.approx(0, abs=1e-12)
+    assert rates[50] == pytest.approx(recipe.rate / 2) and (np.diff(rates) < 0).all()
+    if recipe.ramp:
+        assert recipe.learning_rate(0) == pytest.approx(recipe.rate / 10)
+        assert recipe.learning_rate(recipe.ramp / 2) == pytest.approx(recipe.rate * 10**-0.5)
 
 
 def test_every_network_has_recipes_for_all_budgets():

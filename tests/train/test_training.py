@@ -72,6 +72,23 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monke
     assert all(torch.equal(p, q) for p, q in zip(before, training.loss.parameters(), strict=True))
 
 
+def test_long_gradients_are_cut_and_their_length_is_noted(tiny, tmp_path):
+    """With plain descent the step is the rate times the cut gradient: its length tells."""
+    task = short_task("rae", tiny, tmp_path)
+    moved = {}
+    noted = {}
+    for clip in (None, 1.0):
+        training = Training(replace(task, recipe=replace(task.recipe, clip=clip)))
+        training.optimiser = torch.optim.SGD(training.loss.parameters(), lr=1.0)
+        before = torch.cat([p.detach().flatten().clone() for p in training.loss.parameters()])
+        step = next(training.steps())
+        after = torch.cat([p.detach().flatten() for p in training.loss.parameters()])
+        moved[clip] = torch.dist(after, before).item() / step["learning_rate"]
+        noted[clip] = step["gradient_norm"]
+    assert noted[None] == pytest.approx(moved[None], rel=1e-3) and noted[None] > 2
+    assert noted[1.0] == pytest.approx(noted[None], rel=1e-4) and moved[1.0] == pytest.approx(1, rel=0.01)
+
+
 def test_a_loss_that_is_not_finite_is_never_the_best(tiny, tmp_path):
     training = Training(short_task("rae", tiny, tmp_path))
     training.keep_best(math.nan)

@@ -3,11 +3,23 @@
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from models.denoiser import Denoiser
 
 Parts = dict[str, Tensor]  # of a loss by name: scalars, detached, to display
+
+
+def surface_mean(values: Tensor, depth: Tensor) -> Tensor:
+    """Mean of `values` (B, C, H, W) over the pixels that show a surface; each item of the batch counts the same.
+
+    The background (`depth` 0) is not for networks to learn, and its zeros would thin the mean out. Where an item shows
+    no surface, its mean is 0. So the mean of a batch is that of its parts' means, however it is divided.
+    """
+    surface = depth > 0
+    total = torch.where(surface, values, 0).sum(dim=(1, 2, 3))
+    return (total / (values.shape[1] * surface.sum(dim=(1, 2, 3))).clamp(min=1)).mean()
 
 
 class NetworkLoss(nn.Module):

@@ -9,7 +9,9 @@ from datasets.frame import disoccluded
 from datasets.sequences import Batch
 from models.denoiser import Denoiser, State
 from models.ntd import NTD
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts
+from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+
+FEWEST_OCCLUDED = 1e-3  # share of a sequence's pixels: the mean over fewer would be noise, and is that share of them
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,17 @@ class NTDTerms(LossTerms):
         return NTDLoss(denoiser, self)
 
 
+def masked_mean(values: Tensor, masks: Tensor) -> Tensor:
+    """Mean of `values` (B, 3 F, H, W) over the pixels where `masks` (B, F, H, W) is not 0; items count the same."""
+    count = (masks > 0).sum(dim=(1, 2, 3)).clamp(min=FEWEST_OCCLUDED * masks[0].numel())
+    return (values.sum(dim=(1, 2, 3)) / (3 * count)).mean()
+
+
 class NTDLoss(NetworkLoss):
     """Spatial L1 + temporal L1 + motion occlusion L1 (NTD Eq. 5, 6), means over frames, in the space of `compress`.
+
+    "They are all L1 loss and have equal weight" (§5): the occlusion loss is the mean over the pixels of a sequence that
+    the masks let through, few as they are. Over all pixels it would be near nothing beside the others.
 
     The occlusion loss joins for the last part of the training, but always counts in validation, so that the best
     weights of all of it are comparable.
@@ -55,24 +66,28 @@ class NTDLoss(NetworkLoss):
         hidden: list[Tensor] = []
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
-        occlusion: list[Tensor] = []
+        occluded: list[Tensor] = []
+        masks: list[Tensor] = []
         state: State | None = None
         before: Tensor | None = None  # the error of the frame before
         for frame in batch.frames:
             irradiance, state = denoiser.predict(frame, state)
             images = (irradiance, frame.reference_irradiance(denoiser.signal))
             output, target = (denoiser.compress(image, state.scale, frame) for image in images)
-            error = output - target
-            spatial.append(error.abs().mean())
+            error = torch.where(frame.depth > 0, output - target, 0)
+            spatial.append(surface_mean(error.abs(), frame.depth))
             if before is not None:
-                temporal.append((error - before).abs().mean())
+                temporal.append(surface_mean((error - before).abs(), frame.depth))
             before = error
             if terms.occlusion:
                 hidden.append(disoccluded(frame.motion, frame.dual_motion))
-                occlusion.append((error.abs() * self.masks(hidden)).mean())
+                masks.append(self.masks(hidden))
+                occluded.append(error.abs() * masks[-1])
+        nothing = error.new_zeros(())
         parts = {
-            name: torch.stack(values).mean() if values else error.new_zeros(())
-            for name, values in (("spatial", spatial), ("temporal", temporal), ("occlusion", occlusion))
+            "spatial": torch.stack(spatial).mean(),
+            "temporal": torch.stack(temporal).mean() if temporal else nothing,
+            "occlusion": masked_mean(torch.cat(occluded, dim=1), torch.cat(masks, dim=1)) if masks else nothing,
         }
         starts = not self.training or self.progress >= terms.occlusion_start
         weights = {"spatial": terms.spatial, "temporal": terms.temporal, "occlusion": terms.occlusion * starts}

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from datasets.sequences import Batch
 from models.denoiser import Denoiser, State
 from models.rae import RAE
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts
+from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 
 
 def laplacian_of_gaussian(sigma: float = 1.5, size: int = 15) -> Tensor:
@@ -39,6 +39,9 @@ class RAELoss(NetworkLoss):
     """0.8 spatial L1 + 0.1 HFEN + 0.1 temporal L1, later frames weighted more (RAE §4.4).
 
     All in the space of the network: raw output p against (gain · exposure · irradiance)^0.2 of the reference.
+
+    The paper's weights are for terms of about one scale, and it does not say which scale its HFEN has. Here the kernel
+    has the norm 1: of errors that differ from pixel to pixel like white noise, HFEN is then as large as L1.
     """
 
     kernel: Tensor
@@ -47,10 +50,11 @@ class RAELoss(NetworkLoss):
         super().__init__()
         self.denoiser: RAE = denoiser
         self.terms = terms or RAETerms()
-        self.register_buffer("kernel", laplacian_of_gaussian().float().repeat(3, 1, 1, 1), persistent=False)
+        kernel = laplacian_of_gaussian()
+        self.register_buffer("kernel", (kernel / kernel.norm()).float().repeat(3, 1, 1, 1), persistent=False)
 
     def edges(self, x: Tensor) -> Tensor:
-        """LoG of each of the three channels of x (B, 3, H, W), borders replicated, in full precision."""
+        """LoG, of norm 1, of each of the three channels of x (B, 3, H, W), borders replicated, in full precision."""
         with torch.autocast(x.device.type, enabled=False):
             margin = self.kernel.shape[-1] // 2
             return F.conv2d(F.pad(x, (margin,) * 4, mode="replicate"), self.kernel, groups=3)
@@ -62,11 +66,13 @@ class RAELoss(NetworkLoss):
         before: Tensor | None = None  # the error of the frame before
         for frame, weight in zip(batch.frames, terms.frames, strict=True):
             p, state = self.denoiser.predict(frame, state)
-            error = p - self.denoiser.compress(self.denoiser.target(frame), state.scale, frame)
-            parts["spatial"] = parts["spatial"] + weight * error.abs().mean()
-            parts["gradient"] = parts["gradient"] + weight * self.edges(error).abs().mean()
+            target = self.denoiser.compress(self.denoiser.target(frame), state.scale, frame)
+            error = torch.where(frame.depth > 0, p - target, 0)
+            errors = {"spatial": error, "gradient": self.edges(error)}
             if before is not None:  # |dP/dt - dT/dt| is the change of the error
-                parts["temporal"] = parts["temporal"] + weight * (error - before).abs().mean()
+                errors["temporal"] = error - before
+            for name, each in errors.items():
+                parts[name] = parts[name] + weight * surface_mean(each.abs(), frame.depth)
             before = error
         weights = {"spatial": terms.spatial, "gradient": terms.gradient, "temporal": terms.temporal}
         loss = torch.stack([weights[name] * part for name, part in parts.items()]).sum()

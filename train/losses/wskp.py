@@ -7,12 +7,12 @@ from torch import Tensor
 from models.denoiser import Denoiser
 from models.wskp import KernelPredictor
 from train.crops import Crops
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts
+from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 
 
 def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
-    """Mean of |x - r| / (|x| + |r| + epsilon) over all pixels and channels (WSKP Eq. 6), in [0, 1)."""
-    return ((x - reference).abs() / (x.abs() + reference.abs() + epsilon)).mean()
+    """|x - r| / (|x| + |r| + epsilon) of every pixel and channel (WSKP Eq. 6), in [0, 1)."""
+    return (x - reference).abs() / (x.abs() + reference.abs() + epsilon)
 
 
 @dataclass(frozen=True)
@@ -44,4 +44,4 @@ class SMAPELoss(NetworkLoss):
         exposure = batch.scale.exposure()
         images = (filtered, frame.reference_irradiance(signal))
         output, reference = (exposure * frame.remodulate(image, signal) for image in images)
-        return smape(output, reference, self.terms.epsilon), {}
+        return surface_mean(smape(output, reference, self.terms.epsilon), frame.depth), {}
