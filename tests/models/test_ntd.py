@@ -130,7 +130,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     noisy = torch.rand(1, 3, height, width)
     ones = torch.ones(1, 3, height, width)
     seen: list[Tensor] = []
-    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
+    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, *_: seen.append(image) or image)
     reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
     for image, block in zip(seen, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))
