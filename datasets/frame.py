@@ -140,6 +140,11 @@ class Frame:
         """What demodulation divides by: max(albedo, 0.01), (B, 3, H, W)."""
         return self.albedo.clamp(min=ALBEDO_FLOOR)
 
+    @property
+    def surface(self) -> Tensor | None:
+        """1 where a pixel shows a surface and 0 for background, (B, 1, H, W); None where all show one."""
+        return None if self.depth.amin() > 0 else (self.depth > 0).to(self.depth)
+
     def finite(self) -> "Frame":
         """The frame with 0 instead of NaN and infinities in all channels: one bad pixel must not poison a filter.
 
@@ -175,9 +180,15 @@ class Frame:
         return self.reference_halves(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
-        """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, plus the noise-free emission for "total"."""
-        radiance = irradiance * self.divisor
-        return radiance + self.emission if signal == "total" else radiance
+        """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, see `complete`."""
+        return self.complete(irradiance * self.divisor, signal)
+
+    def complete(self, reflected: Tensor, signal: Signal) -> Tensor:
+        """Radiance (B, 3, H, W) of what was denoised: background reflects nothing; "total" has noise-free emission."""
+        surface = self.surface
+        if surface is not None:
+            reflected = torch.where(surface > 0, reflected, 0)
+        return reflected + self.emission if signal == "total" else reflected
 
     def view_normal(self) -> Tensor:
         """Shading normals (B, 3, H, W) in view space: x right, y up, z toward the viewer."""

@@ -21,17 +21,24 @@ class Accumulation:
     surfaces: Surfaces
 
 
-def accumulate(frame: Frame, irradiance: Tensor, history: Accumulation | None) -> Accumulation:
+def accumulate(
+    frame: Frame, irradiance: Tensor, history: Accumulation | None, change: Tensor | None = None
+) -> Accumulation:
     """Blend noisy `irradiance` (B, 3, H, W) into its history with weight alpha = max(0.2, 1 / (n + 1)).
 
     n is the history's length, so the first five frames are averaged evenly; then it is an exponential moving average.
-    Disoccluded pixels start anew.
+    Disoccluded pixels start anew. `change` (B, 1, H, W) in [0, 1], if given, moves alpha by that share of its way to 1;
+    the length is then at most 1 / alpha, that of the even mean in which the newest frame weighs so much.
     """
     length = torch.ones_like(irradiance[:, :1])
     if history is not None:
         past, found = reproject(frame, torch.cat([history.irradiance, history.length], dim=1), history.surfaces)
         n = past[:, 3:]
-        alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
-        irradiance = torch.lerp(past[:, :3], irradiance, alpha)
-        length = torch.where(found, n + 1, 1)
+        alpha = (1 / (n + 1)).clamp(min=SMALLEST_ALPHA)
+        longer = n + 1
+        if change is not None:
+            alpha = torch.lerp(alpha, torch.ones_like(alpha), change)
+            longer = torch.minimum(longer, 1 / alpha)
+        irradiance = torch.lerp(past[:, :3], irradiance, torch.where(found, alpha, 1))
+        length = torch.where(found, longer, 1)
     return Accumulation(irradiance, length, Surfaces.of(frame))

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from models import compiled
 from models.compiled import fusion as kernels
 from models.operators import STRIP_ROWS
-from models.parameters import LEAST_EXPONENT, OUTSIDE, SAFE_RANGE, WINDOWS
+from models.parameters import LEAST_EXPONENT, LEAST_WEIGHT, OUTSIDE, SAFE_RANGE, WINDOWS
 
 
 def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
@@ -69,12 +69,18 @@ def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, 
     return top, total
 
 
-def windowed_sums(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, Tensor]:
+def windowed_sums(logits: Tensor, values: Tensor, window: int, counted: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """(M, S) with exp(M) S = sum of exp(logits) * values over the window of each pixel, taps outside left out.
 
     `logits` (B, 1, H, W), any finite numbers; `values` (B, C, H, W); S (B, C, H, W); M (B, 1, H, W) or (1, 1, 1, 1).
+    Where `counted` (B, 1, H, W), of bool, is given, other pixels are left out as well.
     """
     low, high = torch.aminmax(logits)
+    if counted is not None:
+        logits = torch.where(counted, logits, OUTSIDE)
+        values = torch.where(counted, values, 0)
+        high = logits.amax()
+        low = torch.where(counted, logits, high).amin()
     if high - low > SAFE_RANGE:
         return sums_in_steps(logits, values, window)
     shift = (low + high) / 2
@@ -94,28 +100,35 @@ class SharedKernel(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, logits: Tensor, window: int) -> Tensor:
-        top, total = windowed_sums(logits, with_ones(image), window)
+    def forward(ctx: Any, image: Tensor, logits: Tensor, window: int, surface: Tensor | None = None) -> Tensor:
+        counted = None if surface is None else surface > 0
+        top, total = windowed_sums(logits, with_ones(image), window, counted)
         weight = total[:, -1:]
-        filtered = total[:, :-1] / weight
+        filtered = total[:, :-1] / weight.clamp(min=LEAST_WEIGHT)
         ctx.window = window
-        ctx.save_for_backward(image, logits, filtered, top + torch.log(weight))
+        ctx.save_for_backward(image, logits, counted, filtered, top + torch.log(weight))
         return filtered
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        image, logits, filtered, log_weight = ctx.saved_tensors
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        image, logits, counted, filtered, log_weight = ctx.saved_tensors
         (gradient,) = gradients
         pulled = torch.cat([gradient, (gradient * filtered).sum(dim=1, keepdim=True)], dim=1)
-        top, total = windowed_sums(-log_weight, pulled, ctx.window)
-        total = total * torch.exp(logits + top)  # at most 1: no denominator is smaller than its own terms
+        # Windows without any surface are 0 whatever the inputs; pixels without one are in no window.
+        filled = None if counted is None else log_weight.isfinite()
+        top, total = windowed_sums(-log_weight, pulled, ctx.window, filled)
+        scale = torch.exp(logits + top)  # at most 1: no denominator is smaller than its own terms
+        total = total * (scale if counted is None else torch.where(counted, scale, 0))
         to_image = total[:, :-1]
-        return to_image, (to_image * image).sum(dim=1, keepdim=True) - total[:, -1:], None
+        return to_image, (to_image * image).sum(dim=1, keepdim=True) - total[:, -1:], None, None
 
 
-def shared_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:
-    """Filter `image` (B, C, H, W) with the kernels that `logits` (B, 1, H, W) encode (Eq. 3, 4). `window` is odd."""
-    filtered: Tensor = SharedKernel.apply(image, logits, window)
+def shared_kernel(image: Tensor, logits: Tensor, window: int, surface: Tensor | None = None) -> Tensor:
+    """Filter `image` (B, C, H, W) with the kernels that `logits` (B, 1, H, W) encode (Eq. 3, 4). `window` is odd.
+
+    Only pixels that show a `surface` (B, 1, H, W) count.
+    """
+    filtered: Tensor = SharedKernel.apply(image, logits, window, surface)
     return filtered
 
 
@@ -128,27 +141,38 @@ def strips(height: int, margin: int) -> Iterator[tuple[slice, slice, slice]]:
         yield slice(start, stop), slice(low, high), slice(start - low, stop - low)
 
 
-def fuse_whole(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int]) -> Tensor:
+def fuse_whole(
+    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int], surface: Tensor | None
+) -> Tensor:
     shares = torch.softmax(mixture, dim=1)
-    parts = [shares[:, [i]] * shared_kernel(image, importance[:, [i]], k) for i, k in enumerate(windows)]
+    parts = [shares[:, [i]] * shared_kernel(image, importance[:, [i]], k, surface) for i, k in enumerate(windows)]
     return torch.stack(parts).sum(dim=0)
 
 
 @compiled.by(kernels.fuse, gpu=kernels.fuse_on_gpu if find_spec("triton") else None)
-def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
+def fuse(
+    image: Tensor,
+    importance: Tensor,
+    mixture: Tensor,
+    windows: Sequence[int] = WINDOWS,
+    surface: Tensor | None = None,
+) -> Tensor:
     """Filter an image with shared kernels of several window sizes and mix the results (Eq. 5).
 
     Args:
         image: (B, 3, H, W), finite. importance: I, (B, M, H, W), one map a window; any finite numbers.
         mixture: logits (B, M, H, W) whose softmax over M are the shares alpha. windows: M odd sizes.
+        surface: (B, 1, H, W), 1 for pixels that count and 0 for those that are left out like taps outside the image;
+            by default all count.
     Returns (B, 3, H, W): a convex combination of the image's pixels within the largest window, taps outside the image
-    left out. Differentiable in the first three.
+    left out; a window none of whose pixels count adds 0. Differentiable in the first three.
     """
     training = torch.is_grad_enabled() and any(t.requires_grad for t in (image, importance, mixture))
     if training or image.device.type != "cpu":
-        return fuse_whole(image, importance, mixture, windows)
+        return fuse_whole(image, importance, mixture, windows, surface)
     fused = torch.empty_like(image)
     for rows, needed, within in strips(image.shape[-2], max(windows) // 2):
-        part = fuse_whole(image[..., needed, :], importance[..., needed, :], mixture[..., needed, :], windows)
+        there = None if surface is None else surface[..., needed, :]
+        part = fuse_whole(image[..., needed, :], importance[..., needed, :], mixture[..., needed, :], windows, there)
         fused[..., rows, :] = part[..., within, :]
     return fused

@@ -11,14 +11,15 @@ from torch.nn import functional as F
 from datasets.frame import Frame, Signal, disoccluded
 from models.convolution import ConvReLU
 from models.denoiser import Denoiser, State, matching_state
-from models.operators import pad_to_multiple
+from models.operators import halve, halve_surface, pad_to_multiple
 from models.pixel_kernels import apply_kernels
 from models.running_scale import RunningScale, running_scale
 
 NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
 TAPS = 25  # of a 5 x 5 kernel
-Pool = Callable[[Tensor], Tensor]  # to half the size, rounded up
+Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, of the pixels that show a surface
+LEAST_SHARE = 1e-6  # of surfaces in what bilinear filters gather; with less there is none
 MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
 
 
@@ -85,49 +86,61 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
 
-def maximum_pool(image: Tensor) -> Tensor:
-    """The maximum of 2 x 2 pixels: D of the paper's Eq. 4."""
-    return F.max_pool2d(image, 2, ceil_mode=True)
+def maximum_pool(image: Tensor, surface: Tensor | None = None) -> Tensor:
+    """The maximum of 2 x 2 pixels, of an image that is not negative: D of the paper's Eq. 4."""
+    return F.max_pool2d(image if surface is None else image * surface, 2, ceil_mode=True)
 
 
-def average_pool(image: Tensor) -> Tensor:
-    """The mean of 2 x 2 pixels, fewer at odd borders."""
-    return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)
-
-
-def combine_levels(fine: Tensor, coarse: Tensor, alpha: Tensor, pool: Pool = maximum_pool) -> Tensor:
+def combine_levels(
+    fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None, pool: Pool = maximum_pool
+) -> Tensor:
     """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D is `pool`, U is bilinear.
 
-    U is linear and so applied once. `fine` (B, C, H, W); `coarse`, and `alpha` (B, 1, ·, ·), have half the size,
-    rounded up. With the paper's maximum, what is taken away is brighter than what is put in its place.
+    U is linear and so applied once. `fine` (B, C, H, W) is not negative; `coarse`, and `alpha` (B, 1, ·, ·), have half
+    the size, rounded up. D and U take pixels that show a `surface` (B, 1, H, W) of 1 and 0. With the paper's maximum,
+    what is taken away is brighter than what is put in its place.
     """
     height, width = fine.shape[-2:]
-    change = alpha * (coarse - pool(fine))
-    return fine + F.interpolate(change, scale_factor=2.0, mode="bilinear")[..., :height, :width]
+
+    def enlarge(x: Tensor) -> Tensor:
+        return F.interpolate(x, scale_factor=2.0, mode="bilinear")[..., :height, :width]
+
+    change = alpha * (coarse - pool(fine, surface))
+    if surface is None:
+        return fine + enlarge(change)
+    there = F.max_pool2d(surface, 2, ceil_mode=True)
+    return fine + enlarge(change * there) / enlarge(there).clamp(min=LEAST_SHARE)
 
 
 def reconstruct_image(
-    noisy: Tensor, warped: Tensor, predictions: Sequence[Tensor], pool: Pool = maximum_pool
+    noisy: Tensor,
+    warped: Tensor,
+    predictions: Sequence[Tensor],
+    surface: Tensor | None = None,
+    pool: Pool = maximum_pool,
 ) -> tuple[Tensor, Tensor]:
     """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
 
     Args:
         noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
         predictions: of the network, coarse to fine, at least as large as the images.
+        surface: what pixels may be gathered from, see Frame.surface.
         pool: D of Eq. 4.
     """
     pyramid = [noisy]
+    surfaces = [surface]
     for _ in predictions[1:]:  # averages: maxima of noise would be biased
-        pyramid.append(average_pool(pyramid[-1]))
+        pyramid.append(halve(pyramid[-1], surfaces[-1]))
+        surfaces.append(halve_surface(surfaces[-1]))
     output = pyramid[-1]
     alpha: Tensor | None = None
-    for image, prediction in zip(pyramid[::-1], predictions, strict=True):
+    for image, there, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
-        filtered = apply_kernels(image, prediction[:, :TAPS])
-        output = filtered if alpha is None else combine_levels(filtered, output, alpha, pool)
+        filtered = apply_kernels(image, prediction[:, :TAPS], there)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha, there, pool)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
-    return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS]), output, alpha), alpha
+    return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS], surface), output, alpha), alpha
 
 
 @dataclass(frozen=True)
@@ -140,6 +153,7 @@ class NTDState(State):
     alpha: Tensor  # (B, 1, H, W)
     motion: Tensor
     dual_motion: Tensor | None
+    surface: Tensor | None  # see Frame.surface
 
     def pictures(self) -> dict[str, Tensor]:
         shown = {"alpha_t": self.alpha, "warped previous": self.warped}
@@ -148,12 +162,22 @@ class NTDState(State):
         return shown
 
 
+def warp_output(state: NTDState, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """The previous output where this frame's pixels were, as `warp` does; nothing is gathered from background."""
+    if state.surface is None:
+        return warp(state.irradiance, motion)
+    past, inside = warp(torch.cat([state.irradiance, state.surface], dim=1), motion)
+    share = past[:, 3:]
+    return past[:, :3] / share.clamp(min=LEAST_SHARE), inside & (share > LEAST_SHARE)
+
+
 class NTD(Denoiser):
     """Predicts kernels for this frame's noise at three resolutions and for the previous output, reprojected.
 
-    Where the motion vector leaves the image there is no previous output, and this frame's noise stands in for it, as
-    it does for all of the first frame (§5): so what comes into view, and all of the image where a cut moves the camera
-    far away, starts anew. The paper leaves that to the network and tests no surfaces, and neither do we.
+    Where the motion vector leaves the image, or leads to background, there is no previous output, and this frame's
+    noise stands in for it, as it does for all of the first frame (§5): so what comes into view, and all of the image
+    where a cut moves the camera far away, starts anew. The paper leaves the rest to the network and tests no surfaces,
+    and neither do we.
 
     It denoises indirect light, as in the paper, unless it is built for "total".
 
@@ -174,9 +198,9 @@ class NTD(Denoiser):
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def pool(self, image: Tensor) -> Tensor:
+    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
         """D of Eq. 4: `image` (B, 3, H, W) in half the size, rounded up."""
-        return maximum_pool(image)
+        return maximum_pool(image, surface)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
@@ -190,16 +214,19 @@ class NTD(Denoiser):
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         warped = noisy
         if before:
-            previous, inside = warp(before.irradiance, getattr(frame, self.vectors))
-            warped = torch.where(inside, previous, noisy)
+            previous, found = warp_output(before, getattr(frame, self.vectors))
+            warped = torch.where(found, previous, noisy)
         colours = (self.compress(image, scale, frame) for image in (noisy, warped))
         x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
         predictions = self.network(pad_to_multiple(x, MULTIPLE))
-        irradiance, alpha = reconstruct_image(noisy, warped, predictions, self.pool)
+        surface = frame.surface
+        irradiance, alpha = reconstruct_image(noisy, warped, predictions, surface, self.pool)
+        if surface is not None:
+            irradiance = irradiance * surface
         dual = frame.dual_motion if self.vectors == "dual_motion" else None
-        after = NTDState(frame.moment, irradiance.clamp(min=0), scale, warped, alpha, frame.motion, dual)
-        return irradiance, after
+        kept = irradiance.clamp(min=0)
+        return irradiance, NTDState(frame.moment, kept, scale, warped, alpha, frame.motion, dual, surface)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         _, after = self.predict(frame, state)
@@ -220,5 +247,5 @@ class NTDMean(NTD):
     network must learn to make up for. Eq. 7 of WSKP (Fan et al. 2021), of the same form, averages as well.
     """
 
-    def pool(self, image: Tensor) -> Tensor:
-        return average_pool(image)
+    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
+        return halve(image, surface)

@@ -87,7 +87,7 @@ class OIDN(Denoiser):
     "fast" (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
     """
 
-    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal")
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
 
     def __init__(self, quality: OIDNQuality = "high", *, signal: Signal | None = None):
@@ -120,7 +120,7 @@ class OIDN(Denoiser):
         denoise = self.filter_for(*frame.size)
         inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
         denoised = torch.stack([denoise(*item) for item in zip(*inputs, strict=True)])
-        return denoised + frame.emission if self.signal == "total" else denoised
+        return frame.complete(denoised, self.signal)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         reflected = frame.indirect if self.signal == "indirect" else frame.direct + frame.indirect

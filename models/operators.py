@@ -19,6 +19,25 @@ def image_luminance(rgb: Tensor) -> Tensor:
     return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64).to(rgb)[:, None, None]).sum(dim=1, keepdim=True)
 
 
+def halve(image: Tensor, surface: Tensor | None = None) -> Tensor:
+    """Means of 2 x 2 pixels, fewer at odd borders: (B, C, H, W) becomes half as large, rounded up.
+
+    Only pixels that show a `surface` count (see Frame.surface); without any, the mean is 0.
+    """
+
+    def mean(x: Tensor) -> Tensor:
+        return F.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)
+
+    if surface is None:
+        return mean(image)
+    return mean(image * surface) / mean(surface).clamp(min=1 / 4)
+
+
+def halve_surface(surface: Tensor | None) -> Tensor | None:
+    """The surface (B, 1, H, W) of an image after `halve`: where any of the 2 x 2 pixels shows one."""
+    return None if surface is None else F.max_pool2d(surface, 2, ceil_mode=True)
+
+
 def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
     """Replicate the right and bottom borders until both sides are multiples of `multiple`."""
     right = -x.shape[-1] % multiple

@@ -22,4 +22,5 @@ FEATURE_CHANNELS = 10  # what the network sees (§5.1): displayed colour, albedo
 GAMMA = 2.2  # of the display transform before the network (§5.1)
 SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither overflows nor vanishes in float32
 LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35
-OUTSIDE = -1e30  # logit of a tap outside the image
+OUTSIDE = -1e30  # logit of a tap outside the image, or without a surface
+LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0

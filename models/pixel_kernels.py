@@ -29,6 +29,12 @@ def kernel_taps(logits: Tensor) -> Iterator[tuple[int, Any, Any]]:
             yield index, (..., *here), (..., *there)
 
 
+def tap_logit(logits: Tensor, index: int, here: Any, there: Any, surface: Tensor | None) -> Tensor:
+    """The logits (B, 1, h, w) of a tap, -inf where it shows no surface."""
+    logit = logits[:, index, None][here]
+    return logit if surface is None else torch.where(surface[there] > 0, logit, -torch.inf)
+
+
 class ApplyKernels(torch.autograd.Function):
     """Keeps the softmax's maximum and sum for the way back, and computes the weights again from the logits.
 
@@ -37,45 +43,48 @@ class ApplyKernels(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, logits: Tensor) -> Tensor:
-        # The centre is inside the image for every pixel, so that this is the logit of a tap that counts.
-        top = logits[:, logits.shape[1] // 2, None].to(image.dtype, copy=True)
-        for index, here, _ in kernel_taps(logits):
-            top[here] = torch.maximum(top[here], logits[:, index, None][here])
+    def forward(ctx: Any, image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
+        top = torch.full_like(image[:, :1], -torch.inf)
+        for index, here, there in kernel_taps(logits):
+            top[here] = torch.maximum(top[here], tap_logit(logits, index, here, there, surface))
+        top = torch.where(top.isneginf(), 0, top)  # without any surface all weights are 0
         total = torch.zeros_like(top)
         output = torch.zeros_like(image)
         for index, here, there in kernel_taps(logits):
-            weight = torch.exp(logits[:, index, None][here] - top[here])
+            weight = torch.exp(tap_logit(logits, index, here, there, surface) - top[here])
             total[here] += weight
             output[here].addcmul_(weight, image[there])
+        total.clamp_(min=1)  # the largest logit's own weight is 1
         output /= total
-        ctx.save_for_backward(image, logits, top, total, output)
+        ctx.save_for_backward(image, logits, surface, top, total, output)
         return output
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor]:
-        image, logits, top, total, output = ctx.saved_tensors
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
+        image, logits, surface, top, total, output = ctx.saved_tensors
         (gradient,) = gradients
         to_image = torch.zeros_like(image) if ctx.needs_input_grad[0] else None
         to_logits = torch.zeros_like(logits)
         mean = (gradient * output).sum(dim=1, keepdim=True)
         for index, here, there in kernel_taps(logits):
-            weight = torch.exp(logits[:, index, None][here] - top[here]) / total[here]
+            weight = torch.exp(tap_logit(logits, index, here, there, surface) - top[here]) / total[here]
             if to_image is not None:
                 to_image[there].addcmul_(weight, gradient[here])
             product = (gradient[here] * image[there]).sum(dim=1, keepdim=True)
             to_logits[:, index, None][here] = weight * (product - mean[here])
-        return to_image, to_logits
+        return to_image, to_logits, None
 
 
 @compiled.by(kernels.apply_kernels)
-def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
+def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
     """Filter `image` (B, C, H, W) with one k x k kernel a pixel; returns (B, C, H, W). Differentiable in both.
 
     Args:
         image: float32, finite, linear. Taps outside it are left out.
         logits: (B, k², H, W), k odd, the taps row by row from the top left; any finite numbers, also in half precision.
+        surface: (B, 1, H, W), 1 for pixels that count and 0 for those that are left out like taps outside; by default
+            all count. Where none of a window does, the output is 0.
     """
     # Taps that lie apart in memory would be gathered one by one, several times each.
-    filtered: Tensor = ApplyKernels.apply(image, logits.contiguous())
+    filtered: Tensor = ApplyKernels.apply(image, logits.contiguous(), surface)
     return filtered

@@ -52,16 +52,29 @@ class RunningScale:
         return torch.where(depth > 0, depth / (depth + scale), 1)
 
 
+def block_luminances(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean luminance of the surfaces in each block, float64, 0 without any, and whether there are any: (B, blocks)."""
+
+    def block_means(image: Tensor) -> Tensor:
+        return F.avg_pool2d(image, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False).flatten(1).double()
+
+    surface = (depth > 0).to(radiance)
+    share = block_means(surface)
+    y = block_means(image_luminance(radiance).clamp(min=0) * surface)
+    return y / torch.where(share > 0, share, 1), share > 0
+
+
 def measure(radiance: Tensor, depth: Tensor) -> Tensor:
     """What one frame tells: the logarithms of its luminance and of its median depth, (B, 2).
 
-    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is all black, or has no surface.
+    `radiance` (B, 3, H, W) is noisy direct + indirect light. Background counts in neither. NaN where a frame is all
+    black, or has no surface.
     """
-    luminance = image_luminance(radiance).clamp(min=0)
-    blocks = F.avg_pool2d(luminance, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False)
-    y = blocks.flatten(1).double()
-    mean = y.mean(dim=1)
-    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)).mean(dim=1).to(radiance.dtype)
+    y, seen = block_luminances(radiance, depth)
+    blocks = seen.sum(dim=1).clamp(min=1)
+    mean = y.sum(dim=1) / blocks
+    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)) * seen
+    log_y = (log_y.sum(dim=1) / blocks).to(radiance.dtype)
     stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
     depths = depth[..., ::stride_y, ::stride_x].flatten(1)
     median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values

@@ -8,7 +8,7 @@ Where the paper is silent, we choose:
   differences to the two neighbours of the same mesh, so that it never sees across a silhouette; 0 without any.
 - ε of Eq. 3 is relative to the depth, so that the scene's scale cancels; ε of Eq. 5 is below any radiance's square.
 - The spatial estimate (§4.2) averages the integrated moments over its 7 × 7 pixels with the weights w_z · w_n.
-- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis.
+- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis, over the pixels that show surfaces.
 - Background has no normal: its weight is 0 except for itself, so it is neither filtered nor mixed with surfaces.
 """
 
@@ -131,15 +131,15 @@ def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
     return spatial_variance(variance, mean, geometry, short) if short.any() else variance
 
 
-def edge_scale(variance: Tensor) -> Tensor:
-    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W)."""
-    total = WindowSum(torch.ones_like(variance), 1 / 4)
-    mean = WindowSum(variance, 1 / 4)
+def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
+    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W); g takes pixels that show a `surface` (B, 1, 1, H, W)."""
+    total = WindowSum(surface.to(variance), 1 / 4)
+    mean = WindowSum(variance * surface, 1 / 4)
     for tap in strip_taps(variance.shape[-2:], 1):
         weight = variance.new_tensor(1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy)))
         total.add(tap, weight)
         mean.add(tap, weight)
-    return 1 / (SIGMA_L * (mean.sum / total.sum + EPSILON_L).sqrt())
+    return 1 / (SIGMA_L * (mean.sum / total.sum.clamp(min=1 / 16) + EPSILON_L).sqrt())
 
 
 @compiled.by(kernels.svgf_level)
@@ -149,7 +149,7 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
     Taps are `step` pixels apart.
     """
     y = image_luminance(colour.flatten(0, 1)).view_as(variance)
-    scale = edge_scale(variance)
+    scale = edge_scale(variance, geometry[:, :, 3:4] > 0)
     total = WindowSum(torch.ones_like(variance), CENTRE)
     mean = WindowSum(colour, CENTRE)
     spread = WindowSum(variance, CENTRE**2)

@@ -14,7 +14,7 @@ from models.baselines import Accumulated, AccumulatedState
 from models.denoiser import Denoiser, State, matching_state
 from models.features import network_features
 from models.fusion import fuse
-from models.operators import pad_to_multiple
+from models.operators import halve, halve_surface, pad_to_multiple
 from models.parameters import FEATURE_CHANNELS, WINDOWS
 from models.pixel_kernels import apply_kernels
 from models.repvgg import BRANCH_SIZES, merge, repvgg
@@ -51,8 +51,13 @@ class KernelPredictor(Denoiser):
         """The network's input, see network_features."""
         return network_features(frame, irradiance, scale)
 
-    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any."""
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any.
+
+        Nothing is gathered from background: see Frame.surface.
+        """
         raise NotImplementedError
 
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
@@ -67,7 +72,7 @@ class KernelPredictor(Denoiser):
         """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any."""
         x = self.features(frame, irradiance, scale)
         predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
-        return self.reconstruct(irradiance, predicted)
+        return self.reconstruct(irradiance, predicted, frame.surface)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         after = self.accumulate(frame, state)
@@ -97,9 +102,11 @@ class WSKP(KernelPredictor):
         self.windows = tuple(windows)
         self.network = trunk(self.layers, 2 * len(windows), sizes)
 
-    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
-        return fuse(irradiance, importance, mixture, self.windows), mixture
+        return fuse(irradiance, importance, mixture, self.windows, surface), mixture
 
 
 class WSKP3(WSKP):
@@ -117,8 +124,10 @@ class KP(KernelPredictor):
         super().__init__(signal=signal)
         self.network = trunk(WSKP.layers, self.window**2, sizes)
 
-    def reconstruct(self, irradiance: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor | None]:
-        return apply_kernels(irradiance, predicted), None
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        return apply_kernels(irradiance, predicted, surface), None
 
 
 def convolutions(inputs: int, outputs: int) -> nn.Sequential:
@@ -153,9 +162,12 @@ class MultiResolutionNet(nn.Module):
         return predictions
 
 
-def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W)."""
-    return fine + alpha * F.interpolate(coarse - F.avg_pool2d(fine, 2), scale_factor=2.0)
+def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None) -> Tensor:
+    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W).
+
+    D counts pixels that show a `surface`, as `halve` does.
+    """
+    return fine + alpha * F.interpolate(coarse - halve(fine, surface), scale_factor=2.0)
 
 
 class WSKPMR(KernelPredictor):
@@ -173,17 +185,21 @@ class WSKPMR(KernelPredictor):
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)
 
-    def reconstruct(self, irradiance: Tensor, predicted: Sequence[Tensor]) -> tuple[Tensor, Tensor | None]:  # type: ignore[override]
+    def reconstruct(  # type: ignore[override]
+        self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         height, width = irradiance.shape[-2:]
         images = [pad_to_multiple(irradiance, 4)]
+        surfaces = [None if surface is None else pad_to_multiple(surface, 4)]
         for _ in predicted[1:]:
-            images.append(F.avg_pool2d(images[-1], 2))
+            images.append(halve(images[-1], surfaces[-1]))
+            surfaces.append(halve_surface(surfaces[-1]))
         output = images[-1]
         mixture: Tensor | None = None
-        for level, (image, maps) in enumerate(zip(images[::-1], predicted, strict=True)):
+        for level, (image, there, maps) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
             maps = maps.to(image.dtype)
             mixture = maps[:, 2:4]
-            filtered = fuse(image, maps[:, :2], mixture, self.windows)
-            output = combine_resolutions(filtered, output, torch.sigmoid(maps[:, 4:])) if level else filtered
+            filtered = fuse(image, maps[:, :2], mixture, self.windows, there)
+            output = combine_resolutions(filtered, output, torch.sigmoid(maps[:, 4:]), there) if level else filtered
         assert mixture is not None
         return output[..., :height, :width].clamp(min=0), mixture[..., :height, :width]

@@ -14,7 +14,7 @@ DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 
 
 class IrradianceRange:
-    """The irradiance that a convex filter has seen since it began: what it must stay within, for each colour.
+    """The irradiance of surfaces that a convex filter has seen since it began: its limits, for each colour.
 
     SVGF filters direct and indirect light separately, so its limits are sums of two.
     """
@@ -27,12 +27,15 @@ class IrradianceRange:
     def see(self, frame: Frame) -> None:
         parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
         seen = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
-        self.low = torch.minimum(self.low, seen.amin((2, 3)))
-        self.high = torch.maximum(self.high, seen.amax((2, 3)))
+        surface = frame.depth > 0
+        self.low = torch.minimum(self.low, torch.where(surface, seen, torch.inf).amin((2, 3)))
+        self.high = torch.maximum(self.high, torch.where(surface, seen, -torch.inf).amax((2, 3)))
 
     def violation(self, frame: Frame, output: Tensor) -> float:
-        """How far radiance `output` (3, H, W) is outside, relative to the limit; at most 0 inside."""
-        irradiance = finite((output - frame.emission).double() / frame.divisor)[0].flatten(1)
+        """How far radiance `output` (3, H, W) of surfaces is outside, relative to the limit; at most 0 inside."""
+        irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, frame.depth[0, 0] > 0]
+        if irradiance.numel() == 0:
+            return 0.0
         low = self.low.sum(dim=0)
         high = self.high.sum(dim=0)
         above = (irradiance.amax(dim=1) - high) / high.clamp(min=DARKEST_LIMIT)

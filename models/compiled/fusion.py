@@ -16,13 +16,14 @@ from torch import Tensor
 
 from models import parameters
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order
+from models.compiled.jit import array, jit_in_any_order, plane_or_empty
 from models.parameters import WINDOWS
 
 THREAD_ROWS = 32  # rows that a thread fuses at once
 SAFE_RANGE = np.float32(parameters.SAFE_RANGE)
 LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
 OUTSIDE = np.float32(parameters.OUTSIDE)
+LEAST_WEIGHT = np.float32(parameters.LEAST_WEIGHT)
 
 
 @jit_in_any_order
@@ -60,7 +61,7 @@ def mix(fused: Any, y: int, total: Any, share: Any) -> None:
         row = fused[c, y]
         sums = total[c]
         for x in range(share.size):
-            row[x] += share[x] * sums[x] / weight[x]
+            row[x] += share[x] * sums[x] / max(weight[x], LEAST_WEIGHT)
 
 
 @jit_in_any_order
@@ -70,6 +71,28 @@ def copy_rows(rows: Any, source: Any) -> None:
         line = rows[y]
         for x in range(line.size):
             line[x] = source[y, x]
+
+
+@jit_in_any_order
+def leave_out(logits: Any, surface: Any) -> None:
+    """logits (n, W) become OUTSIDE where surface (n, W) is 0."""
+    for y in range(logits.shape[0]):
+        line = logits[y]
+        there = surface[y]
+        for x in range(line.size):
+            line[x] = line[x] if there[x] > 0 else OUTSIDE
+
+
+@jit_in_any_order
+def lowest(logits: Any, high: Any) -> Any:
+    """The lowest of logits (n, W) that are not OUTSIDE, at most `high`."""
+    low = high
+    for y in range(logits.shape[0]):
+        line = logits[y]
+        for x in range(line.size):
+            entry = line[x] if line[x] > OUTSIDE else high
+            low = entry if entry < low else low
+    return low
 
 
 @jit_in_any_order
@@ -96,21 +119,20 @@ def softmax(shares: Any, y: int) -> None:
 
 @jit_in_any_order
 def filter_strip(
-    fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
+    fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
 ) -> None:
     """Add a window's share to a strip of rows from `start` on.
 
-    `fused` and `image` (3, H, W) are whole; `logits` (rows, W), from row `low` on, cover the windows of the strip
-    and lie within SAFE_RANGE; `shares` (strip, W); `weighted` (5, rows or more, W) is scratch.
+    `fused` and `image` (3, H, W) are whole; `logits` (rows, W), from row `low` on, cover the windows of the strip and
+    lie within SAFE_RANGE around `shift`, or OUTSIDE; `shares` (strip, W); `weighted` (5, rows or more, W) is scratch.
     """
     height, width = image.shape[1:]
     stop = start + len(shares)
-    shift = (logits.min() + logits.max()) / np.float32(2)
     for y in range(len(logits)):
         line = weighted[3, y]
         entry = logits[y]
         for x in range(width):
-            line[x] = exp(entry[x] - shift)
+            line[x] = exp(max(entry[x] - shift, LEAST_EXPONENT)) if entry[x] > OUTSIDE else np.float32(0)
         for c in range(3):
             product = weighted[c, y]
             pixel = image[c, low + y]
@@ -179,9 +201,9 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
 
 
 def fuse_strips(
-    fused: Any, image: Any, importance: Any, mixture: Any, windows: Any, weighted: Any, shares: Any
+    fused: Any, image: Any, surface: Any, importance: Any, mixture: Any, windows: Any, weighted: Any, shares: Any
 ) -> None:
-    """fused (3, H, W) += image (3, H, W) filtered, strips in parallel.
+    """fused (3, H, W) += image (3, H, W) filtered, strips in parallel; surface (H, W) is empty where all pixels count.
 
     weighted (threads, 5, rows, W) and shares (threads, M, THREAD_ROWS, W) are scratch of the threads' own: memory that
     is allocated within the loop would be cleared anew for every strip.
@@ -202,10 +224,16 @@ def fuse_strips(
             high = min(stop + radius, height)
             logits = my_weighted[4, : high - low]
             copy_rows(logits, importance[i, low:high])
-            if logits.max() - logits.min() <= SAFE_RANGE:
-                filter_strip(fused, image, logits, my_shares[i, : stop - start], radius, start, low, my_weighted)
+            if surface.size > 0:
+                leave_out(logits, surface[low:high])
+            top = logits.max()
+            bottom = lowest(logits, top)
+            my_share = my_shares[i, : stop - start]
+            if top - bottom <= SAFE_RANGE:
+                shift = (bottom + top) / np.float32(2)
+                filter_strip(fused, image, logits, shift, my_share, radius, start, low, my_weighted)
             else:
-                filter_strip_in_steps(fused, image, logits, my_shares[i, : stop - start], radius, start, low)
+                filter_strip_in_steps(fused, image, logits, my_share, radius, start, low)
 
 
 @functools.cache
@@ -214,11 +242,17 @@ def compiled_fuse_strips() -> Any:
     image = numba.float32[:, :, ::1]
     maps = numba.float32[:, :, :]
     scratch = numba.float32[:, :, :, ::1]
-    signature = numba.void(image, image, maps, maps, numba.int64[::1], scratch, scratch)
+    signature = numba.void(image, image, numba.float32[:, ::1], maps, maps, numba.int64[::1], scratch, scratch)
     return numba.njit(signature, cache=True, parallel=True, error_model="numpy")(fuse_strips)
 
 
-def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
+def fuse(
+    image: Tensor,
+    importance: Tensor,
+    mixture: Tensor,
+    windows: Sequence[int] = WINDOWS,
+    surface: Tensor | None = None,
+) -> Tensor:
     """See models.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     threads = numba.get_num_threads()
@@ -226,13 +260,20 @@ def fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[i
     weighted = np.empty((threads, 5, THREAD_ROWS + max(windows), width), np.float32)
     shares = np.empty((threads, len(windows), THREAD_ROWS, width), np.float32)
     for item in range(len(image)):
+        images = fused[item].numpy(), array(image[item]), plane_or_empty(surface, item)
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
-        compiled_fuse_strips()(fused[item].numpy(), array(image[item]), *maps, np.array(windows), weighted, shares)
+        compiled_fuse_strips()(*images, *maps, np.array(windows), weighted, shares)
     return fused
 
 
-def fuse_on_gpu(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
+def fuse_on_gpu(
+    image: Tensor,
+    importance: Tensor,
+    mixture: Tensor,
+    windows: Sequence[int] = WINDOWS,
+    surface: Tensor | None = None,
+) -> Tensor:
     """The same for CUDA devices, by Triton, which is imported here because it takes long and is not everywhere."""
     from models.compiled.fusion_triton import fuse
 
-    return fuse(image, importance, mixture, windows)
+    return fuse(image, importance, mixture, windows, surface)

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_order, jit_parallel
+from models.compiled.jit import array, jit_in_order, jit_parallel, plane_or_empty
 
 LEAST_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
+NEVER = np.float32(-np.inf)  # logit of a tap that shows no surface
 ONE_LINE = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
 
 
@@ -29,6 +30,12 @@ def to_float32(row: Any, logits: Any, bfloat: bool) -> None:
 
 
 @jit_in_order
+def leave_out(logits: Any, surface: Any) -> None:
+    for x in range(surface.size):
+        logits[x] = logits[x] if surface[x] > 0 else NEVER
+
+
+@jit_in_order
 def raise_top(top: Any, logits: Any) -> None:
     for x in range(top.size):
         top[x] = max(top[x], logits[x])
@@ -38,7 +45,8 @@ def raise_top(top: Any, logits: Any) -> None:
 def to_weights(logits: Any, top: Any, total: Any) -> None:
     """In place, weights relative to the largest logit; total += weights."""
     for x in range(top.size):
-        logits[x] = exp(max(logits[x] - top[x], LEAST_LOGIT))
+        weight = exp(max(logits[x] - top[x], LEAST_LOGIT))
+        logits[x] = weight if logits[x] > NEVER else np.float32(0)
         total[x] += logits[x]
 
 
@@ -49,14 +57,16 @@ def add_weighted(line: Any, weight: Any, values: Any) -> None:
 
 
 @jit_in_order
-def apply_to_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
+def apply_to_row(output: Any, image: Any, surface: Any, row: Any, y: Any, size: int) -> None:
     """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
+
+    surface (H, W) is empty where all pixels count.
 
     Slices are taken where they can be seen to be contiguous: else no loop would be vectorised.
     """
     channels, height, width = image.shape
     radius = size // 2
-    top = row[size * radius + radius, :width].copy()
+    top = np.full(width, NEVER)
     total = np.zeros(width, np.float32)
     sums = np.zeros((channels, width), np.float32)
     for gather in (False, True):
@@ -66,30 +76,33 @@ def apply_to_row(output: Any, image: Any, row: Any, y: Any, size: int) -> None:
                 high = min(width, width - dx)
                 logits = row[(dy + radius) * size + dx + radius, low:high]
                 if not gather:
+                    if surface.size > 0:
+                        leave_out(logits, surface[y + dy, low + dx : high + dx])
                     raise_top(top[low:high], logits)
                     continue
                 to_weights(logits, top[low:high], total[low:high])
                 for c in range(channels):
                     add_weighted(sums[c, low:high], logits, image[c, y + dy, low + dx : high + dx])
     for c in range(channels):
-        output[c, y] = sums[c] / total
+        output[c, y] = sums[c] / np.maximum(total, np.float32(1))
 
 
 @jit_parallel
-def apply_to_image(output: Any, image: Any, logits: Any, size: int, bfloat: bool) -> None:
+def apply_to_image(output: Any, image: Any, surface: Any, logits: Any, size: int, bfloat: bool) -> None:
     _, height, width = image.shape
     for y in numba.prange(height):
         row = np.empty((size * size, width + ONE_LINE), np.float32)
         to_float32(row, logits[:, y], bfloat)
-        apply_to_row(output, image, row, np.int64(y), size)
+        apply_to_row(output, image, surface, row, np.int64(y), size)
 
 
-def apply_kernels(image: Tensor, logits: Tensor) -> Tensor:
+def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
     """See models.pixel_kernels.apply_kernels; logits are read as they lie in memory, bfloat16 without a copy."""
     output = torch.empty_like(image, memory_format=torch.contiguous_format)
     bfloat = logits.dtype == torch.bfloat16
     bits = logits.view(torch.int16) if bfloat else logits.float()
     for item in range(len(image)):
         values = bits[item].detach().numpy()
-        apply_to_image(output[item].numpy(), array(image[item]), values, math.isqrt(logits.shape[1]), bfloat)
+        images = array(image[item]), plane_or_empty(surface, item)
+        apply_to_image(output[item].numpy(), *images, values, math.isqrt(logits.shape[1]), bfloat)
     return output

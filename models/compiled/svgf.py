@@ -26,6 +26,7 @@ EPSILON_L = np.float32(parameters.EPSILON_L)
 LEAST_DIVISOR = np.float32(parameters.LEAST_DIVISOR)
 LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 LEAST_WEIGHT = np.float32(1e-15)
+LEAST_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
 SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where one needs it
 
 
@@ -222,7 +223,7 @@ def filter_svgf_image(
 
 
 @jit_in_any_order
-def edge_row(edge: Any, colour: Any, variance: Any, row: Any) -> None:
+def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> None:
     """A row of edge (2, H, W): luminance of colour (3, H, W), and models.svgf.edge_scale of variance (H, W)."""
     height, width = variance.shape
     quarter = np.float32(0.25)
@@ -234,9 +235,11 @@ def edge_row(edge: Any, colour: Any, variance: Any, row: Any) -> None:
     for y in range(max(row - 1, 0), min(row + 2, height)):
         h = half if y == row else quarter
         line = variance[y]
+        z = depth[y]
         for x in range(width):
-            total[x] += h * line[x]
-            weight[x] += h
+            share = h if z[x] > 0 else np.float32(0)
+            total[x] += share * line[x]
+            weight[x] += share
     r = colour[0, row]
     g = colour[1, row]
     b = colour[2, row]
@@ -245,16 +248,17 @@ def edge_row(edge: Any, colour: Any, variance: Any, row: Any) -> None:
     for x in range(width):
         luminance[x] = RED_WEIGHT * r[x] + GREEN_WEIGHT * g[x] + BLUE_WEIGHT * b[x]
         mean = quarter * columns[x] + half * columns[x + 1] + quarter * columns[x + 2]
-        mean /= quarter * inside[x] + half * inside[x + 1] + quarter * inside[x + 2]
+        share = quarter * inside[x] + half * inside[x + 1] + quarter * inside[x + 2]
+        mean /= max(share, LEAST_SHARE)
         scale[x] = np.float32(1) / (SIGMA_L * np.sqrt(mean + EPSILON_L))
 
 
 @jit_parallel
-def edge_image(edge: Any, colour: Any, variance: Any) -> None:
+def edge_image(edge: Any, colour: Any, variance: Any, geometry: Any) -> None:
     signals, height, _ = variance.shape
     for row in numba.prange(height):
         for s in range(signals):
-            edge_row(edge[s], colour[s], variance[s], np.int64(row))
+            edge_row(edge[s], colour[s], variance[s], geometry[3], np.int64(row))
 
 
 def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
@@ -264,9 +268,10 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
     edge = np.empty((colour.shape[1], 2, *colour.shape[-2:]), np.float32)
     for item in range(len(colour)):
         image = array(colour[item]), array(variance[item, :, 0])
-        edge_image(edge, *image)
+        surfaces = array(geometry[item, 0])
+        edge_image(edge, *image, surfaces)
         out = filtered[item].numpy(), spread[item, :, 0].numpy()
-        filter_svgf_image(*out, *image, edge, array(geometry[item, 0]), step)
+        filter_svgf_image(*out, *image, edge, surfaces, step)
     return filtered, spread
 
 

@@ -238,7 +238,7 @@ def test_too_short_or_small_clips_are_refused(clips):
 
 
 def test_demodulation_round_trip_and_unread_channels(clips):
-    frame = read_frame(clips[0], 2, ("direct", "indirect", "emission", "albedo"))
+    frame = read_frame(clips[0], 2, ("direct", "indirect", "emission", "albedo", "depth"))
     total = frame.remodulate(frame.irradiance("total"), "total")
     torch.testing.assert_close(total, frame.radiance("total"), rtol=1e-6, atol=0)
     torch.testing.assert_close(

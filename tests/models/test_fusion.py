@@ -117,6 +117,7 @@ def test_a_poisoned_pixel_stays_within_its_windows():
 
 ON_GPU = """
 import torch
+import models.fusion as PyTorch
 from eval.bench.fusion import unfold_fuse
 from models.compiled.fusion_triton import fuse
 
@@ -127,6 +128,11 @@ for scale in (1.0, 1e4):
     expected = unfold_fuse(*(t.double() for t in inputs), (3, 5, 13))
     fused = fuse(*(t.to(device) for t in inputs), (3, 5, 13)).cpu()
     torch.testing.assert_close(fused.double(), expected, rtol=1e-5, atol=0)
+    surface = (torch.rand(2, 1, 3, 135) < 0.02).float()
+    inputs[1] = torch.where(surface > 0, inputs[1], inputs[1] + 1e4)
+    expected = PyTorch.fuse(*(t.double() for t in inputs), (3, 5, 13), surface.double())
+    fused = fuse(*(t.to(device) for t in inputs), (3, 5, 13), surface.to(device)).cpu()
+    torch.testing.assert_close(fused.double(), expected, rtol=1e-5, atol=1e-30)
 """
 
 

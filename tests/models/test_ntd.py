@@ -112,7 +112,7 @@ def test_combination_equals_eq_4(size, kind, pool):
     fine = rng.uniform(0, 5, (3, *size))
     coarse = rng.uniform(0, 5, (3, *half))
     alpha = rng.uniform(0, 1, (1, *half))
-    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)), kind().pool)
+    result = combine_levels(*(torch.from_numpy(a)[None] for a in (fine, coarse, alpha)), pool=kind().pool)
     np.testing.assert_allclose(result[0], naive_combine(fine, coarse, alpha, pool), atol=1e-12)
 
 
@@ -134,7 +134,7 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     noisy = torch.rand(1, 3, height, width)
     ones = torch.ones(1, 3, height, width)
     seen: list[Tensor] = []
-    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, _: seen.append(image) or image)
+    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, *_: seen.append(image) or image)
     reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
     for image, block in zip(seen, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))

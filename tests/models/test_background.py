@@ -1,0 +1,301 @@
+"""Background reflects nothing: it comes out black, and no surface gathers from it or is darkened by it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.frame import Frame
+from eval.bench.fusion import unfold_kernel
+from eval.stress.irradiance_range import CONVEX
+from models import compiled, registry
+from models.fusion import fuse
+from models.ntd import reconstruct_image
+from models.operators import halve, halve_surface
+from models.pixel_kernels import apply_kernels
+from models.running_scale import running_scale
+from tests.helpers.frames import chain, flat_frame, play, run
+
+NAMES = [name for name in registry.DENOISERS if not registry.unavailable(name)]
+WINDOWS = (3, 5, 13)
+MASKS = st.builds(
+    lambda height, width, share, seed: (
+        torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed)) < share
+    ),
+    st.integers(1, 40),
+    st.integers(1, 20),
+    st.sampled_from([0.0, 0.02, 0.5, 0.98]),
+    st.integers(0, 9999),
+)
+
+
+@pytest.fixture(params=["compiled", "PyTorch"], autouse=True)
+def way(request):
+    """Every test runs with compiled kernels and the PyTorch way."""
+    if request.param == "compiled":
+        yield
+    else:
+        with compiled.disabled():
+            yield
+
+
+def with_background(frame: Frame, surface: torch.Tensor) -> Frame:
+    """The frame with sky, lit by an emission of 3, where `surface` (1, 1, H, W) is false."""
+    cut = {
+        name: torch.where(surface, frame.channels[name], value)
+        for name, value in {
+            "direct": 0.0,
+            "indirect": 0.0,
+            "emission": 3.0,
+            "albedo": 1.0,
+            "normal": 0.0,
+            "depth": 0.0,
+            "roughness": 1.0,
+            "mesh_id": 0.0,
+        }.items()
+    }
+    return replace(frame, channels=frame.channels | cut)
+
+
+def noisy_frames(surface: torch.Tensor, count: int = 3) -> list[Frame]:
+    """A camera that slides along a noisy wall with holes, through which the sky is seen; always the same."""
+    generator = torch.Generator().manual_seed(0)
+    height, width = surface.shape[-2:]
+    frames = []
+    for _ in range(count):
+        light = torch.rand(1, 3, height, width, generator=generator) ** 4 * 10
+        frame = flat_frame(height, width, (0.3, -0.2), irradiance=light)
+        frame.channels.update(indirect=light.flip(1))
+        frames.append(with_background(frame, surface))
+    return chain(frames)
+
+
+def crop(frame: Frame, width: int) -> Frame:
+    """The left part of a frame; its cameras stay, because columns count from the left."""
+    return frame.map(lambda tensor: tensor[..., :width].contiguous())
+
+
+# --- All denoisers ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_background_is_its_emission_alone(name):
+    torch.manual_seed(0)
+    surface = torch.rand(1, 1, 40, 37) < 0.5
+    denoiser = registry.create(name)
+    denoiser.prepare()
+    emission = 3.0 if denoiser.signal == "total" else 0.0
+    outputs, state = play(denoiser, noisy_frames(surface))
+    for output in outputs:
+        assert (output.masked_select(~surface) == emission).all()
+        assert output.masked_select(surface).max() > 0
+    carried = getattr(state, "irradiance", None)
+    if carried is not None:
+        assert (carried.masked_select(~surface) == 0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in CONVEX if name in NAMES])
+@settings(deadline=None)
+@given(surface=MASKS)
+def test_even_light_stays_even_beside_background(name, surface):
+    torch.manual_seed(0)
+    denoiser = registry.create(name)
+    denoiser.prepare()
+    light = torch.full((1, 3, *surface.shape[-2:]), 7.0)
+    frame = with_background(flat_frame(*surface.shape[-2:], irradiance=light), surface)
+    for output in run(denoiser, [frame, frame, frame]):
+        torch.testing.assert_close(output, torch.where(surface, 7.0, 3.0).expand_as(output), rtol=2e-5, atol=0)
+
+
+@pytest.mark.parametrize("name", ["accumulated", "eaw", "svgf"])
+def test_beside_background_is_like_beside_the_border(name):
+    """Sky right of a wall filters it as an image that ends there does."""
+    surface = torch.ones(1, 1, 40, 70, dtype=torch.bool)
+    surface[..., 43:] = False
+    frames = noisy_frames(surface, count=5)
+    denoiser = registry.create(name)
+    denoiser.prepare()
+    whole = run(denoiser, frames)
+    alone = run(denoiser, [crop(frame, 43) for frame in frames])
+    for a, b in zip(whole, alone, strict=True):
+        torch.testing.assert_close(a[..., :43], b, rtol=1e-5, atol=1e-6)
+
+
+# --- The operators of the networks ------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(surface=MASKS, scale=st.sampled_from([1.0, 100.0, 1e4]), seed=st.integers(0, 999))
+def test_fusion_leaves_background_out(surface, scale, seed):
+    """Against softmax over the surfaces of every window, in float64; whatever the background's logits are."""
+    generator = torch.Generator().manual_seed(seed)
+    height, width = surface.shape[-2:]
+    image = torch.rand(1, 3, height, width, generator=generator) + 0.1
+    importance = scale * torch.randn(1, len(WINDOWS), height, width, generator=generator)
+    importance += 1e4 * (~surface & (torch.rand(1, 1, height, width, generator=generator) < 0.1))
+    mixture = torch.randn(1, len(WINDOWS), height, width, generator=generator)
+    shares = torch.softmax(mixture.double(), dim=1)
+    entries = torch.where(surface, importance.double(), -torch.inf)
+    # With only -inf in a window, softmax is NaN.
+    parts = [unfold_kernel(image.double(), entries[:, [i]], k).nan_to_num(0) for i, k in enumerate(WINDOWS)]
+    expected = sum(shares[:, [i]] * part for i, part in enumerate(parts))
+    fused = fuse(image, importance, mixture, WINDOWS, surface.float())
+    torch.testing.assert_close(fused.double(), expected, rtol=2e-5, atol=0)
+
+
+@settings(deadline=None)
+@given(surface=MASKS, size=st.sampled_from([1, 3, 5]), scale=st.sampled_from([1.0, 1e4]), seed=st.integers(0, 999))
+def test_kernels_leave_background_out(surface, size, scale, seed):
+    generator = torch.Generator().manual_seed(seed)
+    height, width = surface.shape[-2:]
+    image = torch.rand(1, 3, height, width, generator=generator) + 0.1
+    logits = scale * torch.randn(1, size * size, height, width, generator=generator)
+    expected = np.zeros((3, height, width))
+    radius = size // 2
+    for y, x in np.ndindex(height, width):
+        taps = [
+            (dy, dx)
+            for dy in range(-radius, radius + 1)
+            for dx in range(-radius, radius + 1)
+            if 0 <= y + dy < height and 0 <= x + dx < width and surface[0, 0, y + dy, x + dx]
+        ]
+        if taps:
+            chosen = [logits[0, (dy + radius) * size + dx + radius, y, x].double() for dy, dx in taps]
+            weights = torch.softmax(torch.stack(chosen), dim=0).numpy()
+            expected[:, y, x] = sum(
+                w * image[0, :, y + dy, x + dx].double().numpy() for w, (dy, dx) in zip(weights, taps, strict=True)
+            )
+    filtered = apply_kernels(image, logits, surface.float())
+    np.testing.assert_allclose(filtered[0], expected, rtol=1e-5, atol=1e-30)
+
+
+@pytest.mark.parametrize("scale", [1.0, 300.0])
+def test_gradients_know_the_background_too(scale):
+    """Of both filters, against plain autograd of the softmax over surfaces, with windows that have none."""
+    generator = torch.Generator().manual_seed(0)
+    surface = torch.rand(1, 1, 9, 11, generator=generator) < 0.5
+    surface[..., :, 7:] = False
+    window = 3
+    image = torch.rand(1, 3, 9, 11, generator=generator)
+    target = torch.rand(1, 3, 9, 11, generator=generator).double()
+    importance = scale * torch.randn(1, 1, 9, 11, generator=generator)
+    logits = scale * torch.randn(1, window**2, 9, 11, generator=generator)
+
+    def taps(values: torch.Tensor) -> torch.Tensor:
+        unfolded = torch.nn.functional.unfold(values, window, padding=window // 2)
+        return unfolded.view(1, values.shape[1], window**2, 9, 11)
+
+    there = taps(surface.double())[:, 0] > 0
+
+    def naive(pixels: torch.Tensor, entries: torch.Tensor) -> torch.Tensor:
+        weights = torch.softmax(torch.where(there, entries, -1e9), dim=1) * there
+        return (taps(pixels) * weights[:, None]).sum(dim=2)
+
+    ways = {
+        "shared": (importance, lambda x, i: fuse(x, i, torch.zeros_like(i), (window,), surface.float())),
+        "own": (logits, lambda x, i: apply_kernels(x, i, surface.float())),
+    }
+    for name, (entries, function) in ways.items():
+        mine = [t.clone().requires_grad_() for t in (image, entries)]
+        exact = [t.double().requires_grad_() for t in (image, entries)]
+        (function(*mine) * target).sum().backward()
+        unfolded = taps(exact[1])[:, 0] if name == "shared" else exact[1]
+        (naive(exact[0], unfolded) * target).sum().backward()
+        for a, b in zip(mine, exact, strict=True):
+            torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-4, atol=1e-5)
+
+
+@given(surface=MASKS)
+def test_halving_takes_the_mean_of_surfaces(surface):
+    image = torch.rand(1, 3, *surface.shape[-2:])
+    half = halve(image, surface.float())
+    there = halve_surface(surface.float())
+    for y, x in np.ndindex(*half.shape[-2:]):
+        block = (..., slice(2 * y, 2 * y + 2), slice(2 * x, 2 * x + 2))
+        chosen = image[block][:, :, surface[0, 0][block[1:]]]
+        assert bool(there[0, 0, y, x]) == bool(surface[block].any())
+        expected = chosen.mean(dim=2) if chosen.numel() else torch.zeros(1, 3)
+        torch.testing.assert_close(half[..., y, x], expected)
+
+
+def network_like(name: str, height: int, width: int, generator: torch.Generator) -> list[torch.Tensor]:
+    """What the pyramid networks predict, coarse to fine, at random."""
+    channels = {"wskp-mr": (5, 5, 5), "ntd": (26, 26, 51)}[name]
+    sizes = [(height // 4, width // 4), (height // 2, width // 2), (height, width)]
+    return [torch.randn(1, c, *size, generator=generator) for c, size in zip(channels, sizes, strict=True)]
+
+
+@pytest.mark.parametrize("name", ["wskp-mr", "ntd"])
+def test_pyramids_end_where_surfaces_do(name):
+    """Sky right of a wall: the wall comes out as from an image that ends there."""
+    generator = torch.Generator().manual_seed(0)
+    surface = torch.zeros(1, 1, 24, 64)
+    surface[..., :28] = 1
+    predicted = network_like(name, 24, 64, generator)
+    left = [maps[..., : maps.shape[-1] * 28 // 64] for maps in predicted]
+    image = torch.rand(1, 3, 24, 64, generator=generator) * surface
+    past = torch.rand(1, 3, 24, 64, generator=generator) * surface
+    if name == "wskp-mr":
+        reconstruct = registry.create(name).reconstruct
+        whole, _ = reconstruct(image, predicted, surface)
+        alone, _ = reconstruct(image[..., :28], left, None)
+    else:
+        whole, _ = reconstruct_image(image, past, predicted, surface)
+        alone, _ = reconstruct_image(image[..., :28], past[..., :28], left)
+    torch.testing.assert_close(whole[..., :28], alone, rtol=1e-5, atol=1e-6)
+
+
+@settings(deadline=None)
+@given(surface=MASKS, name=st.sampled_from(["wskp-mr", "ntd"]), seed=st.integers(0, 999))
+def test_pyramids_keep_even_light_even(surface, name, seed):
+    surface = surface.float().repeat_interleave(4, dim=-1).repeat_interleave(4, dim=-2)
+    surface *= torch.rand(surface.shape, generator=torch.Generator().manual_seed(seed)) < 0.7
+    predicted = network_like(name, *surface.shape[-2:], torch.Generator().manual_seed(seed))
+    image = 7 * surface.expand(1, 3, *surface.shape[-2:])
+    if name == "wskp-mr":
+        output, _ = registry.create(name).reconstruct(image, predicted, surface)
+    else:
+        output, _ = reconstruct_image(image, image, predicted, surface)
+    torch.testing.assert_close(output * surface, image, rtol=2e-5, atol=0)
+
+
+def test_ntd_fetches_surfaces_alone():
+    """A wall of even light that slides past sky by half a pixel: the history at its edge is as bright as elsewhere."""
+    torch.manual_seed(0)
+    ntd = registry.create("ntd")
+    ntd.prepare()
+    surface = torch.ones(1, 1, 16, 32, dtype=torch.bool)
+    surface[..., 20:] = False
+    light = torch.full((1, 3, 16, 32), 5.0)
+    frame = flat_frame(16, 32, (0.5, 0.0))
+    frame = replace(frame, channels=frame.channels | {"direct": torch.zeros_like(light), "indirect": light})
+    frames = chain([with_background(frame, surface)] * 2)
+    _, state = play(ntd, frames)
+    seen = state.warped.masked_select(surface)
+    torch.testing.assert_close(seen, torch.full_like(seen, 5.0), rtol=1e-5, atol=0)
+
+
+@given(surface=MASKS, seed=st.integers(0, 999))
+def test_running_scales_are_of_surfaces(surface, seed):
+    """Against means over the surfaces of each block; what the background holds does not matter."""
+    generator = torch.Generator().manual_seed(seed)
+    depth = 4.0 * surface
+    y = 10 ** torch.randn(surface.shape, generator=generator)
+    light = torch.where(surface, y, 1e4)
+    scale = running_scale(light.repeat(1, 3, 1, 1), depth, None)
+    if not surface.any():
+        assert scale.exposure().item() == pytest.approx(1)
+        return
+    height, width = surface.shape[-2:]
+    means = []
+    for top in range(0, height, 16):
+        for left in range(0, width, 16):
+            block = (0, 0, slice(top, top + 16), slice(left, left + 16))
+            if surface[block].any():
+                means.append(y[block][surface[block]].double().mean().item())
+    floor = 1e-4 * np.mean(means)
+    geometric = np.exp(np.mean(np.log(np.maximum(means, floor))))
+    assert scale.exposure().item() == pytest.approx(0.18 / geometric, rel=1e-4)
