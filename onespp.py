@@ -253,6 +253,22 @@ def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
     print(bench(runs, names))
 
 
+def bench_references(
+    data: DataOfBudget = None,
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+    seeds: Annotated[int, arg(metavar="N", help="trainings of each network; mean and spread are shown")] = 2,
+) -> None:
+    """What a render budget is best spent on: many rooms with noisy references or few with clean. An hour or two.
+
+    Renders rooms, trains wskp6 and ntd-mean with each split and with two losses, judges them on the test clips: table,
+    plot, results.json.
+    """
+    from eval.bench.references import bench_references as bench
+
+    print(bench(data_folder(data, budget), runs, seeds))
+
+
 def bench_loading(data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     """How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
     from eval.bench.loading import bench_loading as bench
@@ -363,6 +379,7 @@ GROUPS: dict[str, Commands] = {
             "scaling": bench_scaling,
             "fusion": bench_fusion,
             "rendering": bench_rendering,
+            "references": bench_references,
             "loading": bench_loading,
             "training": bench_training,
         },

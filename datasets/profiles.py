@@ -1,5 +1,6 @@
 """Data profiles: which clips a data set has, and how well each is sampled."""
 
+import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -65,13 +66,13 @@ DATA_PROFILES = {
     "quick": DataProfile(
         height=128,
         width=128,
-        frames=24,
-        boxes={"train": 3, "val": 1, "test": 1},
-        rooms={"train": 3, "val": 0, "test": 1},
+        frames=16,
+        boxes={"train": 1, "val": 0, "test": 1},
+        rooms={"train": 24, "val": 2, "test": 2},
         quality={
-            "train": SamplingQuality(realisations=7, reference_spp=128, floor=30, most_spp=512),
-            "val": SamplingQuality(realisations=1, reference_spp=256),
-            "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=1024),
+            "train": SamplingQuality(realisations=4, reference_spp=32),
+            "val": SamplingQuality(realisations=1, reference_spp=64),
+            "test": SamplingQuality(realisations=1, reference_spp=64, floor=36, most_spp=256, passes_over=True),
         },
     ),
     # The rooms of release in minutes, small and short, to see how hard they are.
@@ -110,8 +111,27 @@ DATA_PROFILES = {
 }
 
 
+def rooms_profile(rooms: int, spp: int) -> DataProfile:
+    """So many small rooms to train on, whose references have so many samples a pixel, and three to validate on."""
+    return DataProfile(
+        height=96,
+        width=96,
+        frames=12,
+        boxes=dict.fromkeys(SPLITS, 0),
+        rooms={"train": rooms, "val": 3, "test": 0},
+        quality={
+            "train": SamplingQuality(realisations=4, reference_spp=spp),
+            "val": SamplingQuality(realisations=1, reference_spp=64),
+            "test": SamplingQuality(realisations=1, reference_spp=64),
+        },
+    )
+
+
 def profile_of(name: str) -> DataProfile:
-    """The data profile of that name. Raises BadInput for an unknown one."""
+    """The data profile of that name, or for `rooms-NxS` N rooms of S spp. Raises BadInput for an unknown one."""
+    rooms = re.fullmatch(r"rooms-(\d+)x(\d+)", name)
+    if rooms:
+        return rooms_profile(int(rooms[1]), int(rooms[2]))
     if name not in DATA_PROFILES:
         raise BadInput(f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}")
     return DATA_PROFILES[name]
