@@ -14,7 +14,7 @@ LLVM := libllvm19
 .NOTPARALLEL:
 .PHONY: all setup dataset train eval bench stress report test test-all lint clean
 
-all: dataset train eval
+all: dataset train eval report
 
 setup: $(READY)
 

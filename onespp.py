@@ -97,7 +97,7 @@ def train(
     precision: Literal["float32", "bfloat16"] | None = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
 ) -> None:
-    """Train rae, wskp6 and ntd, or the networks named, or go on where a training was interrupted.
+    """Train wskp6, in other budgets than quick rae and ntd-mean too, or the networks named; or go on with that.
 
     On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. A batch is shared by all processes,
     so the steps stay the same.
@@ -107,10 +107,10 @@ def train(
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
     """
     from train.loop import train_network
-    from train.recipes import DEFAULT
+    from train.recipes import trained_by_default
     from train.registry import task_for
 
-    for name in names or DEFAULT:
+    for name in names or trained_by_default(budget):
         train_network(task_for(name, data_folder(data, budget), runs, budget, seed, precision, micro_batch))
 
 
@@ -137,8 +137,10 @@ def report(
     """Make one page of all results, RUNS/report/index.html, which needs no network; and an animation of each clip."""
     from eval.report.page import report as make_report
 
-    for path in make_report(runs, megabytes):
+    page, *animations = make_report(runs, megabytes)
+    for path in animations:
         print(path)
+    print(f"open {page} in a browser")
 
 
 def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metavar="PNG")] = None) -> None:

@@ -32,11 +32,14 @@ def bounce(
     si: mi.SurfaceInteraction3f,
     bsdf: mi.BSDFPtr,
     throughput: mi.Color3f,
+    last: mi.Bool,
     sampler: AnySampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool]:
     """(radiance, si, throughput, active): light that reaches `si` straight from emitters, and the path's next vertex.
 
-    Both strategies of multiple importance sampling count: a point on an emitter, and the direction that goes on.
+    Both strategies of multiple importance sampling count: a point on an emitter, and the direction that goes on. But a
+    path's `last` ray, if it leaves a diffuse surface, is not traced: all it could find are emitters, whose points are
+    the better choice there.
     """
     u_emitter = sampler.next_2d()
     u_lobe = sampler.next_1d()
@@ -47,13 +50,14 @@ def bounce(
     value, bsdf_pdf, sample, bsdf_weight = bsdf.eval_pdf_sample(
         mi.BSDFContext(), si, si.to_local(light.d), u_lobe, u_direction
     )
-    mis = dr.select(light.delta, 1, mis_weight(light.pdf, bsdf_pdf))
+    ends = last & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+    mis = dr.select(light.delta | ends, 1, mis_weight(light.pdf, bsdf_pdf))
     radiance = throughput * value * emitter_weight * mis
     lit = smooth & (light.pdf != 0) & dr.any(radiance != 0)  # shadow rays only for light that would count
     radiance = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit), radiance, 0)
 
     throughput = throughput * bsdf_weight
-    active = dr.any(throughput != 0)
+    active = dr.any(throughput != 0) & ~ends
     following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
     emitter = lights.at(following)
     towards = mi.DirectionSample3f(scene, following, si)
@@ -104,7 +108,7 @@ def sample_mean(
     while primary.is_valid() & (index < spp):
         sampler = draw(key, first + index, depth)
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
-        radiance, si, throughput, active = bounce(scene, lights, si, bsdf, throughput, sampler)
+        radiance, si, throughput, active = bounce(scene, lights, si, bsdf, throughput, depth + 1 == max_depth, sampler)
         direct += dr.select(depth == 1, radiance, 0)
         indirect += dr.select(depth == 1, 0, radiance)
         throughput, active = survive(throughput, depth, active, sampler.next_1d())

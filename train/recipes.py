@@ -85,7 +85,13 @@ RECIPES: dict[tuple[str, str], Recipe] = {
 }
 
 TRAINABLE = tuple(PAPER_AND_BUDGETS)
-DEFAULT = ("rae", "wskp6", "ntd")  # one a paper; what is trained unless something else is named
+ONE_A_PAPER = ("rae", "wskp6", "ntd-mean")
+WORTH_TRAINING = {"quick": ("wskp6",)}  # in a budget in which the others end as a blur
+
+
+def trained_by_default(budget: str) -> tuple[str, ...]:
+    """The networks that are trained unless others are named: those that the budget can train well."""
+    return WORTH_TRAINING.get(budget, ONE_A_PAPER)
 
 
 def recipe_for(name: str, budget: str) -> Recipe:

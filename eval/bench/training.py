@@ -22,7 +22,7 @@ from files import write_json
 from timing import device_clock, take_turns
 from train.data import in_parts, loader, micro_batches
 from train.precision import BFLOAT16, FLOAT32
-from train.recipes import DEFAULT
+from train.recipes import ONE_A_PAPER
 from train.registry import task_for
 from train.training import Training
 
@@ -85,7 +85,7 @@ def bench_training(data: Path, runs: Path, budget: str, names: Sequence[str] = (
     """
     times: list[StepTimes] = []
     shares: list[StepShares] = []
-    for name in tqdm(names or DEFAULT, "training", leave=False):
+    for name in tqdm(names or ONE_A_PAPER, "training", leave=False):
         with TemporaryDirectory() as folder:
             trainings = {
                 precision: Training(task_for(name, data, Path(folder), budget, precision=precision))

@@ -11,7 +11,7 @@ from models.registry import DENOISERS, create
 from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
-from train.recipes import DEFAULT, RECIPES, TRAINABLE, recipe_for
+from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
 ENDS_WELL = {"anneal", "average"}
@@ -69,7 +69,8 @@ def test_short_budgets_anneal_to_zero(name):
 
 def test_every_network_has_recipes_for_all_budgets():
     networks = {name for name in DENOISERS if create(name).parameter_count()}
-    assert set(TRAINABLE) == networks and set(DEFAULT) <= networks
+    assert set(TRAINABLE) == networks and set(ONE_A_PAPER) <= networks
+    assert all(set(trained_by_default(budget)) <= networks for _, budget in RECIPES)
     assert set(RECIPES) == {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")}
 
 
