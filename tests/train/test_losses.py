@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmetrics.functional import symmetric_mean_absolute_percentage_error
 
 from datasets.clip import Dataset
-from datasets.frame import Frame
+from datasets.frame import Frame, disoccluded
 from datasets.sequences import Batch
 from models.ntd import NTD
 from models.rae import RAE
@@ -363,6 +363,33 @@ def test_sequences_of_a_batch_do_not_leak_into_one_another(batch_of, name):
             frame.channels[light][1] *= 3
     for a, b in zip(before, outputs(), strict=True):
         assert torch.equal(a[0], b[0]) and not torch.equal(a[1], b[1])
+
+
+def test_no_term_of_rae_is_next_to_nothing(batch_of):
+    """The share of each weighted term in the loss, after some steps; by a kernel of another norm HFEN had 1 %."""
+    torch.manual_seed(0)
+    loss = RAELoss(RAE())
+    optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
+    batch = batch_of("rae", 2)
+    for _ in range(15):
+        optimiser.zero_grad()
+        loss(batch)[0].backward()
+        optimiser.step()
+    value, parts = loss(batch)
+    shares = {name: getattr(loss.terms, name) * part.item() / value.item() for name, part in parts.items()}
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["gradient"] > 0.04 and shares["temporal"] > 0.01
+
+
+@torch.no_grad()
+def test_occlusion_is_not_next_to_nothing(batch_of):
+    """On the rendered clips, of whose pixels a few percent are hidden in the frame before."""
+    torch.manual_seed(0)
+    batch = batch_of("ntd", 4, length=6, crop=64)
+    value, parts = NTDLoss(NTD()).eval()(batch)
+    hidden = torch.cat([disoccluded(frame.motion, frame.dual_motion) for frame in batch.frames]).float().mean()
+    assert 0 < hidden < 0.05
+    assert parts["occlusion"] > 0.1 * value
 
 
 def test_every_recipe_has_a_loss_for_its_terms():
