@@ -16,7 +16,9 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name for name, channel in CHANNELS.items() if channel.is_image and (not channel.radiance or name == "emission")
+    name
+    for name, channel in CHANNELS.items()
+    if channel.is_image and (not channel.radiance or name in ("emission", "gradient"))
 )
 CLIP_HEAD = (
     "clip",

@@ -7,6 +7,7 @@ import torch
 
 from datasets.frame import Signal
 from errors import BadInput
+from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
@@ -24,6 +25,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "accumulated": Accumulated,
     "eaw": EAW,
     "svgf": SVGF,
+    "asvgf": ASVGF,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
