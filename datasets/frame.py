@@ -231,7 +231,8 @@ def read_frame(
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
     another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
 
-    Raises BadInput where a channel was not rendered or is damaged, and for dual motion and gradients in reversed playback.
+    Raises BadInput where a channel was not rendered or is damaged, and for dual motion and gradients in reversed
+    playback.
     """
     stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead
     if previous is None:

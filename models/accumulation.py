@@ -21,23 +21,17 @@ class Accumulation:
     surfaces: Surfaces
 
 
-def accumulate(
-    frame: Frame, irradiance: Tensor, history: Accumulation | None, change: Tensor | None = None
-) -> Accumulation:
+def accumulate(frame: Frame, irradiance: Tensor, history: Accumulation | None) -> Accumulation:
     """Blend noisy `irradiance` (B, 3, H, W) into its history with weight alpha = max(0.2, 1 / (n + 1)).
 
     n is the history's length, so the first five frames are averaged evenly; then it is an exponential moving average.
-    Disoccluded pixels start anew. Where light has changed by `change` (B, 1, H, W) in [0, 1], alpha is that far on the
-    way to 1, and the length is that of an even mean with that alpha.
+    Disoccluded pixels start anew.
     """
     length = torch.ones_like(irradiance[:, :1])
     if history is not None:
         past, found = reproject(frame, torch.cat([history.irradiance, history.length], dim=1), history.surfaces)
         n = past[:, 3:]
         alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
-        length = torch.where(found, n + 1, 1)
-        if change is not None:
-            alpha = torch.lerp(alpha, torch.ones_like(alpha), change)
-            length = torch.minimum(length, 1 / alpha)
         irradiance = torch.lerp(past[:, :3], irradiance, alpha)
+        length = torch.where(found, n + 1, 1)
     return Accumulation(irradiance, length, Surfaces.of(frame))

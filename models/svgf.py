@@ -46,9 +46,7 @@ class Integrated:
     surfaces: Surfaces
 
 
-def integrate(
-    frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None
-) -> Integrated:
+def integrate(frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None) -> Integrated:
     """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1).
 
     `change` (B, 1, H, W) in [0, 1] is how much of the history to give up (see models.asvgf), by default none.
@@ -194,7 +192,7 @@ class SVGF(Denoiser):
     Their sum so stays within the sums of these limits.
     """
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
 
     def change(self, frame: Frame) -> Tensor | None:

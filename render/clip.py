@@ -67,7 +67,7 @@ GRADIENT_STREAM = 2
 
 
 def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:
-    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM), reference half, and choice of samples."""
+    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM), reference half, choice of samples."""
     return int(np.random.SeedSequence([seed, frame, stream, index]).generate_state(1)[0])
 
 

@@ -2,10 +2,10 @@
 
 Schied et al. 2018, "Gradient Estimation for Real-Time Adaptive Temporal Filtering". A sample is a function of a pixel's
 random numbers and of the scene, so the same numbers at the same surface point differ by what has changed, and by little
-noise.
+noise. Their luminance is that of radiance: both are of one point, so its texture cancels out of their ratio.
 
-As in the paper, a pixel of each stratum of the *previous* frame is projected forward: its sample is known, so that
-only one of each pair is shaded anew. Primary visibility knows no chance here, so the surface point itself is kept, which
+As in the paper, a pixel of each stratum of the *previous* frame is projected forward: its sample is known, so that only
+one of each pair is shaded anew. Primary visibility knows no chance here, so the surface point itself is kept, which
 lands between pixel centres; where another ray finds it hidden or off the image, there is no gradient. The samples are
 those of the first noise realisation, which evaluation plays; for the others the gradient is as unbiased, and
 independent of their noise.
@@ -92,4 +92,3 @@ class Samples(NamedTuple):
         column, row = place[visible & inside].astype(int).T
         gradient[row, column] = pairs[visible & inside]
         return gradient
-

@@ -80,9 +80,10 @@ def sample_mean(
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
-    `pixel` is whose random numbers each ray draws, row by row. `seed`, `first` (the index of the first sample), `spp` and `max_depth` are opaque, so one kernel serves all their
-    values. A lane whose path has ended goes on with its next sample at once, so that short paths leave no lane idle.
-    `draw` is the sampler; `blurred` regularises (see PathTracer).
+    Each ray draws the random numbers of its `pixel`, counted row by row. `seed`, `first` (the index of the first
+    sample), `spp` and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended goes
+    on with its next sample at once, so that short paths leave no lane idle. `draw` is the sampler; `blurred`
+    regularises (see PathTracer).
     """
     primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     # Hash the pixel before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
