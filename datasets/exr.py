@@ -16,7 +16,15 @@ from files import replacing
 from scenes.camera import View, inverse_pose
 
 # Components of layers that are not colours (RGB).
-COMPONENTS = {"normal": "XYZ", "motion": "XY", "dual_motion": "XY", "depth": "Z", "roughness": "Y", "mesh_id": "I"}
+COMPONENTS = {
+    "normal": "XYZ",
+    "depth": "Z",
+    "roughness": "Y",
+    "mesh_id": "I",
+    "motion": "XY",
+    "dual_motion": "XY",
+    "gradient": "XY",
+}
 HALVES = ("_a", "_b")  # endings of the two layers of a reference
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 

@@ -8,7 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.channels import ALBEDO_FLOOR, CAMERA_CHANNELS, CHANNELS, MOTION_CHANNELS, REFERENCES
+from datasets.channels import (
+    ALBEDO_FLOOR,
+    CAMERA_CHANNELS,
+    CHANNELS,
+    MOTION_CHANNELS,
+    REFERENCES,
+    TEMPORAL_CHANNELS,
+)
 from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow
 from errors import BadInput
 from scenes.camera import View
@@ -244,7 +251,8 @@ def read_frame(
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
     another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
 
-    Raises BadInput where a channel was not rendered or is damaged, and for dual motion in reversed playback.
+    Raises BadInput where a channel was not rendered or is damaged, and for dual motion and gradients in reversed
+    playback.
     """
     stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead
     if previous is None:
@@ -253,8 +261,8 @@ def read_frame(
     for name in channels:
         if name in CAMERA_CHANNELS:
             continue
-        if name in MOTION_CHANNELS and previous != stored_previous:
-            array = motion_for_playback(clip, name, index, previous, window)
+        if name in TEMPORAL_CHANNELS and previous != stored_previous:
+            array = for_playback(clip, name, index, previous, window)
         else:
             array = clip.read(name, index, window, realisation)
         tensors[name] = to_tensor(array, has_halves=name in REFERENCES)
@@ -267,14 +275,15 @@ def read_frame(
     )
 
 
-def motion_for_playback(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> np.ndarray:
-    """The channel `name`, "motion" or "dual_motion" (h, w, 2), to a frame that is not the one before in the clip.
+def for_playback(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> np.ndarray:
+    """A channel of TEMPORAL_CHANNELS (h, w, 2), to a frame that is not the one before in the clip.
 
-    Dual motion vectors depend on what hid a surface, which only the renderer sees: they cannot be computed afterwards.
-    But while the camera stands still nothing is hidden, and they equal motion vectors.
+    Dual motion vectors depend on what hid a surface and gradients on how light changes, which only the renderer sees:
+    they cannot be computed afterwards. But while time stands still nothing is hidden and nothing changes: dual motion
+    equals motion, and both are 0 like the gradient.
     """
-    if name == "dual_motion" and previous != index:
-        raise BadInput(f"{clip.path}: dual motion vectors exist for forward playback only; train without reversing")
+    if name != "motion" and previous != index:
+        raise BadInput(f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing")
     return clip.motion_to(index, previous, window)
 
 

@@ -16,8 +16,11 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name for name, channel in CHANNELS.items() if channel.is_image and (not channel.radiance or name == "emission")
+    name
+    for name, channel in CHANNELS.items()
+    if channel.is_image and (not channel.radiance or name in ("emission", "gradient"))
 )
+OPTIONAL_STEPS = ("dual_motion", "gradient")  # of rendering: each makes the channel of its name
 CLIP_HEAD = (
     "clip",
     "frames",
@@ -115,19 +118,20 @@ def channel_table(clips: list[Clip]) -> str:
 
 
 def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
-    """Seconds by step, and what was saved where dual motion was not rendered.
+    """Seconds by step, and what was saved where dual motion and gradients were not rendered.
 
-    The saving is estimated by the mean time per pixel in the clips that have dual motion.
+    The savings are estimated by the mean times per pixel in the clips that have them.
     """
     seconds: SecondsByStep = {}
     for timing in timings:
         for step, spent in timing.items():
             seconds[step] = seconds.get(step, 0.0) + spent
     pixels = [clip.frames * clip.height * clip.width for clip in clips]
-    rendered = sum(count for clip, count in zip(clips, pixels, strict=True) if "dual_motion" in clip.channels)
     saved: dict[str, str] = {}
-    if rendered and "dual_motion" in seconds:
-        saved["dual_motion"] = f"{seconds['dual_motion'] * (sum(pixels) - rendered) / rendered:.2f}"
+    for step in OPTIONAL_STEPS:
+        rendered = sum(count for clip, count in zip(clips, pixels, strict=True) if step in clip.channels)
+        if rendered and step in seconds:
+            saved[step] = f"{seconds[step] * (sum(pixels) - rendered) / rendered:.2f}"
     rows = [[step, f"{spent:.2f}", saved.get(step, "")] for step, spent in seconds.items()]
     return tabulate(rows, ["step", "seconds", "saved"], disable_numparse=True)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from errors import BadInput
 from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.spec import DenoiserSpec, class_of, precision_in_use
-from models.registry import DENOISERS, without_taa
+from models.registry import DENOISERS, plain_name
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 
@@ -45,7 +45,7 @@ def weights_file(name: str, runs: Path, budget: str) -> Path | None:
         return None
     if name in WINDOW_SETS:
         return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS_FILE
-    return run_folder(runs, without_taa(name), budget) / WEIGHTS_FILE
+    return run_folder(runs, plain_name(name), budget) / WEIGHTS_FILE
 
 
 def untrained(runs: Path, budget: str, name: str) -> str | None:
@@ -53,8 +53,8 @@ def untrained(runs: Path, budget: str, name: str) -> str | None:
     path = weights_file(name, runs, budget)
     if path is None or path.exists():
         return None
-    training = "ablate wskp-windows" if name in WINDOW_SETS else f"train {without_taa(name)}"
-    trainable = name in WINDOW_SETS or without_taa(name) in TRAINABLE
+    training = "ablate wskp-windows" if name in WINDOW_SETS else f"train {plain_name(name)}"
+    trainable = name in WINDOW_SETS or plain_name(name) in TRAINABLE
     remedy = f": train them with `onespp {training} --budget {budget} --runs {runs}`" if trainable else ""
     return f"it has no weights at {path}{remedy}"
 

@@ -15,6 +15,8 @@ from models.weights import load_weights
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
+AROUND = {registry.ADAPTIVE: "models.adaptive", registry.TAA: "models.taa"}  # where the parts of a name are defined
+
 
 def class_of(name: str) -> type[Denoiser]:
     """The class of a denoiser, which knows all that can be asked of it. Raises BadInput for an unknown name."""
@@ -81,9 +83,8 @@ class DenoiserSpec:
     @property
     def modules(self) -> tuple[str, ...]:
         """Those of onespp in which the denoiser is defined."""
-        plain = registry.without_taa(self.name)
-        antialiasing = ("models.taa",) if plain != self.name else ()
-        return (class_of(plain).__module__, *antialiasing)
+        around = [module for suffix, module in AROUND.items() if suffix in self.name]
+        return (class_of(registry.plain_name(self.name)).__module__, *around)
 
     def build(self) -> Denoiser:
         """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
@@ -91,7 +92,7 @@ class DenoiserSpec:
         denoiser = create_any(self.name, self.signal)
         if self.weights:
             name = windows_label(WINDOW_SETS[self.name]) if self.name in WINDOW_SETS else self.name
-            load_weights(inner_denoiser(denoiser), registry.without_taa(name), self.weights)
+            load_weights(inner_denoiser(denoiser), registry.plain_name(name), self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         return denoiser.to(self.device)
 

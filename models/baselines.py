@@ -1,5 +1,6 @@
 """The two baselines that every denoiser must beat: nothing, and temporal accumulation alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -27,13 +28,22 @@ class AccumulatedState(State):
         return {"history length": self.history.length}
 
 
-class Accumulated(Denoiser):
+class Accumulating(Denoiser):
+    """A denoiser that begins with temporal accumulation, in whose place models.adaptive puts its own."""
+
+    accumulation: Callable[[Frame, Tensor, Accumulation | None], Accumulation] = staticmethod(accumulate)
+
+    def accumulated(self, frame: Frame, before: AccumulatedState | None) -> Accumulation:
+        """The history with the frame's irradiance."""
+        return self.accumulation(frame, frame.irradiance(self.signal), before.history if before else None)
+
+
+class Accumulated(Accumulating):
     """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), no spatial filter."""
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = matching_state(state, AccumulatedState, frame)
-        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
+        history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
         return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.moment, history)

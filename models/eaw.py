@@ -11,11 +11,10 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models import compiled
-from models.accumulation import accumulate
 from models.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
-from models.baselines import Accumulated, AccumulatedState
+from models.baselines import Accumulated, AccumulatedState, Accumulating
 from models.compiled import eaw as kernels
-from models.denoiser import CLASSICAL, Denoiser, State, matching_state
+from models.denoiser import CLASSICAL, State, matching_state
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import rays
 
@@ -65,7 +64,7 @@ class EAWState(AccumulatedState):
     scale: RunningScale
 
 
-class EAW(Denoiser):
+class EAW(Accumulating):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
     reads = Accumulated.reads
@@ -73,9 +72,10 @@ class EAW(Denoiser):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = matching_state(state, EAWState, frame)
-        irradiance = frame.irradiance(self.signal)
-        history = accumulate(frame, irradiance, before.history if before else None)
-        scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None)
+        history = self.accumulated(frame, before)
+        scale = running_scale(
+            frame.irradiance(self.signal) * frame.divisor, frame.depth, before.scale if before else None
+        )
         geometry = guides(frame, scale)
         colour = history.irradiance
         for level in range(ATROUS_LEVELS):

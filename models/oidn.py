@@ -8,8 +8,7 @@ from torch import Tensor
 
 from datasets.frame import Frame, Signal
 from errors import BadInput
-from models.accumulation import accumulate
-from models.baselines import Accumulated, AccumulatedState
+from models.baselines import Accumulated, AccumulatedState, Accumulating
 from models.denoiser import Denoiser, State, matching_state
 
 OIDNQuality = Literal["high", "balanced", "fast"]
@@ -127,12 +126,11 @@ class OIDN(Denoiser):
         return self.denoise(frame, reflected), State(frame.moment)
 
 
-class OIDNAccumulated(OIDN):
+class OIDNAccumulated(Accumulating, OIDN):
     """Denoises temporally accumulated irradiance, re-modulated. The history is not filtered."""
 
     reads = Accumulated.reads
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = matching_state(state, AccumulatedState, frame)
-        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
+        history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
         return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.moment, history)

@@ -7,6 +7,8 @@ import torch
 
 from datasets.frame import Signal
 from errors import BadInput
+from models.adaptive import adaptive
+from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
@@ -20,11 +22,13 @@ from models.weights import load_weights
 from models.wskp import KP, WSKP, WSKP3, WSKPMR
 
 TAA = "+taa"
+ADAPTIVE = "+adaptive"
 DENOISERS: dict[str, type[Denoiser]] = {
     "noisy": Noisy,
     "accumulated": Accumulated,
     "eaw": EAW,
     "svgf": SVGF,
+    "asvgf": ASVGF,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
@@ -39,20 +43,26 @@ DENOISERS: dict[str, type[Denoiser]] = {
 }
 
 
-def without_taa(name: str) -> str:
-    """The name of the denoiser alone: what its weights are called."""
-    return name.removesuffix(TAA)
+def plain_name(name: str) -> str:
+    """The name of the denoiser alone, without what is done before and after it: what its weights are called."""
+    return name.removesuffix(TAA).removesuffix(ADAPTIVE)
 
 
 def denoiser_class(name: str) -> type[Denoiser]:
     """The class of a denoiser, which tells what it reads and refuses. Raises BadInput for an unknown name.
 
-    A name that ends in "+taa" means that denoiser with temporal antialiasing after it.
+    A name that ends in "+adaptive" means that denoiser on adaptively accumulated frames, which is another BadInput
+    where it does not accumulate; one that ends in "+taa", with temporal antialiasing after it.
     """
     if name.endswith(TAA):
-        return antialiased(denoiser_class(without_taa(name)))  # type: ignore[arg-type]  # classes are hashable
+        return antialiased(denoiser_class(name.removesuffix(TAA)))  # type: ignore[arg-type]  # classes are hashable
+    if name.endswith(ADAPTIVE):
+        return adaptive(denoiser_class(name.removesuffix(ADAPTIVE)))  # type: ignore[arg-type]
     if name not in DENOISERS:
-        raise BadInput(f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}")
+        raise BadInput(
+            f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}, "
+            f"and those that accumulate with {ADAPTIVE}"
+        )
     return DENOISERS[name]
 
 
@@ -86,7 +96,7 @@ def load(
     if denoiser.is_network:
         if weights is None:
             raise BadInput(f"'{name}' needs trained weights")
-        load_weights(inner_denoiser(denoiser), without_taa(name), weights)
+        load_weights(inner_denoiser(denoiser), plain_name(name), weights)
     denoiser.prepare(precision or inference_precision(name))
     return denoiser
 

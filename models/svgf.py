@@ -46,8 +46,11 @@ class Integrated:
     surfaces: Surfaces
 
 
-def integrate(frame: Frame, colour: Tensor, history: Integrated | None) -> Integrated:
-    """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1)."""
+def integrate(frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None) -> Integrated:
+    """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1).
+
+    `change` (B, 1, H, W) in [0, 1] is how much of the history to give up (see models.asvgf), by default none.
+    """
     y = (
         image_luminance(colour.flatten(0, 1))
         .clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
@@ -58,11 +61,12 @@ def integrate(frame: Frame, colour: Tensor, history: Integrated | None) -> Integ
     if history is not None:
         before = [history.colour.flatten(1, 2), history.moments.flatten(1, 2), history.length]
         past, found = reproject(frame, torch.cat(before, dim=1), history.surfaces)
-        alpha = torch.where(found, ALPHA, 1)
+        change = torch.zeros_like(past[:, :1]) if change is None else change
+        alpha = torch.where(found, (1 - change) * ALPHA + change, 1)
         past_colour, past_moments, past_length = past.split([part.shape[1] for part in before], dim=1)
         colour = torch.lerp(past_colour.view_as(colour), colour, alpha[:, None])
         moments = torch.lerp(past_moments.view_as(moments), moments, alpha[:, None])
-        length = torch.where(found, past_length + 1, 1)
+        length = torch.where(found, past_length * (1 - change) + 1, 1)
     return Integrated(colour, moments, length, Surfaces.of(frame))
 
 
@@ -188,12 +192,17 @@ class SVGF(Denoiser):
     Their sum so stays within the sums of these limits.
     """
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
+
+    def change(self, frame: Frame) -> Tensor | None:
+        """How much of the history to give up, (B, 1, H, W) in [0, 1]; None for nothing anywhere."""
+        return None
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = matching_state(state, SVGFState, frame)
-        integrated = integrate(frame, irradiances(frame, self.signal), before.history if before else None)
+        history = before.history if before else None
+        integrated = integrate(frame, irradiances(frame, self.signal), history, self.change(frame))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         estimated = estimate_variance(integrated, geometry)
         colour, variance = svgf_level(integrated.colour, estimated, geometry, 1)

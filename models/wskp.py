@@ -9,9 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.accumulation import accumulate
-from models.baselines import Accumulated, AccumulatedState
-from models.denoiser import Denoiser, State, matching_state
+from models.baselines import Accumulated, AccumulatedState, Accumulating
+from models.denoiser import State, matching_state
 from models.features import network_features
 from models.fusion import fuse
 from models.operators import halve, halve_surface, pad_to_multiple
@@ -39,7 +38,7 @@ class WSKPState(AccumulatedState):
         return shown
 
 
-class KernelPredictor(Denoiser):
+class KernelPredictor(Accumulating):
     """Temporal accumulation, a network that predicts how to filter, the filter on irradiance, re-modulation (§4)."""
 
     reads = Accumulated.reads
@@ -63,7 +62,7 @@ class KernelPredictor(Denoiser):
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
         """The state after a frame, before any filter: accumulated irradiance and running scales."""
         before = matching_state(state, WSKPState, frame)
-        history = accumulate(frame, frame.irradiance(self.signal), before.history if before else None)
+        history = self.accumulated(frame, before)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
         return WSKPState(frame.moment, history, scale, None)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.gbuffer import render_gbuffer
+from render.gradient import Samples
 from render.motion import dual_motion_vectors
 from render.path import PathTracer
 from render.stage import Stage
@@ -62,10 +63,11 @@ class StepTimer:
 
 NOISY_STREAM = 0
 REFERENCE_STREAM = 1
+GRADIENT_STREAM = 2
 
 
 def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:
-    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM) or reference half (REFERENCE_STREAM)."""
+    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM), reference half, choice of samples."""
     return int(np.random.SeedSequence([seed, frame, stream, index]).generate_state(1)[0])
 
 
@@ -123,6 +125,8 @@ def render_clip(
     tracer = PathTracer(stage, regularise=regularise)
     noisy_tracer = PathTracer(stage, halton, regularise) if halton else tracer
     wants_dual = channels is None or "dual_motion" in channels
+    wants_gradient = channels is None or "gradient" in channels
+    samples: Samples | None = None  # of the frame before
     timer = StepTimer()
     for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
         ray = stage.rays(view)
@@ -130,11 +134,16 @@ def render_clip(
         # A Halton cycle goes on from frame to frame with the shift of its realisation.
         first = frame * spp if halton else 0
         shift = 0 if halton else frame
-        noisy = [
-            noisy_tracer.radiance(ray, stream_seed(seed, shift, NOISY_STREAM, i), spp, first)
-            for i in range(sampling.realisations)
-        ]
+        seeds = [stream_seed(seed, shift, NOISY_STREAM, i) for i in range(sampling.realisations)]
+        noisy = [noisy_tracer.radiance(ray, noisy_seed, spp, first) for noisy_seed in seeds]
         timer.lap("noisy")
+        if wants_gradient:
+            still = np.zeros((height, width, 2))
+            arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still
+            drawn_by = {"seed": seeds[0], "spp": spp, "first": first}
+            choice = stream_seed(seed, frame, GRADIENT_STREAM, 0)
+            samples = Samples.of(arrays, *noisy[0], view, stage.poses, drawn_by, choice)
+            timer.lap("gradient")
         spp = sampling.reference_spp // 2
         halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), spp) for i in range(2)]
         timer.lap("reference")

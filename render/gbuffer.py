@@ -1,6 +1,6 @@
 """What the primary rays see, free of noise: geometry, material and light seen directly."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,24 @@ def depth_along_axis(stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, v
     return (distance * cosine).astype(np.float32)
 
 
-def trace_visible(stage: Stage, view: View, pixels: Array) -> tuple[Array, NDArray[np.uint32], Array]:
-    """Depth (N,), mesh id (N,) and geometric normal (N, 3) of what is seen through `pixels` (N, 2).
+class VisibleSurface(NamedTuple):
+    """What is seen at some places of an image."""
 
-    The stage must be posed for `view`'s frame.
-    """
-    ray = stage.rays(view, pixels)
+    depth: Array  # (...,), along the viewing axis; 0 for background
+    mesh_id: NDArray[np.uint32]  # (...,), 0 for background
+    normal: Array  # (..., 3), geometric
+
+
+def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
+    """What is seen through `pixels` (..., 2). The stage must be posed for `view`'s frame."""
+    shape = pixels.shape[:-1]
+    ray = stage.rays(view, pixels.reshape(-1, 2))
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
     mesh_id = stage.mesh_id(si)
     dr.eval(si.t, si.n, mesh_id)
     depth = depth_along_axis(stage, si, ray, view).astype(np.float64)
-    return depth, np.array(mesh_id), np.array(si.n, dtype=np.float64).T
+    normal = np.array(si.n, dtype=np.float64).T
+    return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:

@@ -3,11 +3,22 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from render.gbuffer import trace_visible
+from render.gbuffer import VisibleSurface, trace_visible
 from render.stage import Stage
 from scenes.camera import Array, View, motion_vectors, move, pixel_centres, unproject
 
 SAME_SURFACE = 0.002  # of the depth: a point farther than this from the plane of what is seen there was hidden
+
+
+def same_surface(
+    points: Array, mesh_id: NDArray[np.integer], pixels: Array, seen: VisibleSurface, view: View
+) -> NDArray[np.bool_]:
+    """Whether surface points (..., 3) of `view`'s frame lie on what is `seen` there through `pixels` (..., 2).
+
+    Background directions, whose `mesh_id` (...,) is 0, do where background is seen.
+    """
+    off_plane = np.abs(np.sum(seen.normal * (points - unproject(pixels, seen.depth, view)), axis=-1))
+    return (seen.mesh_id == mesh_id) & ((mesh_id == 0) | (off_plane < SAME_SURFACE * seen.depth))
 
 
 def dual_motion_vectors(
@@ -22,17 +33,10 @@ def dual_motion_vectors(
     height, width = depth.shape
     x = pixel_centres(height, width)
     y = x + motion
-    traced_depth, traced_mesh, traced_normal = trace_visible(stage, previous, y.reshape(-1, 2))
-    then_depth = traced_depth.reshape(height, width)
-    then_mesh = traced_mesh.reshape(height, width)
-    then_normal = traced_normal.reshape(height, width, 3)
+    seen = trace_visible(stage, previous, y)
+    visible = same_surface(move(unproject(x, depth, now), mesh_id, now, previous), mesh_id, y, seen, previous)
 
-    seen = unproject(y, then_depth, previous)
-    moved = move(unproject(x, depth, now), mesh_id, now, previous)
-    off_plane = np.abs(np.sum(then_normal * (moved - seen), axis=-1))
-    visible = (then_mesh == mesh_id) & ((mesh_id == 0) | (off_plane < SAME_SURFACE * then_depth))
-
-    z = y + motion_vectors(y, then_depth, then_mesh, previous, now)
+    z = y + motion_vectors(y, seen.depth, seen.mesh_id, previous, now)
     x_previous = y + (x - z)
 
     def inside(p: Array) -> NDArray[np.bool_]:

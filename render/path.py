@@ -82,6 +82,7 @@ def sample_mean(
     scene: mi.Scene,
     lights: Lights,
     ray: mi.Ray3f,
+    pixel: mi.UInt32,
     seed: mi.UInt32,
     first: mi.UInt32,
     spp: mi.UInt32,
@@ -91,14 +92,14 @@ def sample_mean(
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
-    `seed`, `first` (the index of the first sample), `spp` and `max_depth` are opaque, so one kernel serves all their
-    values. A lane whose path has ended goes on with its next sample at once, so that short paths leave no lane idle.
-    `draw` is the sampler; `blurred` regularises (see PathTracer).
+    Each ray draws the random numbers of its `pixel`, counted row by row. `seed`, `first` (the index of the first
+    sample), `spp` and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended goes
+    on with its next sample at once, so that short paths leave no lane idle. `draw` is the sampler; `blurred`
+    regularises (see PathTracer).
     """
     primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    lane = dr.arange(mi.UInt32, dr.width(ray))
-    # Hash the lane before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
-    key = hash32(hash32(lane) ^ seed)
+    # Hash the pixel before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
+    key = hash32(hash32(pixel) ^ seed)
     direct = mi.Color3f(0)
     indirect = mi.Color3f(0)
     si = dr.copy(primary)
@@ -136,6 +137,8 @@ class PathTracer:
 
     def __init__(self, stage: Stage, halton: bool = False, regularise: bool = False):
         self.stage = stage
+        self.every_pixel = dr.arange(mi.UInt32, stage.height * stage.width)
+        dr.make_opaque(self.every_pixel)
         self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
@@ -143,12 +146,12 @@ class PathTracer:
         # while another scene is loaded).
         self.freezes = bool(stage.shapes) and not halton and not regularise
 
-    def radiance(
-        self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary rays `ray` of all pixels.
+    def samples(
+        self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """(direct, indirect) radiance along the primary rays `ray`, which need not be those of all pixels.
 
-        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes. Emission is not included.
+        Each draws the random numbers of the `pixel`, counted row by row. For the rest see `radiance`.
         """
         stage = self.stage
         if self.frozen_pose != stage.poses:
@@ -162,6 +165,7 @@ class PathTracer:
             stage.mitsuba_scene,
             stage.lights,
             ray,
+            pixel,
             seed=dr.opaque(mi.UInt32, seed),
             first=dr.opaque(mi.UInt32, first),
             spp=dr.opaque(mi.UInt32, spp),
@@ -170,4 +174,14 @@ class PathTracer:
             blurred=self.blurred,
         )
         dr.eval(direct, indirect)
-        return stage.image(direct), stage.image(indirect)
+        return direct, indirect
+
+    def radiance(
+        self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary rays `ray` of all pixels.
+
+        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes. Emission is not included.
+        """
+        direct, indirect = self.samples(ray, self.every_pixel, seed, spp, first)
+        return self.stage.image(direct), self.stage.image(indirect)

@@ -1,7 +1,7 @@
 """An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from render.palette import palette
 from scenes.animation import Scene, Shape
 from scenes.bsdf import Bsdf
 from scenes.camera import Array, View, directions, pixel_centres
+
+T = TypeVar("T", np.float32, np.uint32)
 
 
 def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
@@ -90,16 +92,21 @@ def load_mesh(shape: Shape) -> mi.Mesh:
     return mesh
 
 
-def upload(values: NDArray[np.floating]) -> mi.Float:
-    """`values` (N,) as data for kernels: Python numbers would be compiled into them.
+def aligned(values: NDArray[T]) -> NDArray[T]:
+    """`values` (N,), of 4 bytes each, where a kernel for any other such array can read them.
 
-    On the CPU Dr.Jit borrows numpy's memory and compiles its alignment in as well, so it is always aligned here.
+    On the CPU Dr.Jit borrows numpy's memory and compiles its alignment into kernels.
     """
     spare = 64 // 4
-    buffer = np.empty(len(values) + spare, np.float32)
+    buffer = np.empty(len(values) + spare, values.dtype)
     start = -(buffer.ctypes.data // 4) % spare
     buffer[start : start + len(values)] = values
-    return mi.Float(buffer[start : start + len(values)])
+    return buffer[start : start + len(values)]
+
+
+def upload(values: NDArray[np.floating]) -> mi.Float:
+    """`values` (N,) as data for kernels: Python numbers would be compiled into them."""
+    return mi.Float(aligned(values.astype(np.float32)))
 
 
 def unit_of(scene: Scene) -> float:

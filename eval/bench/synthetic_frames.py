@@ -133,6 +133,7 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "mesh_id": seen.mesh_id[..., None],
         "motion": motion,
         "dual_motion": dual,
+        "gradient": np.zeros_like(motion),
     }
     gain = to_tensor(np.ones((1, 1, 3)))
     tensors = {name: to_tensor(array) for name, array in channels.items()}

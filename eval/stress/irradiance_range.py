@@ -8,7 +8,14 @@ from torch import Tensor
 from datasets.frame import Frame
 from models.operators import finite
 
-CONVEX = ("eaw", "svgf", "wskp3", "wskp6", "kp")  # filters whose output is a mean of irradiance that they have seen
+CONVEX = (
+    "eaw",
+    "svgf",
+    "asvgf",
+    "wskp3",
+    "wskp6",
+    "kp",
+)  # filters whose output is a mean of irradiance that they have seen
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 
@@ -16,11 +23,11 @@ DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 class IrradianceRange:
     """The irradiance of surfaces that a convex filter has seen since it began: its limits, for each colour.
 
-    SVGF filters direct and indirect light separately, so its limits are sums of two.
+    SVGF and A-SVGF filter direct and indirect light separately, so its limits are sums of two.
     """
 
     def __init__(self, name: str):
-        self.separate = name == "svgf"
+        self.separate = name in ("svgf", "asvgf")
         self.low = torch.tensor(torch.inf)
         self.high = torch.tensor(-torch.inf)
 

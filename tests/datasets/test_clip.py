@@ -45,7 +45,7 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
     frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
     for index, (channels, _) in enumerate(frames):
-        for name in ("direct", "depth", "motion", "dual_motion", "normal", "mesh_id"):
+        for name in ("direct", "depth", "motion", "dual_motion", "gradient", "normal", "mesh_id"):
             rendered = channels[name][0] if name == "direct" else channels[name]
             stored = clip.read(name, index)
             np.testing.assert_array_equal(stored, rendered.astype(stored.dtype))

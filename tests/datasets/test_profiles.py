@@ -176,11 +176,22 @@ def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
 
 def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
     clip = static_box(lean, "train")
-    names = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+    names = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion", "gradient")
     assert set(AUXILIARY_CHANNELS) == set(names)
     stored = sum(stored_size(clip, name) for name in names)
     full = sum(size_in_full(clip, name) for name in names)
     assert 0.2 < stored / full <= 0.6
+
+
+def test_gradients_of_a_still_clip_are_one_value(tmp_path):
+    quality = {"test": SamplingQuality(realisations=1, reference_spp=4)}
+    profile = DataProfile(height=16, width=20, frames=3, boxes={}, rooms={}, quality=quality)
+    folder = tmp_path / "test" / "cornell_box_moving" / "still"
+    folder.parent.mkdir(parents=True)
+    render_to_folder(folder, profile, 0, tuple(CHANNELS))
+    clip = Clip(folder)
+    assert clip.channels["gradient"] == {"value": [0.0, 0.0]}
+    assert np.array_equal(clip.read("gradient", 2), np.zeros((16, 20, 2)))
 
 
 def test_info_shows_what_is_saved(lean):

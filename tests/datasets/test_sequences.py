@@ -14,8 +14,10 @@ from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from errors import BadInput
 
-# Dual motion exists for forward playback only.
-IMAGE_CHANNELS = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name != "dual_motion")
+# The others exist for forward playback only.
+IMAGE_CHANNELS = tuple(
+    name for name, channel in CHANNELS.items() if channel.is_image and name not in ("dual_motion", "gradient")
+)
 AUGMENTATIONS = {
     "none": Augmentation(),
     "reverse": Augmentation(reverse=True),
@@ -198,10 +200,13 @@ def test_reversed_playback_uses_forward_vectors(clips):
     assert (forward + backward).abs().max() > 0.005  # computed, not negated
 
 
-def test_dual_motion_refuses_reversed_playback(clips):
-    with pytest.raises(BadInput, match="forward playback only"):
-        read_frame(clips[0], 3, ("dual_motion",), previous=4)
-    assert (read_frame(clips[0], 3, ("dual_motion",), previous=3).dual_motion == 0).all()
+@pytest.mark.parametrize("name", ["dual_motion", "gradient"])
+def test_what_only_the_renderer_sees_refuses_reversed_playback(tiny, name):
+    clip = Dataset(tiny).clips("test")[1]
+    with pytest.raises(BadInput, match=f"'{name}' exists for forward playback only"):
+        read_frame(clip, 3, (name,), previous=4)
+    assert (read_frame(clip, 3, (name,), previous=3).channels[name] == 0).all()
+    assert (read_frame(clip, 3, (name,)).channels[name] != 0).any()
 
 
 def test_gain_is_one_factor_a_channel_and_sequence(clips):

@@ -11,7 +11,7 @@ from eval.selection import choose, evaluated, untrained, weights_file, with_indi
 from eval.spec import PRECISIONS, DenoiserSpec, class_of, create_any, precision_in_use, precisions_of
 from models.registry import DENOISERS
 
-NAMES = (*DENOISERS, *EXTRA, "svgf+taa", "wskp3+taa")
+NAMES = (*DENOISERS, *EXTRA, "svgf+taa", "wskp3+taa", "wskp3+adaptive", "eaw+adaptive+taa")
 
 
 def left_handed(name: str) -> str | None:

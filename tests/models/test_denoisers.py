@@ -23,7 +23,9 @@ def denoisers():
     return {name: registry.create(name).eval() for name in NAMES}
 
 
-@pytest.mark.parametrize("name", [*NAMES, "noisy+taa", "svgf+taa", "wskp6+taa", "ntd+taa"])
+@pytest.mark.parametrize(
+    "name", [*NAMES, "noisy+taa", "svgf+taa", "wskp6+taa", "ntd+taa", "eaw+adaptive", "wskp6+adaptive+taa"]
+)
 def test_classes_tell_what_their_instances_are(name):
     kind = registry.denoiser_class(name)
     denoiser = registry.create(name)

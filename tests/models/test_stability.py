@@ -22,7 +22,11 @@ from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
 from models import registry
 from tests.helpers.frames import chain, flat_frame, play, run
 
-NAMES = [name for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa") if not registry.unavailable(name)]
+NAMES = [
+    name
+    for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive")
+    if not registry.unavailable(name)
+]
 THREADS = torch.get_num_threads()
 ALL = tuple(registry.channels_read())
 
@@ -67,6 +71,7 @@ def frames_strategy(draw, longest=4, largest=19):
             indirect=torch.from_numpy(np.float32(light[:, ::-1].copy())),
             albedo=torch.full((1, 3, height, width), albedo),
             roughness=torch.full((1, 1, height, width), roughness),
+            gradient=torch.from_numpy(np.float32(light[:, :2] - light[:, 1:, ::-1])),  # the largest may be too small
         )
         if depth == 0:
             frame.channels.update(depth=torch.zeros(1, 1, height, width), mesh_id=torch.zeros(1, 1, height, width))
@@ -96,9 +101,7 @@ def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
 @given(
     frames=frames_strategy(),
     poison=st.sampled_from([np.nan, np.inf, -np.inf]),
-    channel=st.sampled_from(
-        ["direct", "indirect", "albedo", "normal", "depth", "emission", "roughness", "mesh_id", "motion", "dual_motion"]
-    ),
+    channel=st.sampled_from(ALL),
     place=st.tuples(st.integers(0, 18), st.integers(0, 18)),
 )
 def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channel, place):

@@ -1,0 +1,206 @@
+"""Adaptive accumulation: false alarms, energy, fireflies, and light that changes."""
+
+import pytest
+import torch
+
+import models.adaptive
+from errors import BadInput
+from models import registry
+from models.accumulation import accumulate
+from models.adaptive import (
+    BRIGHTEST,
+    LARGEST_GAIN,
+    Neighbourhoods,
+    accumulate_adaptively,
+    bounded,
+    brightest,
+    gain,
+)
+from models.baselines import Accumulated
+from tests.helpers.frames import chain, flat_frame, play, run
+
+SIZE = 48
+
+
+def grey(light: torch.Tensor) -> torch.Tensor:
+    return light.expand(1, 3, *light.shape[-2:]).contiguous()
+
+
+def one_sample(generator: torch.Generator, level: float = 1.0) -> torch.Tensor:
+    """Light of mean `level` as one sample a pixel finds it: half of the pixels black, a long tail, (1, 3, H, W)."""
+    size = (1, 1, SIZE, SIZE)
+    tail = torch.exp(torch.randn(size, generator=generator) - 0.5)  # of mean 1
+    return grey(level * 2 * tail * (torch.rand(size, generator=generator) < 0.5))
+
+
+def play_noise(monkeypatch, frames: int, firefly: float, every: int) -> tuple[float, float]:
+    """The share of pixels with a false alarm, and the relative error of the mean, in noise around constant light.
+
+    A firefly of that luminance falls on a pixel every so many frames.
+    """
+    factors = []
+
+    def listening(*arguments):
+        factors.append(gain(*arguments))
+        return factors[-1]
+
+    monkeypatch.setattr(models.adaptive, "gain", listening)
+    generator = torch.Generator().manual_seed(1)
+    history = None
+    shown = []
+    true = []
+    for index in range(frames):
+        light = one_sample(generator)
+        if index % every == every // 2:
+            light[..., (7 * index) % SIZE, (11 * index) % SIZE] += firefly
+        history = accumulate_adaptively(flat_frame(SIZE, SIZE, irradiance=light), light, history)
+        shown.append(history.irradiance.mean())
+        true.append(light.mean())
+    alarms = torch.stack([(factor != 1).float().mean() for factor in factors[10:]]).mean()
+    # What is shown lags by some frames.
+    return float(alarms), float(torch.stack(shown[10:]).mean() / torch.stack(true[6:-4]).mean() - 1)
+
+
+@pytest.mark.parametrize(("firefly", "every"), [(0.0, 1), (100.0, 1), (1e3, 1), (1e4, 50)])
+def test_noise_raises_few_false_alarms_and_loses_no_energy(monkeypatch, firefly, every):
+    """A χ² of one degree of freedom exceeds 6 in 1.4 % of cases; fireflies must not add many."""
+    alarms, bias = play_noise(monkeypatch, 150, firefly, every)
+    assert 0 < alarms < 0.03
+    assert abs(bias) < 0.01
+
+
+def test_a_firefly_is_no_change(monkeypatch):
+    """Nowhere within reach of it is the history touched."""
+    generator = torch.Generator().manual_seed(0)
+    even = flat_frame(SIZE, SIZE, irradiance=grey(1 + 0.1 * torch.rand(1, 1, SIZE, SIZE, generator=generator)))
+    history = None
+    for _ in range(6):
+        history = accumulate_adaptively(even, even.direct, history)
+    light = even.direct.clone()
+    light[..., 20, 20] = 65504
+    after = accumulate_adaptively(flat_frame(SIZE, SIZE, irradiance=light), light, history)
+    mean = float(even.direct.mean())
+    share = ((65504 - BRIGHTEST * mean) / 441 + (BRIGHTEST - 1) * mean) / 5  # at its own pixel, which keeps the limit
+    assert (after.irradiance - history.irradiance).abs().max() == pytest.approx(share, rel=0.01)
+    plain = accumulate(even, light, history)
+    assert plain.irradiance.max() > 400 * after.irradiance.max() / 5
+
+
+def test_bounding_loses_no_energy_at_the_edges_of_surfaces():
+    """The mean of many bounded frames, beside an edge and at the border: what is cut off comes back."""
+    generator = torch.Generator().manual_seed(0)
+    mesh_id = torch.ones(1, 1, SIZE, SIZE)
+    mesh_id[..., 20:] = 2
+    mesh_id[..., 40:] = 0
+    total = torch.zeros(1, 3, SIZE, SIZE)
+    for _ in range(600):
+        light = one_sample(generator) * (mesh_id > 0)
+        frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
+        frame.channels["depth"] = 2.0 * mesh_id
+        frame.channels["normal"][:, :, :, 20:] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
+        around = Neighbourhoods(frame)
+        total += bounded(light, brightest(mesh_id.clamp(max=1), around), around)
+    mean = total[0, 0] / 600
+    assert (mean[:, 40:] == 0).all()
+    for columns in (slice(0, 3), slice(3, 17), slice(17, 20), slice(20, 23), slice(23, 37), slice(37, 40)):
+        assert abs(mean[:, columns].mean() - 1) < 0.03
+    assert abs(mean[:, :40].mean() - 1) < 0.01
+
+
+def test_a_firefly_is_shared_out_around_it():
+    light = torch.ones(1, 3, SIZE, SIZE)
+    light[..., 20, 20] = 1000
+    frame = flat_frame(SIZE, SIZE, irradiance=light)
+    around = Neighbourhoods(frame)
+    result = bounded(light, brightest(torch.ones(1, 1, SIZE, SIZE), around), around)
+    rest = 1000 - BRIGHTEST
+    assert result[0, 0, 20, 20] == pytest.approx(BRIGHTEST + rest / 441, rel=1e-3)  # 7 x 7 strata of 9 pixels
+    assert result[0, 0, 25, 14] == pytest.approx(1 + rest / 441, rel=1e-3)
+    assert result[0, 0, 40, 20] == 1
+
+
+def test_no_light_crosses_to_another_mesh():
+    mesh_id = torch.ones(1, 1, SIZE, SIZE)
+    mesh_id[..., 23:] = 2  # within a stratum, whose middle is of mesh 1
+    light = torch.ones(1, 3, SIZE, SIZE)
+    light[..., 20, 20] = 1000
+    frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
+    frame.channels["normal"][:, :, :, 23:] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
+    around = Neighbourhoods(frame)
+    result = bounded(light, brightest(torch.ones(1, 1, SIZE, SIZE), around), around)
+    assert (result[..., 23:] == 1).all() and result[0, 0, 20, 22] > 2
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.4, -0.3)])
+def test_even_light_is_accumulated_as_ever(motion):
+    frames = chain([flat_frame(SIZE, SIZE, motion) for _ in range(7)])
+    (outputs, state), (plain, expected) = (play(kind(), frames) for kind in (create_adaptive, Accumulated))
+    for a, b in zip(outputs, plain, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
+    assert torch.equal(state.history.length, expected.history.length)
+
+
+def create_adaptive():
+    return registry.create("accumulated+adaptive")
+
+
+def test_the_newest_frame_has_the_weight_that_it_has_in_plain_accumulation():
+    """Noise too small to be cut, and too independent to be significant: the same average."""
+    generator = torch.Generator().manual_seed(0)
+    frames = [
+        flat_frame(SIZE, SIZE, irradiance=grey(1 + 0.1 * torch.randn(1, 1, SIZE, SIZE, generator=generator)))
+        for _ in range(4)
+    ]
+    history = adaptive_history = None
+    for frame in frames:
+        history = accumulate(frame, frame.direct, history)
+        adaptive_history = accumulate_adaptively(frame, frame.direct, adaptive_history)
+    same = (adaptive_history.irradiance - history.irradiance).abs().amax(dim=1) < 1e-5
+    assert same.float().mean() > 0.9
+    assert torch.equal(adaptive_history.length, history.length)
+
+
+@pytest.mark.parametrize("factor", [0.3, 2.5])
+def test_history_follows_a_light_that_jumps(factor):
+    """In one frame, and without giving up what is free of noise."""
+    generator = torch.Generator().manual_seed(0)
+    lights = [one_sample(generator) for _ in range(20)] + [one_sample(generator, factor) for _ in range(2)]
+    frames = [flat_frame(SIZE, SIZE, irradiance=light) for light in lights]
+    adaptive = run(create_adaptive(), frames)[-2:]
+    plain = run(Accumulated(), frames)[-2:]
+    assert abs(plain[0].mean() - factor) > 0.7 * abs(1 - factor)
+    for output in adaptive:
+        assert abs(output.mean() / factor - 1) < 0.1
+        assert output.std() / output.mean() < plain[0].std() / plain[0].mean() * 1.1
+
+
+def test_a_gain_is_bounded():
+    light = [torch.full((1, 3, SIZE, SIZE), level) for level in (1.0, 100.0)]
+    frames = [flat_frame(SIZE, SIZE, irradiance=level) for level in light]
+    output = run(create_adaptive(), frames)[1]
+    torch.testing.assert_close(output, torch.full_like(output, (LARGEST_GAIN + 100) / 2))
+
+
+def test_brightness_does_not_matter():
+    generator = torch.Generator().manual_seed(0)
+    lights = [one_sample(generator, level) for level in (1.0, 1.0, 1.0, 0.4)]
+    outputs = [
+        run(create_adaptive(), [flat_frame(SIZE, SIZE, irradiance=scale * light) for light in lights])
+        for scale in (1.0, 1e-6, 1e4)
+    ]
+    for one, dim, bright in zip(*outputs, strict=True):
+        torch.testing.assert_close(1e-6 * one, dim, rtol=1e-3, atol=0)
+        torch.testing.assert_close(1e4 * one, bright, rtol=1e-3, atol=0)
+
+
+def test_whatever_accumulates_can_accumulate_adaptively():
+    for name in ("accumulated", "eaw", "oidn-accumulated", "wskp6", "kp", "wskp-mr"):
+        kind = registry.denoiser_class(f"{name}+adaptive")
+        assert kind.accumulation is accumulate_adaptively
+        assert kind.reads == registry.denoiser_class(name).reads
+        assert registry.denoiser_class(name).accumulation is accumulate
+    assert registry.plain_name("wskp6+adaptive+taa") == "wskp6"
+    assert "motion" in registry.denoiser_class("eaw+adaptive+taa").reads
+    for name in ("noisy+adaptive", "svgf+adaptive", "eaw+taa+adaptive"):
+        with pytest.raises(BadInput, match="temporal accumulation"):
+            registry.denoiser_class(name)

@@ -1,0 +1,91 @@
+"""A-SVGF: SVGF where light stays, and its newest frame where light is another."""
+
+import numpy as np
+import pytest
+import torch
+
+from models.asvgf import ASVGF, change_of_light
+from models.strata import STRATUM, middles, repeated, sums
+from models.svgf import ALPHA, SVGF, SVGFState
+from tests.helpers.frames import chain, flat_frame, play, run
+
+SIZE = 24
+
+
+def noise(count: int, level: float = 1.0, seed: int = 0) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return [level * 2 * torch.rand(1, 1, SIZE, SIZE, generator=generator).repeat(1, 3, 1, 1) for _ in range(count)]
+
+
+def with_gradient(frame, difference: float, largest: float, where=(slice(None), slice(None))):
+    """The frame with one sample in the middle of each stratum of a region (in strata)."""
+    gradient = torch.zeros(1, 2, *frame.size)
+    strata = gradient[..., 1::STRATUM, 1::STRATUM]
+    strata[(slice(None), 0, *where)] = difference
+    strata[(slice(None), 1, *where)] = largest
+    frame.channels["gradient"] = gradient
+    return frame
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.4, -0.3)])
+def test_it_is_svgf_to_the_bit_where_light_stays(motion):
+    frames = chain([flat_frame(SIZE, SIZE, motion, irradiance=light) for light in noise(8)])
+    for a, b in zip(run(ASVGF(), frames), run(SVGF(), frames), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_equal_ratios_are_found_as_they_are():
+    frame = with_gradient(flat_frame(SIZE, SIZE), -0.6, 2.0)
+    torch.testing.assert_close(change_of_light(frame), torch.full((1, 1, SIZE, SIZE), 0.3))
+    frame = with_gradient(flat_frame(SIZE, SIZE), 5.0, 2.0)  # rounded badly: λ is at most 1
+    assert (change_of_light(frame) == 1).all()
+
+
+def test_a_change_ends_where_the_surface_does():
+    mesh_id = torch.ones(1, 1, SIZE, SIZE)
+    mesh_id[..., SIZE // 2 :] = 2
+    frame = with_gradient(flat_frame(SIZE, SIZE, mesh_id=mesh_id), 0.0, 1.0)
+    frame.channels["gradient"][:, 0, 1::STRATUM, 1 : SIZE // 2 : STRATUM] = 0.5
+    frame.channels["normal"][:, :, :, SIZE // 2 :] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
+    change = change_of_light(frame)
+    torch.testing.assert_close(change[..., : SIZE // 2], torch.full((1, 1, SIZE, SIZE // 2), 0.5))
+    assert (change[..., SIZE // 2 :] == 0).all()
+
+
+def test_strata_without_a_sample_take_that_of_others():
+    frame = with_gradient(flat_frame(SIZE, SIZE), 0.5, 1.0, (slice(2, 4), slice(3, 5)))
+    torch.testing.assert_close(change_of_light(frame), torch.full((1, 1, SIZE, SIZE), 0.5))
+
+
+def test_it_follows_a_light_that_jumps():
+    bright = noise(6)
+    dark = noise(2, 0.1, seed=1)
+    frames = [flat_frame(SIZE, SIZE, irradiance=light) for light in bright + dark]
+    with_gradient(frames[6], -0.9, 1.0)
+    adaptive = run(ASVGF(), frames)[6].mean()
+    lagging = run(SVGF(), frames)[6].mean()
+    assert abs(adaptive - 0.1) < 0.25 * abs(lagging - 0.1)
+    assert lagging > 0.5
+
+
+def test_history_forgets_in_proportion():
+    """The integrated colour is (1 - α) C' + α C with α = (1 - λ) 0.2 + λ; the length shrinks by 1 - λ."""
+    frames = [flat_frame(SIZE, SIZE, irradiance=torch.full((1, 3, SIZE, SIZE), level)) for level in (1.0, 3.0)]
+    with_gradient(frames[1], 0.5, 2.0)
+    _, state = play(ASVGF(), frames)
+    assert isinstance(state, SVGFState)
+    alpha = 0.75 * ALPHA + 0.25
+    torch.testing.assert_close(state.history.moments[:, 0, 0], torch.full((1, SIZE, SIZE), (1 - alpha) + 3 * alpha))
+    torch.testing.assert_close(state.history.length, torch.full((1, 1, SIZE, SIZE), 1.75))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 3), (4, 7), (9, 5)])
+def test_strata_and_back(size):
+    image = torch.arange(size[0] * size[1], dtype=torch.float32).view(1, 1, *size)
+    whole = np.zeros((-(-size[0] // 3) * 3, -(-size[1] // 3) * 3), np.float32)
+    whole[: size[0], : size[1]] = image[0, 0]
+    expected = whole.reshape(whole.shape[0] // 3, 3, -1, 3).sum(axis=(1, 3))
+    np.testing.assert_array_equal(sums(image)[0, 0], expected)
+    assert repeated(sums(image), size).shape == image.shape
+    np.testing.assert_array_equal(repeated(middles(image), size)[0, 0, ::3, ::3], middles(image)[0, 0])
+    assert middles(image)[0, 0, 0, 0] == image[0, 0, min(1, size[0] - 1), min(1, size[1] - 1)]

@@ -1,0 +1,141 @@
+"""Temporal gradients: nothing where nothing changes, and the change of noise-free light on average."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from render.clip import Sampling, render_clip
+from render.gbuffer import render_gbuffer
+from render.gradient import STRATUM, Samples, luminance, one_of_each_stratum
+from render.path import PathTracer
+from render.shot import Shot
+from render.stage import Stage
+from scenes.animation import RigidMotion, Scene, Track
+from scenes.cornell import cornell_box
+from scenes.registry import build_scene
+
+SIZE = 32
+
+
+def samples_of(tracer: PathTracer, frame: int, seed: int) -> Samples:
+    """Samples of a frame for which the stage is posed; the same `seed` draws and chooses them."""
+    stage = tracer.stage
+    view = stage.view(frame)
+    light = tracer.radiance(stage.rays(view), seed, 1)
+    drawn_by = {"seed": seed, "spp": 1, "first": 0}
+    return Samples.of(render_gbuffer(stage, view), *light, view, stage.poses, drawn_by, seed)
+
+
+def still_camera(scene: Scene) -> Scene:
+    return replace(scene, camera=scene.still().camera)
+
+
+@given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 99))
+def test_every_stratum_has_one_sample(height, width, seed):
+    row, column = np.divmod(one_of_each_stratum(height, width, seed), width)
+    strata = {(r // STRATUM, c // STRATUM) for r, c in zip(row, column, strict=True)}
+    assert len(strata) == len(row) == -(-height // STRATUM) * -(-width // STRATUM)
+    assert (row < height).all() and (column < width).all()
+
+
+def test_all_places_in_a_stratum_are_taken_alike():
+    counts = np.bincount(np.concatenate([one_of_each_stratum(3, 3, seed) for seed in range(900)]), minlength=9)
+    assert counts.min() > 60 and counts.max() < 140  # 100 each, standard deviation 9.4
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "room-5"])
+def test_shading_an_unchanged_scene_anew_changes_no_bit(name):
+    tracer = PathTracer(Stage(build_scene(name, 3, 24), SIZE, SIZE))
+    samples = samples_of(tracer, 0, seed=7)
+    shaded = samples._replace(poses=-1).gradient(tracer, tracer.stage.view(0))  # as if something had changed
+    at = shaded.reshape(-1, 2)[samples.pixel]
+    hit = samples.mesh_id > 0
+    assert (shaded[..., 0] == 0).all()
+    assert np.array_equal(at[hit, 1], samples.luminance[hit]) and samples.luminance.max() > 0
+    assert (samples.gradient(tracer, tracer.stage.view(0)) == 0).all()  # nor is anything shaded
+
+
+def test_a_camera_that_moves_alone_changes_no_diffuse_light():
+    tracer = PathTracer(Stage(build_scene("cornell_box", 3, 24), SIZE, SIZE))
+    samples = samples_of(tracer, 4, seed=1)
+    difference, largest = np.moveaxis(samples.gradient(tracer, tracer.stage.view(5)), -1, 0)
+    lit = largest > 0
+    assert lit.sum() > 0.6 * len(samples.pixel)
+    # Rounding may flip whether a ray just misses something.
+    assert (np.abs(difference[lit]) < 1e-3 * largest[lit]).mean() > 0.98
+
+
+def test_gradients_average_to_the_change_of_noise_free_light():
+    """A lamp that dims by 40 % and moves: in blocks of pixels, against the difference of two references."""
+    scene = still_camera(cornell_box(np.random.default_rng(0), 2))
+    *rest, lamp = scene.shapes
+    dims = Track(lamp.radiance.at(0) * np.array([[1.0], [0.6]]))
+    slides = RigidMotion(Track(np.array([[0.0, 0.99, 0.0], [0.3, 0.99, 0.2]])), lamp.motion.angle)
+    stage = Stage(replace(scene, shapes=(*rest, replace(lamp, radiance=dims, motion=slides))), SIZE, SIZE)
+    references = [luminance(Shot(stage, frame).reflected(9, 1024).reshape(-1, 3)) for frame in (0, 1)]
+    lamp_id = len(scene.shapes)
+    seen = [render_gbuffer(stage, stage.view(frame))["mesh_id"].ravel() for frame in (0, 1)]
+
+    tracer = PathTracer(stage)
+    stage.pose(0)
+    pairs = [samples_of(tracer, 0, seed) for seed in range(150)]
+    stage.pose(1)
+    images = [samples.gradient(tracer, stage.view(1)).reshape(-1, 2) for samples in pairs]
+    pixel = np.concatenate([samples.pixel for samples in pairs])
+    found = np.concatenate([image[samples.pixel, 0] for image, samples in zip(images, pairs, strict=True)])
+    expected = (references[1] - references[0])[pixel]
+    wall = (seen[0] != lamp_id)[pixel] & (seen[1] != lamp_id)[pixel]
+    block = (pixel // SIZE // 8 * 4 + pixel % SIZE // 8)[wall]
+    error = (found - expected)[wall]
+    z = np.array(
+        [error[block == b].mean() / (error[block == b].std() / np.sqrt((block == b).sum())) for b in range(16)]
+    )
+    assert np.abs(z).max() < 4 and (np.abs(z) < 2).mean() > 0.7
+    assert np.abs(expected[wall].mean()) > 0.2 * np.abs(references[0].mean())
+    # The same random numbers on both sides leave far less noise than two independent frames would.
+    assert found.std() < 0.5 * np.std(np.concatenate([samples.luminance for samples in pairs])) * np.sqrt(2)
+
+
+def test_hidden_samples_leave_none():
+    """What a moving block covers is not shaded anew: gradients stand on the mesh that their samples were on."""
+    tracer = PathTracer(Stage(build_scene("cornell_box_moving", 3, 24), 64, 64))
+    tracer.stage.pose(8)
+    samples = samples_of(tracer, 8, seed=1)
+    tracer.stage.pose(14)
+    gradient = samples.gradient(tracer, tracer.stage.view(14))
+    covered = render_gbuffer(tracer.stage, tracer.stage.view(14))["mesh_id"].ravel()[samples.pixel] != samples.mesh_id
+    assert covered.sum() > 10
+    landed = (gradient[..., 1] != 0).sum()
+    assert 0.5 * len(samples.pixel) < landed < len(samples.pixel) - 0.5 * covered.sum()
+
+
+@pytest.fixture(scope="module")
+def clip():
+    scene = build_scene("cornell_box_moving", 3, 24)
+    return [arrays for arrays, _ in render_clip(scene, 3, SIZE, SIZE, Sampling(2, 1, 2), 1)]
+
+
+def test_a_clip_begins_without_gradients(clip):
+    assert (clip[0]["gradient"] == 0).all()
+    for frame in clip[1:]:
+        difference, largest = np.moveaxis(frame["gradient"], -1, 0)
+        assert (largest >= np.abs(difference)).all() and (difference != 0).any()
+
+
+def test_gradients_cost_no_other_channel_a_bit(clip):
+    names = [name for name in clip[0] if name != "gradient"]
+    scene = build_scene("cornell_box_moving", 3, 24)
+    without = render_clip(scene, 3, SIZE, SIZE, Sampling(2, 1, 2), 1, names)
+    for frame, (arrays, seconds) in zip(clip, without, strict=True):
+        assert "gradient" not in arrays and "gradient" not in seconds
+        assert all(frame[name].tobytes() == arrays[name].tobytes() for name in names)
+
+
+def test_they_are_of_the_first_realisation(clip):
+    scene = build_scene("cornell_box_moving", 3, 24)
+    alone = render_clip(scene, 3, SIZE, SIZE, Sampling(1, 1, 2), 1)
+    for frame, (arrays, _) in zip(clip, alone, strict=True):
+        assert np.array_equal(frame["gradient"], arrays["gradient"])
