@@ -15,17 +15,16 @@ class Lights:
     compile these numbers into every kernel.
     """
 
-    DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32, "sky": mi.EmitterPtr}
+    DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32}
 
     def __init__(self, scene: mi.Scene | None = None):
         if scene is None:  # Dr.Jit makes empty ones
             return
         emitters = scene.emitters()
-        sky = scene.environment()
-        self.emitters = mi.EmitterPtr([*emitters, None, None])  # arrays of one entry are compiled in another way
+        # The sky once more behind them all: a pointer of its own would be compiled in, and so would a single entry.
+        self.emitters = mi.EmitterPtr([*emitters, scene.environment(), None])
         self.count = mi.UInt32(len(emitters))
-        self.sky = mi.EmitterPtr([sky])
-        dr.make_opaque(self.emitters, self.count, self.sky)
+        dr.make_opaque(self.emitters, self.count)
 
     def sample_direction(
         self, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool
@@ -45,4 +44,5 @@ class Lights:
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
         """The light that shines at `si`, the sky's where nothing is hit; none elsewhere."""
-        return dr.select(si.is_valid(), si.shape.emitter(), self.sky)
+        sky = dr.gather(mi.EmitterPtr, self.emitters, self.count)
+        return dr.select(si.is_valid(), si.shape.emitter(), sky)

@@ -2,8 +2,8 @@
 
 Dr.Jit compiles into a kernel what every living object of a class may do when it is called, and how many such objects
 there may be; what they hold enters as data. So objects of all kinds are kept here, always in the same order, and the
-numbers of further ones are bounded. A scene then has the kernels of any other with as many lights, and a sky or none.
-What holds other kinds or more objects gets kernels of its own.
+numbers of further ones are bounded. A scene then has the kernels of any other. What holds other kinds, more objects
+or a sky of another size gets kernels of its own.
 """
 
 from functools import cache
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import mi
+from scenes.sky import SKY_SIZE
 
 MOST_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
 
@@ -65,7 +66,7 @@ def palette() -> list[object]:
     objects: list[object] = [*materials()]
     objects += [mi.load_dict({"type": "uniform", "value": 0.5})]
     objects += [mesh(normals, uv, shines) for shines in flags for normals in flags for uv in flags]
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((*SKY_SIZE, 3), np.float32))}
     objects += [mi.load_dict({"type": "scene", "sky": sky})]  # a sky knows the extent of its scene
     fillers = {
         "BSDF": lambda: mi.load_dict({"type": "diffuse"}),

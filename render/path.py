@@ -60,7 +60,8 @@ def bounce(
     active = dr.any(throughput != 0) & ~ends
     following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
     emitter = lights.at(following)
-    towards = mi.DirectionSample3f(scene, following, si)
+    towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in which light the sky is
+    towards.emitter = emitter
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
     mis = mis_weight(sample.pdf, emitter_pdf)

@@ -7,13 +7,16 @@ from scenes.colours import light_colour
 from scenes.draws import Rng, log_uniform
 from scenes.shell import wall_pose
 
+SKY_SIZE = (64, 128)  # rows and columns; kernels of scenes with skies of the same size are shared
 
-def sky(rng: Rng, sun: Array | None, height: int = 64) -> Array:
-    """Radiance (height, 2 * height, 3) of a sky over dark ground: latitude-longitude, y up.
+
+def sky(rng: Rng, sun: Array | None) -> Array:
+    """Radiance (*SKY_SIZE, 3) of a sky over dark ground: latitude-longitude, y up.
 
     `sun` is the direction to the sun, (3,) with y up, or None under clouds. A clear day's sun gives a few times the
     light of its sky (0.3 to 30 times here).
     """
+    height, width = SKY_SIZE
     rows = (np.arange(height) + 0.5) / height
     up = np.cos(np.pi * rows)[:, None, None]
     zenith = rng.uniform(0.6, 1.0, 3) * [0.4, 0.6, 1.0]
@@ -21,11 +24,11 @@ def sky(rng: Rng, sun: Array | None, height: int = 64) -> Array:
     ground = rng.uniform(0.5, 1.0, 3) * 0.2
     blend = np.clip(up, 0, 1) ** 0.5
     image = np.where(up > 0, zenith * blend + horizon * (1 - blend), ground)
-    image = np.repeat(image, 2 * height, axis=1)
+    image = np.repeat(image, width, axis=1)
     if sun is not None:
         x, y, z = sun / np.linalg.norm(sun)
         row = np.arccos(y) / np.pi * height
-        column = np.arctan2(x, -z) / np.pi % 2 * height
+        column = np.arctan2(x, -z) / np.pi / 2 % 1 * width
         image[int(row), int(column)] += light_colour(rng) * log_uniform(rng, 300, 20000)
     return np.asarray(image)
 
