@@ -87,7 +87,7 @@ class Samples(NamedTuple):
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
         pixel = mi.UInt32(aligned(self.pixel.astype(np.uint32)))
         direct, indirect = tracer.samples(stage.rays(now, place), pixel, **self.random_numbers)
-        shaded = luminance((np.array(direct) + np.array(indirect)).T)
+        shaded = luminance(np.stack([np.array(channel) for channel in direct + indirect], axis=-1))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)
         column, row = place[visible & inside].astype(int).T
         gradient[row, column] = pairs[visible & inside]
