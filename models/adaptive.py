@@ -138,7 +138,7 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
     past_luminance = luminance_of(past)
     limit = brightest(torch.where(found, past_luminance, luminance), around)
     comparable = found & around.members
-    factor = gain(*(image * comparable for image in (luminance, past_luminance, past_cut)), limit, around)
+    factor = gain(luminance * comparable, past_luminance * comparable, past_cut * comparable, limit, around)
     limit = limit * factor
     alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
     return AdaptiveAccumulation(
