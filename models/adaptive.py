@@ -92,19 +92,21 @@ def trust(difference: Tensor, around: Neighbourhoods) -> Tensor:
     return ((t_squared - INSIGNIFICANT) / (SIGNIFICANT - INSIGNIFICANT)).clamp(0, 1)
 
 
-def gain(newest: Tensor, past: Tensor, limit: Tensor, comparable: Tensor, around: Neighbourhoods) -> Tensor:
+def gain(newest: Tensor, past: Tensor, cut: Tensor, limit: Tensor, around: Neighbourhoods) -> Tensor:
     """What to multiply history by, (B, 1, H, W): 1 where its difference from the newest frame may well be noise.
 
-    From the `newest` luminance and that of the `past`, cut at `limit`, where they are `comparable`; all (B, 1, H, W).
-    The newest one is to be cut where history would have been in today's light: at `limit` times the gain itself.
+    From the luminance of the `newest` frame and of the `past`, and that of the past `cut` at `limit`; all (B, 1, H, W),
+    and 0 where they are not to be compared. The newest one is to be cut where history would have been in today's light:
+    at `limit` times the gain itself. What is cut tells changes from fireflies, but where limits have changed its ratio
+    may be too large: the gain is at most that of the whole.
     """
-    weight = comparable.to(past)
-    believed = trust((torch.minimum(newest, limit) - past) * weight, around)
-    then = around.sums(past * weight) + LEAST_DIVISOR
+    believed = trust(torch.minimum(newest, limit) - cut, around)
+    now, then, then_cut = (around.sums(torch.cat([newest, past, cut], dim=1)) + LEAST_DIVISOR).split(1, dim=1)
+    whole = (now / then).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
     factor = torch.ones_like(past)
     for _ in range(GAIN_STEPS):
-        now = around.sums(torch.minimum(newest, limit * factor) * weight) + LEAST_DIVISOR
-        factor = repeated((now / then).clamp(1 / LARGEST_GAIN, LARGEST_GAIN) ** believed, around.size)
+        ratio = (around.sums(torch.minimum(newest, limit * factor)) + LEAST_DIVISOR) / then_cut
+        factor = repeated(ratio.clamp(whole.clamp(max=1), whole.clamp(min=1)) ** believed, around.size)
     return factor
 
 
@@ -133,8 +135,10 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
     before = torch.cat([history.irradiance, history.length, history.cut], dim=1)
     fetched, found = reproject(frame, before, history.surfaces)
     past, n, past_cut = fetched.split([3, 1, 1], dim=1)
-    limit = brightest(torch.where(found, luminance_of(past), luminance), around)
-    factor = gain(luminance, past_cut, limit, found & around.members, around)
+    past_luminance = luminance_of(past)
+    limit = brightest(torch.where(found, past_luminance, luminance), around)
+    comparable = found & around.members
+    factor = gain(luminance * comparable, past_luminance * comparable, past_cut * comparable, limit, around)
     limit = limit * factor
     alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
     return AdaptiveAccumulation(

@@ -21,7 +21,7 @@ from render.gbuffer import trace_visible
 from render.motion import same_surface
 from render.path import PathTracer
 from render.stage import aligned
-from scenes.camera import Array, View, move, pixel_centres, project, unproject
+from scenes.camera import Array, View, move, project, unproject
 
 STRATUM = 3  # px, the side of the squares of which each has one sample
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (ITU-R BT.709)
@@ -66,9 +66,9 @@ class Samples(NamedTuple):
         """One of each stratum of a `frame`, of which `direct` and `indirect` (H, W, 3) is what the tracer made."""
         height, width = direct.shape[:2]
         pixel = one_of_each_stratum(height, width, seed)
-        depth = frame["depth"].ravel()[pixel].astype(np.float64)
-        point = unproject(pixel_centres(height, width).reshape(-1, 2)[pixel], depth, view)
-        light = luminance((direct + indirect).reshape(-1, 3)[pixel])
+        centre = np.stack([pixel % width, pixel // width], axis=-1) + 0.5
+        point = unproject(centre, frame["depth"].ravel()[pixel].astype(np.float64), view)
+        light = luminance(direct.reshape(-1, 3)[pixel] + indirect.reshape(-1, 3)[pixel])
         return Samples(pixel, light, point, frame["mesh_id"].ravel()[pixel], view, poses, random_numbers)
 
     def gradient(self, tracer: PathTracer, now: View) -> Array:

@@ -174,6 +174,17 @@ def test_history_follows_a_light_that_jumps(factor):
         assert output.std() / output.mean() < plain[0].std() / plain[0].mean() * 1.1
 
 
+@pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (1e-3, 1.0), (1.0, 20.0), (20.0, 1.0)])
+def test_history_does_not_overshoot_light_that_is_switched(before, after):
+    """Where it was nearly dark, limits were far too low: what is cut at them tells nothing of the light now."""
+    generator = torch.Generator().manual_seed(0)
+    lights = [one_sample(generator, level) for level in [before] * 8 + [after] * 10]
+    frames = [flat_frame(SIZE, SIZE, irradiance=light) for light in lights]
+    means = [float(output.mean()) for output in run(create_adaptive(), frames)[10:]]
+    assert all(abs(mean / after - 1) < 0.15 for mean in means)
+    assert abs(float(run(Accumulated(), frames)[10].mean()) / after - 1) > 0.4
+
+
 def test_a_gain_is_bounded():
     light = [torch.full((1, 3, SIZE, SIZE), level) for level in (1.0, 100.0)]
     frames = [flat_frame(SIZE, SIZE, irradiance=level) for level in light]
