@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.stage import Stage
+from render.stage import Stage, columns
 from scenes.camera import Array, View
 
 
 def depth_along_axis(stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View) -> NDArray[np.float32]:
     """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored."""
     distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64) * stage.unit
-    cosine = np.array(ray.d, dtype=np.float64).T @ view.camera_to_world[:3, 2]
+    cosine = columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2]
     return (distance * cosine).astype(np.float32)
 
 
@@ -33,7 +33,7 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
     mesh_id = stage.mesh_id(si)
     dr.eval(si.t, si.n, mesh_id)
     depth = depth_along_axis(stage, si, ray, view).astype(np.float64)
-    normal = np.array(si.n, dtype=np.float64).T
+    normal = columns(si.n).astype(np.float64)
     return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 

@@ -20,7 +20,7 @@ from render.backend import mi
 from render.gbuffer import trace_visible
 from render.motion import same_surface
 from render.path import PathTracer
-from render.stage import aligned
+from render.stage import aligned, columns
 from scenes.camera import Array, View, move, project, unproject
 
 STRATUM = 3  # px, the side of the squares of which each has one sample
@@ -87,7 +87,7 @@ class Samples(NamedTuple):
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
         pixel = mi.UInt32(aligned(self.pixel.astype(np.uint32)))
         direct, indirect = tracer.samples(stage.rays(now, place), pixel, **self.random_numbers)
-        shaded = luminance(np.stack([np.array(channel) for channel in direct + indirect], axis=-1))
+        shaded = luminance(columns(direct) + columns(indirect))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)
         column, row = place[visible & inside].astype(int).T
         gradient[row, column] = pairs[visible & inside]

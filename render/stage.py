@@ -109,6 +109,14 @@ def upload(values: NDArray[np.floating]) -> mi.Float:
     return mi.Float(aligned(values.astype(np.float32)))
 
 
+def columns(vector: dr.AnyArray) -> NDArray[Any]:
+    """(N, C) of a Dr.Jit vector of C components and N lanes; its own dtype.
+
+    Taken at once they would be put together by a kernel that is compiled for this N.
+    """
+    return np.stack([np.array(component) for component in vector], axis=-1)
+
+
 def unit_of(scene: Scene) -> float:
     """How many world units a unit of Mitsuba's is: 1, or a power of two for very small and very large scenes.
 
