@@ -75,18 +75,14 @@ DATA_PROFILES = {
             "test": SamplingQuality(realisations=1, reference_spp=64, floor=36, most_spp=256, passes_over=True),
         },
     ),
-    # The rooms of release in minutes, small and short, to see how hard they are.
+    # Rooms as those of release in minutes, small and short, to see how hard they are.
     "sketch": DataProfile(
         height=64,
         width=64,
         frames=4,
         boxes={"train": 0, "val": 0, "test": 0},
         rooms={"train": 64, "val": 8, "test": 0},
-        quality={
-            "train": SamplingQuality(realisations=1, reference_spp=64, floor=30),
-            "val": SamplingQuality(realisations=1, reference_spp=64, floor=30),
-            "test": SamplingQuality(realisations=1, reference_spp=64, floor=30),
-        },
+        quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=64)),
     ),
     "release": DataProfile(
         height=256,

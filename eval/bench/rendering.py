@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from itertools import count
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 from tabulate import tabulate
 from tqdm import tqdm
@@ -40,6 +41,7 @@ class TimeToFloor:
         floor: PSNR in dB, as displayed, of the mean of two halves of the samples.
         seconds: to the target. Where `spp` was not enough, they are extrapolated: noise falls as 1 / spp.
         ratio: of stock Mitsuba's seconds.
+        kernels, compiling: see Compilations; None for stock Mitsuba, whose first frame is not looked at.
     """
 
     scene: str
@@ -50,6 +52,8 @@ class TimeToFloor:
     seconds: float
     extrapolated: bool
     ratio: float
+    kernels: int | None = None
+    compiling: float | None = None  # seconds
 
 
 def displayed_noise(render: Render, exposure: float, spp: int) -> float:
@@ -64,6 +68,24 @@ def samples_needed(render: Render, exposure: float, target: float) -> tuple[int,
     while (noise := displayed_noise(render, exposure, spp)) > target and spp < MOST_SPP:
         spp *= 2
     return spp, noise
+
+
+class Compilations(NamedTuple):
+    """Kernels that a scene needed for its first frame and that nothing in this process had compiled before."""
+
+    kernels: int
+    compiling: float  # seconds, 0 where they lay on disk
+
+
+def first_frame(scene: str, size: int) -> tuple[Shot, Compilations]:
+    """A frame of `size` x `size` pixels, ready to be sampled, and what it took to compile."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        shot = Shot(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
+        shot.radiance(0, 1)
+        launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    new = [kernel for kernel in launched if kernel["cache_disk"] or not kernel["cache_hit"]]
+    return shot, Compilations(len(new), sum(kernel["backend_time"] for kernel in new) / 1e3)
 
 
 def rendering_halves(render: Render, spp: int) -> Callable[[], None]:
@@ -83,7 +105,7 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
 
     Both share the exposure of ours. Raises BadInput for an unknown scene.
     """
-    shot = Shot(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
+    shot, compiled = first_frame(scene, size)
     renders: dict[str, Render] = {STOCK: stock_render(shot), ONESPP: shot.radiance}
     exposure = clip_exposure(luminance(shot.radiance(9, 256)))
     target = 10 ** (-TARGET_DB / 10)
@@ -104,6 +126,7 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
             seconds=to_target,
             extrapolated=noise > target,
             ratio=to_target / rows[0].seconds if rows else 1.0,
+            **(compiled._asdict() if renderer == ONESPP else {}),
         )
         rows.append(row)
     dr.flush_malloc_cache()
@@ -127,5 +150,11 @@ def bench_rendering(
         "rows": rows,
     }
     write_json(bench_folder(runs) / "rendering.json", content)
-    heads = {"samples_per_second": "samples/s", "floor": "floor dB", "seconds": f"seconds to {TARGET_DB:.0f} dB"}
-    return tabulate(rows, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f"))
+    heads = {
+        "samples_per_second": "samples/s",
+        "floor": "floor dB",
+        "seconds": f"seconds to {TARGET_DB:.0f} dB",
+        "kernels": "new kernels",
+        "compiling": "compiling s",
+    }
+    return tabulate(rows, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f", ".0f", ".2f"))
