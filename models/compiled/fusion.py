@@ -16,7 +16,7 @@ from torch import Tensor
 
 from models import parameters
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, plane_or_empty
+from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
 from models.parameters import WINDOWS
 
 THREAD_ROWS = 32  # rows that a thread fuses at once
@@ -32,7 +32,9 @@ def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -
     width = source.shape[2]
     for c in range(4):
         row = columns[c][margin : margin + width]
-        row[:] = source[c, first]
+        top = source[c, first]
+        for x in range(width):
+            row[x] = top[x]
         for y in range(first + 1, last):
             line = source[c, y]
             for x in range(width):
@@ -46,7 +48,8 @@ def row_sums(total: Any, columns: Any, radius: int) -> None:
         row = total[c]
         line = columns[c]
         width = row.size
-        row[:] = line[:width]
+        for x in range(width):
+            row[x] = line[x]
         for tap in range(1, 2 * radius + 1):
             shifted = line[tap : tap + width]
             for x in range(width):
@@ -95,7 +98,7 @@ def lowest(logits: Any, high: Any) -> Any:
     return low
 
 
-@jit_in_any_order
+@jit_with_memory
 def softmax(shares: Any, y: int) -> None:
     """Row y of shares (M, rows, W) becomes its softmax over M."""
     count, _, width = shares.shape
@@ -117,7 +120,7 @@ def softmax(shares: Any, y: int) -> None:
             share[x] /= total[x]
 
 
-@jit_in_any_order
+@jit_with_memory
 def filter_strip(
     fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
 ) -> None:
@@ -146,7 +149,7 @@ def filter_strip(
         mix(fused, y, total, shares[y - start])
 
 
-@jit_in_any_order
+@jit_with_memory
 def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: Any, taps: int) -> None:
     """Largest entry (taps, W), and sums of exp(entry - largest) * value (4, taps, W), into tops and totals.
 
@@ -174,7 +177,7 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
                 total[x] += weight[x] * value[x]
 
 
-@jit_in_any_order
+@jit_with_memory
 def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
     """The same for any finite logits: relative to the largest of every window, columns first, then rows."""
     height, width = image.shape[1:]

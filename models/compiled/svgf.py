@@ -15,7 +15,7 @@ from datasets.channels import LUMINANCE_WEIGHTS
 from models import parameters
 from models.atrous import RADIUS
 from models.compiled.atrous import SPLINE, columns_with_tap, decay
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 from models.parameters import SPATIAL_RADIUS, SQUARINGS
 
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
@@ -47,7 +47,7 @@ def depth_steps(step: Any, depth: Any, to_depth: Any, mesh: Any, to_mesh: Any) -
         step[i] = to_depth[i] - depth[i] if mesh[i] == to_mesh[i] else np.float32(np.inf)
 
 
-@jit_in_any_order
+@jit_with_memory
 def pack_geometry_row(packed: Any, row: Any, depth: Any, normal: Any, mesh: Any) -> None:
     """A row of packed (7, H, W) from depth (H, W), normal (3, H, W), mesh (H, W)."""
     height, width = depth.shape
@@ -166,7 +166,7 @@ def add_svgf_tap(
         spread[i] += w * w * v[i]
 
 
-@jit_in_any_order
+@jit_with_memory
 def sum_svgf_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edge: Any, geometry: Any) -> None:
     """sums (S, 5, W) over the taps of one row of colour (S, 3, H, W), variance (S, H, W), edge (S, 2, H, W)."""
     signals, _, height, width = colour.shape
@@ -222,7 +222,7 @@ def filter_svgf_image(
             divide_svgf_row(colour_out[s], variance_out[s], row, sums[s])
 
 
-@jit_in_any_order
+@jit_with_memory
 def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> None:
     """A row of edge (2, H, W): luminance of colour (3, H, W), and models.svgf.edge_scale of variance (H, W)."""
     height, width = variance.shape
@@ -305,7 +305,7 @@ def add_spatial_tap(
         squares[i] += weight[i] * (off * off + v[i])
 
 
-@jit_in_any_order
+@jit_with_memory
 def sum_spatial_block(sums: Any, row: int, first: int, last: int, variance: Any, mean: Any, geometry: Any) -> None:
     """sums (S, 3, SPATIAL_BLOCK) over the windows of the pixels `first` to `last` - 1 of a row.
 
@@ -328,7 +328,7 @@ def sum_spatial_block(sums: Any, row: int, first: int, last: int, variance: Any,
                 add_spatial_tap(sums[s], first, weight, variance[s], mean[s], row, left, dx, dy)
 
 
-@jit_in_any_order
+@jit_with_memory
 def spatial_variance_row(out: Any, row: Any, variance: Any, mean: Any, geometry: Any, where: Any) -> None:
     """A row of out (S, H, W) `where` (H, W) it is wanted."""
     signals, _, width = variance.shape
