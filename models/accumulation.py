@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
+from models import compiled
+from models.compiled import accumulation as kernels
+from models.parameters import SMALLEST_ALPHA
 from models.reprojection import reproject
 from models.surfaces import Surfaces
-
-SMALLEST_ALPHA = 0.2
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,25 @@ class Accumulation:
     irradiance: Tensor
     length: Tensor
     surfaces: Surfaces
+
+
+@compiled.by(kernels.accumulate_samples)
+def accumulate_samples(
+    frame: Frame,
+    noisy: Tensor,
+    past_irradiance: Tensor,
+    past_length: Tensor,
+    surfaces: Surfaces,
+    change: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """`accumulate` with a history: irradiance (B, 3, H, W) and length (B, 1, H, W); `surfaces` are the history's."""
+    past, found = reproject(frame, torch.cat([past_irradiance, past_length], dim=1), surfaces)
+    length = past[:, 3:] + 1
+    alpha = (1 / length).clamp(min=SMALLEST_ALPHA)
+    if change is not None:
+        alpha = torch.lerp(alpha, torch.ones_like(alpha), change)
+        length = torch.minimum(length, 1 / alpha)
+    return torch.lerp(past[:, :3], noisy, torch.where(found, alpha, 1)), torch.where(found, length, 1)
 
 
 def accumulate(
@@ -32,13 +52,6 @@ def accumulate(
     """
     length = torch.ones_like(irradiance[:, :1])
     if history is not None:
-        past, found = reproject(frame, torch.cat([history.irradiance, history.length], dim=1), history.surfaces)
-        n = past[:, 3:]
-        alpha = (1 / (n + 1)).clamp(min=SMALLEST_ALPHA)
-        longer = n + 1
-        if change is not None:
-            alpha = torch.lerp(alpha, torch.ones_like(alpha), change)
-            longer = torch.minimum(longer, 1 / alpha)
-        irradiance = torch.lerp(past[:, :3], irradiance, torch.where(found, alpha, 1))
-        length = torch.where(found, longer, 1)
+        past = history.irradiance, history.length, history.surfaces
+        irradiance, length = accumulate_samples(frame, irradiance, *past, change)
     return Accumulation(irradiance, length, Surfaces.of(frame))
