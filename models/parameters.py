@@ -11,6 +11,8 @@ SMALLEST_ALPHA = 0.2  # weight of the newest frame in a long history
 
 # --- SVGF (Schied et al. 2017) ----------------------------------------------------------------------------------------
 
+ALPHA = 0.2  # §4.1: weight of the newest sample
+LARGEST_LUMINANCE = 1e16  # its square must stay finite
 SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
 SIGMA_Z = 1.0  # §4.4
 SIGMA_L = 4.0

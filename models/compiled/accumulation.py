@@ -17,8 +17,7 @@ from models.compiled.reprojection import (
     Buffers,
     Past,
     Views,
-    fetch_boxes,
-    fetch_line,
+    fetch,
     find_row,
     new_search,
 )
@@ -74,14 +73,12 @@ def accumulate_image(
         start = np.int64(block) * BLOCK_ROWS
         for y in range(start, min(start + BLOCK_ROWS, height)):
             find_row(search, y, Past(motion, now, then, views))
-            fetch_line(fetched, past_length, y, search)
-            fetch_boxes(fetched, past_length, search)
+            fetch(fetched, past_length, y, search)
             weigh(alpha, length[y], fetched, search.found)
             if change.size > 0:
                 shorten(alpha, length[y], change[y])
             for c in range(3):
-                fetch_line(fetched, past_irradiance[c], y, search)
-                fetch_boxes(fetched, past_irradiance[c], search)
+                fetch(fetched, past_irradiance[c], y, search)
                 blend(irradiance[c, y], fetched, alpha, noisy[c, y])
 
 

@@ -371,8 +371,8 @@ def mix_taps(
 
 
 @jit_with_reciprocals
-def fetch_line(line: Any, plane: Any, y: int, search: Search) -> None:
-    """line (W): what `plane` (H, W) of the previous frame holds for the pixels of a row, 0 where none was found."""
+def fetch_runs(line: Any, plane: Any, y: int, search: Search) -> None:
+    """What consistent taps hold, in line (W)."""
     height, width = plane.shape
     weight = search.weight
     for run in range(search.counts[0]):
@@ -407,7 +407,7 @@ def fetch_line(line: Any, plane: Any, y: int, search: Search) -> None:
 
 @jit_with_reciprocals
 def fetch_boxes(line: Any, plane: Any, search: Search) -> None:
-    """The same for the pixels that were found in boxes: the mean of those of 3 x 3 pixels that are consistent."""
+    """The mean of what the consistent ones of 3 x 3 pixels hold, for pixels that were found in boxes."""
     for box in range(search.counts[1]):
         column = np.int64(search.boxes[box, 1])
         row = np.int64(search.boxes[box, 2])
@@ -422,11 +422,10 @@ def fetch_boxes(line: Any, plane: Any, search: Search) -> None:
 
 
 @jit_with_reciprocals
-def fetch(lines: Any, history: Any, y: int, search: Search) -> None:
-    """lines (C, W) of history (C, H, W), as `search` has found them for row y."""
-    for c in range(lines.shape[0]):
-        fetch_line(lines[c], history[c], y, search)
-        fetch_boxes(lines[c], history[c], search)
+def fetch(line: Any, plane: Any, y: int, search: Search) -> None:
+    """line (W): what `plane` (H, W) of the previous frame holds for the pixels of row y, 0 where none was found."""
+    fetch_runs(line, plane, y, search)
+    fetch_boxes(line, plane, search)
 
 
 @jit_parallel
@@ -438,7 +437,8 @@ def fetch_image(fetched: Any, found: Any, history: Any, motion: Any, now: Buffer
         start = np.int64(block) * BLOCK_ROWS
         for y in range(start, min(start + BLOCK_ROWS, height)):
             find_row(search, y, Past(motion, now, then, views))
-            fetch(fetched[:, y], history, y, search)
+            for c in range(history.shape[0]):
+                fetch(fetched[c, y], history[c], y, search)
             found[y] = search.found > 0
 
 
