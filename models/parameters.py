@@ -5,7 +5,7 @@
 PLANE_TOLERANCE = 0.01  # of the depth: a tap's surface may lie this far off the point's plane
 NORMAL_TOLERANCE = 0.9  # smallest cosine between a tap's normal and the point's
 
-# --- Accumulation (SVGF §4.1) ------------------------------------------------------------------------------------------
+# --- Accumulation (SVGF §4.1) -----------------------------------------------------------------------------------------
 
 SMALLEST_ALPHA = 0.2  # weight of the newest frame in a long history
 

@@ -51,7 +51,7 @@ def interleave(out: Any, lines: Any) -> None:
 
 @jit_parallel
 def feature_image(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any, exposure: Any, scale: Any) -> None:
-    """out (H, W, 10) from irradiance, albedo and normal (3, H, W), depth (H, W), exposure (3,), and the depth `scale`."""
+    """out (H, W, 10) from irradiance, albedo and normal (3, H, W), depth (H, W), exposure (3,), the depth's scale."""
     height, width = depth.shape
     for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
         lines = np.empty((FEATURE_CHANNELS, width), np.float32)

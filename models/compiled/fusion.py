@@ -95,7 +95,7 @@ def add_share(red: Any, green: Any, blue: Any, share: Any, r: Any, g: Any, b: An
 
 
 @jit_in_any_order
-def split_row(lines: Any, to: int, maps: Any, row: int) -> None:
+def split_row(lines: Any, to: Any, maps: Any, row: Any) -> None:
     """Row `to` of lines (M, rows, W) = a row of maps (M, H, W), whose channels may lie side by side."""
     count, _, width = lines.shape
     for first in range(0, width, CHUNK):
@@ -105,7 +105,7 @@ def split_row(lines: Any, to: int, maps: Any, row: int) -> None:
 
 
 @jit_in_any_order
-def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -> None:
+def column_sums(columns: Any, margin: int, source: Any, first: Any, last: Any) -> None:
     """columns (4, W + 2 margin), within its margins, = sum of rows first to last - 1 of source (4, rows, W)."""
     width = source.shape[2]
     for c in range(4):
@@ -123,7 +123,7 @@ def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -
 
 
 @jit_in_any_order
-def row_sums(total: Any, columns: Any, radius: int) -> None:
+def row_sums(total: Any, columns: Any, radius: Any) -> None:
     """total (4, W) = sums of 2 radius + 1 neighbours in columns (4, W + 2 radius)."""
     width = total.shape[1]
     for c in range(4):
@@ -144,7 +144,7 @@ def row_sums(total: Any, columns: Any, radius: int) -> None:
 
 
 @jit_in_any_order
-def mix(fused: Any, y: int, total: Any, share: Any) -> None:
+def mix(fused: Any, y: Any, total: Any, share: Any) -> None:
     """Row y of fused (3, H, W) += share (W) times the ratio of sums in total (4, W)."""
     add_share(fused[0, y], fused[1, y], fused[2, y], share, total[0], total[1], total[2], total[3])
 
@@ -161,7 +161,7 @@ def logit_range(logits: Any) -> Any:
 
 
 @jit_in_any_order
-def softmax(shares: Any, y: int, top: Any, total: Any) -> None:
+def softmax(shares: Any, y: Any, top: Any, total: Any) -> None:
     """Row y of shares (M, rows, W) becomes its softmax over M; top and total (W) are scratch."""
     count, _, width = shares.shape
     copy_line(top, shares[0, y])
@@ -185,7 +185,7 @@ def softmax(shares: Any, y: int, top: Any, total: Any) -> None:
 
 @jit_with_memory
 def filter_strip(
-    fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
+    fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: Any, start: Any, low: Any, weighted: Any
 ) -> None:
     """Add a window's share to a strip of rows from `start` on.
 
@@ -236,7 +236,7 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
 
 
 @jit_with_memory
-def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
+def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: Any, start: Any, low: Any) -> None:
     """The same for any finite logits: relative to the largest of every window, columns first, then rows."""
     height, width = image.shape[1:]
     taps = 2 * radius + 1

@@ -1,8 +1,8 @@
 """models.reprojection for the processor: rows in parallel, each split into runs of pixels whose taps lie side by side.
 
 Where neighbours show one mesh and move by the same whole pixels, their taps are contiguous lines of memory, and every
-loop over them is vectorised; the few pixels of short runs and at borders are looked at one by one. Points and directions
-are in the world's axes around the previous eye, so that they keep their precision wherever in the world that is.
+loop over them is vectorised; the few pixels of short runs and at borders are looked at one by one. Points and
+directions are in the world's axes around the previous eye, so that they keep their precision wherever that is.
 """
 
 from typing import Any, NamedTuple
@@ -171,7 +171,7 @@ def turn_normals(nx: Any, ny: Any, nz: Any, x: Any, y: Any, z: Any, turn: Any) -
 
 
 @jit_with_reciprocals
-def expect(search: Search, y: int, first: int, last: int, past: Past) -> None:
+def expect(search: Search, y: Any, first: Any, last: Any, past: Past) -> None:
     """Where the surface points of a run's pixels were, and their normals."""
     now = past.now
     views = past.views
@@ -201,7 +201,7 @@ def expect(search: Search, y: int, first: int, last: int, past: Past) -> None:
 
 
 @jit_with_reciprocals
-def is_consistent(x: int, y: int, pixel: int, mesh: float, search: Search, then: Buffers, views: Views) -> Any:
+def is_consistent(x: Any, y: Any, pixel: Any, mesh: float, search: Search, then: Buffers, views: Views) -> Any:
     """Whether the tap at column x, row y of the previous frame shows the surface point of the row's `pixel`."""
     height, width = then.mesh_id.shape
     if x < 0 or y < 0 or y >= height or x >= width or then.mesh_id[y, x] != mesh:
@@ -239,7 +239,7 @@ def compare_normals(good: Any, nx: Any, ny: Any, nz: Any, x: Any, y: Any, z: Any
 def compare_planes(
     good: Any, px: Any, py: Any, pz: Any, depth: Any, x: Any, y: Any, z: Any, axes: Any, left: Any, row: Any
 ) -> None:
-    """good (n) becomes 0 where the points are not on the planes of taps with normals (x, y, z), from column `left` on."""
+    """good (n) becomes 0 where the points are not on the planes of taps with normals (x, y, z), from `left` on."""
     ax, ay, az = axes[0, 0], axes[0, 1], axes[0, 2]
     bx = ax * left + axes[1, 0] * row + axes[2, 0]
     by = ay * left + axes[1, 1] * row + axes[2, 1]
@@ -254,7 +254,7 @@ def compare_planes(
 
 
 @jit_with_reciprocals
-def compare(good: Any, search: Search, x: int, y: int, low: int, mesh: float, then: Buffers, views: Views) -> None:
+def compare(good: Any, search: Search, x: Any, y: Any, low: Any, mesh: float, then: Buffers, views: Views) -> None:
     """good (n): whether the taps from column x of row y on show the surface points of the pixels from `low` on."""
     high = low + good.size
     end = x + good.size
@@ -306,7 +306,7 @@ def weigh(found: Any, one: Any, two: Any, three: Any, four: Any, across: Any, do
 
 
 @jit_with_reciprocals
-def find_boxes(search: Search, y: int, past: Past) -> None:
+def find_boxes(search: Search, y: Any, past: Past) -> None:
     """Look for the pixels that have no consistent taps among the 3 x 3 around where they were."""
     count = 0
     for x in range(search.found.size):
@@ -330,7 +330,7 @@ def find_boxes(search: Search, y: int, past: Past) -> None:
 
 
 @jit_with_reciprocals
-def find_row(search: Search, y: int, past: Past) -> None:
+def find_row(search: Search, y: Any, past: Past) -> None:
     """Fill `search` for a row."""
     height, width = past.now.mesh_id.shape
     meshes = past.now.mesh_id[y]
@@ -371,7 +371,7 @@ def mix_taps(
 
 
 @jit_with_reciprocals
-def fetch_runs(line: Any, plane: Any, y: int, search: Search) -> None:
+def fetch_runs(line: Any, plane: Any, y: Any, search: Search) -> None:
     """What consistent taps hold, in line (W)."""
     height, width = plane.shape
     weight = search.weight
@@ -422,7 +422,7 @@ def fetch_boxes(line: Any, plane: Any, search: Search) -> None:
 
 
 @jit_with_reciprocals
-def fetch(line: Any, plane: Any, y: int, search: Search) -> None:
+def fetch(line: Any, plane: Any, y: Any, search: Search) -> None:
     """line (W): what `plane` (H, W) of the previous frame holds for the pixels of row y, 0 where none was found."""
     fetch_runs(line, plane, y, search)
     fetch_boxes(line, plane, search)

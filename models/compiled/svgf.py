@@ -190,7 +190,7 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
 
 
 @jit_in_any_order
-def geometry_weights(weight: Any, exponent: Any, geometry: Any, row: int, left: int, dx: int, dy: int) -> None:
+def geometry_weights(weight: Any, exponent: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
     """models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W).
 
     As weight (n) times e to the power of -exponent (n).
@@ -241,7 +241,7 @@ def add_svgf_tap(
     colour: Any,
     variance: Any,
     edge: Any,
-    row: int,
+    row: Any,
     left: int,
     dx: int,
     dy: int,
@@ -302,7 +302,7 @@ def sum_svgf_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edg
 
 
 @jit_in_any_order
-def divide_svgf_row(colour: Any, variance: Any, row: int, sums: Any) -> None:
+def divide_svgf_row(colour: Any, variance: Any, row: Any, sums: Any) -> None:
     """A row of colour (3, H, W) and of variance (H, W) from sums (5, W)."""
     r = colour[0, row]
     g = colour[1, row]
@@ -391,7 +391,7 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
 
 @jit_in_any_order
 def add_spatial_tap(
-    sums: Any, first: int, weight: Any, variance: Any, mean: Any, row: int, left: int, dx: int, dy: int
+    sums: Any, first: Any, weight: Any, variance: Any, mean: Any, row: Any, left: int, dx: int, dy: int
 ) -> None:
     """Add one tap of the n pixels from `left` on to sums (3, SPATIAL_BLOCK), which begin with the pixel at `first`.
 
@@ -417,7 +417,7 @@ def add_spatial_tap(
 
 
 @jit_with_memory
-def sum_spatial_block(sums: Any, row: int, first: int, last: int, variance: Any, mean: Any, geometry: Any) -> None:
+def sum_spatial_block(sums: Any, row: Any, first: Any, last: Any, variance: Any, mean: Any, geometry: Any) -> None:
     """sums (S, 3, SPATIAL_BLOCK) over the windows of the pixels `first` to `last` - 1 of a row.
 
     variance, mean (S, H, W).
