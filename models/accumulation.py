@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
+from models import compiled
+from models.compiled import accumulation as kernels
+from models.parameters import SMALLEST_ALPHA
 from models.reprojection import reproject
 from models.surfaces import Surfaces
-
-SMALLEST_ALPHA = 0.2
 
 
 @dataclass(frozen=True)
@@ -21,24 +22,25 @@ class Accumulation:
     surfaces: Surfaces
 
 
-def accumulate(
-    frame: Frame, irradiance: Tensor, history: Accumulation | None, change: Tensor | None = None
-) -> Accumulation:
+@compiled.by(kernels.accumulate_samples)
+def accumulate_samples(
+    frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, surfaces: Surfaces
+) -> tuple[Tensor, Tensor]:
+    """`accumulate` with a history: irradiance (B, 3, H, W) and length (B, 1, H, W); `surfaces` are the history's."""
+    past, found = reproject(frame, torch.cat([past_irradiance, past_length], dim=1), surfaces)
+    length = past[:, 3:] + 1
+    alpha = (1 / length).clamp(min=SMALLEST_ALPHA)
+    return torch.lerp(past[:, :3], noisy, torch.where(found, alpha, 1)), torch.where(found, length, 1)
+
+
+def accumulate(frame: Frame, irradiance: Tensor, history: Accumulation | None) -> Accumulation:
     """Blend noisy `irradiance` (B, 3, H, W) into its history with weight alpha = max(0.2, 1 / (n + 1)).
 
     n is the history's length, so the first five frames are averaged evenly; then it is an exponential moving average.
-    Disoccluded pixels start anew. `change` (B, 1, H, W) in [0, 1], if given, moves alpha by that share of its way to 1;
-    the length is then at most 1 / alpha, that of the even mean in which the newest frame weighs so much.
+    Disoccluded pixels start anew.
     """
     length = torch.ones_like(irradiance[:, :1])
     if history is not None:
-        past, found = reproject(frame, torch.cat([history.irradiance, history.length], dim=1), history.surfaces)
-        n = past[:, 3:]
-        alpha = (1 / (n + 1)).clamp(min=SMALLEST_ALPHA)
-        longer = n + 1
-        if change is not None:
-            alpha = torch.lerp(alpha, torch.ones_like(alpha), change)
-            longer = torch.minimum(longer, 1 / alpha)
-        irradiance = torch.lerp(past[:, :3], irradiance, torch.where(found, alpha, 1))
-        length = torch.where(found, longer, 1)
+        past = history.irradiance, history.length, history.surfaces
+        irradiance, length = accumulate_samples(frame, irradiance, *past)
     return Accumulation(irradiance, length, Surfaces.of(frame))

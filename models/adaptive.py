@@ -23,16 +23,16 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.accumulation import SMALLEST_ALPHA, Accumulation
+from models.accumulation import Accumulation
 from models.atrous import Tap, WindowSum, strip_taps
 from models.baselines import Accumulating
 from models.denoiser import Denoiser
 from models.operators import image_luminance
-from models.parameters import LEAST_DIVISOR
+from models.parameters import LARGEST_LUMINANCE, LEAST_DIVISOR, SMALLEST_ALPHA
 from models.reprojection import reproject
 from models.strata import middles, repeated, sums
 from models.surfaces import Surfaces
-from models.svgf import LARGEST_LUMINANCE, geometry_weight, pack_geometry
+from models.svgf import geometry_weight, pack_geometry
 
 RADIUS = 3  # strata: windows of 7 x 7
 BRIGHTEST = 3.0  # times the mean around it: what a sample may count

@@ -5,8 +5,14 @@
 PLANE_TOLERANCE = 0.01  # of the depth: a tap's surface may lie this far off the point's plane
 NORMAL_TOLERANCE = 0.9  # smallest cosine between a tap's normal and the point's
 
+# --- Accumulation (SVGF §4.1) -----------------------------------------------------------------------------------------
+
+SMALLEST_ALPHA = 0.2  # weight of the newest frame in a long history
+
 # --- SVGF (Schied et al. 2017) ----------------------------------------------------------------------------------------
 
+ALPHA = 0.2  # §4.1: weight of the newest sample
+LARGEST_LUMINANCE = 1e16  # its square must stay finite
 SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
 SIGMA_Z = 1.0  # §4.4
 SIGMA_L = 4.0

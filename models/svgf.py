@@ -24,13 +24,21 @@ from models.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, s
 from models.compiled import svgf as kernels
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.operators import image_luminance
-from models.parameters import EPSILON_L, EPSILON_Z, LEAST_DIVISOR, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
+from models.parameters import (
+    ALPHA,
+    EPSILON_L,
+    EPSILON_Z,
+    LARGEST_LUMINANCE,
+    LEAST_DIVISOR,
+    SIGMA_L,
+    SIGMA_Z,
+    SPATIAL_RADIUS,
+    SQUARINGS,
+)
 from models.reprojection import reproject
 from models.surfaces import Surfaces
 
-ALPHA = 0.2  # §4.1: weight of the newest sample
 RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
-LARGEST_LUMINANCE = 1e16  # its square must stay finite
 
 
 @dataclass(frozen=True)
@@ -46,28 +54,44 @@ class Integrated:
     surfaces: Surfaces
 
 
+def luminance_moments(colour: Tensor) -> Tensor:
+    """Raw moments (B, S, 2, H, W) of the luminance of single samples (B, S, 3, H, W)."""
+    y = image_luminance(colour.flatten(0, 1)).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+    return torch.cat([y, y.square()], dim=1).unflatten(0, colour.shape[:2])
+
+
+@compiled.by(kernels.integrate_samples)
+def integrate_samples(
+    frame: Frame,
+    noisy: Tensor,
+    past_colour: Tensor,
+    past_moments: Tensor,
+    past_length: Tensor,
+    surfaces: Surfaces,
+    change: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`integrate` with a history, whose G-buffer is `surfaces`: colour, moments and length of Integrated."""
+    before = [past_colour.flatten(1, 2), past_moments.flatten(1, 2), past_length]
+    past, found = reproject(frame, torch.cat(before, dim=1), surfaces)
+    change = torch.zeros_like(past_length) if change is None else change
+    alpha = torch.where(found, (1 - change) * ALPHA + change, 1)
+    colour, moments, length = past.split([part.shape[1] for part in before], dim=1)
+    return (
+        torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
+        torch.lerp(moments.view_as(past_moments), luminance_moments(noisy), alpha[:, None]),
+        torch.where(found, length * (1 - change) + 1, 1),
+    )
+
+
 def integrate(frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None) -> Integrated:
     """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1).
 
     `change` (B, 1, H, W) in [0, 1] is how much of the history to give up (see models.asvgf), by default none.
     """
-    y = (
-        image_luminance(colour.flatten(0, 1))
-        .clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
-        .unflatten(0, colour.shape[:2])
-    )
-    moments = torch.cat([y, y.square()], dim=2)
-    length = torch.ones_like(frame.depth)
-    if history is not None:
-        before = [history.colour.flatten(1, 2), history.moments.flatten(1, 2), history.length]
-        past, found = reproject(frame, torch.cat(before, dim=1), history.surfaces)
-        change = torch.zeros_like(past[:, :1]) if change is None else change
-        alpha = torch.where(found, (1 - change) * ALPHA + change, 1)
-        past_colour, past_moments, past_length = past.split([part.shape[1] for part in before], dim=1)
-        colour = torch.lerp(past_colour.view_as(colour), colour, alpha[:, None])
-        moments = torch.lerp(past_moments.view_as(moments), moments, alpha[:, None])
-        length = torch.where(found, past_length * (1 - change) + 1, 1)
-    return Integrated(colour, moments, length, Surfaces.of(frame))
+    if history is None:
+        return Integrated(colour, luminance_moments(colour), torch.ones_like(frame.depth), Surfaces.of(frame))
+    past = history.colour, history.moments, history.length, history.surfaces
+    return Integrated(*integrate_samples(frame, colour, *past, change), Surfaces.of(frame))
 
 
 def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from models.atrous import RADIUS
 from models.compiled.atrous import SPLINE, columns_with_tap, decay
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 
 
 @jit_in_any_order
@@ -46,7 +46,7 @@ def add_eaw_tap(sums: Any, h: Any, apart: Any, colour: Any, row: int, left: int,
         blue[i] += w * b[i]
 
 
-@jit_in_any_order
+@jit_with_memory
 def filter_eaw_row(out: Any, row: Any, colour: Any, features: Any, step: int) -> None:
     """A row of out (3, H, W)."""
     _, height, width = colour.shape

@@ -14,31 +14,55 @@ from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
 from models.parameters import FEATURE_CHANNELS, GAMMA
 from models.running_scale import RunningScale
 
+ONE = np.float32(1)
+HALF = np.float32(0.5)
+BLOCK_ROWS = 8  # that share one piece of scratch memory
 LEAST_ALBEDO = np.float32(ALBEDO_FLOOR)
 INVERSE_GAMMA = np.float32(1 / GAMMA)
 LEAST_EXPOSED = np.float32(1e-30)  # its power is 0 as far as a network can tell, and its logarithm is finite
 
 
 @jit_with_reciprocals
-def feature_row(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any, exposure: Any, scale: Any) -> None:
-    """out (W, 10) from irradiance, albedo and normal (3, W), depth (W), exposure (3,), and the depth `scale`."""
-    line = np.empty(depth.size, np.float32)
-    for c in range(3):
-        for x in range(line.size):
-            exposed = exposure[c] * irradiance[c, x] * max(albedo[c, x], LEAST_ALBEDO)
-            line[x] = exp(INVERSE_GAMMA * log(min(max(exposed, LEAST_EXPOSED), np.float32(1))))
-        for x in range(line.size):
-            out[x, c] = line[x]
-            out[x, 3 + c] = albedo[c, x]
-            out[x, 6 + c] = normal[c, x] * np.float32(0.5) + np.float32(0.5)
+def display(line: Any, irradiance: Any, albedo: Any, exposure: Any) -> None:
     for x in range(line.size):
-        out[x, 9] = depth[x] / (depth[x] + scale) if depth[x] > 0 else np.float32(1)
+        exposed = exposure * irradiance[x] * max(albedo[x], LEAST_ALBEDO)
+        line[x] = exp(INVERSE_GAMMA * log(min(max(exposed, LEAST_EXPOSED), ONE)))
+
+
+@jit_with_reciprocals
+def scale_normal(line: Any, normal: Any) -> None:
+    for x in range(line.size):
+        line[x] = normal[x] * HALF + HALF
+
+
+@jit_with_reciprocals
+def scale_depth(line: Any, depth: Any, scale: Any) -> None:
+    for x in range(line.size):
+        line[x] = depth[x] / (depth[x] + scale) if depth[x] > 0 else ONE
+
+
+@jit_with_reciprocals
+def interleave(out: Any, lines: Any) -> None:
+    """out (n, C) = lines (C, n), transposed."""
+    for x in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            out[x, c] = lines[c, x]
 
 
 @jit_parallel
 def feature_image(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any, exposure: Any, scale: Any) -> None:
-    for y in numba.prange(depth.shape[0]):
-        feature_row(out[y], irradiance[:, y], albedo[:, y], normal[:, y], depth[y], exposure, scale)
+    """out (H, W, 10) from irradiance, albedo and normal (3, H, W), depth (H, W), exposure (3,), the depth's scale."""
+    height, width = depth.shape
+    for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
+        lines = np.empty((FEATURE_CHANNELS, width), np.float32)
+        start = np.int64(block) * BLOCK_ROWS
+        for y in range(start, min(start + BLOCK_ROWS, height)):
+            for c in range(3):
+                display(lines[c], irradiance[c, y], albedo[c, y], exposure[c])
+                lines[3 + c] = albedo[c, y]
+                scale_normal(lines[6 + c], normal[c, y])
+            scale_depth(lines[9], depth[y], scale)
+            interleave(out[y], lines)
 
 
 def network_features(frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:

@@ -16,95 +16,161 @@ from torch import Tensor
 
 from models import parameters
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, plane_or_empty
+from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
 from models.parameters import WINDOWS
 
 THREAD_ROWS = 32  # rows that a thread fuses at once
+CHUNK = 256  # px; of all maps, they fit into the fastest cache
 SAFE_RANGE = np.float32(parameters.SAFE_RANGE)
 LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
 OUTSIDE = np.float32(parameters.OUTSIDE)
 LEAST_WEIGHT = np.float32(parameters.LEAST_WEIGHT)
 
 
-@jit_in_any_order
-def column_sums(columns: Any, margin: int, source: Any, first: int, last: int) -> None:
-    """columns (4, W + 2 margin), within its margins, = sum of rows first to last - 1 of source (4, rows, W)."""
-    width = source.shape[2]
-    for c in range(4):
-        row = columns[c][margin : margin + width]
-        row[:] = source[c, first]
-        for y in range(first + 1, last):
-            line = source[c, y]
-            for x in range(width):
-                row[x] += line[x]
+# --- Lines of W pixels ------------------------------------------------------------------------------------------------
 
 
 @jit_in_any_order
-def row_sums(total: Any, columns: Any, radius: int) -> None:
-    """total (4, W) = sums of 2 radius + 1 neighbours in columns (4, W + 2 radius)."""
-    for c in range(4):
-        row = total[c]
-        line = columns[c]
-        width = row.size
-        row[:] = line[:width]
-        for tap in range(1, 2 * radius + 1):
-            shifted = line[tap : tap + width]
-            for x in range(width):
-                row[x] += shifted[x]
+def copy_line(line: Any, source: Any) -> None:
+    for x in range(line.size):
+        line[x] = source[x]
 
 
 @jit_in_any_order
-def mix(fused: Any, y: int, total: Any, share: Any) -> None:
-    """Row y of fused (3, H, W) += share (W) times the ratio of sums in total (4, W)."""
-    weight = total[3]
-    for c in range(3):
-        row = fused[c, y]
-        sums = total[c]
-        for x in range(share.size):
-            row[x] += share[x] * sums[x] / max(weight[x], LEAST_WEIGHT)
+def add_one(line: Any, a: Any) -> None:
+    for x in range(line.size):
+        line[x] += a[x]
 
 
 @jit_in_any_order
-def copy_rows(rows: Any, source: Any) -> None:
-    """rows (n, W) = source (n, W), of any strides."""
-    for y in range(rows.shape[0]):
-        line = rows[y]
-        for x in range(line.size):
-            line[x] = source[y, x]
+def add_two(line: Any, a: Any, b: Any) -> None:
+    for x in range(line.size):
+        line[x] += a[x] + b[x]
+
+
+@jit_in_any_order
+def add_four(line: Any, a: Any, b: Any, c: Any, d: Any) -> None:
+    for x in range(line.size):
+        line[x] += (a[x] + b[x]) + (c[x] + d[x])
 
 
 @jit_in_any_order
 def leave_out(logits: Any, surface: Any) -> None:
-    """logits (n, W) become OUTSIDE where surface (n, W) is 0."""
-    for y in range(logits.shape[0]):
-        line = logits[y]
-        there = surface[y]
-        for x in range(line.size):
-            line[x] = line[x] if there[x] > 0 else OUTSIDE
+    """logits become OUTSIDE where surface is 0."""
+    for x in range(logits.size):
+        logits[x] = logits[x] if surface[x] > 0 else OUTSIDE
 
 
 @jit_in_any_order
-def lowest(logits: Any, high: Any) -> Any:
-    """The lowest of logits (n, W) that are not OUTSIDE, at most `high`."""
-    low = high
-    for y in range(logits.shape[0]):
-        line = logits[y]
-        for x in range(line.size):
-            entry = line[x] if line[x] > OUTSIDE else high
-            low = entry if entry < low else low
-    return low
+def widen(low: Any, high: Any, logits: Any) -> None:
+    """low and high come to include the logits that are not OUTSIDE."""
+    for x in range(logits.size):
+        entry = logits[x]
+        high[x] = entry if entry > high[x] else high[x]
+        low[x] = entry if entry < low[x] and entry > OUTSIDE else low[x]
 
 
 @jit_in_any_order
-def softmax(shares: Any, y: int) -> None:
-    """Row y of shares (M, rows, W) becomes its softmax over M."""
+def weigh(weight: Any, r: Any, g: Any, b: Any, logits: Any, shift: Any, red: Any, green: Any, blue: Any) -> None:
+    """weight = exp(logits - shift), 0 for logits OUTSIDE, and r, g, b = weight times red, green, blue."""
+    for x in range(weight.size):
+        w = exp(max(logits[x] - shift, LEAST_EXPONENT)) if logits[x] > OUTSIDE else np.float32(0)
+        weight[x] = w
+        r[x] = w * red[x]
+        g[x] = w * green[x]
+        b[x] = w * blue[x]
+
+
+@jit_in_any_order
+def add_share(red: Any, green: Any, blue: Any, share: Any, r: Any, g: Any, b: Any, weight: Any) -> None:
+    """red, green, blue += share times the sums r, g, b over that of weights."""
+    for x in range(share.size):
+        factor = share[x] / max(weight[x], LEAST_WEIGHT)
+        red[x] += factor * r[x]
+        green[x] += factor * g[x]
+        blue[x] += factor * b[x]
+
+
+# --- Rows and windows of them -----------------------------------------------------------------------------------------
+
+
+@jit_in_any_order
+def split_row(lines: Any, to: Any, maps: Any, row: Any) -> None:
+    """Row `to` of lines (M, rows, W) = a row of maps (M, H, W), whose channels may lie side by side."""
+    count, _, width = lines.shape
+    for first in range(0, width, CHUNK):
+        last = min(first + CHUNK, width)
+        for i in range(count):
+            copy_line(lines[i, to, first:last], maps[i, row, first:last])
+
+
+@jit_in_any_order
+def column_sums(columns: Any, margin: int, source: Any, first: Any, last: Any) -> None:
+    """columns (4, W + 2 margin), within its margins, = sum of rows first to last - 1 of source (4, rows, W)."""
+    width = source.shape[2]
+    for c in range(4):
+        line = columns[c, margin : margin + width]
+        copy_line(line, source[c, first])
+        y = first + 1
+        while y + 4 <= last:
+            add_four(line, source[c, y], source[c, y + 1], source[c, y + 2], source[c, y + 3])
+            y += 4
+        if y + 2 <= last:
+            add_two(line, source[c, y], source[c, y + 1])
+            y += 2
+        if y < last:
+            add_one(line, source[c, y])
+
+
+@jit_in_any_order
+def row_sums(total: Any, columns: Any, radius: Any) -> None:
+    """total (4, W) = sums of 2 radius + 1 neighbours in columns (4, W + 2 radius)."""
+    width = total.shape[1]
+    for c in range(4):
+        line = total[c]
+        copy_line(line, columns[c, :width])
+        x = 1
+        while x + 4 <= 2 * radius + 1:
+            add_four(
+                line,
+                columns[c, x : x + width],
+                columns[c, x + 1 : x + 1 + width],
+                columns[c, x + 2 : x + 2 + width],
+                columns[c, x + 3 : x + 3 + width],
+            )
+            x += 4
+        if x < 2 * radius + 1:
+            add_two(line, columns[c, x : x + width], columns[c, x + 1 : x + 1 + width])
+
+
+@jit_in_any_order
+def mix(fused: Any, y: Any, total: Any, share: Any) -> None:
+    """Row y of fused (3, H, W) += share (W) times the ratio of sums in total (4, W)."""
+    add_share(fused[0, y], fused[1, y], fused[2, y], share, total[0], total[1], total[2], total[3])
+
+
+@jit_with_memory
+def logit_range(logits: Any) -> Any:
+    """The lowest and highest of logits (n, W) that are not OUTSIDE, or OUTSIDE twice."""
+    low = np.full(logits.shape[1], np.float32(np.inf))
+    high = np.full(logits.shape[1], OUTSIDE)
+    for y in range(logits.shape[0]):
+        widen(low, high, logits[y])
+    top = high.max()
+    return min(low.min(), top), top
+
+
+@jit_in_any_order
+def softmax(shares: Any, y: Any, top: Any, total: Any) -> None:
+    """Row y of shares (M, rows, W) becomes its softmax over M; top and total (W) are scratch."""
     count, _, width = shares.shape
-    top = shares[0, y].copy()
-    total = np.zeros(width, np.float32)
+    copy_line(top, shares[0, y])
     for i in range(1, count):
         share = shares[i, y]
         for x in range(width):
             top[x] = share[x] if share[x] > top[x] else top[x]
+    for x in range(width):
+        total[x] = 0
     for i in range(count):
         share = shares[i, y]
         for x in range(width):
@@ -117,27 +183,22 @@ def softmax(shares: Any, y: int) -> None:
             share[x] /= total[x]
 
 
-@jit_in_any_order
+@jit_with_memory
 def filter_strip(
-    fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: int, start: int, low: int, weighted: Any
+    fused: Any, image: Any, logits: Any, shift: Any, shares: Any, radius: Any, start: Any, low: Any, weighted: Any
 ) -> None:
     """Add a window's share to a strip of rows from `start` on.
 
     `fused` and `image` (3, H, W) are whole; `logits` (rows, W), from row `low` on, cover the windows of the strip and
-    lie within SAFE_RANGE around `shift`, or OUTSIDE; `shares` (strip, W); `weighted` (5, rows or more, W) is scratch.
+    lie within SAFE_RANGE around `shift`, or OUTSIDE; `shares` (strip, W); `weighted` (4, rows or more, W) is scratch.
     """
     height, width = image.shape[1:]
     stop = start + len(shares)
     for y in range(len(logits)):
-        line = weighted[3, y]
-        entry = logits[y]
-        for x in range(width):
-            line[x] = exp(max(entry[x] - shift, LEAST_EXPONENT)) if entry[x] > OUTSIDE else np.float32(0)
-        for c in range(3):
-            product = weighted[c, y]
-            pixel = image[c, low + y]
-            for x in range(width):
-                product[x] = pixel[x] * line[x]
+        r = weighted[0, y]
+        g = weighted[1, y]
+        b = weighted[2, y]
+        weigh(weighted[3, y], r, g, b, logits[y], shift, image[0, low + y], image[1, low + y], image[2, low + y])
     columns = np.zeros((4, width + 2 * radius), np.float32)
     total = np.empty((4, width), np.float32)
     for y in range(start, stop):
@@ -146,7 +207,7 @@ def filter_strip(
         mix(fused, y, total, shares[y - start])
 
 
-@jit_in_any_order
+@jit_with_memory
 def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: Any, taps: int) -> None:
     """Largest entry (taps, W), and sums of exp(entry - largest) * value (4, taps, W), into tops and totals.
 
@@ -174,8 +235,8 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
                 total[x] += weight[x] * value[x]
 
 
-@jit_in_any_order
-def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: int, start: int, low: int) -> None:
+@jit_with_memory
+def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radius: Any, start: Any, low: Any) -> None:
     """The same for any finite logits: relative to the largest of every window, columns first, then rows."""
     height, width = image.shape[1:]
     taps = 2 * radius + 1
@@ -201,39 +262,52 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
 
 
 def fuse_strips(
-    fused: Any, image: Any, surface: Any, importance: Any, mixture: Any, windows: Any, weighted: Any, shares: Any
+    fused: Any,
+    image: Any,
+    surface: Any,
+    importance: Any,
+    mixture: Any,
+    windows: Any,
+    logits: Any,
+    shares: Any,
+    weighted: Any,
 ) -> None:
     """fused (3, H, W) += image (3, H, W) filtered, strips in parallel; surface (H, W) is empty where all pixels count.
 
-    weighted (threads, 5, rows, W) and shares (threads, M, THREAD_ROWS, W) are scratch of the threads' own: memory that
-    is allocated within the loop would be cleared anew for every strip.
+    logits (threads, M, rows, W), shares (threads, M, THREAD_ROWS, W) and weighted (threads, 4, rows, W) are scratch of
+    the threads' own: memory that is allocated within the loop would be cleared anew for every strip.
     """
-    height = image.shape[1]
+    _, height, width = image.shape
+    margin = windows.max() // 2
     for strip in numba.prange((height + THREAD_ROWS - 1) // THREAD_ROWS):
-        start = strip * THREAD_ROWS
-        stop = min((strip + 1) * THREAD_ROWS, height)
+        start = np.int64(strip) * THREAD_ROWS
+        stop = min(start + THREAD_ROWS, height)
+        first = max(start - margin, 0)
+        last = min(stop + margin, height)
         my_weighted = weighted[get_thread_id()]
+        my_logits = logits[get_thread_id()]
         my_shares = shares[get_thread_id()]
-        for i in range(windows.size):
-            copy_rows(my_shares[i, : stop - start], mixture[i, start:stop])
-        for y in range(stop - start):
-            softmax(my_shares, y)
+        scratch = np.empty((2, width), np.float32)
+        for y in range(start, stop):
+            split_row(my_shares, y - start, mixture, y)
+            softmax(my_shares, y - start, scratch[0], scratch[1])
+        for y in range(first, last):
+            split_row(my_logits, y - first, importance, y)
+            if surface.size > 0 and surface[y].min() == 0:
+                for i in range(windows.size):
+                    leave_out(my_logits[i, y - first], surface[y])
         for i in range(windows.size):
             radius = windows[i] // 2
             low = max(start - radius, 0)
             high = min(stop + radius, height)
-            logits = my_weighted[4, : high - low]
-            copy_rows(logits, importance[i, low:high])
-            if surface.size > 0:
-                leave_out(logits, surface[low:high])
-            top = logits.max()
-            bottom = lowest(logits, top)
+            entries = my_logits[i, low - first : high - first]
+            bottom, top = logit_range(entries)
             my_share = my_shares[i, : stop - start]
             if top - bottom <= SAFE_RANGE:
                 shift = (bottom + top) / np.float32(2)
-                filter_strip(fused, image, logits, shift, my_share, radius, start, low, my_weighted)
+                filter_strip(fused, image, entries, shift, my_share, radius, start, low, my_weighted)
             else:
-                filter_strip_in_steps(fused, image, logits, my_share, radius, start, low)
+                filter_strip_in_steps(fused, image, entries, my_share, radius, start, low)
 
 
 @functools.cache
@@ -242,7 +316,7 @@ def compiled_fuse_strips() -> Any:
     image = numba.float32[:, :, ::1]
     maps = numba.float32[:, :, :]
     scratch = numba.float32[:, :, :, ::1]
-    signature = numba.void(image, image, numba.float32[:, ::1], maps, maps, numba.int64[::1], scratch, scratch)
+    signature = numba.void(image, image, numba.float32[:, ::1], maps, maps, numba.int64[::1], scratch, scratch, scratch)
     return numba.njit(signature, cache=True, parallel=True, error_model="numpy")(fuse_strips)
 
 
@@ -257,12 +331,15 @@ def fuse(
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     threads = numba.get_num_threads()
     width = image.shape[-1]
-    weighted = np.empty((threads, 5, THREAD_ROWS + max(windows), width), np.float32)
-    shares = np.empty((threads, len(windows), THREAD_ROWS, width), np.float32)
+    count = len(windows)
+    rows = THREAD_ROWS + max(windows)
+    logits = np.empty((threads, count, rows, width), np.float32)
+    shares = np.empty((threads, count, THREAD_ROWS, width), np.float32)
+    weighted = np.empty((threads, 4, rows, width), np.float32)
     for item in range(len(image)):
         images = fused[item].numpy(), array(image[item]), plane_or_empty(surface, item)
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
-        compiled_fuse_strips()(*images, *maps, np.array(windows), weighted, shares)
+        compiled_fuse_strips()(*images, *maps, np.array(windows), logits, shares, weighted)
     return fused
 
 

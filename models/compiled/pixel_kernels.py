@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_order, jit_parallel, plane_or_empty
+from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory, plane_or_empty
 
 LEAST_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
 NEVER = np.float32(-np.inf)  # logit of a tap that shows no surface
@@ -56,7 +56,7 @@ def add_weighted(line: Any, weight: Any, values: Any) -> None:
         line[x] += weight[x] * values[x]
 
 
-@jit_in_order
+@jit_with_memory
 def apply_to_row(output: Any, image: Any, surface: Any, row: Any, y: Any, size: int) -> None:
     """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
 

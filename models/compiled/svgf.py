@@ -12,13 +12,25 @@ import torch
 from torch import Tensor
 
 from datasets.channels import LUMINANCE_WEIGHTS
+from datasets.frame import Frame
 from models import parameters
 from models.atrous import RADIUS
 from models.compiled.atrous import SPLINE, columns_with_tap, decay
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.jit import (
+    array,
+    jit_in_any_order,
+    jit_parallel,
+    jit_with_memory,
+    jit_with_reciprocals,
+    plane_or_empty,
+)
+from models.compiled.reprojection import BLOCK_ROWS, ONE, Buffers, Past, Views, fetch, find_row, new_search
 from models.parameters import SPATIAL_RADIUS, SQUARINGS
+from models.surfaces import Surfaces
 
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
+ALPHA = np.float32(parameters.ALPHA)
+LARGEST_LUMINANCE = np.float32(parameters.LARGEST_LUMINANCE)
 SIGMA_Z = np.float32(parameters.SIGMA_Z)
 SIGMA_L = np.float32(parameters.SIGMA_L)
 EPSILON_Z = np.float32(parameters.EPSILON_Z)
@@ -28,6 +40,107 @@ LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 LEAST_WEIGHT = np.float32(1e-15)
 LEAST_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
 SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where one needs it
+
+
+# --- Temporal integration ---------------------------------------------------------------------------------------------
+
+
+@jit_with_reciprocals
+def clamp_luminance(y: Any, red: Any, green: Any, blue: Any) -> None:
+    for x in range(y.size):
+        luminance = RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x]
+        y[x] = min(max(luminance, -LARGEST_LUMINANCE), LARGEST_LUMINANCE)
+
+
+@jit_with_reciprocals
+def square(line: Any, y: Any) -> None:
+    for x in range(line.size):
+        line[x] = y[x] * y[x]
+
+
+@jit_with_reciprocals
+def weigh(alpha: Any, length: Any, past_length: Any, change: Any, found: Any) -> None:
+    """The weight of the newest frame and the new history length, (W), where `change` of the history is given up."""
+    for x in range(alpha.size):
+        kept = ONE - change[x]
+        alpha[x] = kept * ALPHA + change[x]
+        length[x] = past_length[x] * kept + ONE if found[x] > 0 else ONE
+
+
+@jit_with_reciprocals
+def blend(line: Any, past: Any, new: Any, alpha: Any, found: Any) -> None:
+    for x in range(line.size):
+        line[x] = past[x] + alpha[x] * (new[x] - past[x]) if found[x] > 0 else new[x]
+
+
+@jit_parallel
+def integrate_image(
+    colour: Any,
+    moments: Any,
+    length: Any,
+    noisy: Any,
+    past_colour: Any,
+    past_moments: Any,
+    past_length: Any,
+    change: Any,
+    motion: Any,
+    now: Buffers,
+    then: Buffers,
+    views: Views,
+) -> None:
+    """colour (S, 3, H, W), moments (S, 2, H, W) and length (H, W) from `noisy` colour and the history.
+
+    change (H, W) is empty for none.
+    """
+    signals, _, height, width = noisy.shape
+    for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
+        search = new_search(width)
+        fetched = np.empty(width, np.float32)
+        new = np.empty((2, width), np.float32)
+        alpha = np.empty(width, np.float32)
+        none = np.zeros(width, np.float32)
+        start = np.int64(block) * BLOCK_ROWS
+        for y in range(start, min(start + BLOCK_ROWS, height)):
+            find_row(search, y, Past(motion, now, then, views))
+            fetch(fetched, past_length, y, search)
+            weigh(alpha, length[y], fetched, change[y] if change.size > 0 else none, search.found)
+            for s in range(signals):
+                for c in range(3):
+                    fetch(fetched, past_colour[s, c], y, search)
+                    blend(colour[s, c, y], fetched, noisy[s, c, y], alpha, search.found)
+                clamp_luminance(new[0], noisy[s, 0, y], noisy[s, 1, y], noisy[s, 2, y])
+                square(new[1], new[0])
+                for c in range(2):
+                    fetch(fetched, past_moments[s, c], y, search)
+                    blend(moments[s, c, y], fetched, new[c], alpha, search.found)
+
+
+def integrate_samples(
+    frame: Frame,
+    noisy: Tensor,
+    past_colour: Tensor,
+    past_moments: Tensor,
+    past_length: Tensor,
+    surfaces: Surfaces,
+    change: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See models.svgf.integrate_samples."""
+    colour = torch.empty_like(noisy, memory_format=torch.contiguous_format)
+    moments = torch.empty_like(past_moments, memory_format=torch.contiguous_format)
+    length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
+    for item in range(len(noisy)):
+        integrate_image(
+            colour[item].numpy(),
+            moments[item].numpy(),
+            length[item, 0].numpy(),
+            array(noisy[item]),
+            array(past_colour[item]),
+            array(past_moments[item]),
+            array(past_length[item, 0]),
+            plane_or_empty(change, item),
+            *Past.of(frame, surfaces, item),
+        )
+    return colour, moments, length
 
 
 # --- What stops the filters at edges of surfaces ----------------------------------------------------------------------
@@ -47,7 +160,7 @@ def depth_steps(step: Any, depth: Any, to_depth: Any, mesh: Any, to_mesh: Any) -
         step[i] = to_depth[i] - depth[i] if mesh[i] == to_mesh[i] else np.float32(np.inf)
 
 
-@jit_in_any_order
+@jit_with_memory
 def pack_geometry_row(packed: Any, row: Any, depth: Any, normal: Any, mesh: Any) -> None:
     """A row of packed (7, H, W) from depth (H, W), normal (3, H, W), mesh (H, W)."""
     height, width = depth.shape
@@ -100,8 +213,11 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
 
 
 @jit_in_any_order
-def geometry_weights(weight: Any, geometry: Any, row: int, left: int, dx: int, dy: int) -> None:
-    """models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W): weight (n)."""
+def geometry_weights(weight: Any, exponent: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
+    """models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W).
+
+    As weight (n) times e to the power of -exponent (n).
+    """
     right = left + weight.size
     to = row + dy
     to_left = left + dx
@@ -125,8 +241,15 @@ def geometry_weights(weight: Any, geometry: Any, row: int, left: int, dx: int, d
         for _ in range(SQUARINGS):
             w_n *= w_n
         expected = abs(along_x[i] * by_x + along_y[i] * by_y) + tolerance[i]
-        w_n *= decay(abs(depth[i] - to_depth[i]) / expected)
-        weight[i] = w_n if w_n > LEAST_WEIGHT else np.float32(0)
+        weight[i] = w_n
+        exponent[i] = abs(depth[i] - to_depth[i]) / expected
+
+
+@jit_in_any_order
+def apply_exponents(weight: Any, exponent: Any) -> None:
+    for i in range(weight.size):
+        w = weight[i] * decay(exponent[i])
+        weight[i] = w if w > LEAST_WEIGHT else np.float32(0)
 
 
 # --- A level of the à-trous transform ---------------------------------------------------------------------------------
@@ -134,11 +257,21 @@ def geometry_weights(weight: Any, geometry: Any, row: int, left: int, dx: int, d
 
 @jit_in_any_order
 def add_svgf_tap(
-    sums: Any, h: Any, weight: Any, colour: Any, variance: Any, edge: Any, row: int, left: int, dx: int, dy: int
+    sums: Any,
+    h: Any,
+    weight: Any,
+    exponent: Any,
+    colour: Any,
+    variance: Any,
+    edge: Any,
+    row: Any,
+    left: int,
+    dx: int,
+    dy: int,
 ) -> None:
     """Add one tap of the n pixels from `left` on in a row to sums (5, W): of weights, of colours, of variances.
 
-    weight (n) is geometrical; colour (3, H, W), variance (H, W), edge (2, H, W): luminance and its scale.
+    weight and exponent (n) are geometrical; colour (3, H, W), variance (H, W), edge (2, H, W): luminance and its scale.
     """
     right = left + weight.size
     to = row + dy
@@ -157,7 +290,7 @@ def add_svgf_tap(
     to_y = edge[0, to, to_left:to_right]
     scale = edge[1, row, left:right]
     for i in range(weight.size):
-        w = h * weight[i] * decay(abs(y[i] - to_y[i]) * scale[i])
+        w = h * weight[i] * decay(abs(y[i] - to_y[i]) * scale[i] + exponent[i])
         w = w if w > LEAST_WEIGHT else np.float32(0)
         total[i] += w
         red[i] += w * r[i]
@@ -166,11 +299,11 @@ def add_svgf_tap(
         spread[i] += w * w * v[i]
 
 
-@jit_in_any_order
+@jit_with_memory
 def sum_svgf_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edge: Any, geometry: Any) -> None:
     """sums (S, 5, W) over the taps of one row of colour (S, 3, H, W), variance (S, H, W), edge (S, 2, H, W)."""
     signals, _, height, width = colour.shape
-    space = np.empty(width, np.float32)
+    space = np.empty((2, width), np.float32)
     h = SPLINE[RADIUS] * SPLINE[RADIUS]
     for s in range(signals):
         sums[s, 0] = h
@@ -184,14 +317,15 @@ def sum_svgf_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edg
             if left >= right:
                 continue
             h = SPLINE[j + RADIUS] * SPLINE[i + RADIUS]
-            weight = space[: right - left]
-            geometry_weights(weight, geometry, row, left, dx, dy)
+            weight = space[0, : right - left]
+            exponent = space[1, : right - left]
+            geometry_weights(weight, exponent, geometry, row, left, dx, dy)
             for s in range(signals):
-                add_svgf_tap(sums[s], h, weight, colour[s], variance[s], edge[s], row, left, dx, dy)
+                add_svgf_tap(sums[s], h, weight, exponent, colour[s], variance[s], edge[s], row, left, dx, dy)
 
 
 @jit_in_any_order
-def divide_svgf_row(colour: Any, variance: Any, row: int, sums: Any) -> None:
+def divide_svgf_row(colour: Any, variance: Any, row: Any, sums: Any) -> None:
     """A row of colour (3, H, W) and of variance (H, W) from sums (5, W)."""
     r = colour[0, row]
     g = colour[1, row]
@@ -222,7 +356,7 @@ def filter_svgf_image(
             divide_svgf_row(colour_out[s], variance_out[s], row, sums[s])
 
 
-@jit_in_any_order
+@jit_with_memory
 def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> None:
     """A row of edge (2, H, W): luminance of colour (3, H, W), and models.svgf.edge_scale of variance (H, W)."""
     height, width = variance.shape
@@ -280,7 +414,7 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
 
 @jit_in_any_order
 def add_spatial_tap(
-    sums: Any, first: int, weight: Any, variance: Any, mean: Any, row: int, left: int, dx: int, dy: int
+    sums: Any, first: Any, weight: Any, variance: Any, mean: Any, row: Any, left: int, dx: int, dy: int
 ) -> None:
     """Add one tap of the n pixels from `left` on to sums (3, SPATIAL_BLOCK), which begin with the pixel at `first`.
 
@@ -305,14 +439,14 @@ def add_spatial_tap(
         squares[i] += weight[i] * (off * off + v[i])
 
 
-@jit_in_any_order
-def sum_spatial_block(sums: Any, row: int, first: int, last: int, variance: Any, mean: Any, geometry: Any) -> None:
+@jit_with_memory
+def sum_spatial_block(sums: Any, row: Any, first: Any, last: Any, variance: Any, mean: Any, geometry: Any) -> None:
     """sums (S, 3, SPATIAL_BLOCK) over the windows of the pixels `first` to `last` - 1 of a row.
 
     variance, mean (S, H, W).
     """
     signals, height, width = variance.shape
-    space = np.empty(SPATIAL_BLOCK, np.float32)
+    space = np.empty((2, SPATIAL_BLOCK), np.float32)
     sums[:, 0] = 1
     sums[:, 1] = 0
     sums[:, 2, : last - first] = variance[:, row, first:last]
@@ -322,13 +456,15 @@ def sum_spatial_block(sums: Any, row: int, first: int, last: int, variance: Any,
             right = min(last, width - dx)
             if (dx == 0 and dy == 0) or left >= right:
                 continue
-            weight = space[: right - left]
-            geometry_weights(weight, geometry, row, left, dx, dy)
+            weight = space[0, : right - left]
+            exponent = space[1, : right - left]
+            geometry_weights(weight, exponent, geometry, row, left, dx, dy)
+            apply_exponents(weight, exponent)
             for s in range(signals):
                 add_spatial_tap(sums[s], first, weight, variance[s], mean[s], row, left, dx, dy)
 
 
-@jit_in_any_order
+@jit_with_memory
 def spatial_variance_row(out: Any, row: Any, variance: Any, mean: Any, geometry: Any, where: Any) -> None:
     """A row of out (S, H, W) `where` (H, W) it is wanted."""
     signals, _, width = variance.shape

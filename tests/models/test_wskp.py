@@ -13,7 +13,7 @@ from eval.bench.fusion import unfold_fuse
 from models import compiled, registry
 from models.accumulation import accumulate
 from models.compiled.exponential import exp, log
-from models.repvgg import RepVGGBlock, merge, repvgg
+from models.repvgg import PairedConv2d, RepVGGBlock, merge, repvgg
 from models.running_scale import running_scale
 from models.wskp import combine_resolutions
 from tests.helpers.frames import flat_frame, run
@@ -117,3 +117,15 @@ def test_compiled_functions_are_the_mathematical_ones():
     np.testing.assert_allclose([exp(v) for v in x], np.exp(x.astype(np.float64)), rtol=1e-5)
     positive = np.float32(10 ** np.linspace(-30, 30, 999))
     np.testing.assert_allclose([log(v) for v in positive], np.log(positive.astype(np.float64)), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("size", [(6, 10), (5, 7), (1, 1)])
+def test_pairs_of_pixels_are_convolved_as_pixels_are(dtype, size):
+    torch.manual_seed(0)
+    layer = PairedConv2d(10, 24, 5, padding=2)
+    layer.pair()
+    layer = layer.to(dtype).to(memory_format=torch.channels_last)
+    x = torch.randn(2, 10, *size).to(dtype)
+    for image in (x, x.contiguous(memory_format=torch.channels_last)):
+        torch.testing.assert_close(layer(image), F.conv2d(x, layer.weight, layer.bias, padding=2))
