@@ -69,8 +69,8 @@ class Clip:
     @property
     def realisations(self) -> int:
         """Number of independent noise realisations of the noisy channels."""
-        entry = self.entry("direct")
-        return entry["shape"][1] if "shape" in entry else 1
+        entries = [self.entry(channel) for channel in ("direct", "indirect")]
+        return max(entry["shape"][1] if "shape" in entry else 1 for entry in entries)  # one may be black, and a value
 
     def entry(self, channel: str) -> dict[str, Any]:
         """What clip.json says of how a channel is stored. Raises BadInput where the channel was not rendered."""

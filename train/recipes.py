@@ -55,7 +55,7 @@ RAE_BUDGETS = {
 }
 WSKP_BUDGETS = {
     "tiny": SHORT | {"epochs": 4, "crop": 32, "crops": (8, 2), "batch": 8},
-    "quick": SHORT | {"epochs": 60, "crop": 64, "crops": (4, 2)},
+    "quick": SHORT | {"epochs": 10, "rate": 4e-3, "crop": 64, "crops": (4, 2), "batch": 16},
     "release": SHORT | {"epochs": 60, "crops": (4, 1)},
     "paper": {},
 }
