@@ -8,11 +8,13 @@ from pathlib import Path
 from errors import BadInput
 from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.spec import DenoiserSpec, class_of, precision_in_use
-from models.registry import DENOISERS, plain_name
+from models.registry import ADAPTIVE, DENOISERS, plain_name
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 
 BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
+
+WORTH_ADAPTING = ("oidn-accumulated", "wskp6")  # these are judged with adaptive accumulation as well
 
 Obstacle = Callable[[str], str | None]  # why the denoiser of a name cannot run, and the remedy
 
@@ -22,15 +24,18 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
 
     Raises BadInput where a named one is unknown or cannot run.
     """
-    chosen = []
+    chosen: list[str] = []
+    skipped: dict[str, list[str]] = {}  # names by what is in the way of all of them alike
     for name in dict.fromkeys(names or everyone):
         reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
         if reason and names:
             raise BadInput(f"{name}: {reason}")
         if reason:
-            print(f"{name}: skipped, {reason}")
+            skipped.setdefault(reason.replace(plain_name(name), "NAME"), []).append(name)
         else:
             chosen.append(name)
+    for reason, alike in skipped.items():
+        print(f"{', '.join(alike)}: skipped, {reason if len(alike) > 1 else reason.replace('NAME', alike[0])}")
     return chosen
 
 
@@ -64,7 +69,8 @@ def evaluated(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpe
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
-    chosen = choose(names, DENOISERS, cannot_run, partial(untrained, runs, budget))
+    adapted = [name + ADAPTIVE for name in WORTH_ADAPTING if name in DENOISERS]
+    chosen = choose(names, [*DENOISERS, *adapted], cannot_run, partial(untrained, runs, budget))
     return [
         DenoiserSpec(name, precision=precision_in_use(name), weights=weights_file(name, runs, budget))
         for name in chosen

@@ -113,7 +113,7 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
     has_reference = all(channel in clip.channels for channel in REFERENCES)
     references: Column = []
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
-        wanted = channels | {*REFERENCES, "albedo"} if has_reference and index in shown else channels
+        wanted = channels | {*REFERENCES, "albedo", "depth"} if has_reference and index in shown else channels
         frame = read_frame(clip, index, sorted(wanted))
         for view in views:
             output = view.step(frame)

@@ -28,6 +28,7 @@ def test_plan_and_layout(tiny):
         "options",
         "channels",
         "splits",
+        "needed_spp",
     }
     for path in Dataset(tiny).planned():
         names = {file.name for file in path.iterdir()}

@@ -23,6 +23,11 @@ def test_of_all_those_who_can_and_a_word_on_the_others(capsys):
     assert capsys.readouterr().out == "left: skipped, it is left-handed\n"
 
 
+def test_those_with_the_same_in_their_way_share_a_line(capsys):
+    assert choose([], ["kp", "rae", "svgf"], lambda n: f"no {n}.weights" if n != "svgf" else None) == ["svgf"]
+    assert capsys.readouterr().out == "kp, rae: skipped, no NAME.weights\n"
+
+
 def test_whoever_is_named_must_be_able_to(capsys):
     assert choose(["right", "up", "right"], ["left"], left_handed) == ["right", "up"]
     with pytest.raises(BadInput, match="left: it is left-handed"):

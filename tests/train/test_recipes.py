@@ -14,7 +14,7 @@ from train.losses.wskp import SMAPETerms
 from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
-ENDS_WELL = {"anneal", "average"}
+ENDS_WELL = {"anneal", "average", "rate"}
 
 
 def test_rae_is_the_paper_s():
