@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -147,7 +148,7 @@ class Frame:
         """What demodulation divides by: max(albedo, 0.01), (B, 3, H, W)."""
         return self.albedo.clamp(min=ALBEDO_FLOOR)
 
-    @property
+    @cached_property
     def surface(self) -> Tensor | None:
         """1 where a pixel shows a surface and 0 for background, (B, 1, H, W); None where all show one."""
         return None if self.depth.amin() > 0 else (self.depth > 0).to(self.depth)

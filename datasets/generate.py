@@ -12,7 +12,7 @@ from datasets.channels import CHANNELS
 from datasets.clip import Dataset, is_clip
 from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
 from datasets.pilots import choose_rooms
-from datasets.profiles import check_seed, plan, profile_of
+from datasets.profiles import NO_PILOTS, check_seed, plan, profile_of
 from errors import BadInput
 from files import read_json, write_json
 from provenance import RENDERING, versions
@@ -70,8 +70,10 @@ def generate(
     check_seed(seed)
     check_folder(root)
     facts = root / "dataset.json"
-    known = read_json(facts).get("needed_spp", {}) if facts.exists() else {}
-    needed_spp = choose_rooms(profile_of(profile), seed, options, known)
+    if facts.exists():  # its rooms are chosen; whether they are those of this profile is checked below, without a pilot
+        needed_spp = read_json(facts).get("needed_spp", {})
+    else:
+        needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
     wanted = plan(profile, seed, reads, options, needed_spp)
     root.mkdir(parents=True, exist_ok=True)
     write_or_check_plan(root, wanted)

@@ -126,6 +126,8 @@ def rooms_profile(rooms: int, spp: int) -> DataProfile:
 def profile_of(name: str) -> DataProfile:
     """The data profile of that name, or for `rooms-NxS` N rooms of S spp. Raises BadInput for an unknown one."""
     rooms = re.fullmatch(r"rooms-(\d+)x(\d+)", name)
+    if rooms and (int(rooms[1]) < 1 or int(rooms[2]) < 2):
+        raise BadInput(f"profile '{name}': name 1 room or more, and 2 spp or more for the two halves of a reference")
     if rooms:
         return rooms_profile(int(rooms[1]), int(rooms[2]))
     if name not in DATA_PROFILES:

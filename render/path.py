@@ -158,9 +158,7 @@ class PathTracer:
         if self.frozen_pose != stage.poses:
             # Tracing the program in Python takes longer than running it at 1 spp: frozen, it is replayed. But a frozen
             # function does not notice all changes of meshes (seen with Dr.Jit 1.5), so it lasts as long as a pose.
-            self.sample_mean = (
-                dr.freeze(sample_mean, state_fn=lambda *_, **__: palette()) if self.freezes else sample_mean
-            )
+            self.sample_mean = dr.freeze(sample_mean, state_fn=all_objects) if self.freezes else sample_mean
             self.frozen_pose = stage.poses
         direct, indirect = self.sample_mean(
             stage.mitsuba_scene,

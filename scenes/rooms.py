@@ -112,7 +112,7 @@ def shell(layout: Layout) -> list[Shape]:
         *([] if roofless else [Shape("ceiling", above, diffuse_bsdf(rgb(tone.tolist())))]),
     ]
     paint = finish(rng, slot, layout.gloss / 3, 1.0)
-    for wall in set(range(4)) - layout.missing_walls:
+    for wall in sorted(set(range(4)) - layout.missing_walls):
         mesh = wall_with_openings(wall_width(wall, layout.size) + 0.1, height, layout.openings.get(wall, []))
         mesh.apply_transform(wall_pose(wall, layout.size))
         own = finish(rng, slot, layout.gloss / 3, 1.0) if rng.random() < 0.25 else paint
@@ -166,7 +166,7 @@ def room(rng: Rng, frames: int) -> Scene:
     lamps = lamps_of(layout, style)
     furnish(layout)
     if style.day and around is None:
-        panels = [sky_panel(layout, wall, hole) for wall, holes in layout.openings.items() for hole in holes]
+        panels = [sky_panel(layout, wall, hole) for wall, openings in layout.openings.items() for hole in openings]
         lamps = (lamps + panels)[:MAX_LAMPS]
     if not lamps and around is None:
         lamps = ceiling_panel(layout) or orb(layout) or hanging(layout)

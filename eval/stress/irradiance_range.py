@@ -8,14 +8,8 @@ from torch import Tensor
 from datasets.frame import Frame
 from models.operators import finite
 
-CONVEX = (
-    "eaw",
-    "svgf",
-    "asvgf",
-    "wskp3",
-    "wskp6",
-    "kp",
-)  # filters whose output is a mean of irradiance that they have seen
+# Filters whose output is a mean of irradiance that they have seen.
+CONVEX = ("eaw", "svgf", "asvgf", "wskp3", "wskp6", "kp")
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 

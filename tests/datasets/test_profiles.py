@@ -145,6 +145,12 @@ def test_rooms_that_would_need_too_many_samples_are_passed_over():
     assert choose_rooms(profile, 0, NO_OPTIONS, needed) == needed  # nothing is rendered again
 
 
+@pytest.mark.parametrize("name", ["rooms-0x16", "rooms-4x1", "rooms-4x0"])
+def test_rooms_need_a_room_and_two_halves(name):
+    with pytest.raises(BadInput, match="2 spp or more"):
+        profile_of(name)
+
+
 READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot be derived
 
 
