@@ -9,11 +9,11 @@ from tqdm import tqdm
 from datasets.adaptive_spp import samples_needed
 from datasets.clip import is_clip
 from datasets.clip_kind import ClipKind
-from datasets.profiles import DataProfile, clip_seed, profile_of
+from datasets.clip_scene import scene_of_clip
+from datasets.profiles import DataProfile, profile_of
 from datasets.writer import ClipWriter
 from files import locked
 from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
-from scenes.registry import build_scene
 
 
 class RenderJob(NamedTuple):
@@ -68,18 +68,15 @@ def render_to_folder(
     The clip is a function of the arguments alone. Raises BadInput for an unknown scene or clip name.
     """
     split, scene_name, clip_name = folder.parts[-3:]
-    kind = ClipKind.of(clip_name)
+    noisy_spp = ClipKind.of(clip_name).noisy_spp
     quality = profile.quality[split]
-    seed = clip_seed(dataset_seed, scene_name, split, kind.number)
-    scene = build_scene(scene_name, seed, profile.frames)
-    if kind.still:
-        scene = scene.still()
+    scene, seed = scene_of_clip(folder, profile.frames, dataset_seed)
     clock = StepTimer()
     if needed_spp is None:
         needed_spp = samples_needed(scene, profile.frames, profile.height, profile.width, quality, seed, options)
         clock.lap("pilot")
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
-    sampling = Sampling(quality.realisations, kind.noisy_spp, spp, options)
+    sampling = Sampling(quality.realisations, noisy_spp, spp, options)
     frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed, channels)
     # While only the camera moves, motion follows from depth.
     derived = {} if scene.moves() or "motion" not in channels else {"motion": "camera"}
@@ -89,7 +86,7 @@ def render_to_folder(
         for arrays, seconds in progress:
             writer.add(arrays, seconds)
         facts = {
-            "noisy_spp": kind.noisy_spp,
+            "noisy_spp": noisy_spp,
             "reference_spp": spp // 2 * 2,
             "meshes": [shape.name for shape in scene.shapes],
         }

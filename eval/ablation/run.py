@@ -86,6 +86,19 @@ def clip_means(entrant: Entrant, clips: Sequence[Clip], folder: Path) -> dict[st
     return {f"{result.scene}/{result.clip}": result.metrics for result in results}
 
 
+def trained_run(
+    variant: AblationVariant, task: Task, entrant: Entrant, clips: Sequence[Clip], folder: Path
+) -> VariantRun:
+    """How a finished training went, and how it is judged on `clips`."""
+    return VariantRun(
+        variant=variant.label,
+        seed=task.seed,
+        parameters=variant.create().parameter_count(),  # as trained
+        losses=epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs),
+        clips=clip_means(entrant, clips, folder),
+    )
+
+
 def fusion_of(denoiser: Denoiser, clip: Clip) -> Callable[[], tuple[Tensor, Tensor | None]]:
     """What builds and fuses a kernel predictor's kernels for the first frame of `clip`, without the network."""
     assert isinstance(denoiser, KernelPredictor)
@@ -113,15 +126,7 @@ def train_and_judge(ablation: Ablation, trainings: Trainings, clips: Sequence[Cl
         weights = train_network(replace(task, precision=precision))
         precision = load_checkpoint(task.folder)["precision"]
         entrants[variant.label] = entrant_of(variant, task, weights)
-        runs.append(
-            VariantRun(
-                variant=variant.label,
-                seed=task.seed,
-                parameters=variant.create().parameter_count(),  # as trained
-                losses=epoch_losses(task.folder / METRICS_CSV, task.recipe.epochs),
-                clips=clip_means(entrants[variant.label], clips, folder),
-            )
-        )
+        runs.append(trained_run(variant, task, entrants[variant.label], clips, folder))
     if not ablation.timed:
         return runs
     times = fusion_ms({label: entrant.denoiser for label, entrant in entrants.items()}, clips[0])

@@ -5,11 +5,10 @@ denoisers at one sample a pixel.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from statistics import mean
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
@@ -20,10 +19,12 @@ from datasets.clip import Clip, Dataset
 from datasets.generate import generate
 from errors import BadInput
 from eval.ablation.definitions import AblationVariant
-from eval.ablation.run import clip_means, entrant_of
+from eval.ablation.run import entrant_of, trained_run
+from eval.ablation.summary import seed_mean_text
+from eval.ablation.variant_run import VariantRun, over_seeds
 from eval.bench.output import bench_folder
 from eval.harness import clips_of_one_spp
-from eval.metrics import METRICS, Values
+from eval.metrics import METRICS
 from files import read_json, write_file, write_json
 from models.registry import create
 from plotting import DPI, plt, save_figure
@@ -54,27 +55,19 @@ LOSSES: dict[str, LossTerms | None] = {"relative": RelativeTerms(), "paper": Non
 SHOWN = ("psnr", "ssim", "temporal_error")
 
 
-@dataclass(frozen=True)
-class BudgetRun:
-    """One training on one split of the budget.
-
-    Attributes:
-        spp: of a reference.
-        seconds: that the rooms took to render.
-        clips: means of metrics on each test clip.
-    """
+class Way(NamedTuple):
+    """A network, a loss and a split of the budget: what is trained once for each seed."""
 
     network: str
     loss: str
-    rooms: int
-    spp: int
-    seed: int
-    seconds: float
-    clips: dict[str, Values]
+    split: Split
 
-    def value(self, metric: str) -> float:
-        """The mean over the clips."""
-        return mean(value for values in self.clips.values() if (value := values[metric]) is not None)
+    @property
+    def label(self) -> str:
+        return f"{self.network}-{self.loss}-{self.split.rooms}x{self.split.spp}"
+
+
+WAYS = tuple(Way(*way) for way in product(STEPS, LOSSES, SPLITS))
 
 
 def recipe_of(network: str, loss: str, clips: Sequence[Clip]) -> Recipe:
@@ -89,55 +82,46 @@ def recipe_of(network: str, loss: str, clips: Sequence[Clip]) -> Recipe:
     return replace(small, epochs=max(1, round(STEPS[network] / per_epoch)), loss=LOSSES[loss] or quick.loss)
 
 
-def run_once(folder: Path, clips: Sequence[Clip], network: str, loss: str, split: Split, seed: int) -> BudgetRun:
-    """Train and judge; what is there already is kept."""
-    dataset = Dataset(folder / split.profile)
-    train_clips = dataset.clips("train")
-    variant = AblationVariant(f"{network}-{loss}-{split.rooms}x{split.spp}", network, partial(create, network))
-    own = folder / f"{variant.label}-{seed}"
-    recipe = recipe_of(network, loss, train_clips)
-    task = Task(variant.label, variant.create, recipe, BUDGET, dataset, own, folder / "accumulated", seed)
-    entrant = entrant_of(variant, task, train_network(task))
-    seconds = sum(sum(read_json(clip.path / "timing.json").values()) for clip in train_clips)
-    return BudgetRun(network, loss, split.rooms, split.spp, seed, seconds, clip_means(entrant, clips, folder))
+def render_seconds(dataset: Dataset) -> float:
+    """What the rooms to train on took to render."""
+    return sum(sum(read_json(clip.path / "timing.json").values()) for clip in dataset.clips("train"))
 
 
-def over_seeds(runs: Sequence[BudgetRun], network: str, loss: str, split: Split, metric: str) -> tuple[float, float]:
-    """Mean and half the range over the seeds."""
-    values = [
-        run.value(metric)
-        for run in runs
-        if (run.network, run.loss, run.rooms, run.spp) == (network, loss, split.rooms, split.spp)
+def train_and_judge(way: Way, seed: int, clips: Sequence[Clip], folder: Path) -> VariantRun:
+    """One training and its means on `clips`; what is there already is kept."""
+    dataset = Dataset(folder / way.split.profile)
+    variant = AblationVariant(way.label, way.network, partial(create, way.network))
+    recipe = recipe_of(way.network, way.loss, dataset.clips("train"))
+    own_folder = folder / f"{way.label}-{seed}"
+    task = Task(way.label, variant.create, recipe, BUDGET, dataset, own_folder, folder / "accumulated", seed)
+    return trained_run(variant, task, entrant_of(variant, task, train_network(task)), clips, folder)
+
+
+def curve_table(runs: Sequence[VariantRun], seconds: Sequence[float]) -> str:
+    """A row for each network and loss, a column for each split of the budget, which took so many seconds to render."""
+    heads = [f"{split.rooms} rooms, {split.spp} spp ({s:.0f} s)" for split, s in zip(SPLITS, seconds, strict=True)]
+    rows = [
+        [METRICS[metric].title, network, loss]
+        + [seed_mean_text(runs, Way(network, loss, split).label, metric) for split in SPLITS]
+        for metric, network, loss in product(SHOWN, STEPS, LOSSES)
     ]
-    return mean(values), (max(values) - min(values)) / 2
-
-
-def curve_table(runs: Sequence[BudgetRun]) -> str:
-    """A row for each network and loss, a column for each split of the budget."""
-    seconds = {split: mean(run.seconds for run in runs if (run.rooms, run.spp) == split) for split in SPLITS}
-    heads = [f"{split.rooms} rooms, {split.spp} spp ({seconds[split]:.0f} s)" for split in SPLITS]
-    rows = []
-    for metric, network, loss in product(SHOWN, STEPS, LOSSES):
-        cells = [over_seeds(runs, network, loss, split, metric) for split in SPLITS]
-        shown = [f"{METRICS[metric].form.format(value)} ± {spread:.2g}" for value, spread in cells]
-        rows.append([METRICS[metric].title, network, loss, *shown])
     return tabulate(rows, ["", "network", "loss", *heads], tablefmt="github", disable_numparse=True)
 
 
-def curve_figure(runs: Sequence[BudgetRun]) -> Figure:
+def curve_figure(runs: Sequence[VariantRun]) -> Figure:
     """Quality against samples a reference, at a fixed budget."""
-    figure, axes = plt.subplots(1, len(STEPS), figsize=(9, 4), dpi=DPI, layout="constrained")
-    for axis, network in zip(axes, STEPS, strict=True):
+    figure, axes = plt.subplots(1, len(STEPS), figsize=(9, 4), dpi=DPI, layout="constrained", squeeze=False)
+    for axis, network in zip(axes[0], STEPS, strict=True):
         for loss in LOSSES:
-            cells = [over_seeds(runs, network, loss, split, "psnr") for split in SPLITS]
-            means, spreads = zip(*cells, strict=True)
+            found = [over_seeds(runs, Way(network, loss, split).label, "psnr") for split in SPLITS]
+            means, spreads = zip(*((each.mean, each.spread or 0.0) for each in found if each), strict=True)
             axis.errorbar([split.spp for split in SPLITS], means, spreads, fmt="o-", ms=4, capsize=3, label=loss)
         axis.set(xscale="log", title=network, xlabel="samples a pixel of references; rooms make up for it")
         axis.set_xticks([split.spp for split in SPLITS], [f"{split.spp}\n{split.rooms} rooms" for split in SPLITS])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel(METRICS["psnr"].title)
-    axes[0].legend(title="loss", fontsize=8)
+    axes[0, 0].set_ylabel(METRICS["psnr"].title)
+    axes[0, 0].legend(title="loss", fontsize=8)
     return figure
 
 
@@ -152,14 +136,15 @@ def bench_references(data: Path, runs: Path, seeds: int) -> str:
     folder = bench_folder(runs) / "references"
     for split in SPLITS:
         generate(folder / split.profile, split.profile, seed=0)
-    combinations = [*product(range(seeds), STEPS, LOSSES, SPLITS)]
-    done = [
-        run_once(folder, clips, network, loss, split, seed)
-        for seed, network, loss, split in tqdm(combinations, "budget curve", unit="training")
+    seconds = [render_seconds(Dataset(folder / split.profile)) for split in SPLITS]
+    trainings = [*product(range(seeds), WAYS)]
+    judged = [
+        train_and_judge(way, seed, clips, folder) for seed, way in tqdm(trainings, "budget curve", unit="training")
     ]
-    save_figure(folder / "plot.png", curve_figure(done))
-    table = curve_table(done)
+    save_figure(folder / "plot.png", curve_figure(judged))
+    table = curve_table(judged, seconds)
     write_file(folder / "table.md", f"{table}\n".encode())
     content = {"schema": 1, "dataset": str(data), "device": device_in_words(), "steps": STEPS}
-    write_json(folder / "results.json", content | {"rows": [asdict(run) for run in done]})
+    content |= {"seconds": {split.profile: s for split, s in zip(SPLITS, seconds, strict=True)}}
+    write_json(folder / "results.json", content | {"rows": [asdict(run) for run in judged]})
     return table

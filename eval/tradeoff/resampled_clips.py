@@ -11,16 +11,15 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
-from datasets.clip_kind import ClipKind
+from datasets.clip_scene import scene_of_clip
 from datasets.generate import check_versions
-from datasets.profiles import GENERATOR, clip_seed, profile_of
+from datasets.profiles import GENERATOR, profile_of
 from datasets.writer import to_storage
 from errors import BadInput
 from files import locked, read_json, write_json
 from render.clip import Options, Sampling, render_clip
 from render.sampler import CYCLE
 from scenes.animation import Scene
-from scenes.registry import build_scene
 
 NOISY_CHANNELS = ("direct", "indirect")
 
@@ -36,11 +35,7 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
     check_versions(dataset)
-    split = clip.path.parent.parent.name
-    kind = ClipKind.of(clip.name)
-    seed = clip_seed(dataset.facts["seed"], clip.scene, split, kind.number)
-    scene = build_scene(clip.scene, seed, profile_of(dataset.facts["profile"]).frames)
-    return scene.still() if kind.still else scene, seed
+    return scene_of_clip(clip.path, profile_of(dataset.facts["profile"]).frames, dataset.facts["seed"])
 
 
 def averaged(clip: Clip, count: int) -> Iterator[NoisyFrame]:

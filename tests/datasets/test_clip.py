@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from datasets.clip import Clip, Dataset
-from datasets.profiles import clip_seed, profile_of
+from datasets.clip_scene import scene_of_clip
+from datasets.profiles import profile_of
 from errors import BadInput
 from render.clip import Sampling, render_clip
-from scenes.registry import build_scene
 
 
 def test_plan_and_layout(tiny):
@@ -41,8 +41,7 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     """Render one clip again, in this process, and compare with the disk."""
     clip = Dataset(tiny).clips("test")[1]
     profile = profile_of("tiny")
-    seed = clip_seed(0, clip.scene, "test", 0)
-    scene = build_scene(clip.scene, seed, profile.frames)
+    scene, seed = scene_of_clip(clip.path, profile.frames, 0)
     sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
     frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
     for index, (channels, _) in enumerate(frames):

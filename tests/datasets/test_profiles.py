@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets import pilots
 from datasets.adaptive_spp import noise_of_reference, samples_needed
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
@@ -143,6 +144,14 @@ def test_rooms_that_would_need_too_many_samples_are_passed_over():
     passed_over = set(needed) - set(chosen)
     assert passed_over and all(needed[room] > 128 for room in passed_over)
     assert choose_rooms(profile, 0, NO_OPTIONS, needed) == needed  # nothing is rendered again
+
+
+def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
+    monkeypatch.setattr(pilots, "needed_for", lambda *_: 4096)
+    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, passes_over=True)
+    profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 2}, quality={"test": bounded})
+    with pytest.raises(BadInput, match="fewer than 2 in 64 rooms reach 90 dB within 128 spp"):
+        choose_rooms(profile, 0, NO_OPTIONS, {})
 
 
 @pytest.mark.parametrize("name", ["rooms-0x16", "rooms-4x1", "rooms-4x0"])
