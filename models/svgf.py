@@ -12,6 +12,7 @@ Where the paper is silent, we choose:
 - Background has no normal: its weight is 0 except for itself, so it is neither filtered nor mixed with surfaces.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -38,6 +39,7 @@ from models.parameters import (
 from models.reprojection import reproject
 from models.surfaces import Surfaces
 
+STEPS = tuple(2**level for level in range(ATROUS_LEVELS))  # px from tap to tap
 RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
 
 
@@ -170,7 +172,6 @@ def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
     return 1 / (SIGMA_L * (mean.sum / total.sum.clamp(min=1 / 16) + EPSILON_L).sqrt())
 
 
-@compiled.by(kernels.svgf_level)
 def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
     """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered.
 
@@ -189,6 +190,18 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
         mean.add(tap, weight)
         spread.add(tap, weight.square_())
     return mean.sum / total.sum, spread.sum / total.sum.square()
+
+
+@compiled.by(kernels.svgf_levels)
+def svgf_levels(
+    colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Level after level of the à-trous transform, with those steps: the first colour, the last colour and variance."""
+    first, variance = svgf_level(colour, variance, geometry, steps[0])
+    colour = first
+    for step in steps[1:]:
+        colour, variance = svgf_level(colour, variance, geometry, step)
+    return first, colour, variance
 
 
 @dataclass(frozen=True)
@@ -229,8 +242,6 @@ class SVGF(Denoiser):
         integrated = integrate(frame, irradiances(frame, self.signal), history, self.change(frame))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         estimated = estimate_variance(integrated, geometry)
-        colour, variance = svgf_level(integrated.colour, estimated, geometry, 1)
-        history = replace(integrated, colour=colour)  # §4.3: the first level's output
-        for level in range(1, ATROUS_LEVELS):
-            colour, variance = svgf_level(colour, variance, geometry, 2**level)
+        first, colour, _ = svgf_levels(integrated.colour, estimated, geometry, STEPS)
+        history = replace(integrated, colour=first)  # §4.3: the first level's output
         return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)

@@ -7,25 +7,25 @@ import numpy as np
 from models.compiled.jit import jit_inlined
 
 LOG2E = np.float32(1.4426950408889634)
-# 2^f on [-1/2, 1/2] by its Taylor series, coefficients ln(2)^i / i!
-EXP_1, EXP_2, EXP_3, EXP_4, EXP_5, EXP_6 = (
-    np.float32(np.log(2) ** i / factorial) for i, factorial in enumerate((1, 2, 6, 24, 120, 720), 1)
+# 2^f on [-1/2, 1/2] as 1 + f * a polynomial: with these coefficients its largest relative error is the least, 9.2e-8
+EXP_1, EXP_2, EXP_3, EXP_4, EXP_5 = (
+    np.float32(coefficient) for coefficient in (0.69314698, 0.24022242, 0.05550734, 0.00967151, 0.00132647)
 )
+MANTISSA_WIDTH = np.int32(23)
 
 
 @jit_inlined
 def exp(x: Any) -> Any:
-    """e^x for x in [-87, 88], within 4e-7 of relative error."""
+    """e^x for x in [-87, 88], within 3e-7 of relative error; exactly 1 for 0."""
     t = x * LOG2E
-    n = np.floor(t + np.float32(0.5))
+    n = np.rint(t)
     f = t - n
-    p = EXP_5 + f * EXP_6
-    p = EXP_4 + f * p
+    p = EXP_4 + f * EXP_5
     p = EXP_3 + f * p
     p = EXP_2 + f * p
     p = EXP_1 + f * p
     p = np.float32(1) + f * p
-    return p * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return np.int32(np.float32(p).view(np.int32) + (np.int32(n) << MANTISSA_WIDTH)).view(np.float32)  # p * 2^n
 
 
 MANTISSA_BITS = np.int32(0x7FFFFF)
@@ -39,7 +39,7 @@ def log(x: Any) -> Any:
     """ln x for normal positive x: exponent and mantissa apart, and the series of 2 artanh((m - 1) / (m + 1))."""
     bits = np.float32(x).view(np.int32)
     m = np.int32((bits & MANTISSA_BITS) | BITS_OF_ONE).view(np.float32)
-    e = np.float32((bits >> np.int32(23)) - np.int32(127))
+    e = np.float32((bits >> MANTISSA_WIDTH) - np.int32(127))
     large = m > np.float32(1.4142135)
     m = m * np.float32(0.5) if large else m
     e = e + np.float32(1) if large else e

@@ -42,6 +42,7 @@ jit_inlined = numba.njit(inline="always", fastmath={"contract"}, error_model="nu
 jit_in_order = without_memory("contract", "nsz")
 jit_with_reciprocals = without_memory("contract", "nsz", "arcp", inline=True)
 jit_in_any_order = without_memory("contract", "nsz", "arcp", "reassoc")
+jit_inlined_in_any_order = without_memory("contract", "nsz", "arcp", "reassoc", inline=True)
 jit_with_memory = numba.njit(error_model="numpy", boundscheck=False)  # what allocates itself, for the others
 # For the kernels themselves, which alone are kept on disk, with all that they call. Numba counts the rows of a prange
 # without a sign: take np.int64(row) before anything is subtracted from it.

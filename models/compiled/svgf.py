@@ -1,24 +1,28 @@
 """models.svgf for the processor: every row by itself, every loop along it vectorised.
 
 Each line of memory has a name of its own in the innermost functions: Numba knows slices along the last dimension as
-contiguous, unlike lines of a slice in two dimensions.
+contiguous, unlike lines of a slice in two dimensions. Scratch memory is flat, with offsets that are constants: LLVM
+vectorises a loop only where it can tell, by few comparisons, that what is written overlaps nothing that is read.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.frame import Frame
 from models import parameters
 from models.atrous import RADIUS
-from models.compiled.atrous import SPLINE, columns_with_tap, decay
+from models.compiled.atrous import SPLINE, decay
 from models.compiled.jit import (
     array,
     jit_in_any_order,
+    jit_inlined_in_any_order,
     jit_parallel,
     jit_with_memory,
     jit_with_reciprocals,
@@ -36,9 +40,14 @@ SIGMA_L = np.float32(parameters.SIGMA_L)
 EPSILON_Z = np.float32(parameters.EPSILON_Z)
 EPSILON_L = np.float32(parameters.EPSILON_L)
 LEAST_DIVISOR = np.float32(parameters.LEAST_DIVISOR)
+unsigned = np.uint64  # an index that cannot count from the end: one that can, keeps loops scalar
 LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 LEAST_WEIGHT = np.float32(1e-15)
 LEAST_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
+TAPS = 2 * RADIUS + 1  # of a row
+BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
+GEOMETRY = 7  # lines of pack_geometry
+SIGNAL = 6
 SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where one needs it
 
 
@@ -212,12 +221,33 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
     return packed
 
 
-@jit_in_any_order
-def geometry_weights(weight: Any, exponent: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
-    """models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W).
+@jit_inlined_in_any_order
+def geometry_terms(
+    x: Any,
+    y: Any,
+    z: Any,
+    depth: Any,
+    along_x: Any,
+    along_y: Any,
+    tolerance: Any,
+    to_x: Any,
+    to_y: Any,
+    to_z: Any,
+    to_depth: Any,
+    dx: Any,
+    dy: Any,
+) -> tuple[Any, Any]:
+    """models.svgf.geometry_weight of one pixel as w times e to the power of -exponent."""
+    w_n = x * to_x + y * to_y + z * to_z
+    w_n = w_n if w_n > LEAST_COSINE else np.float32(0)
+    for _ in range(SQUARINGS):
+        w_n *= w_n
+    return w_n, abs(depth - to_depth) / (abs(along_x * dx + along_y * dy) + tolerance)
 
-    As weight (n) times e to the power of -exponent (n).
-    """
+
+@jit_in_any_order
+def geometry_weights(weight: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
+    """models.svgf.geometry_weight (n) of the n pixels from `left` on in a row of the geometry (7, H, W)."""
     right = left + weight.size
     to = row + dy
     to_left = left + dx
@@ -236,129 +266,135 @@ def geometry_weights(weight: Any, exponent: Any, geometry: Any, row: Any, left: 
     by_x = np.float32(dx)
     by_y = np.float32(dy)
     for i in range(weight.size):
-        w_n = x[i] * to_x[i] + y[i] * to_y[i] + z[i] * to_z[i]
-        w_n = w_n if w_n > LEAST_COSINE else np.float32(0)
-        for _ in range(SQUARINGS):
-            w_n *= w_n
-        expected = abs(along_x[i] * by_x + along_y[i] * by_y) + tolerance[i]
-        weight[i] = w_n
-        exponent[i] = abs(depth[i] - to_depth[i]) / expected
-
-
-@jit_in_any_order
-def apply_exponents(weight: Any, exponent: Any) -> None:
-    for i in range(weight.size):
-        w = weight[i] * decay(exponent[i])
+        here = (x[i], y[i], z[i], depth[i], along_x[i], along_y[i], tolerance[i])
+        w_n, exponent = geometry_terms(*here, to_x[i], to_y[i], to_z[i], to_depth[i], by_x, by_y)
+        w = w_n * decay(exponent)
         weight[i] = w if w > LEAST_WEIGHT else np.float32(0)
 
 
-# --- A level of the à-trous transform ---------------------------------------------------------------------------------
+# --- The à-trous transform --------------------------------------------------------------------------------------------
+#
+# What taps read is kept row by row: `surfaces` (H, GEOMETRY, W), the lines of pack_geometry, and `signals`
+# (H, S, SIGNAL, W), of each signal red, green, blue, variance, luminance, edge_scale. In planes the lines of a row
+# would be a multiple of 4096 bytes apart at 1280 x 720 and at 1920 x 1080, and share the few places that the first
+# cache has for such addresses. On either side is a margin of background, from which no tap takes anything.
 
 
 @jit_in_any_order
-def add_svgf_tap(
-    sums: Any,
-    h: Any,
-    weight: Any,
-    exponent: Any,
-    colour: Any,
-    variance: Any,
-    edge: Any,
-    row: Any,
-    left: int,
-    dx: int,
-    dy: int,
-) -> None:
-    """Add one tap of the n pixels from `left` on in a row to sums (5, W): of weights, of colours, of variances.
+def weigh_taps(weights: Any, surfaces: Any, row: Any, to: Any, step: int, first: int, count: int) -> None:
+    """Geometrical weights of all taps in the row `to`, for `count` pixels of a row from `first` on.
 
-    weight and exponent (n) are geometrical; colour (3, H, W), variance (H, W), edge (2, H, W): luminance and its scale.
+    As weights (2 * TAPS * BLOCK): for each tap the two that geometry_terms returns.
     """
-    right = left + weight.size
-    to = row + dy
-    to_left = left + dx
-    to_right = right + dx
-    total = sums[0, left:right]
-    red = sums[1, left:right]
-    green = sums[2, left:right]
-    blue = sums[3, left:right]
-    spread = sums[4, left:right]
-    r = colour[0, to, to_left:to_right]
-    g = colour[1, to, to_left:to_right]
-    b = colour[2, to, to_left:to_right]
-    v = variance[to, to_left:to_right]
-    y = edge[0, row, left:right]
-    to_y = edge[0, to, to_left:to_right]
-    scale = edge[1, row, left:right]
-    for i in range(weight.size):
-        w = h * weight[i] * decay(abs(y[i] - to_y[i]) * scale[i] + exponent[i])
-        w = w if w > LEAST_WEIGHT else np.float32(0)
-        total[i] += w
-        red[i] += w * r[i]
-        green[i] += w * g[i]
-        blue[i] += w * b[i]
-        spread[i] += w * w * v[i]
-
-
-@jit_with_memory
-def sum_svgf_row(sums: Any, row: Any, step: int, colour: Any, variance: Any, edge: Any, geometry: Any) -> None:
-    """sums (S, 5, W) over the taps of one row of colour (S, 3, H, W), variance (S, H, W), edge (S, 2, H, W)."""
-    signals, _, height, width = colour.shape
-    space = np.empty((2, width), np.float32)
-    h = SPLINE[RADIUS] * SPLINE[RADIUS]
-    for s in range(signals):
-        sums[s, 0] = h
-        sums[s, 1:4] = h * colour[s, :, row]
-        sums[s, 4] = h * h * variance[s, row]
-    for j in range(-RADIUS, RADIUS + 1):
-        for i in range(-RADIUS, RADIUS + 1):
-            dx = i * step
-            dy = j * step
-            left, right = columns_with_tap(row, dx, dy, height, width)
-            if left >= right:
-                continue
-            h = SPLINE[j + RADIUS] * SPLINE[i + RADIUS]
-            weight = space[0, : right - left]
-            exponent = space[1, : right - left]
-            geometry_weights(weight, exponent, geometry, row, left, dx, dy)
-            for s in range(signals):
-                add_svgf_tap(sums[s], h, weight, exponent, colour[s], variance[s], edge[s], row, left, dx, dy)
+    x = surfaces[row, 0]
+    y = surfaces[row, 1]
+    z = surfaces[row, 2]
+    depth = surfaces[row, 3]
+    along_x = surfaces[row, 4]
+    along_y = surfaces[row, 5]
+    tolerance = surfaces[row, 6]
+    to_x = surfaces[to, 0]
+    to_y = surfaces[to, 1]
+    to_z = surfaces[to, 2]
+    to_depth = surfaces[to, 3]
+    dy = np.float32(to - row)
+    for i in range(count):
+        p = unsigned(first + i)
+        here = (x[p], y[p], z[p], depth[p], along_x[p], along_y[p], tolerance[p])
+        for tap in range(TAPS):
+            dx = (tap - RADIUS) * step
+            q = unsigned(first + i + dx)
+            w_n, exponent = geometry_terms(*here, to_x[q], to_y[q], to_z[q], to_depth[q], np.float32(dx), dy)
+            weights[unsigned(2 * tap * BLOCK + i)] = w_n
+            weights[unsigned((2 * tap + 1) * BLOCK + i)] = exponent
 
 
 @jit_in_any_order
-def divide_svgf_row(colour: Any, variance: Any, row: Any, sums: Any) -> None:
-    """A row of colour (3, H, W) and of variance (H, W) from sums (5, W)."""
-    r = colour[0, row]
-    g = colour[1, row]
-    b = colour[2, row]
-    v = variance[row]
-    total = sums[0]
-    red = sums[1]
-    green = sums[2]
-    blue = sums[3]
-    spread = sums[4]
-    for i in range(total.size):
-        normalise = np.float32(1) / total[i]
-        r[i] = red[i] * normalise
-        g[i] = green[i] * normalise
-        b[i] = blue[i] * normalise
-        v[i] = spread[i] * normalise * normalise
+def add_taps(
+    sums: Any, h: Any, weights: Any, signals: Any, s: int, row: Any, to: Any, step: int, first: int, count: int
+) -> None:
+    """Add all taps in the row `to` to sums (5 * BLOCK): of colours, of variances, of weights.
+
+    h (TAPS) are the spline's weights, `weights` those of weigh_taps.
+    """
+    r = signals[to, s, 0]
+    g = signals[to, s, 1]
+    b = signals[to, s, 2]
+    v = signals[to, s, 3]
+    to_y = signals[to, s, 4]
+    y = signals[row, s, 4]
+    scale = signals[row, s, 5]
+    for i in range(count):
+        p = unsigned(first + i)
+        red = np.float32(0)
+        green = np.float32(0)
+        blue = np.float32(0)
+        spread = np.float32(0)
+        total = np.float32(0)
+        for tap in range(TAPS):
+            q = unsigned(first + i + (tap - RADIUS) * step)
+            exponent = weights[unsigned((2 * tap + 1) * BLOCK + i)]
+            w = h[tap] * weights[unsigned(2 * tap * BLOCK + i)] * decay(abs(y[p] - to_y[q]) * scale[p] + exponent)
+            w = w if w > LEAST_WEIGHT else np.float32(0)
+            red += w * r[q]
+            green += w * g[q]
+            blue += w * b[q]
+            spread += w * w * v[q]
+            total += w
+        sums[unsigned(i)] += red
+        sums[unsigned(i + BLOCK)] += green
+        sums[unsigned(i + 2 * BLOCK)] += blue
+        sums[unsigned(i + 3 * BLOCK)] += spread
+        sums[unsigned(i + 4 * BLOCK)] += total
+
+
+@jit_in_any_order
+def divide_sums(filtered: Any, signals: Any, row: Any, s: int, first: int, count: int, sums: Any) -> None:
+    """Colour and variance of `count` pixels of `filtered` from `first` on, from sums (5 * BLOCK) and the centre's."""
+    h = SPLINE[RADIUS] * SPLINE[RADIUS]
+    for c in range(3):
+        line = filtered[row, s, c]
+        centre = signals[row, s, c]
+        for i in range(count):
+            p = unsigned(first + i)
+            line[p] = (sums[unsigned(i + c * BLOCK)] + h * centre[p]) / (sums[unsigned(i + 4 * BLOCK)] + h)
+    line = filtered[row, s, 3]
+    centre = signals[row, s, 3]
+    for i in range(count):
+        p = unsigned(first + i)
+        normalise = np.float32(1) / (sums[unsigned(i + 4 * BLOCK)] + h)
+        line[p] = (sums[unsigned(i + 3 * BLOCK)] + h * h * centre[p]) * normalise * normalise
 
 
 @jit_parallel
-def filter_svgf_image(
-    colour_out: Any, variance_out: Any, colour: Any, variance: Any, edge: Any, geometry: Any, step: int
-) -> None:
-    signals, _, height, width = colour.shape
-    for row in numba.prange(height):
-        sums = np.empty((signals, 5, width), np.float32)
-        sum_svgf_row(sums, np.int64(row), step, colour, variance, edge, geometry)
-        for s in range(signals):
-            divide_svgf_row(colour_out[s], variance_out[s], row, sums[s])
+def filter_image(filtered: Any, signals: Any, surfaces: Any, margin: int, step: int) -> None:
+    """Colour and variance of `filtered`, as `signals`, by one level with taps `step` pixels apart."""
+    height, count_signals, _, width = signals.shape
+    for line in numba.prange(height):
+        row = np.int64(line)
+        sums = np.empty((count_signals, 5 * BLOCK), np.float32)
+        weights = np.empty(2 * TAPS * BLOCK, np.float32)
+        h = np.empty(TAPS, np.float32)
+        for first in range(margin, width - margin, BLOCK):
+            count = min(BLOCK, width - margin - first)
+            sums[:] = 0
+            for j in range(-RADIUS, RADIUS + 1):
+                to = row + j * step
+                if to < 0 or to >= height:
+                    continue
+                h[:] = SPLINE[j + RADIUS] * SPLINE
+                if j == 0:
+                    h[RADIUS] = 0  # the pixel itself, of which divide_sums takes care
+                weigh_taps(weights, surfaces, row, to, step, first, count)
+                for s in range(count_signals):
+                    add_taps(sums[s], h, weights, signals, s, row, to, step, first, count)
+            for s in range(count_signals):
+                divide_sums(filtered, signals, row, s, first, count, sums[s])
 
 
 @jit_with_memory
-def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> None:
-    """A row of edge (2, H, W): luminance of colour (3, H, W), and models.svgf.edge_scale of variance (H, W)."""
+def edge_row(lines: Any, row: Any, variance: Any, depth: Any) -> None:
+    """Luminance and models.svgf.edge_scale of a row's lines (SIGNAL, W); variance (H, W), depth (H, W)."""
     height, width = variance.shape
     quarter = np.float32(0.25)
     half = np.float32(0.5)
@@ -374,11 +410,11 @@ def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> Non
             share = h if z[x] > 0 else np.float32(0)
             total[x] += share * line[x]
             weight[x] += share
-    r = colour[0, row]
-    g = colour[1, row]
-    b = colour[2, row]
-    luminance = edge[0, row]
-    scale = edge[1, row]
+    r = lines[0]
+    g = lines[1]
+    b = lines[2]
+    luminance = lines[4]
+    scale = lines[5]
     for x in range(width):
         luminance[x] = RED_WEIGHT * r[x] + GREEN_WEIGHT * g[x] + BLUE_WEIGHT * b[x]
         mean = quarter * columns[x] + half * columns[x + 1] + quarter * columns[x + 2]
@@ -388,25 +424,79 @@ def edge_row(edge: Any, colour: Any, variance: Any, depth: Any, row: Any) -> Non
 
 
 @jit_parallel
-def edge_image(edge: Any, colour: Any, variance: Any, geometry: Any) -> None:
-    signals, height, _ = variance.shape
-    for row in numba.prange(height):
-        for s in range(signals):
-            edge_row(edge[s], colour[s], variance[s], geometry[3], np.int64(row))
+def edge_image(signals: Any, surfaces: Any) -> None:
+    for row in numba.prange(len(signals)):
+        for s in range(signals.shape[1]):
+            edge_row(signals[row, s], np.int64(row), signals[:, s, 3], surfaces[:, 3])
 
 
-def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
-    """See models.svgf.svgf_level."""
-    filtered = torch.empty_like(colour, memory_format=torch.contiguous_format)
+@jit_in_any_order
+def copy(line: Any, values: Any) -> None:
+    for x in range(line.size):
+        line[x] = values[x]
+
+
+@jit_in_any_order
+def pack(line: Any, margin: int, values: Any) -> None:
+    """A line from values without margins."""
+    line[:margin] = 0
+    copy(line[margin : line.size - margin], values)
+    line[line.size - margin :] = 0
+
+
+@jit_with_memory
+def pack_row(row: Any, signals: Any, surfaces: Any, margin: int, colour: Any, variance: Any, geometry: Any) -> None:
+    """The row's lines, signals (S, SIGNAL, W) and surfaces (GEOMETRY, W).
+
+    From colour (S, 3, H, W), variance (S, H, W), geometry (GEOMETRY, H, W).
+    """
+    for line in range(GEOMETRY):
+        pack(surfaces[line], margin, geometry[line, row])
+    for s in range(len(signals)):
+        for c in range(3):
+            pack(signals[s, c], margin, colour[s, c, row])
+        pack(signals[s, 3], margin, variance[s, row])
+
+
+@jit_parallel
+def pack_rows(
+    signals: Any, filtered: Any, surfaces: Any, margin: int, colour: Any, variance: Any, geometry: Any
+) -> None:
+    """All rows; and no light in the margins of `filtered`."""
+    for row in numba.prange(len(signals)):
+        pack_row(np.int64(row), signals[row], surfaces[row], margin, colour, variance, geometry)
+        filtered[row, :, :, :margin] = 0
+        filtered[row, :, :, filtered.shape[-1] - margin :] = 0
+
+
+def planes_of(signals: NDArray[np.float32], margin: int) -> Tensor:
+    """Signals without their margins, (S, SIGNAL, H, W)."""
+    return torch.from_numpy(signals[..., margin:-margin]).permute(1, 2, 0, 3)
+
+
+def svgf_levels(
+    colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See models.svgf.svgf_levels."""
+    count_signals, _, height, width = colour.shape[1:]
+    margin = RADIUS * max(steps)
+    first = torch.empty_like(colour, memory_format=torch.contiguous_format)
+    last = torch.empty_like(first)
     spread = torch.empty_like(variance, memory_format=torch.contiguous_format)
-    edge = np.empty((colour.shape[1], 2, *colour.shape[-2:]), np.float32)
+    signals, filtered = np.empty((2, height, count_signals, SIGNAL, width + 2 * margin), np.float32)
+    surfaces = np.empty((height, GEOMETRY, width + 2 * margin), np.float32)
     for item in range(len(colour)):
-        image = array(colour[item]), array(variance[item, :, 0])
-        surfaces = array(geometry[item, 0])
-        edge_image(edge, *image, surfaces)
-        out = filtered[item].numpy(), spread[item, :, 0].numpy()
-        filter_svgf_image(*out, *image, edge, surfaces, step)
-    return filtered, spread
+        images = array(colour[item]), array(variance[item, :, 0]), array(geometry[item, 0])
+        pack_rows(signals, filtered, surfaces, margin, *images)
+        for step in steps:
+            edge_image(signals, surfaces)
+            filter_image(filtered, signals, surfaces, margin, step)
+            signals, filtered = filtered, signals
+            if step == steps[0]:
+                first[item] = planes_of(signals, margin)[:, :3]
+        last[item] = planes_of(signals, margin)[:, :3]
+        spread[item] = planes_of(signals, margin)[:, 3:4]
+    return first, last, spread
 
 
 # --- The spatial estimate of variance ---------------------------------------------------------------------------------
@@ -446,7 +536,7 @@ def sum_spatial_block(sums: Any, row: Any, first: Any, last: Any, variance: Any,
     variance, mean (S, H, W).
     """
     signals, height, width = variance.shape
-    space = np.empty((2, SPATIAL_BLOCK), np.float32)
+    space = np.empty(SPATIAL_BLOCK, np.float32)
     sums[:, 0] = 1
     sums[:, 1] = 0
     sums[:, 2, : last - first] = variance[:, row, first:last]
@@ -456,10 +546,8 @@ def sum_spatial_block(sums: Any, row: Any, first: Any, last: Any, variance: Any,
             right = min(last, width - dx)
             if (dx == 0 and dy == 0) or left >= right:
                 continue
-            weight = space[0, : right - left]
-            exponent = space[1, : right - left]
-            geometry_weights(weight, exponent, geometry, row, left, dx, dy)
-            apply_exponents(weight, exponent)
+            weight = space[: right - left]
+            geometry_weights(weight, geometry, row, left, dx, dy)
             for s in range(signals):
                 add_spatial_tap(sums[s], first, weight, variance[s], mean[s], row, left, dx, dy)
 

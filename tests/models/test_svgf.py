@@ -56,6 +56,11 @@ def packed(depth, normal, mesh):
     return svgf.pack_geometry(to_torch(depth), to_torch(normal), to_torch(mesh.astype(float)))
 
 
+def level(colour, variance, geometry, step):
+    """One level of the à-trous transform."""
+    return svgf.svgf_levels(colour, variance, geometry, (step,))[1:]
+
+
 # --- Slow versions ----------------------------------------------------------------------------------------------------
 
 
@@ -279,7 +284,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
     variance = torch.tensor([0.04, 0.01]).view(1, 1, 1, 1, 2)
     difference = 0.2126 * 2 + 0.0722 * 1
     sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
-    out, spread = svgf.svgf_level(colour, variance, geometry, 1)
+    out, spread = level(colour, variance, geometry, 1)
     centre = 9 / 64
     side = 3 / 32
     for x in range(2):
@@ -289,7 +294,7 @@ def test_luminance_weighs_by_the_standard_deviation_around(way):
         v = (centre**2 * variance[..., x] + w**2 * variance[..., 1 - x]) / (centre + w) ** 2
         assert spread[..., x].item() == pytest.approx(v.item(), rel=1e-5)
     # Without variance, nothing that differs mixes.
-    out, spread = svgf.svgf_level(colour, torch.zeros_like(variance), geometry, 1)
+    out, spread = level(colour, torch.zeros_like(variance), geometry, 1)
     torch.testing.assert_close(out, colour)
     assert (spread == 0).all()
 
@@ -307,7 +312,7 @@ def test_a_level_is_the_paper_s(name, size, step, seed):
     variance = np.float32(rng.random((2, *size)) / 4)
     with WAYS[name]():
         images = to_torch(colour, 1, 2, 3, *size), to_torch(variance, 1, 2, 1, *size)
-        out, spread = svgf.svgf_level(*images, packed(depth, normal, mesh), step)
+        out, spread = level(*images, packed(depth, normal, mesh), step)
     for s in range(2):
         expected = naive_level(colour[s].astype(float), variance[s].astype(float), depth, normal, mesh, step)
         np.testing.assert_allclose(out[0, s].numpy(), expected[0], rtol=1e-4)
@@ -319,21 +324,37 @@ def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
     geometry = packed(*plane(65, 65))
     colour = torch.ones(1, 1, 3, 65, 65)
     variance = torch.full((1, 1, 1, 65, 65), 0.5)
-    _, spread = svgf.svgf_level(colour, variance, geometry, 4)
+    _, spread = level(colour, variance, geometry, 4)
     assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_levels_follow_each_other(name):
+    """Signals of two items of a batch, in an image that is narrower than the last level's window."""
+    rng = np.random.default_rng(5)
+    depth, normal, mesh = surfaces(rng, 9, 40)
+    images = torch.rand(2, 1, 3, 9, 40), torch.rand(2, 1, 1, 9, 40)
+    geometry = torch.cat([packed(depth, normal, mesh), packed(depth[::-1], normal[:, ::-1], mesh[::-1])])
+    with WAYS[name]():
+        first, last, spread = svgf.svgf_levels(*images, geometry, (1, 2, 16))
+        one = level(*images, geometry, 1)
+        three = level(*level(*one, geometry, 2), geometry, 16)
+    torch.testing.assert_close(first, one[0])
+    torch.testing.assert_close((last, spread), three)
 
 
 def test_five_levels_and_the_first_is_the_history(monkeypatch):
     frame = synthetic_frame(3, 24, 32)
     seen = []
-    original = svgf.svgf_level
+    original = svgf.svgf_levels
     monkeypatch.setattr(
-        svgf, "svgf_level", lambda c, v, g, step: seen.append((step, *original(c, v, g, step))) or seen[-1][1:]
+        svgf, "svgf_levels", lambda *inputs: seen.append((inputs[-1], *original(*inputs))) or seen[-1][1:]
     )
     (output,), state = play(SVGF(), [frame])
-    assert [step for step, _, _ in seen] == [1, 2, 4, 8, 16]
-    assert state.history.colour is seen[0][1]
-    torch.testing.assert_close(output, frame.emission + seen[-1][1].sum(dim=1) * frame.albedo.clamp(min=0.01))
+    ((steps, first, last, _),) = seen
+    assert steps == (1, 2, 4, 8, 16)
+    assert state.history.colour is first
+    torch.testing.assert_close(output, frame.emission + last.sum(dim=1) * frame.albedo.clamp(min=0.01))
 
 
 # --- The whole --------------------------------------------------------------------------------------------------------
