@@ -23,7 +23,15 @@ MAY_IMPORT = {
     "train": {"train", "models", "datasets"},
     "eval": {"eval", "train", "models", "datasets"},
 }
-GENERATION_JOB = {"adaptive_spp.py", "clip_job.py", "cluster.py", "generate.py", "pilots.py", "profiles.py"}
+GENERATION_JOB = {
+    "adaptive_spp.py",
+    "clip_job.py",
+    "clip_scene.py",
+    "cluster.py",
+    "generate.py",
+    "pilots.py",
+    "profiles.py",
+}
 RENDERING_ROOMS = {"bench", "figures", "tradeoff"}
 
 

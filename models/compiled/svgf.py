@@ -17,8 +17,8 @@ from torch import Tensor
 from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.frame import Frame
 from models import parameters
-from models.atrous import RADIUS
-from models.compiled.atrous import SPLINE, decay
+from models.atrous import B3_SPLINE, RADIUS
+from models.compiled.exponential import exp
 from models.compiled.jit import (
     array,
     jit_in_any_order,
@@ -43,7 +43,9 @@ LEAST_DIVISOR = np.float32(parameters.LEAST_DIVISOR)
 unsigned = np.uint64  # an index that cannot count from the end: one that can, keeps loops scalar
 LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 LEAST_WEIGHT = np.float32(1e-15)
+LARGEST_EXPONENT = np.float32(40)  # e^-40 is below LEAST_WEIGHT
 LEAST_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
+SPLINE = np.array(B3_SPLINE, np.float32)
 TAPS = 2 * RADIUS + 1  # of a row
 BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
 GEOMETRY = 7  # lines of pack_geometry
@@ -245,10 +247,17 @@ def geometry_terms(
     return w_n, abs(depth - to_depth) / (abs(along_x * dx + along_y * dy) + tolerance)
 
 
+@jit_inlined_in_any_order
+def weight(w: Any, exponent: Any) -> Any:
+    """w times e to the power of -exponent, 0 where that is negligible: denormal numbers are slow."""
+    w *= exp(-min(exponent, LARGEST_EXPONENT))
+    return w if w > LEAST_WEIGHT else np.float32(0)
+
+
 @jit_in_any_order
-def geometry_weights(weight: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
-    """models.svgf.geometry_weight (n) of the n pixels from `left` on in a row of the geometry (7, H, W)."""
-    right = left + weight.size
+def geometry_weights(weights: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
+    """As weights (n) models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W)."""
+    right = left + weights.size
     to = row + dy
     to_left = left + dx
     to_right = right + dx
@@ -265,11 +274,9 @@ def geometry_weights(weight: Any, geometry: Any, row: Any, left: int, dx: int, d
     tolerance = geometry[6, row, left:right]
     by_x = np.float32(dx)
     by_y = np.float32(dy)
-    for i in range(weight.size):
+    for i in range(weights.size):
         here = (x[i], y[i], z[i], depth[i], along_x[i], along_y[i], tolerance[i])
-        w_n, exponent = geometry_terms(*here, to_x[i], to_y[i], to_z[i], to_depth[i], by_x, by_y)
-        w = w_n * decay(exponent)
-        weight[i] = w if w > LEAST_WEIGHT else np.float32(0)
+        weights[i] = weight(*geometry_terms(*here, to_x[i], to_y[i], to_z[i], to_depth[i], by_x, by_y))
 
 
 # --- The à-trous transform --------------------------------------------------------------------------------------------
@@ -281,10 +288,10 @@ def geometry_weights(weight: Any, geometry: Any, row: Any, left: int, dx: int, d
 
 
 @jit_in_any_order
-def weigh_taps(weights: Any, surfaces: Any, row: Any, to: Any, step: int, first: int, count: int) -> None:
+def weigh_taps(weights: Any, h: Any, surfaces: Any, row: Any, to: Any, step: int, first: int, count: int) -> None:
     """Geometrical weights of all taps in the row `to`, for `count` pixels of a row from `first` on.
 
-    As weights (2 * TAPS * BLOCK): for each tap the two that geometry_terms returns.
+    As weights (2 * TAPS * BLOCK): for each tap the two that geometry_terms returns, the first times h (TAPS).
     """
     x = surfaces[row, 0]
     y = surfaces[row, 1]
@@ -305,17 +312,17 @@ def weigh_taps(weights: Any, surfaces: Any, row: Any, to: Any, step: int, first:
             dx = (tap - RADIUS) * step
             q = unsigned(first + i + dx)
             w_n, exponent = geometry_terms(*here, to_x[q], to_y[q], to_z[q], to_depth[q], np.float32(dx), dy)
-            weights[unsigned(2 * tap * BLOCK + i)] = w_n
+            weights[unsigned(2 * tap * BLOCK + i)] = h[tap] * w_n
             weights[unsigned((2 * tap + 1) * BLOCK + i)] = exponent
 
 
 @jit_in_any_order
 def add_taps(
-    sums: Any, h: Any, weights: Any, signals: Any, s: int, row: Any, to: Any, step: int, first: int, count: int
+    sums: Any, weights: Any, signals: Any, s: int, row: Any, to: Any, step: int, first: int, count: int
 ) -> None:
-    """Add all taps in the row `to` to sums (5 * BLOCK): of colours, of variances, of weights.
+    """Add all taps in the row `to`, with the weights of weigh_taps, to sums (5 * BLOCK).
 
-    h (TAPS) are the spline's weights, `weights` those of weigh_taps.
+    Of colours, of variances, of weights.
     """
     r = signals[to, s, 0]
     g = signals[to, s, 1]
@@ -334,8 +341,7 @@ def add_taps(
         for tap in range(TAPS):
             q = unsigned(first + i + (tap - RADIUS) * step)
             exponent = weights[unsigned((2 * tap + 1) * BLOCK + i)]
-            w = h[tap] * weights[unsigned(2 * tap * BLOCK + i)] * decay(abs(y[p] - to_y[q]) * scale[p] + exponent)
-            w = w if w > LEAST_WEIGHT else np.float32(0)
+            w = weight(weights[unsigned(2 * tap * BLOCK + i)], abs(y[p] - to_y[q]) * scale[p] + exponent)
             red += w * r[q]
             green += w * g[q]
             blue += w * b[q]
@@ -385,49 +391,51 @@ def filter_image(filtered: Any, signals: Any, surfaces: Any, margin: int, step: 
                 h[:] = SPLINE[j + RADIUS] * SPLINE
                 if j == 0:
                     h[RADIUS] = 0  # the pixel itself, of which divide_sums takes care
-                weigh_taps(weights, surfaces, row, to, step, first, count)
+                weigh_taps(weights, h, surfaces, row, to, step, first, count)
                 for s in range(count_signals):
-                    add_taps(sums[s], h, weights, signals, s, row, to, step, first, count)
+                    add_taps(sums[s], weights, signals, s, row, to, step, first, count)
             for s in range(count_signals):
                 divide_sums(filtered, signals, row, s, first, count, sums[s])
 
 
-@jit_with_memory
-def edge_row(lines: Any, row: Any, variance: Any, depth: Any) -> None:
-    """Luminance and models.svgf.edge_scale of a row's lines (SIGNAL, W); variance (H, W), depth (H, W)."""
-    height, width = variance.shape
+@jit_in_any_order
+def add_weighted(total: Any, weight: Any, h: Any, variance: Any, depth: Any) -> None:
+    for x in range(total.size):
+        share = h if depth[x] > 0 else np.float32(0)
+        total[x] += share * variance[x]
+        weight[x] += share
+
+
+@jit_in_any_order
+def finish_edge(luminance: Any, scale: Any, r: Any, g: Any, b: Any, columns: Any, inside: Any) -> None:
+    """From weighted sums of columns, of variances and of weights, (W + 2)."""
     quarter = np.float32(0.25)
     half = np.float32(0.5)
-    columns = np.zeros(width + 2, np.float32)
-    inside = np.zeros(width + 2, np.float32)
-    total = columns[1:-1]
-    weight = inside[1:-1]
-    for y in range(max(row - 1, 0), min(row + 2, height)):
-        h = half if y == row else quarter
-        line = variance[y]
-        z = depth[y]
-        for x in range(width):
-            share = h if z[x] > 0 else np.float32(0)
-            total[x] += share * line[x]
-            weight[x] += share
-    r = lines[0]
-    g = lines[1]
-    b = lines[2]
-    luminance = lines[4]
-    scale = lines[5]
-    for x in range(width):
+    for x in range(scale.size):
         luminance[x] = RED_WEIGHT * r[x] + GREEN_WEIGHT * g[x] + BLUE_WEIGHT * b[x]
         mean = quarter * columns[x] + half * columns[x + 1] + quarter * columns[x + 2]
         share = quarter * inside[x] + half * inside[x + 1] + quarter * inside[x + 2]
-        mean /= max(share, LEAST_SHARE)
-        scale[x] = np.float32(1) / (SIGMA_L * np.sqrt(mean + EPSILON_L))
+        scale[x] = np.float32(1) / (SIGMA_L * np.sqrt(mean / max(share, LEAST_SHARE) + EPSILON_L))
+
+
+@jit_with_memory
+def edge_row(signals: Any, surfaces: Any, row: Any, s: int) -> None:
+    """Luminance and models.svgf.edge_scale of a row."""
+    height, _, _, width = signals.shape
+    columns = np.zeros(width + 2, np.float32)
+    inside = np.zeros(width + 2, np.float32)
+    for y in range(max(row - 1, 0), min(row + 2, height)):
+        h = np.float32(0.5) if y == row else np.float32(0.25)
+        add_weighted(columns[1:-1], inside[1:-1], h, signals[y, s, 3], surfaces[y, 3])
+    colour = signals[row, s, 0], signals[row, s, 1], signals[row, s, 2]
+    finish_edge(signals[row, s, 4], signals[row, s, 5], *colour, columns, inside)
 
 
 @jit_parallel
 def edge_image(signals: Any, surfaces: Any) -> None:
     for row in numba.prange(len(signals)):
         for s in range(signals.shape[1]):
-            edge_row(signals[row, s], np.int64(row), signals[:, s, 3], surfaces[:, 3])
+            edge_row(signals, surfaces, np.int64(row), s)
 
 
 @jit_in_any_order

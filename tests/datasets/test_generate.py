@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import datasets.clip_job
+import datasets.clip_scene
 from datasets.clip import Dataset, is_clip
 from datasets.clip_job import RenderJob
 from datasets.generate import Share, generate
@@ -154,14 +155,14 @@ def test_what_is_no_share_is_refused(text):
 
 def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
     failing, other = remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = datasets.clip_job.build_scene
+    genuine = datasets.clip_scene.build_scene
 
     def broken(name, seed, frames):
         if name == "cornell_box":
             raise RuntimeError("no such texture")
         return genuine(name, seed, frames)
 
-    monkeypatch.setattr(datasets.clip_job, "build_scene", broken)
+    monkeypatch.setattr(datasets.clip_scene, "build_scene", broken)
     with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
         generate_tiny(tiny_copy)
     assert is_clip(other)

@@ -193,7 +193,9 @@ def test_what_ntd_makes_negative_still_learns(monkeypatch):
     assert value.item() == pytest.approx((0.31 / 0.01) ** 2, rel=0.01) and parameter.grad < 0
 
 
-@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd-mean"])
+@pytest.mark.parametrize(
+    "name", ["wskp6", pytest.param("rae", marks=pytest.mark.slow), pytest.param("ntd-mean", marks=pytest.mark.slow)]
+)
 def test_a_training_by_it_ends_with_weights(tiny, tmp_path, name):
     changes = {"crops": (2, 1)} if name == "wskp6" else {}
     recipe: dict[str, object] = {"epochs": 1, "loss": RelativeTerms(), "clip": 1.0, **changes}

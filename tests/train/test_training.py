@@ -16,10 +16,10 @@ from train.training import BEST_FILE, MOST_SKIPPED_IN_A_ROW, Training
 
 
 def test_gradients_of_parts_add_up_to_those_of_the_batch(tiny, tmp_path):
-    """Four sequences at once, two, and one: the same loss and weights up to rounding."""
+    """Four sequences at once, and one by one: the same loss and weights up to rounding."""
     task = short_task("rae", tiny, tmp_path)
     results = []
-    for micro_batch in (4, 2, 1):
+    for micro_batch in (4, 1):
         training = Training(replace(task, micro_batch=micro_batch))
         assert training.parts == 4 // micro_batch
         steps = training.steps()
