@@ -50,11 +50,14 @@ stress: $(READY)
 report: $(READY)
 	$(BIN)/onespp report --runs $(RUNS)
 
+# Two tests at a time, each on one thread: threads that wait for each other would keep both cores busy.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
+
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	$(PYTEST)
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -q -m '' --hypothesis-profile thorough
+	$(PYTEST) -m '' --hypothesis-profile thorough
 
 lint: $(READY)
 	$(BIN)/ruff check $(SOURCES)
