@@ -21,8 +21,9 @@ Runs = Annotated[Path, arg(metavar="DIR", help="where trainings and results are 
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,sketch,release}",
-        help="which clips, how well sampled: seconds, minutes, a small release, the release (days)",
+        metavar="{tiny,quick,sketch,release,rooms-NxS}",
+        help="which clips, how well sampled: seconds, minutes, small rooms, the release (days), "
+        "or N small rooms with references of S samples a pixel",
     ),
 ]
 Budget = Annotated[

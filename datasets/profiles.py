@@ -89,10 +89,10 @@ DATA_PROFILES = {
         width=256,
         frames=32,
         boxes={"train": 0, "val": 0, "test": 1},
-        rooms={"train": 64, "val": 8, "test": 6},
+        rooms={"train": 128, "val": 8, "test": 6},
         quality={
-            "train": SamplingQuality(realisations=4, reference_spp=64, floor=30),
-            "val": SamplingQuality(realisations=1, reference_spp=64, floor=30),
+            "train": SamplingQuality(realisations=4, reference_spp=32),
+            "val": SamplingQuality(realisations=1, reference_spp=256),
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={

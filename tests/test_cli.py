@@ -49,7 +49,7 @@ def test_help_begins_with_a_first_day(capsys):
 
 
 def test_help_names_every_profile_and_budget(capsys):
-    assert "{" + ",".join(DATA_PROFILES) + "}" in help_of(capsys, "dataset")
+    assert "{" + ",".join([*DATA_PROFILES, "rooms-NxS"]) + "}" in help_of(capsys, "dataset")
     assert "{" + ",".join(dict.fromkeys(budget for _, budget in RECIPES)) + "}" in help_of(capsys, "train")
 
 

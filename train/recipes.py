@@ -50,20 +50,20 @@ SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 RAE_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "ramp": 1},
     "quick": SHORT | {"epochs": 50, "crop": 64, "ramp": 2},
-    "release": SHORT | {"epochs": 100, "ramp": 4},
+    "release": SHORT | {"epochs": 50, "ramp": 2},
     "paper": {},
 }
 # In a thousand steps WSKP gets further at a higher rate than the paper's (docs/training.md).
 WSKP_BUDGETS = {
     "tiny": SHORT | {"epochs": 4, "crop": 32, "crops": (8, 2), "batch": 8},
     "quick": SHORT | {"epochs": 10, "rate": 4e-3, "crop": 64, "crops": (4, 2), "batch": 16},
-    "release": SHORT | {"epochs": 60, "crops": (4, 1)},
+    "release": SHORT | {"epochs": 30, "crops": (4, 1)},
     "paper": {},
 }
 NTD_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
     "quick": SHORT | {"epochs": 40, "crop": 128},
-    "release": SHORT | {"epochs": 100, "crop": 128},
+    "release": SHORT | {"epochs": 50, "crop": 128},
     "paper": {},
 }
 

@@ -39,7 +39,7 @@ def test_release_has_rooms_enough_and_tests_on_others():
     assert not boxes["train"] and {"cornell_box/000", "cornell_box_moving/still"} <= set(boxes["test"])
     assert {f"cornell_box_moving/000-{spp}spp" for spp in (4, 64, 256)} <= set(boxes["test"])
     quality = profile_of("release").quality
-    assert quality["train"].floor == 30 and quality["test"].floor == 40
+    assert quality["train"].floor is None and quality["test"].floor == 40  # docs/training.md, Samples where they teach
 
 
 def test_other_seeds_have_other_rooms():

@@ -77,6 +77,17 @@ def test_it_fits_the_screen_and_loads_nothing(page, request):
     assert (paper == "rgb(255, 255, 255)") == ("light" in request.node.name)
 
 
+def test_it_begins_with_the_noisy_frame_and_the_best_denoiser(page):
+    _, left, right, *_ = shows(page, "slider")
+    assert left == "noisy"
+    Select(page.find_element(By.ID, "table-clip")).select_by_visible_text("cornell_box/000")
+    headings = [heading.text for heading in page.find_elements(By.CSS_SELECTOR, "#table th")]
+    rows = zip(*(column(page, headings.index(name)) for name in ("denoiser", "signal", "FLIP")), strict=True)
+    names = {option.text for option in Select(page.find_element(By.ID, "left")).options} - {"reference"}
+    flips = {name: float(flip) for name, signal, flip in rows if name in names and signal == "total"}
+    assert len(flips) == len(names) >= 3 and right == min(flips, key=flips.get)
+
+
 def test_the_table_sorts_and_filters(page):
     Select(page.find_element(By.ID, "table-clip")).select_by_visible_text("cornell_box/000")
     assert set(column(page, 0)) == {"cornell_box/000"}

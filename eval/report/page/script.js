@@ -251,6 +251,11 @@ function setFrame(frame) {
   return refresh();
 }
 
+function bestOf(clip) {
+  const error = name => clip.curves.flip[name].reduce((sum, value) => sum + value, 0);
+  return Object.keys(clip.flips).reduce((best, name) => (error(name) < error(best) ? name : best));
+}
+
 function setClip(index) {
   view.clip = index;
   const clip = clipNow(), names = Object.keys(clip.images), error = byId("metric");
@@ -361,7 +366,8 @@ function startComparer() {
   byId("out").onclick = () => zoom(0.5);
   byId("canvas").onpointerdown = byId("canvas").onpointermove = followPointer;
   document.onkeydown = onKey;
-  view.left = data.denoisers.find(name => name === "svgf") ?? data.denoisers[data.denoisers.length - 1];
+  view.left = "noisy";
+  view.right = bestOf(clipNow());
   view.frame = Math.floor(clipNow().frames.length / 2);
   setClip(0);
 }
