@@ -7,6 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import render.gradient
+from datasets import channels
+from models import strata
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import STRATUM, Samples, luminance, one_of_each_stratum
@@ -31,6 +34,12 @@ def samples_of(tracer: PathTracer, frame: int, seed: int) -> Samples:
 
 def still_camera(scene: Scene) -> Scene:
     return replace(scene, camera=scene.still().camera)
+
+
+def test_renderer_and_denoisers_mean_the_same_strata_and_luminance():
+    """The renderer imports nothing of what reads its channels."""
+    assert strata.STRATUM == STRATUM
+    assert tuple(render.gradient.LUMINANCE_WEIGHTS) == tuple(channels.LUMINANCE_WEIGHTS)
 
 
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 99))
