@@ -282,9 +282,9 @@ def geometry_weights(weights: Any, geometry: Any, row: Any, left: int, dx: int, 
 # --- The à-trous transform --------------------------------------------------------------------------------------------
 #
 # All taps of a row are taken at once, so that a pixel's own values and its sums stay in registers for five taps. What
-# taps read lies row by row: `surfaces` (H, GEOMETRY, W), the lines of pack_geometry, and `signals` (H, S, SIGNAL, W), of
-# each signal red, green, blue, variance, luminance, edge_scale. On either side is a margin of background, from which no
-# tap takes anything, so that none needs to ask where the image ends.
+# taps read lies row by row: `surfaces` (H, GEOMETRY, W), the lines of pack_geometry, and `signals` (H, S, SIGNAL, W),
+# of each signal red, green, blue, variance, luminance, edge_scale. On either side is a margin of background, from which
+# no tap takes anything, so that none needs to ask where the image ends.
 
 
 @jit_in_any_order
