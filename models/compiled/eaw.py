@@ -23,8 +23,8 @@ def decay(a: Any) -> Any:
 
 @jit_in_any_order
 def columns_with_tap(row: Any, dx: int, dy: int, height: int, width: int) -> Any:
-    """The columns, first and beyond the last, of a row whose tap at (dx, dy) is another pixel of the image."""
-    outside = (dx == 0 and dy == 0) or row + dy < 0 or row + dy >= height
+    """The columns, first and beyond the last, of a row whose tap at (dx, dy) is in the image."""
+    outside = row + dy < 0 or row + dy >= height
     return (0, 0) if outside else (max(0, -dx), min(width, width - dx))
 
 
@@ -32,7 +32,8 @@ def columns_with_tap(row: Any, dx: int, dy: int, height: int, width: int) -> Any
 def feature_distances(apart: Any, features: Any, row: int, left: int, dx: int, dy: int) -> None:
     """apart (n): squared distances of features (C, H, W) of n pixels of a row, from `left` on, to their taps."""
     right = left + apart.size
-    apart[:] = 0
+    for i in range(apart.size):
+        apart[i] = 0
     for c in range(len(features)):
         here = features[c, row, left:right]
         there = features[c, row + dy, left + dx : right + dx]
@@ -62,15 +63,18 @@ def add_eaw_tap(sums: Any, h: Any, apart: Any, colour: Any, row: int, left: int,
         blue[i] += w * b[i]
 
 
+@jit_in_any_order
+def divide(line: Any, sums: Any, weights: Any) -> None:
+    for x in range(line.size):
+        line[x] = sums[x] / weights[x]
+
+
 @jit_with_memory
 def filter_eaw_row(out: Any, row: Any, colour: Any, features: Any, step: int) -> None:
     """A row of out (3, H, W)."""
     _, height, width = colour.shape
-    sums = np.empty((4, width), np.float32)
+    sums = np.zeros((4, width), np.float32)
     space = np.empty(width, np.float32)
-    h = SPLINE[RADIUS] * SPLINE[RADIUS]
-    sums[0] = h
-    sums[1:] = h * colour[:, row]
     for j in range(-RADIUS, RADIUS + 1):
         for i in range(-RADIUS, RADIUS + 1):
             dx = i * step
@@ -82,7 +86,7 @@ def filter_eaw_row(out: Any, row: Any, colour: Any, features: Any, step: int) ->
             feature_distances(apart, features, row, left, dx, dy)
             add_eaw_tap(sums, SPLINE[j + RADIUS] * SPLINE[i + RADIUS], apart, colour, row, left, dx, dy)
     for c in range(3):
-        out[c, row] = sums[c + 1] / sums[0]
+        divide(out[c, row], sums[c + 1], sums[0])
 
 
 @jit_parallel

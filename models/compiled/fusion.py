@@ -216,7 +216,7 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
     width = entries.shape[1]
     top = tops[margin : margin + width]
     weight = np.empty(width, np.float32)
-    top[:] = entries[0]
+    copy_line(top, entries[0])
     for tap in range(1, taps):
         entry = entries[tap]
         for x in range(width):
@@ -250,13 +250,15 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
         first = max(y - radius, 0)
         last = min(y + radius + 1, height)
         for tap in range(last - first):
-            entries[tap] = logits[first + tap - low]
-            values[:3, tap] = image[:, first + tap]
+            copy_line(entries[tap], logits[first + tap - low])
+            for c in range(3):
+                copy_line(values[c, tap], image[c, first + tap])
             values[3, tap] = 1
         gather_in_steps(tops, totals, radius, entries, values, last - first)
         for tap in range(taps):
-            entries[tap] = tops[tap : tap + width]
-            values[:, tap] = totals[:, tap : tap + width]
+            copy_line(entries[tap], tops[tap : tap + width])
+            for c in range(4):
+                copy_line(values[c, tap], totals[c, tap : tap + width])
         gather_in_steps(top, total, 0, entries, values, taps)
         mix(fused, y, total, shares[y - start])
 
