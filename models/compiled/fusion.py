@@ -17,6 +17,7 @@ from torch import Tensor
 from models import parameters
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
+from models.compiled.lines import copy_line
 from models.parameters import WINDOWS
 
 THREAD_ROWS = 32  # rows that a thread fuses at once
@@ -28,12 +29,6 @@ LEAST_WEIGHT = np.float32(parameters.LEAST_WEIGHT)
 
 
 # --- Lines of W pixels ------------------------------------------------------------------------------------------------
-
-
-@jit_in_any_order
-def copy_line(line: Any, source: Any) -> None:
-    for x in range(line.size):
-        line[x] = source[x]
 
 
 @jit_in_any_order

@@ -28,6 +28,7 @@ from models.compiled.jit import (
     jit_with_reciprocals,
     plane_or_empty,
 )
+from models.compiled.lines import copy_line
 from models.compiled.reprojection import BLOCK_ROWS, ONE, Buffers, Past, Views, fetch, find_row, new_search
 from models.parameters import SPATIAL_RADIUS, SQUARINGS
 from models.surfaces import Surfaces
@@ -439,16 +440,10 @@ def edge_image(signals: Any, surfaces: Any) -> None:
 
 
 @jit_in_any_order
-def copy(line: Any, values: Any) -> None:
-    for x in range(line.size):
-        line[x] = values[x]
-
-
-@jit_in_any_order
 def pack(line: Any, margin: int, values: Any) -> None:
     """A line from values without margins."""
     line[:margin] = 0
-    copy(line[margin : line.size - margin], values)
+    copy_line(line[margin : line.size - margin], values)
     line[line.size - margin :] = 0
 
 
@@ -496,11 +491,11 @@ def svgf_levels(
     for item in range(len(colour)):
         images = array(colour[item]), array(variance[item, :, 0]), array(geometry[item, 0])
         pack_rows(signals, filtered, surfaces, margin, *images)
-        for step in steps:
+        for level, step in enumerate(steps):
             edge_image(signals, surfaces)
             filter_image(filtered, signals, surfaces, margin, step)
             signals, filtered = filtered, signals
-            if step == steps[0]:
+            if level == 0:
                 first[item] = planes_of(signals, margin)[:, :3]
         last[item] = planes_of(signals, margin)[:, :3]
         spread[item] = planes_of(signals, margin)[:, 3:4]
