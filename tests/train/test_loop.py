@@ -239,7 +239,7 @@ def test_two_processes_follow_the_loss_of_one(tiny, tmp_path, name, recipe):
 
 @pytest.mark.slow
 def test_a_batch_that_cannot_be_shared_is_refused(tiny, tmp_path):
-    data_and_runs = ("--data", str(tiny), "--profile", "tiny", "--runs", str(tmp_path))
+    data_and_runs = ("--data", str(tiny), "--budget", "tiny", "--runs", str(tmp_path))
     result = torchrun(2, "-m", "onespp", "train", "ntd", *data_and_runs)
     assert result.returncode != 0 and "a batch of 1 cannot be shared by 2 processes" in result.stderr
     assert not list(tmp_path.iterdir())
