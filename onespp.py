@@ -172,11 +172,24 @@ def verify(data: Path = Path("data/quick")) -> None:
     print(f"{data}: everything is as it was written")
 
 
-def exr(clip: ClipFolder, out: Annotated[Path, Positional, arg(metavar="OUT")]) -> None:
-    """Write a multi-layer OpenEXR file of each frame of a clip's folder, such as data/quick/test/cornell_box/000."""
-    from datasets.exr import export_clip
+def exr(
+    source: Annotated[Path, Positional, arg(metavar="CLIP|DATA", help="the folder of a clip; for oidn of a data set")],
+    out: Annotated[Path, Positional, arg(metavar="OUT", help="the folder to write")],
+    layout: Literal["frames", "oidn"] = "frames",
+) -> None:
+    """Write OpenEXR files: a multi-layer file a frame of a clip, or a data set for OIDN's training; or go on with that.
 
-    print(f"{out}: {export_clip(clip, out)} files")
+    Args:
+        layout: "frames" takes a clip, such as data/quick/test/cornell_box/000; "oidn" takes a data set, whose splits
+            become OUT/train, OUT/valid and OUT/test for the preprocess.py of Intel Open Image Denoise.
+    """
+    from datasets.exr import export_clip
+    from datasets.oidn_layout import export_dataset
+
+    if layout == "oidn":
+        print(f"{out}: {export_dataset(source, out)} noisy images with their references")
+    else:
+        print(f"{out}: {export_clip(source, out)} files")
 
 
 def show(
