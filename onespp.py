@@ -97,6 +97,8 @@ def train(
     seed: int = 0,
     precision: Literal["float32", "bfloat16"] | None = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
+    from_: Annotated[Path | None, arg(name="from", metavar="WEIGHTS")] = None,
+    specialise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
     """Train wskp6, in other budgets than quick rae and ntd-mean too, or the networks named; or go on with that.
 
@@ -106,13 +108,17 @@ def train(
     Args:
         precision: by default the fastest on this machine.
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
+        from_: weights of the same network to begin with, to fit them to the scenes of this data set: at a lower rate,
+            and kept apart by another --runs.
+        specialise: leave out of the network's inputs what does not vary in this data set, such as a white albedo.
     """
     from train.loop import train_network
     from train.recipes import trained_by_default
     from train.registry import task_for
 
+    folder = data_folder(data, budget)
     for name in names or trained_by_default(budget):
-        train_network(task_for(name, data_folder(data, budget), runs, budget, seed, precision, micro_batch))
+        train_network(task_for(name, folder, runs, budget, seed, precision, micro_batch, from_, specialise))
 
 
 def evaluate(

@@ -28,8 +28,8 @@ CLIP_COLUMNS = {
 PAGE = """# {profile}, seed {seed}
 
 {clips} clips of animated scenes, rendered for denoising: noisy frames with few samples a pixel, references in two
-independent halves, and what the primary rays see (albedo, normals, depth, motion, cameras). {bytes} bytes. `card.json` has
-all of this page for programs.
+independent halves, and what the primary rays see (albedo, normals, depth, motion, cameras). {bytes} bytes. `card.json`
+has all of this page for programs.
 
 - Made by `{command}`, with {versions}; generator version {generator}.{reads}
 - Options of rendering: {options}.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from datasets.clip import Dataset
 from models.registry import create
-from train.recipes import recipe_for
+from train.recipes import fine_tuning, recipe_for
 from train.task import Task, run_folder
 
 
@@ -17,12 +17,15 @@ def task_for(
     seed: int = 0,
     precision: str | None = None,
     micro_batch: int | None = None,
+    start: Path | None = None,
+    specialised: bool = False,
 ) -> Task:
-    """The training of a denoiser in a budget. Raises BadInput for an unknown name or budget, or no data set."""
+    """The training of a denoiser in a budget, see Task. Raises BadInput for an unknown name or budget, or no data."""
+    recipe = recipe_for(name, budget)
     return Task(
         name=name,
         create=partial(create, name),
-        recipe=recipe_for(name, budget),
+        recipe=fine_tuning(recipe) if start else recipe,
         budget=budget,
         data=Dataset(data),
         folder=run_folder(runs, name, budget),
@@ -30,4 +33,6 @@ def task_for(
         seed=seed,
         precision=precision,
         micro_batch=micro_batch,
+        start=start,
+        specialised=specialised,
     )
