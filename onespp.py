@@ -108,8 +108,8 @@ def train(
     Args:
         precision: by default the fastest on this machine.
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
-        from_: weights of the same network to begin with, to fit them to the scenes of this data set: at a lower rate,
-            and kept apart by another --runs.
+        from_: weights of the same network to begin with, to fit them to the scenes of this data set; what comes out
+            takes another --runs.
         specialise: leave out of the network's inputs what does not vary in this data set, such as a white albedo.
     """
     from train.loop import train_network

@@ -14,17 +14,6 @@ CARD_FILE = "card.json"
 PAGE_FILE = "README.md"
 LICENCE = "CC0-1.0"  # of scenes built in; a data set of others names its own in dataset.json
 
-CLIP_COLUMNS = {
-    "frames": "frames",
-    "width": "width",
-    "height": "height",
-    "noisy_spp": "noisy spp",
-    "realisations": "realisations",
-    "reference_spp": "reference spp",
-    "floor_db": "floor dB",
-    "bytes": "bytes",
-    "crc32": "crc32",
-}
 PAGE = """# {profile}, seed {seed}
 
 {clips} clips of animated scenes, rendered for denoising: noisy frames with few samples a pixel, references in two
@@ -39,7 +28,7 @@ has all of this page for programs.
 
 {splits}
 
-*floor dB*: PSNR of the reference's own noise, as displayed, on average over the clips and in the worst one.
+*floor_db*: PSNR in dB of the reference's own noise, as displayed, on average over the clips and in the worst one.
 
 ## Channels
 
@@ -105,7 +94,7 @@ def command_of(facts: dict[str, Any]) -> str:
 
 
 def clip_facts(clip: Clip) -> dict[str, Any]:
-    """What the card says of a clip, by the keys of CLIP_COLUMNS."""
+    """What the card says of a clip; the keys are the columns of the page too."""
     stored = [clip.path / entry["file"] for entry in clip.channels.values() if "file" in entry]
     return {
         "frames": clip.frames,
@@ -139,19 +128,19 @@ def page_of(card: dict[str, Any]) -> str:
     """The card as Markdown."""
     options = [name for name, on in card["options"].items() if on]
     left_out = [name for name, channel in card["channels"].items() if channel["splits"] != list(card["splits"])]
-    splits = [[split, *facts.values()] for split, facts in card["splits"].items()]
+    splits = [{"split": split, **facts} for split, facts in card["splits"].items()]
     channels = [
         [name, ", ".join(map(str, channel["axes"])), channel["unit"], ", ".join(channel["splits"])]
         for name, channel in card["channels"].items()
     ]
-    rows = [[name, *(clip[key] for key in CLIP_COLUMNS)] for name, clip in card["clips"].items()]
+    rows = [{"clip": name, **clip} for name, clip in card["clips"].items()]
     return PAGE.format(
         **{key: card[key] for key in ("profile", "seed", "command", "generator", "licence", "bytes")},
         clips=len(card["clips"]),
         versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),
         reads=f" `--reads` left out {', '.join(left_out)}, but for tests." if left_out else "",
         options=", ".join(options) or "none",
-        splits=tabulate(splits, ["split", "clips", "frames", "floor dB", "worst"], "github", disable_numparse=True),
+        splits=tabulate(splits, "keys", "github", disable_numparse=True),
         channels=tabulate(channels, ["channel", "axes", "unit", "in"], "github"),
-        rows=tabulate(rows, ["clip", *CLIP_COLUMNS.values()], "github", disable_numparse=True),
+        rows=tabulate(rows, "keys", "github", disable_numparse=True),
     )

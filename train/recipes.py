@@ -85,8 +85,6 @@ RECIPES: dict[tuple[str, str], Recipe] = {
     for budget, changes in budgets.items()
 }
 
-FINE_TUNING_RATE = 0.25  # of the recipe's. Ours
-
 TRAINABLE = tuple(PAPER_AND_BUDGETS)
 ONE_A_PAPER = ("rae", "wskp6", "ntd-mean")
 WORTH_TRAINING = {"quick": ("wskp6",)}  # in a budget in which the others end as a blur
@@ -95,11 +93,6 @@ WORTH_TRAINING = {"quick": ("wskp6",)}  # in a budget in which the others end as
 def trained_by_default(budget: str) -> tuple[str, ...]:
     """The networks that are trained unless others are named: those that the budget can train well."""
     return WORTH_TRAINING.get(budget, ONE_A_PAPER)
-
-
-def fine_tuning(recipe: Recipe) -> Recipe:
-    """The recipe to go on with from trained weights: without a ramp, from a lower rate that falls to zero."""
-    return replace(recipe, rate=FINE_TUNING_RATE * recipe.rate, ramp=0, anneal=True)
 
 
 def recipe_for(name: str, budget: str) -> Recipe:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from datasets.clip import Dataset
 from models.registry import create
-from train.recipes import fine_tuning, recipe_for
+from train.recipes import recipe_for
 from train.task import Task, run_folder
 
 
@@ -21,11 +21,10 @@ def task_for(
     specialised: bool = False,
 ) -> Task:
     """The training of a denoiser in a budget, see Task. Raises BadInput for an unknown name or budget, or no data."""
-    recipe = recipe_for(name, budget)
     return Task(
         name=name,
         create=partial(create, name),
-        recipe=fine_tuning(recipe) if start else recipe,
+        recipe=recipe_for(name, budget),
         budget=budget,
         data=Dataset(data),
         folder=run_folder(runs, name, budget),
