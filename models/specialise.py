@@ -16,8 +16,8 @@ def specialise(denoiser: Denoiser, constants: Mapping[str, Sequence[float]]) -> 
     have, but a bias goes on there.
     """
     for name in [name for name in denoiser.inputs if name in denoiser.dispensable and name in constants]:
-        before = list(denoiser.inputs)[: list(denoiser.inputs).index(name)]
-        first = sum(denoiser.inputs[other] for other in before)
+        names = list(denoiser.inputs)
+        first = sum(denoiser.inputs[other] for other in names[: names.index(name)])
         seen = denoiser.dispensable[name](torch.tensor(constants[name]))
         for layer in denoiser.first_layers():
             drop_inputs(layer, first, seen)
