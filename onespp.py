@@ -97,6 +97,8 @@ def train(
     seed: int = 0,
     precision: Literal["float32", "bfloat16"] | None = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
+    from_: Annotated[Path | None, arg(name="from", metavar="WEIGHTS")] = None,
+    specialise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
     """Train wskp6, in other budgets than quick rae and ntd-mean too, or the networks named; or go on with that.
 
@@ -106,13 +108,17 @@ def train(
     Args:
         precision: by default the fastest on this machine.
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
+        from_: weights of the same network to begin with, to fit them to the scenes of this data set; what comes out
+            takes another --runs.
+        specialise: leave out of the network's inputs what does not vary in this data set, such as a white albedo.
     """
     from train.loop import train_network
     from train.recipes import trained_by_default
     from train.registry import task_for
 
+    folder = data_folder(data, budget)
     for name in names or trained_by_default(budget):
-        train_network(task_for(name, data_folder(data, budget), runs, budget, seed, precision, micro_batch))
+        train_network(task_for(name, folder, runs, budget, seed, precision, micro_batch, from_, specialise))
 
 
 def evaluate(
@@ -172,11 +178,24 @@ def verify(data: Path = Path("data/quick")) -> None:
     print(f"{data}: everything is as it was written")
 
 
-def exr(clip: ClipFolder, out: Annotated[Path, Positional, arg(metavar="OUT")]) -> None:
-    """Write a multi-layer OpenEXR file of each frame of a clip's folder, such as data/quick/test/cornell_box/000."""
-    from datasets.exr import export_clip
+def exr(
+    source: Annotated[Path, Positional, arg(metavar="CLIP|DATA", help="the folder of a clip; for oidn of a data set")],
+    out: Annotated[Path, Positional, arg(metavar="OUT", help="the folder to write")],
+    layout: Literal["frames", "oidn"] = "frames",
+) -> None:
+    """Write OpenEXR files: a multi-layer file a frame of a clip, or a data set for OIDN's training; or go on with that.
 
-    print(f"{out}: {export_clip(clip, out)} files")
+    Args:
+        layout: "frames" takes a clip, such as data/quick/test/cornell_box/000; "oidn" takes a data set, whose splits
+            become OUT/train, OUT/valid and OUT/test for the preprocess.py of Intel Open Image Denoise.
+    """
+    from datasets.exr import export_clip
+    from datasets.oidn_layout import export_dataset
+
+    if layout == "oidn":
+        print(f"{out}: {export_dataset(source, out)} noisy images with their references")
+    else:
+        print(f"{out}: {export_clip(source, out)} files")
 
 
 def show(

@@ -176,6 +176,16 @@ class Dataset:
         return [Clip(path) for path in paths]
 
 
+def constant_channels(clips: Sequence[Clip]) -> dict[str, list[float]]:
+    """The channels that have one value in all of the clips, and that value, a number per component."""
+    values = [{name: entry.get("value") for name, entry in clip.channels.items()} for clip in clips]
+    return {
+        name: value
+        for name, value in values[0].items()
+        if value is not None and all(others.get(name) == value for others in values)
+    }
+
+
 def allow_open_files(count: int) -> None:
     """Raise this process's limit of open files by `count`, as far as the system allows.
 

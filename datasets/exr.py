@@ -39,8 +39,21 @@ def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return {f"{name}.{c}": np.ascontiguousarray(exact[..., i]) for i, c in enumerate(components)}
 
 
+def write_planes(path: Path, planes: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:
+    """Write EXR channels (H, W) by name atomically, ZIP-compressed, with further `attributes` in the header.
+
+    Raises BadInput where the disk is full or the folder cannot be written.
+    """
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+    try:
+        with replacing(path) as temporary, OpenEXR.File(header, planes) as file:
+            file.write(str(temporary))
+    except RuntimeError as error:  # what OpenEXR raises for a full or unwritable disk
+        raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None
+
+
 def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
-    """Write one frame of a clip atomically, ZIP-compressed.
+    """Write one frame of a clip atomically.
 
     Layers are all channels that the clip has, in their stored precision, and the noisy beauty image as plain R, G, B
     (float32). The header has `worldToCamera` (for row vectors, in the camera frame of docs/format.md), and the exact
@@ -67,17 +80,11 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
         "camera_to_world": view.camera_to_world.tolist(),
         "object_to_world": view.object_to_world.tolist(),
     }
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
+    attributes = {
         "worldToCamera": np.ascontiguousarray(inverse_pose(view.camera_to_world).T, np.float32),
         FACTS_ATTRIBUTE: json.dumps(facts),
     }
-    try:
-        with replacing(path) as temporary, OpenEXR.File(header, planes) as file:
-            file.write(str(temporary))
-    except RuntimeError as error:  # what OpenEXR raises for a full or unwritable disk
-        raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None
+    write_planes(path, planes, attributes)
 
 
 def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]:

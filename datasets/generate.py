@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from datasets.card import write_card
 from datasets.channels import CHANNELS
 from datasets.clip import Dataset, is_clip
 from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
@@ -63,7 +64,8 @@ def generate(
     Clips for training and validation get the channels in `reads` and those that are always needed.
 
     Several jobs may work on one folder, on machines that share it or not: each clip is rendered by one of them, and
-    the folders of disjoint shares merge into the whole. A clip that fails is left out, and the rest goes on.
+    the folders of disjoint shares merge into the whole. A clip that fails is left out, and the rest goes on. A data set
+    that is whole gets its card.
 
     Raises BadInput at the end, naming the first clip that failed, and OSError at once: a full disk is full for all.
     """
@@ -84,10 +86,12 @@ def generate(
         return RenderJob(clip, profile, seed, channels, options, needed_spp.get("/".join(clip.parts[-3:])))
 
     jobs = [job(clip) for clip in share.of(dataset.planned()) if not is_clip(clip)]
-    if not jobs:
-        return 0
-    check_versions(dataset)
-    return count_rendered(tqdm(render(jobs), "clips", len(jobs), unit="clip"))
+    rendered = 0
+    if jobs:
+        check_versions(dataset)
+        rendered = count_rendered(tqdm(render(jobs), "clips", len(jobs), unit="clip"))
+    write_card(dataset)
+    return rendered
 
 
 def check_folder(root: Path) -> None:

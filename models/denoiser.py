@@ -1,10 +1,11 @@
 """The one interface of everything that denoises."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from datasets.frame import Frame, Moment, Signal
 from errors import BadInput
@@ -24,7 +25,14 @@ class State:
 # Why filters without a network compute in float32 alone, whatever the hardware.
 CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
+CONSTANT = 1e-3  # how far a channel may be from its one value: more than float16 rounds
+
 S = TypeVar("S", bound=State)
+
+
+def as_it_is(value: Tensor) -> Tensor:
+    """What a network sees of a channel that is an input without any change."""
+    return value
 
 
 def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None:
@@ -43,6 +51,9 @@ class Denoiser(torch.nn.Module):
             default for instances.
         refuses: precisions that it does not compute in, with the reason.
         is_network: whether it needs trained weights.
+        dispensable: channels that its network can do without where they do not vary, and what it sees of a value.
+        inputs: what its network sees, in order, and how many inputs each is; channels by their names.
+        constants: channels that it does without, see models.specialise, and the value that each has everywhere.
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
     """
 
@@ -50,12 +61,15 @@ class Denoiser(torch.nn.Module):
     signal: Signal = "total"
     refuses: ClassVar[dict[torch.dtype, str]] = {}
     is_network: ClassVar[bool] = False
+    dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     precision: torch.dtype = torch.float32
 
     def __init__(self, *, signal: Signal | None = None):
         """`signal` is the class's unless another one is named."""
         super().__init__()
         self.signal = signal or type(self).signal
+        self.inputs: dict[str, int] = {}
+        self.constants: dict[str, list[float]] = {}
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -63,7 +77,11 @@ class Denoiser(torch.nn.Module):
         return None
 
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        """What `forward` makes of the frame's finite part: pixels that are NaN or infinite count as 0."""
+        """What `forward` makes of the frame's finite part: pixels that are NaN or infinite count as 0.
+
+        Raises BadInput where one of `constants` varies.
+        """
+        self.check_constants(frame)
         result: tuple[Tensor, State] = super().__call__(frame.finite(), state)
         return result
 
@@ -73,6 +91,21 @@ class Denoiser(torch.nn.Module):
         `state` is None on the first frame of a sequence; one that the frame does not follow is discarded.
         """
         raise NotImplementedError
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        """The convolutions that see `inputs`."""
+        raise NotImplementedError
+
+    def check_constants(self, frame: Frame) -> None:
+        """Raise BadInput where a channel that the network does without is not what it was in training."""
+        for name, value in self.constants.items():
+            channel: Tensor = getattr(frame, name)
+            wanted = channel.new_tensor(value)[:, None, None]
+            if ((channel - wanted).abs() > CONSTANT).any():
+                raise BadInput(
+                    f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
+                    f"{type(self).__name__} are specialised: use general weights"
+                )
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""

@@ -10,12 +10,12 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
 from models.convolution import ConvReLU
-from models.denoiser import Denoiser, State, matching_state
+from models.denoiser import Denoiser, State, as_it_is, matching_state
 from models.operators import halve, halve_surface, pad_to_multiple
 from models.pixel_kernels import apply_kernels
 from models.running_scale import RunningScale, running_scale
 
-NETWORK_INPUTS = 13  # §4.2: noisy and warped colour, albedo, normal, depth
+INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
 TAPS = 25  # of a 5 x 5 kernel
 Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, of the pixels that show a surface
@@ -47,7 +47,7 @@ class KernelNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inputs = (NETWORK_INPUTS, *WIDTHS[:-1])
+        inputs = (sum(INPUTS.values()), *WIDTHS[:-1])
         self.encode = nn.ModuleList(
             nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
         )
@@ -191,12 +191,17 @@ class NTD(Denoiser):
     signal: Signal = "indirect"
     refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
     is_network = True
+    dispensable: ClassVar = {"albedo": as_it_is, "normal": as_it_is}
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
+        self.inputs = dict(INPUTS)
         if self.signal == "total":
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.encode[0][0]]
 
     def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
         """D of Eq. 4: `image` (B, 3, H, W) in half the size, rounded up."""
@@ -216,8 +221,14 @@ class NTD(Denoiser):
         if before:
             previous, found = warp_output(before, getattr(frame, self.vectors))
             warped = torch.where(found, previous, noisy)
-        colours = (self.compress(image, scale, frame) for image in (noisy, warped))
-        x = torch.cat([*colours, frame.albedo, frame.normal, scale.normalised_depth(frame.depth)], dim=1)
+        parts = {
+            "noisy": self.compress(noisy, scale, frame),
+            "warped": self.compress(warped, scale, frame),
+            "albedo": frame.albedo,
+            "normal": frame.normal,
+            "depth": scale.normalised_depth(frame.depth),
+        }
+        x = torch.cat([parts[name] for name in self.inputs], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
         predictions = self.network(pad_to_multiple(x, MULTIPLE))
         surface = frame.surface

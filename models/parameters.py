@@ -24,7 +24,7 @@ LEAST_DIVISOR = 1e-30  # keeps quotients finite where lengths and depths are 0
 # --- Weight-shared kernels (Fan et al. 2021) --------------------------------------------------------------------------
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3
-FEATURE_CHANNELS = 10  # what the network sees (§5.1): displayed colour, albedo, normal, depth
+FEATURES = {"colour": 3, "albedo": 3, "normal": 3, "depth": 1}  # what the network sees (§5.1), and how many inputs
 GAMMA = 2.2  # of the display transform before the network (§5.1)
 SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither overflows nor vanishes in float32
 LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35

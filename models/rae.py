@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State, matching_state
+from models.denoiser import Denoiser, State, as_it_is, matching_state
 from models.operators import pad_to_multiple
 from models.running_scale import RunningScale, running_scale
 
@@ -106,14 +107,18 @@ class RAE(Denoiser):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
     is_network = True
+    dispensable: ClassVar = {"roughness": as_it_is}
 
     def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.auxiliary = tuple(auxiliary)
+        self.inputs = {"colour": 3} | {name: AUXILIARY[name][0] for name in auxiliary}
         needed = {*auxiliary, "depth"}  # depth has its running scale in any case
         self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
-        network = RecurrentAutoencoder(3 + sum(AUXILIARY[name][0] for name in auxiliary))
+        network = RecurrentAutoencoder(sum(self.inputs.values()))
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.first]
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
@@ -122,7 +127,7 @@ class RAE(Denoiser):
         irradiance = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         colour = self.compress(irradiance, scale, frame)
-        auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.auxiliary)
+        auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.inputs if name in AUXILIARY)
         x = pad_to_multiple(torch.cat([colour, *auxiliary], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)

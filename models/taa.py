@@ -110,6 +110,7 @@ class Antialiased(Denoiser):
         super().__init__(signal=signal)
         self.inner = self.inner_class(signal=signal)
         self.reads = with_history(self.inner.reads)
+        self.constants = self.inner.constants
 
     @classmethod
     def unavailable(cls) -> str | None:

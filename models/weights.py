@@ -11,6 +11,7 @@ from safetensors.torch import save
 from errors import BadInput
 from files import write_file
 from models.denoiser import Denoiser
+from models.specialise import specialise
 
 
 def save_weights(
@@ -22,11 +23,16 @@ def save_weights(
     """
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
     metadata = {"denoiser": name, "recipe": json.dumps(recipe), "made_by": json.dumps(list(made_by))}
+    if denoiser.constants:
+        metadata["constants"] = json.dumps(denoiser.constants)
     write_file(path, save(tensors, metadata))
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
-    """Fill `denoiser` from a file. Raises BadInput where it is missing, damaged or of another network."""
+    """Fill `denoiser` from a file, specialised as that says.
+
+    Raises BadInput where it is missing, damaged or of another network.
+    """
     if not path.exists():
         raise BadInput(f"there are no weights at {path}: train them with `onespp train {name}`")
     try:
@@ -37,6 +43,7 @@ def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
         raise BadInput(f"{path} is damaged or not a safetensors file ({error})") from None
     if metadata.get("denoiser") != name:
         raise BadInput(f"{path} holds weights of '{metadata.get('denoiser')}', not of '{name}'")
+    specialise(denoiser, json.loads(metadata.get("constants", "{}")))
     wanted = {key: tensor.shape for key, tensor in denoiser.state_dict().items()}
     if {key: tensor.shape for key, tensor in tensors.items()} != wanted:
         raise BadInput(f"{path} holds a '{name}' of another shape: train it again with `onespp train {name}`")

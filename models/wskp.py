@@ -10,13 +10,13 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models.baselines import Accumulated, AccumulatedState, Accumulating
-from models.denoiser import State, matching_state
-from models.features import network_features
+from models.denoiser import State, as_it_is, matching_state
+from models.features import network_features, scaled_normal
 from models.fusion import fuse
 from models.operators import halve, halve_surface, pad_to_multiple
-from models.parameters import FEATURE_CHANNELS, WINDOWS
+from models.parameters import FEATURES, WINDOWS
 from models.pixel_kernels import apply_kernels
-from models.repvgg import BRANCH_SIZES, merge, repvgg
+from models.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.running_scale import RunningScale, running_scale
 
 WIDTH = 24  # ours: the widths drawn in the paper are not known
@@ -43,12 +43,22 @@ class KernelPredictor(Accumulating):
 
     reads = Accumulated.reads
     is_network = True
+    dispensable: ClassVar = {"albedo": as_it_is, "normal": scaled_normal}
     filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
     network: nn.Module
 
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inputs = dict(FEATURES)
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        first = next(iter(self.network.children()))
+        assert isinstance(first, RepVGGBlock)
+        return first.branches
+
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         """The network's input, see network_features."""
-        return network_features(frame, irradiance, scale)
+        return network_features(frame, irradiance, scale, tuple(self.inputs))
 
     def reconstruct(
         self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
@@ -86,7 +96,7 @@ class KernelPredictor(Accumulating):
 
 def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
     """`layers` RepVGG blocks from the inputs to `outputs` channels."""
-    return repvgg([FEATURE_CHANNELS, *[WIDTH] * (layers - 1), outputs], sizes)
+    return repvgg([sum(FEATURES.values()), *[WIDTH] * (layers - 1), outputs], sizes)
 
 
 class WSKP(KernelPredictor):
@@ -179,7 +189,10 @@ class WSKPMR(KernelPredictor):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.network = MultiResolutionNet(FEATURE_CHANNELS, 2 * len(self.windows) + 1)
+        self.network = MultiResolutionNet(sum(FEATURES.values()), 2 * len(self.windows) + 1)
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.down[0][0]]  # type: ignore[index, list-item]
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)

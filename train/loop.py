@@ -52,6 +52,9 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
             outcome = f"trained with {others}, kept at {weights}; delete {task.folder} to train again"
         elif others and fabric.is_global_zero:
             print(f"{task.name}: begun with {others}, goes on with what is here; its weights name both")
+        if task.specialised and fabric.is_global_zero:
+            left_out = ", ".join(training.judged.denoiser.constants) or "nothing: all that it sees varies"
+            print(f"{task.name}: specialised to {task.data.path}, left out {left_out}")
         if fabric.is_global_zero:
             train_to_end(training, save_seconds)
         else:

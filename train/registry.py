@@ -17,8 +17,10 @@ def task_for(
     seed: int = 0,
     precision: str | None = None,
     micro_batch: int | None = None,
+    start: Path | None = None,
+    specialised: bool = False,
 ) -> Task:
-    """The training of a denoiser in a budget. Raises BadInput for an unknown name or budget, or no data set."""
+    """The training of a denoiser in a budget, see Task. Raises BadInput for an unknown name or budget, or no data."""
     return Task(
         name=name,
         create=partial(create, name),
@@ -30,4 +32,6 @@ def task_for(
         seed=seed,
         precision=precision,
         micro_batch=micro_batch,
+        start=start,
+        specialised=specialised,
     )

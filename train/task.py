@@ -20,7 +20,10 @@ def run_folder(runs: Path, name: str, budget: str) -> Path:
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, on what, and where that is kept. `create` makes the network with fresh weights."""
+    """What is trained, on what, and where that is kept. `create` makes the network with fresh weights.
+
+    `start` has the weights to begin with instead; `specialised` networks do without what does not vary in the data.
+    """
 
     name: str
     create: Callable[[], Denoiser]
@@ -32,6 +35,8 @@ class Task:
     seed: int = 0
     precision: str | None = None  # by default the fastest here
     micro_batch: int | None = None  # items in memory together; by default what fits a few gigabytes
+    start: Path | None = None
+    specialised: bool = False
 
     def check(self, processes: int) -> None:
         """Raises BadInput where this data set, or so many processes, cannot be trained with."""

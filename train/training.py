@@ -15,6 +15,7 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
 from errors import BadInput
 from models.weights import save_weights
+from provenance import file_digest
 from train.average import decay_after, join_average
 from train.checkpoint import Checkpoint, save_checkpoint
 from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
@@ -22,6 +23,7 @@ from train.fabric import fabric_here
 from train.losses.network_loss import NetworkLoss
 from train.made_by import UNKNOWN, maker_here
 from train.precision import fastest_precision
+from train.start import starting_network
 from train.task import Task
 
 BEST_FILE = "best.safetensors"
@@ -53,11 +55,11 @@ class Training:
         self.recipe = task.recipe
         torch.backends.mkldnn.deterministic = True  # type: ignore[assignment]
         torch.manual_seed(task.seed)
-        denoiser = task.create()
+        self.clips = {split: task.data.clips(split) for split in ("train", "val")}
+        denoiser = starting_network(task, [*self.clips["train"], *self.clips["val"]])
         loss = self.recipe.loss.around(denoiser)
         fabric = fabric_here()
         with fabric.rank_zero_first():  # the others find the accumulated frames that the first has cached
-            self.clips = {split: task.data.clips(split) for split in ("train", "val")}
             make = partial(items, recipe=self.recipe, denoiser=denoiser, seed=task.seed, cache=task.cache)
             self.items = make(self.clips["train"], training=True)
             self.val_items = make(self.clips["val"], training=False)
@@ -75,13 +77,17 @@ class Training:
         self.judged: NetworkLoss = self.loss.module
         if self.recipe.average:
             self.judged = self.recipe.loss.around(deepcopy(denoiser)).to(self.fabric.device)
-        self.facts = {
+        self.facts: dict[str, Any] = {
             "profile": task.budget,  # the name that it has in checkpoints
             "seed": task.seed,
             "data": {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")},
             **asdict(self.recipe),
             "parameters": denoiser.parameter_count(),
         }
+        if task.start:
+            self.facts["from"] = file_digest(task.start)
+        if denoiser.constants:
+            self.facts["constants"] = denoiser.constants
         self.maker = maker_here(loss)
         self.makers = saved.get("made_by", [UNKNOWN]) if saved else []
         if saved:
@@ -114,8 +120,8 @@ class Training:
     def resume(self, saved: Checkpoint) -> None:
         if saved.get("facts") != self.facts:
             raise BadInput(
-                f"{self.task.folder} holds a training with another recipe, seed or data set: delete it or use another "
-                "--runs"
+                f"{self.task.folder} holds a training with another recipe, seed, data set or start: delete it or use "
+                "another --runs"
             )
         self.loss.load_state_dict(saved["loss"])
         self.judged.load_state_dict(saved["judged"])

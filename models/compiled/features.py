@@ -1,5 +1,6 @@
 """models.features for the processor: in one pass, and in the order of memory that convolutions like."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -11,7 +12,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
-from models.parameters import FEATURE_CHANNELS, GAMMA
+from models.parameters import FEATURES, GAMMA
 from models.running_scale import RunningScale
 
 ONE = np.float32(1)
@@ -50,26 +51,44 @@ def interleave(out: Any, lines: Any) -> None:
 
 
 @jit_parallel
-def feature_image(out: Any, irradiance: Any, albedo: Any, normal: Any, depth: Any, exposure: Any, scale: Any) -> None:
-    """out (H, W, 10) from irradiance, albedo and normal (3, H, W), depth (H, W), exposure (3,), the depth's scale."""
+def feature_image(
+    out: Any,
+    irradiance: Any,
+    albedo: Any,
+    normal: Any,
+    depth: Any,
+    exposure: Any,
+    scale: Any,
+    sees_albedo: bool,
+    sees_normal: bool,
+) -> None:
+    """out (H, W, C) from irradiance, albedo and normal (3, H, W), depth (H, W), exposure (3,), the depth's scale.
+
+    C is 10, and 3 less for each of albedo and normal that the network does not see.
+    """
     height, width = depth.shape
+    after_albedo = 6 if sees_albedo else 3
     for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
-        lines = np.empty((FEATURE_CHANNELS, width), np.float32)
+        lines = np.empty((out.shape[2], width), np.float32)
         start = np.int64(block) * BLOCK_ROWS
         for y in range(start, min(start + BLOCK_ROWS, height)):
             for c in range(3):
                 display(lines[c], irradiance[c, y], albedo[c, y], exposure[c])
-                lines[3 + c] = albedo[c, y]
-                scale_normal(lines[6 + c], normal[c, y])
-            scale_depth(lines[9], depth[y], scale)
+                if sees_albedo:
+                    lines[3 + c] = albedo[c, y]
+                if sees_normal:
+                    scale_normal(lines[after_albedo + c], normal[c, y])
+            scale_depth(lines[out.shape[2] - 1], depth[y], scale)
             interleave(out[y], lines)
 
 
-def network_features(frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
+def network_features(
+    frame: Frame, irradiance: Tensor, scale: RunningScale, seen: Sequence[str] = tuple(FEATURES)
+) -> Tensor:
     """See models.features.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
-    out = torch.empty(len(irradiance), *frame.size, FEATURE_CHANNELS)
+    out = torch.empty(len(irradiance), *frame.size, sum(FEATURES[name] for name in seen))
     for item in range(len(out)):
         feature_image(
             out[item].numpy(),
@@ -79,5 +98,7 @@ def network_features(frame: Frame, irradiance: Tensor, scale: RunningScale) -> T
             array(frame.depth[item, 0]),
             exposure[item],
             depth_scale[item],
+            "albedo" in seen,
+            "normal" in seen,
         )
     return out.permute(0, 3, 1, 2)

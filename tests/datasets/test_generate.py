@@ -138,6 +138,7 @@ def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path)
     merged = tmp_path / "merged"
     for root in roots:
         shutil.copytree(root, merged, dirs_exist_ok=True)
+    assert generate_tiny(merged) == 0  # which adds the card
     assert digest(merged) == digest(tiny)
 
 

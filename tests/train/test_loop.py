@@ -69,7 +69,7 @@ def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, t
     before = {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()}
     assert train_network(short_task("rae", tiny, tmp_path, precision=None)) == weights
     assert {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()} == before
-    with pytest.raises(BadInput, match="another recipe, seed or data set"):
+    with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
         train_network(short_task("rae", tiny, tmp_path, seed=1, precision=None))
     with pytest.raises(BadInput, match="a training in bfloat16"):
         train_network(short_task("rae", tiny, tmp_path, precision=FLOAT32))

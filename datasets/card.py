@@ -1,0 +1,146 @@
+"""The data set card: what a data set is, how it was made, how clean its references are, its licence and hashes."""
+
+import json
+from typing import Any
+
+from tabulate import tabulate
+
+from datasets.channels import CHANNELS
+from datasets.clip import Clip, Dataset, is_clip
+from datasets.tonemap import psnr
+from files import write_file
+
+CARD_FILE = "card.json"
+PAGE_FILE = "README.md"
+LICENCE = "CC0-1.0"  # of scenes built in; a data set of others names its own in dataset.json
+
+PAGE = """# {profile}, seed {seed}
+
+{clips} clips of animated scenes, rendered for denoising: noisy frames with few samples a pixel, references in two
+independent halves, and what the primary rays see (albedo, normals, depth, motion, cameras). {bytes} bytes. `card.json`
+has all of this page for programs.
+
+- Made by `{command}`, with {versions}; generator version {generator}.{reads}
+- Options of rendering: {options}.
+- Licence: {licence}.
+
+## Splits
+
+{splits}
+
+*floor_db*: PSNR in dB of the reference's own noise, as displayed, on average over the clips and in the worst one.
+
+## Channels
+
+{channels}
+
+Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or follows
+from others: `clip.json` of each clip.
+
+## Clips
+
+{rows}
+
+*crc32* is the checksum of the clip's `clip.json`, which holds those of all channels.
+"""
+
+
+def write_card(dataset: Dataset) -> None:
+    """Write the card of a data set into its folder, where all its clips are there and it is not written already."""
+    if not all(map(is_clip, dataset.planned())):
+        return
+    card = card_of(dataset)
+    for name, text in ((CARD_FILE, card_text(card)), (PAGE_FILE, page_of(card))):
+        path = dataset.path / name
+        if not path.exists() or path.read_bytes() != text.encode():
+            write_file(path, text.encode())
+
+
+def card_of(dataset: Dataset) -> dict[str, Any]:
+    """The card as JSON holds it. It follows from the data alone: the same data set has the same card anywhere.
+
+    Raises BadInput where a clip is missing or damaged.
+    """
+    facts = dataset.facts
+    clips = {str(path.relative_to(dataset.path)): clip_facts(Clip(path)) for path in dataset.planned()}
+    used = [split for split, names in facts["splits"].items() if names]
+    return {
+        "profile": facts["profile"],
+        "seed": facts["seed"],
+        "command": command_of(facts),
+        "generator": facts["generator"],
+        "versions": facts["versions"],
+        "options": facts["options"],
+        "licence": facts.get("licence", LICENCE),
+        "scenes": facts["scenes"],
+        "bytes": sum(clip["bytes"] for clip in clips.values()),
+        "splits": {split: split_facts([clips[f"{split}/{name}"] for name in facts["splits"][split]]) for split in used},
+        "channels": {
+            name: {
+                "axes": list(channel.axes),
+                "unit": channel.unit,
+                "splits": [split for split in used if name in facts["channels"][split]],
+            }
+            for name, channel in CHANNELS.items()
+        },
+        "clips": clips,
+    }
+
+
+def command_of(facts: dict[str, Any]) -> str:
+    """What renders such a data set, given what dataset.json says of it."""
+    options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
+    return f"onespp dataset --profile {facts['profile']} --seed {facts['seed']}{options}"
+
+
+def clip_facts(clip: Clip) -> dict[str, Any]:
+    """What the card says of a clip; the keys are the columns of the page too."""
+    stored = [clip.path / entry["file"] for entry in clip.channels.values() if "file" in entry]
+    return {
+        "frames": clip.frames,
+        "width": clip.width,
+        "height": clip.height,
+        "noisy_spp": clip.facts["noisy_spp"],
+        "realisations": clip.realisations,
+        "reference_spp": clip.facts["reference_spp"],
+        "floor_db": round(psnr(clip.facts["floor_mse"]), 2),
+        "bytes": sum(path.stat().st_size for path in [*stored, clip.path / "clip.json"]),
+        "crc32": clip.fingerprint,
+    }
+
+
+def split_facts(clips: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the card says of a split, from its clips."""
+    floors = [clip["floor_db"] for clip in clips]
+    return {
+        "clips": len(clips),
+        "frames": sum(clip["frames"] for clip in clips),
+        "floor_db": round(sum(floors) / len(floors), 2),
+        "worst_floor_db": min(floors),
+    }
+
+
+def card_text(card: dict[str, Any]) -> str:
+    return json.dumps(card, indent=1) + "\n"
+
+
+def page_of(card: dict[str, Any]) -> str:
+    """The card as Markdown."""
+    options = [name for name, on in card["options"].items() if on]
+    left_out = [name for name, channel in card["channels"].items() if channel["splits"] != list(card["splits"])]
+    splits = [{"split": split, **facts} for split, facts in card["splits"].items()]
+    channels = [
+        [name, ", ".join(map(str, channel["axes"])), channel["unit"], ", ".join(channel["splits"])]
+        for name, channel in card["channels"].items()
+    ]
+    rows = [{"clip": name, **clip} for name, clip in card["clips"].items()]
+    return PAGE.format(
+        **{key: card[key] for key in ("profile", "seed", "command", "generator", "licence", "bytes")},
+        clips=len(card["clips"]),
+        versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),
+        reads=f" `--reads` left out {', '.join(left_out)}, but for tests." if left_out else "",
+        options=", ".join(options) or "none",
+        splits=tabulate(splits, "keys", "github", disable_numparse=True),
+        channels=tabulate(channels, ["channel", "axes", "unit", "in"], "github"),
+        rows=tabulate(rows, "keys", "github", disable_numparse=True),
+    )

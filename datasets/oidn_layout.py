@@ -1,0 +1,81 @@
+"""A data set as the training toolkit of Intel Open Image Denoise reads it: one OpenEXR file a feature of an image.
+
+Its rules (RenderKit/oidn, training/dataset.py and image.py): the images of a folder are GROUP_SAMPLES.FEATURE.exr. Of
+each group, the last one in the order of their names as text is the target, and all others are noisy inputs. An input
+needs all features that are trained with, the target its colour. Features are the first three channels of a file.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from datasets.card import CARD_FILE, card_of
+from datasets.clip import Clip, Dataset
+from datasets.exr import write_planes
+from errors import BadInput
+from files import read_json, write_json
+
+FOLDERS = {"train": "train", "val": "valid", "test": "test"}  # as its options are called by default
+TARGET = "reference"  # comes after all numbers
+
+
+def export_dataset(root: Path, out: Path) -> int:
+    """Write all splits of a data set to `out`, or go on with that. Returns how many noisy images there are.
+
+    Every noise realisation of a frame is a group of its own, SCENE-CLIP-FRAME-REALISATION: a group holds one image for
+    each number of samples. Files that are there are kept. The data set's card tells what the images are of.
+
+    Raises BadInput where a clip is missing or damaged, or `out` holds something else.
+    """
+    dataset = Dataset(root)
+    splits = [split for split, names in dataset.facts["splits"].items() if names]
+    clips = [(split, clip) for split in splits for clip in dataset.clips(split)]
+    claim_folder(out, dataset)
+    images = 0
+    for split, clip in tqdm(clips, "exr", unit="clip"):
+        folder = out / FOLDERS[split]
+        folder.mkdir(exist_ok=True)
+        for frame in range(clip.frames):
+            for realisation in range(clip.realisations):
+                write_group(folder, clip, frame, realisation)
+        images += clip.frames * clip.realisations
+    return images
+
+
+def claim_folder(out: Path, dataset: Dataset) -> None:
+    """Put the data set's card into `out`. Raises BadInput where that holds another data set, or something else."""
+    card = card_of(dataset)
+    out.mkdir(parents=True, exist_ok=True)
+    if (out / CARD_FILE).exists():
+        if read_json(out / CARD_FILE) != card:
+            raise BadInput(f"{out} holds another data set than {dataset.path}: choose another folder or delete it")
+    elif any(out.glob("[!.]*")):
+        raise BadInput(f"{out} holds something else than a data set for OIDN: choose an empty or new folder")
+    else:
+        write_json(out / CARD_FILE, card)
+
+
+def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
+    """Write the noisy image of one realisation with its features, and its reference, unless they are there."""
+    group = f"{clip.scene}-{clip.name}-{frame:04d}-{realisation}"
+    noisy = f"{group}_{clip.facts['noisy_spp']:04d}spp"
+    images: dict[str, Callable[[], NDArray[np.generic]]] = {
+        f"{noisy}.hdr": lambda: noisy_radiance(clip, frame, realisation),
+        f"{noisy}.alb": lambda: clip.read("albedo", frame),
+        f"{noisy}.nrm": lambda: clip.read("normal", frame),
+        f"{group}_{TARGET}.hdr": lambda: clip.reference(frame).mean(axis=0),
+    }
+    for name, read in images.items():
+        path = folder / f"{name}.exr"
+        if not path.exists():
+            image = read()
+            write_planes(path, {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}, {})
+
+
+def noisy_radiance(clip: Clip, frame: int, realisation: int) -> NDArray[np.float32]:
+    """Noisy radiance (H, W, 3): emission + direct + indirect."""
+    parts = (clip.read(name, frame, realisation=realisation) for name in ("emission", "direct", "indirect"))
+    return np.sum([part.astype(np.float32) for part in parts], axis=0, dtype=np.float32)

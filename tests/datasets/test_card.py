@@ -1,0 +1,80 @@
+"""The data set card: there when a data set is whole, the same wherever it is made, and true."""
+
+import json
+import math
+import shutil
+import zlib
+from pathlib import Path
+
+import pytest
+
+from datasets.card import CARD_FILE, PAGE_FILE, card_of, page_of
+from datasets.clip import Dataset
+from datasets.generate import Share
+from datasets.verify import find_problems
+from tests.helpers.datasets import generate_tiny
+
+
+def card_in(root: Path) -> dict:
+    return json.loads((root / CARD_FILE).read_text())
+
+
+def test_it_says_what_the_files_say(tiny):
+    card = card_in(tiny)
+    clips = {str(path.parent.relative_to(tiny)): path for path in sorted(tiny.glob("*/*/*/clip.json"))}
+    assert card["clips"].keys() == clips.keys() and card["splits"]["train"] == card["splits"]["train"] | {
+        "clips": 2,
+        "frames": 16,
+    }
+    for name, path in clips.items():
+        facts = json.loads(path.read_text())
+        said = card["clips"][name]
+        assert said["crc32"] == f"{zlib.crc32(path.read_bytes()):08x}"
+        assert said["bytes"] == sum(f.stat().st_size for f in path.parent.iterdir() if f.name != "timing.json")
+        assert said["floor_db"] == pytest.approx(-10 * math.log10(facts["floor_mse"]), abs=0.006)
+        assert (said["reference_spp"], said["realisations"]) == ((64, 2) if "train" in name else (128, 1))
+    assert card["bytes"] == sum(clip["bytes"] for clip in card["clips"].values())
+    assert card["splits"]["test"]["worst_floor_db"] == min(
+        clip["floor_db"] for name, clip in card["clips"].items() if name.startswith("test/")
+    )
+    assert card["licence"] == "CC0-1.0" and card["command"] == "onespp dataset --profile tiny --seed 0"
+    assert card["channels"]["depth"] == {
+        "axes": ["F", "H", "W", 1],
+        "unit": "world units",
+        "splits": ["train", "val", "test"],
+    }
+
+
+def test_the_page_names_what_the_card_has(tiny):
+    page = (tiny / PAGE_FILE).read_text()
+    card = card_in(tiny)
+    facts = [card["command"], "CC0-1.0", *card["clips"], *card["channels"], *card["versions"].values()]
+    assert all(fact in page for fact in facts)
+    assert all(clip["crc32"] in page and f"{clip['floor_db']}" in page for clip in card["clips"].values())
+
+
+def test_options_and_what_was_left_out_are_told(tiny_copy):
+    path = tiny_copy / "dataset.json"
+    facts = json.loads(path.read_text())
+    facts["options"]["halton"] = True
+    facts["channels"]["train"].remove("gradient")
+    facts["licence"] = "CC-BY-4.0"
+    path.write_text(json.dumps(facts))
+    card = card_of(Dataset(tiny_copy))
+    assert card["command"].endswith(" --halton") and card["licence"] == "CC-BY-4.0"
+    page = page_of(card)
+    assert "left out gradient" in page and "Licence: CC-BY-4.0" in page and "CC0" not in page
+
+
+def test_it_comes_with_the_last_clip_and_harms_nothing(tiny, tiny_copy):
+    shutil.rmtree(tiny_copy / "val" / "cornell_box" / "000")
+    for name in (CARD_FILE, PAGE_FILE):
+        (tiny_copy / name).unlink()
+    assert generate_tiny(tiny_copy, share=Share(1, 6)) == 0
+    assert not (tiny_copy / CARD_FILE).exists()
+    assert generate_tiny(tiny_copy) == 1
+    assert all((tiny_copy / name).read_bytes() == (tiny / name).read_bytes() for name in (CARD_FILE, PAGE_FILE))
+    assert find_problems(tiny_copy) == []
+    before = (tiny_copy / CARD_FILE).stat().st_mtime_ns
+    assert generate_tiny(tiny_copy) == 0
+    assert (tiny_copy / CARD_FILE).stat().st_mtime_ns == before

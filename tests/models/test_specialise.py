@@ -1,0 +1,168 @@
+"""Specialised networks: the general ones' output where a channel does not vary, and a clear word where it does."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame
+from errors import BadInput
+from models import compiled, registry
+from models.denoiser import Denoiser
+from models.features import network_features
+from models.running_scale import running_scale
+from models.specialise import drop_inputs, specialise
+from models.weights import save_weights
+from tests.helpers.frames import chain, flat_frame, run
+
+GREY = [0.25, 0.5, 0.75]
+CONSTANTS = {"albedo": GREY, "normal": [0.0, 0.0, -1.0], "roughness": [1.0], "depth": [2.0]}
+LEFT_OUT = {
+    "wskp3": {"albedo", "normal"},
+    "wskp6": {"albedo", "normal"},
+    "wskp-mr": {"albedo", "normal"},
+    "kp": {"albedo", "normal"},
+    "rae": {"roughness"},
+    "ntd": {"albedo", "normal"},
+}
+FEWER = {"wskp3": 6 * 24 * (1 + 9 + 25), "wskp-mr": 6 * 32 * 9, "rae": 32 * 9, "ntd": 6 * 32 * 9}  # weights
+
+
+def frames(height: int, width: int, count: int = 2) -> list[Frame]:
+    """A wall of one colour in noisy light, with the camera sliding along it."""
+    noise = torch.Generator().manual_seed(1)
+    albedo = torch.tensor(GREY)[None, :, None, None].repeat(1, 1, height, width)
+    shifted = []
+    for _ in range(count):
+        light = torch.rand(1, 3, height, width, generator=noise) * 3
+        frame = flat_frame(height, width, motion=(1.0, 0.0), irradiance=light * albedo)
+        shifted.append(replace(frame, channels=frame.channels | {"albedo": albedo, "indirect": light * albedo / 2}))
+    return chain(shifted)
+
+
+def pair(name: str) -> tuple[Denoiser, Denoiser]:
+    """A network with random weights, and the same one specialised."""
+    torch.manual_seed(0)
+    general = registry.create(name)
+    special = registry.create(name)
+    special.load_state_dict(general.state_dict())
+    specialise(special, CONSTANTS)
+    return general, special
+
+
+@torch.no_grad()
+def test_a_convolution_without_an_input_that_is_constant():
+    torch.manual_seed(0)
+    layer = nn.Conv2d(4, 5, 3, padding=1)
+    x = torch.randn(1, 4, 8, 9)
+    x[:, 1:3] = torch.tensor([2.0, -3.0])[:, None, None]
+    before = layer(x)
+    weight, bias = layer.weight.clone(), layer.bias.clone()
+    drop_inputs(layer, 1, torch.tensor([2.0, -3.0]))
+    after = layer(x[:, [0, 3]])
+    torch.testing.assert_close(after[..., 1:-1, 1:-1], before[..., 1:-1, 1:-1])
+    assert layer.in_channels == 2 and not torch.allclose(after, before)
+    # Outside of the image, what was dropped goes on, as if it alone were padded with its value.
+    outside = torch.zeros(1, 4, 10, 11)
+    outside[:, 1:3] = torch.tensor([2.0, -3.0])[:, None, None]
+    outside[..., 1:-1, 1:-1] = x
+    torch.testing.assert_close(after, F.conv2d(outside, weight, bias))
+
+
+@pytest.mark.parametrize("name, border", [("wskp3", 3 * 2 + 6), ("wskp6", 6 * 2 + 6), ("kp", 6 * 2 + 6)])
+def test_the_output_is_the_general_one_s_but_near_the_border(name, border):
+    """How far the border reaches: two pixels a convolution, and half of the largest window."""
+    general, special = pair(name)
+    sequence = frames(48, 51)
+    for a, b in zip(run(general, sequence), run(special, sequence), strict=True):
+        inner = (..., slice(border, -border), slice(border, -border))
+        torch.testing.assert_close(a[inner], b[inner], rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def without_border(denoiser: Denoiser, names: set[str]) -> None:
+    """Let the network see these channels through the middle of its kernels only, so that zeros around do not matter."""
+    start = 0
+    for name, count in denoiser.inputs.items():
+        if name in names:
+            for layer in denoiser.first_layers():
+                middle = layer.kernel_size[0] // 2
+                kept = layer.weight.data[:, start : start + count, middle, middle].clone()
+                layer.weight.data[:, start : start + count] = 0
+                layer.weight.data[:, start : start + count, middle, middle] = kept
+        start += count
+
+
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_every_network_can_do_without_what_does_not_vary(name, tmp_path):
+    """Also after a way through a file, in the form for inference, compiled and not."""
+    torch.manual_seed(0)
+    general = registry.create(name)
+    without_border(general, LEFT_OUT[name])
+    special = registry.create(name)
+    special.load_state_dict(general.state_dict())
+    specialise(special, CONSTANTS)
+    assert special.constants == {channel: CONSTANTS[channel] for channel in sorted(LEFT_OUT[name])}
+    if name in FEWER:
+        assert special.parameter_count() == general.parameter_count() - FEWER[name]
+    path = tmp_path / "w.safetensors"
+    save_weights(special, name, {}, path)
+    loaded = registry.load(name, path, torch.float32)
+    sequence = frames(40, 37, 3)
+    expected = run(general, sequence)
+    for output in (run(special, sequence), run(loaded, sequence)):
+        for a, b in zip(expected, output, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    with compiled.disabled():
+        for a, b in zip(expected, run(loaded, sequence), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("seen", [("colour", "normal", "depth"), ("colour", "albedo", "depth"), ("colour", "depth")])
+def test_what_is_seen_is_part_of_all_features(seen):
+    [frame] = frames(9, 13, 1)
+    irradiance = frame.irradiance("total")
+    scale = running_scale(irradiance * frame.divisor, frame.depth, None)
+    places = {"colour": [0, 1, 2], "albedo": [3, 4, 5], "normal": [6, 7, 8], "depth": [9]}
+    with compiled.disabled():
+        everything = network_features(frame, irradiance, scale)
+        slow = network_features(frame, irradiance, scale, seen)
+    assert torch.equal(slow, everything[:, [i for name in seen for i in places[name]]])
+    torch.testing.assert_close(network_features(frame, irradiance, scale, seen), slow, rtol=1e-5, atol=1e-6)
+
+
+def with_channel(frame: Frame, name: str, change: Tensor) -> Frame:
+    return replace(frame, channels=frame.channels | {name: frame.channels[name] + change})
+
+
+@pytest.mark.parametrize("name, channel", [("rae", "roughness"), ("wskp3", "albedo"), ("wskp3+taa", "normal")])
+def test_a_frame_in_which_such_a_channel_varies_is_refused(name, channel, tmp_path):
+    plain = registry.plain_name(name)
+    _, special = pair(plain)
+    path = tmp_path / "w.safetensors"
+    save_weights(special, plain, {}, path)
+    denoiser = registry.load(name, path, torch.float32)
+    [frame] = frames(8, 8, 1)
+    odd = torch.zeros(1, 1, 8, 8)
+    odd[..., 3, 4] = 1
+    run(denoiser, [frame, with_channel(frame, channel, odd * 2e-4)])  # as float16 rounds
+    run(denoiser, [with_channel(frame, channel, odd * torch.nan)])  # as any pixel that is not finite
+    with pytest.raises(BadInput, match=f"test: {channel} is not .* specialised: use general weights"):
+        run(denoiser, [with_channel(frame, channel, odd * 0.01)])
+
+
+def constants_in(path: Path) -> str | None:
+    with safe_open(path, "pt") as file:
+        return file.metadata().get("constants")
+
+
+def test_weights_say_what_they_do_without(tmp_path):
+    general, special = pair("rae")
+    save_weights(general, "rae", {}, tmp_path / "general")
+    save_weights(special, "rae", {}, tmp_path / "special")
+    assert constants_in(tmp_path / "general") is None
+    assert constants_in(tmp_path / "special") == '{"roughness": [1.0]}'

@@ -1,0 +1,138 @@
+"""Trainings that begin with trained weights, and networks specialised to a data set."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from datasets.clip import Dataset
+from datasets.frame import read_frame
+from errors import BadInput
+from models import registry
+from models.weights import save_weights
+from onespp import main
+from provenance import file_digest
+from tests.helpers.frames import run
+from tests.helpers.training import SHORT, folder_of, metadata, short_task, tensors
+from train.loop import train_network
+from train.registry import task_for
+from train.task import WEIGHTS_FILE, Task
+from train.training import Training
+
+GREY = {"value": [0.5, 0.5, 0.5]}
+
+
+@pytest.fixture
+def general(tmp_path) -> Path:
+    """Weights of wskp3 that were not trained."""
+    return fresh_weights("wskp3", tmp_path / "general.safetensors")
+
+
+def fresh_weights(name: str, path: Path, seed: int = 5) -> Path:
+    torch.manual_seed(seed)
+    save_weights(registry.create(name), name, {}, path)
+    return path
+
+
+@pytest.fixture
+def grey(tiny, tmp_path) -> Path:
+    """The tiny data set, all of whose surfaces have the same grey albedo in training and validation."""
+    copy = Path(shutil.copytree(tiny, tmp_path / "grey"))
+    for path in [*copy.glob("train/*/*/clip.json"), *copy.glob("val/*/*/clip.json")]:
+        facts = json.loads(path.read_text())
+        facts["channels"]["albedo"] = GREY
+        path.write_text(json.dumps(facts))
+    return copy
+
+
+def short(name: str, data: Path, runs: Path, **arguments) -> Task:
+    """A training of a few steps from other weights, or specialised."""
+    task = task_for(name, data, runs, "tiny", precision="float32", **arguments)
+    return replace(task, recipe=replace(task.recipe, **SHORT["rae" if name == "rae" else "wskp6"]))
+
+
+def test_it_begins_with_the_general_network_bit_for_bit(tiny, tmp_path, general):
+    training = Training(short("wskp3", tiny, tmp_path, start=general))
+    wanted = tensors(general)
+    assert "network.0.branches.2.weight" in wanted  # what was merged for inference could not be trained further
+    for denoiser in (training.loss.module.denoiser, training.judged.denoiser):
+        begun = denoiser.state_dict()
+        assert begun.keys() == wanted.keys() and all(torch.equal(begun[key], wanted[key]) for key in wanted)
+
+
+def test_its_weights_and_checkpoint_name_what_it_began_with(tiny, tmp_path, general):
+    task = short("wskp3", tiny, tmp_path / "runs", start=general)
+    weights = train_network(task)
+    assert json.loads(metadata(weights)["recipe"])["from"] == file_digest(general)
+    assert train_network(task) == weights  # finished
+    other = fresh_weights("wskp3", tmp_path / "other.safetensors", seed=6)
+    for start in (other, None):
+        with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
+            train_network(replace(task, start=start))
+    shutil.copyfile(general, tmp_path / "moved.safetensors")
+    assert train_network(replace(task, start=tmp_path / "moved.safetensors")) == weights
+
+
+def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, general):
+    def said(*arguments: str) -> str:
+        there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny"]
+        with pytest.raises(SystemExit) as exit_:
+            main(["train", *arguments, *there])
+        assert exit_.value.code == 2
+        return capsys.readouterr().err
+
+    assert "there are no weights at missing" in said("wskp3", "--from", "missing")
+    assert "holds weights of 'wskp3', not of 'rae'" in said("rae", "--from", str(general))
+    assert not list(tmp_path.glob("runs/train/*/[!.]*"))
+
+
+def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):
+    """Before the first step nothing has changed, but near the border of the image."""
+    task = short("wskp3", grey, tmp_path, start=general, specialised=True)
+    training = Training(task)
+    special = training.judged.denoiser
+    assert special.constants == {"albedo": GREY["value"]} and training.facts["constants"] == special.constants
+    frame = read_frame(Dataset(grey).clips("val")[0], 0, special.reads)
+    before = registry.load("wskp3", general, torch.float32)
+    inner = (..., slice(12, -12), slice(12, -12))
+    torch.testing.assert_close(run(special, [frame])[0][inner], run(before, [frame])[0][inner], rtol=1e-3, atol=1e-4)
+
+    weights = train_network(task)
+    assert f"wskp3: specialised to {grey}, left out albedo\n" in capsys.readouterr().out
+    assert json.loads(metadata(weights)["constants"]) == special.constants
+    assert tensors(weights)["network.0.branches.2.weight"].shape == (24, 7, 5, 5)
+    trained = registry.load("wskp3", weights, torch.float32)
+    assert torch.isfinite(run(trained, [frame])[0]).all()
+    with pytest.raises(BadInput, match="albedo is not"):  # test clips are as they were
+        run(trained, [read_frame(Dataset(grey).clips("test")[0], 0, trained.reads)])
+    with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
+        train_network(replace(task, specialised=False))
+
+
+def test_specialised_weights_go_on_with_such_scenes_only(tiny, grey, tmp_path, general):
+    weights = train_network(short("wskp3", grey, tmp_path, start=general, specialised=True))
+    for specialised in (True, False):
+        again = Training(short("wskp3", grey, tmp_path / "again", start=weights, specialised=specialised))
+        assert again.judged.denoiser.constants == {"albedo": GREY["value"]}
+    with pytest.raises(BadInput, match=r"specialised to scenes whose albedo is \[0.5, 0.5, 0.5\] everywhere"):
+        Training(short("wskp3", tiny, tmp_path / "tiny", start=weights))
+
+
+def test_a_network_is_specialised_from_scratch_too(tiny, tmp_path):
+    """All surfaces of the tiny data set are diffuse."""
+    task = short("rae", tiny, tmp_path, specialised=True)
+    weights = train_network(task)
+    assert json.loads(metadata(weights)["constants"]) == {"roughness": [1.0]}
+    assert tensors(weights)["network.first.weight"].shape == (32, 6, 3, 3)
+    assert weights == folder_of(tmp_path, "rae") / WEIGHTS_FILE
+
+
+def test_where_all_varies_nothing_is_left_out(capsys, tiny, tmp_path):
+    general = Training(short_task("wskp6", tiny, tmp_path / "general"))
+    special = Training(short("wskp6", tiny, tmp_path / "special", specialised=True))
+    assert special.facts == general.facts and special.judged.denoiser.constants == {}
+    train_network(short("wskp6", tiny, tmp_path / "special", specialised=True))
+    assert "left out nothing: all that it sees varies" in capsys.readouterr().out
