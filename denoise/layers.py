@@ -62,8 +62,10 @@ def grouped(channels: Iterable[str]) -> dict[str, dict[str, str]]:
             layers[channel] = {"v": channel}
         else:
             layers.setdefault(layer, {})[component.casefold()] = channel
-    alone = {members["z"]: {"v": members["z"]} for members in layers.values() if "z" in members and "x" not in members}
-    return layers | alone
+    beside_colour = [
+        members["z"] for layer, members in layers.items() if "z" in members and (not layer or "r" in members)
+    ]
+    return layers | {channel: {"v": channel} for channel in beside_colour}
 
 
 def layer_of(quantity: str, name: str, members: Mapping[str, str]) -> Layer | None:

@@ -47,8 +47,10 @@ class Meaning:
         """Motion (H, W, 2) in our convention of foreign `motion` (H, W, 2 or 4); what is not finite becomes 0."""
         height, width = motion.shape[:2]
         size = np.array([width, height], np.float32)
-        unit = {"pixels": np.ones_like(size), "fractions": size, "half-fractions": size / 2}[self.unit]
-        vectors = motion[..., PAIRS[self.pair]] * unit * np.array([SIGNS[self.x], SIGNS[self.y]], np.float32)
+        units: dict[str, NDArray[np.floating]] = {"pixels": np.ones(2), "fractions": size, "half-fractions": size / 2}
+        vectors = (
+            motion[..., PAIRS[self.pair]] * units[self.unit] * np.array([SIGNS[self.x], SIGNS[self.y]], np.float32)
+        )
         return np.nan_to_num(vectors, nan=0, posinf=0, neginf=0).clip(-FAR_OUTSIDE, FAR_OUTSIDE).astype(np.float32)
 
     def in_words(self) -> str:
