@@ -25,6 +25,7 @@ from denoise.settings import claim
 from denoise.sources import Sources, find_sources
 from denoise.understanding import report, understand
 from errors import BadInput
+from eval.bench.memory import status_mb
 from eval.spec import DenoiserSpec, precision_in_use
 from files import replacing
 from models.denoiser import Denoiser, State
@@ -83,7 +84,9 @@ def denoise(job: Job) -> None:
     claim(job.out, work.settings())
     nonfinite = list(work.play())
     print(f"{job.out}: {len(frames)} frames, {len(nonfinite)} of them new", end="; ")
-    print(f"{sum(nonfinite)} pixels were not finite and count as 0")
+    print(f"{sum(nonfinite)} pixels were not finite and count as 0", end="")
+    peak = status_mb("VmHWM")
+    print(f"; peak memory {peak / 1000:.2f} GB" if peak else "")
     if references:
         print(compare(frames, references, job.out, work.exposure))
 
