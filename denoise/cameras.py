@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scenes.camera import Array, View, pixel_centres
 
 SAMPLES = 1 << 14  # positions that a camera is fitted to
+FEW = 12  # of them that are tried at first
+DRAWS = 32  # of that many: one is all but sure to be free of outliers where less than a tenth are
 LARGEST_ERROR = 0.25  # px: the median distance of fitted positions from their pixels that is still a camera
 FLAT = 1e-4  # thickness of the positions, of their extent, below which they leave the camera open
 ORIGIN = 1e-4  # of the positions' distance: a camera so close to (0, 0, 0) stands there
@@ -40,27 +42,31 @@ def view_of(projection: Array) -> View | None:
 def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]) -> View | None:
     """The view that sees `positions` (H, W, 3) at their pixels where there is a `surface` (H, W).
 
-    The direct linear transform (Hartley and Zisserman, §7.1), once with all and once without outliers. None where there
-    is no such pinhole camera, or more than one, as for points in a plane.
+    The direct linear transform (Hartley and Zisserman, §7.1), first of a few points (RANSAC, §4.7), then of all that
+    agree. None where there is no such pinhole camera, or more than one, as for points in a plane.
     """
     place = np.nonzero(surface & np.isfinite(positions).all(axis=-1))
     stride = max(1, len(place[0]) // SAMPLES)
     rows, columns = (index[::stride] for index in place)
     points = positions[rows, columns].astype(np.float64)
     pixels = pixel_centres(*surface.shape)[rows, columns]
-    if len(points) < 16:
+    if len(points) < FEW:
         return None
     middle = points.mean(axis=0)
     thickness = np.linalg.svd(points - middle, compute_uv=False)
     if thickness[2] < FLAT * thickness[0]:
         return None
-    fit = linear_fit(points, pixels)
-    error = reprojection_error(fit, points, pixels)
-    good = error <= max(3 * float(np.median(error)), 1e-3)
-    fit = linear_fit(points[good], pixels[good])
-    if not np.median(reprojection_error(fit, points, pixels)) <= LARGEST_ERROR:
-        return None
-    return view_of(fit)
+
+    def median_error(fit: Array) -> float:
+        return float(np.median(reprojection_error(fit, points, pixels)))
+
+    rng = np.random.default_rng(0)
+    draws = (rng.choice(len(points), FEW, replace=False) for _ in range(DRAWS))
+    fit = min((linear_fit(points[few], pixels[few]) for few in draws), key=median_error)
+    for _ in range(2):
+        good = reprojection_error(fit, points, pixels) <= max(3 * median_error(fit), 1e-3)
+        fit = linear_fit(points[good], pixels[good])
+    return view_of(fit) if median_error(fit) <= LARGEST_ERROR else None
 
 
 def linear_fit(points: Array, pixels: Array) -> Array:
