@@ -28,9 +28,12 @@ class ExrImage:
         if not path.is_file():
             raise BadInput(f"{path} is missing")
         try:
-            self.file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+            headers = OpenEXR.File(str(path), header_only=True)
+            self.file = headers if header_only else OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, TypeError) as error:
             raise BadInput(f"{path} is damaged or no OpenEXR image ({error}): render it again") from None
+        if len(self.file.parts) < len(headers.parts) or not headers.parts:  # OpenEXR leaves out what it cannot read
+            raise BadInput(f"{path} is damaged: render it again")
         several = len(self.file.parts) > 1
         self.header: dict[str, Any] = {key: value for part in self.file.parts for key, value in part.header.items()}
         self.channels: dict[str, Any] = {
