@@ -11,7 +11,7 @@ from scenes.camera import Array, View, pixel_centres
 SAMPLES = 1 << 14  # positions that a camera is fitted to
 FEW = 12  # of them that are tried at first
 DRAWS = 32  # of that many: one is all but sure to be free of outliers where less than a tenth are
-LARGEST_ERROR = 0.25  # px: the median distance of fitted positions from their pixels that is still a camera
+LARGEST_ERROR = 1 / 200  # of the image: the median distance of fitted positions from their pixels, rounded to half
 FLAT = 1e-4  # thickness of the positions, of their extent, below which they leave the camera open
 ORIGIN = 1e-4  # of the positions' distance: a camera so close to (0, 0, 0) stands there
 SQUARE = 0.01  # by how much focal lengths may differ
@@ -66,7 +66,7 @@ def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]
     for _ in range(2):
         good = reprojection_error(fit, points, pixels) <= max(3 * median_error(fit), 1e-3)
         fit = linear_fit(points[good], pixels[good])
-    return view_of(fit) if median_error(fit) <= LARGEST_ERROR else None
+    return view_of(fit) if median_error(fit) <= LARGEST_ERROR * max(surface.shape) else None
 
 
 def linear_fit(points: Array, pixels: Array) -> Array:

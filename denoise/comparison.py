@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from tabulate import tabulate
-from torch import Tensor
 
 from datasets.frame import to_tensor
 from denoise.exr_image import ExrImage
@@ -23,15 +22,17 @@ MEASURED = ("rmse", "psnr", "ssim")
 FILE = "metrics.csv"
 
 
-def compare(frames: Sequence[FrameFiles], references: Sequence[Path], out: Path, exposure: float) -> str:
-    """Measure the frames on disk against references, as displayed at `exposure`; keep all in metrics.csv.
+def compare(
+    frames: Sequence[FrameFiles], references: Sequence[Path], out: Path, target: Sequence[str], exposure: float
+) -> str:
+    """Measure the `target` channels of frames on disk against references, as displayed; keep all in metrics.csv.
 
     Returns a table of the means. Raises BadInput where a reference is of another size.
     """
     rows = []
     for files, reference in zip(frames, references, strict=True):
-        halves = radiance(reference).repeat(2, 1, 1, 1)  # of one reference, whose noise is not known
-        denoised = radiance(out / files.name)
+        halves = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)  # of one reference: its noise is not known
+        denoised = to_tensor(radiance(out / files.name, target))
         if halves.shape[1:] != denoised.shape[1:]:
             raise BadInput(f"{reference} is of another size than {out / files.name}")
         comparison = Comparison(denoised, halves, exposure)
@@ -47,8 +48,8 @@ def compare(frames: Sequence[FrameFiles], references: Sequence[Path], out: Path,
     return tabulate([cells], [f"mean {METRICS[name].title}" for name in MEASURED], disable_numparse=True)
 
 
-def radiance(path: Path) -> Tensor:
-    """The radiance (1, 3, H, W) of a finished image: its `Combined` rather than `Noisy Image`, finite."""
+def radiance(path: Path, target: Sequence[str]) -> NDArray[np.float32]:
+    """The radiance (H, W, 3) of a finished image, finite: its `target` channels, or else those known to be radiance."""
     image = ExrImage(path)
-    channels = find_sources({COLOUR: image}, {}).target
-    return torch.nan_to_num(to_tensor(image.stacked(channels)), nan=0.0, posinf=0.0, neginf=0.0)
+    channels = target if all(name in image.channels for name in target) else find_sources({COLOUR: image}, {}).target
+    return np.nan_to_num(image.stacked(channels), nan=0.0, posinf=0.0, neginf=0.0)

@@ -139,6 +139,11 @@ class Shot:
         motion = self.reading.meaning.pixels(pixels.arrays["motion"])
         return motion if self.view is not None else np.zeros_like(motion)
 
+    def given_normal(self, pixels: Pixels) -> Image | None:
+        """The renderer's normals (H, W, 3) in [-1, 1]; None where there are none."""
+        normal = pixels.arrays.get("normal")
+        return 2 * normal - 1 if normal is not None and self.reading.normals_are_encoded else normal
+
     def parallel_view(self, pixels: Pixels, depth: Image, motion: Image | None) -> View:
         """A view for frames without cameras: from so far that all rays are parallel.
 
@@ -148,7 +153,7 @@ class Shot:
         height, width = pixels.size
         K = np.array([[-TELEPHOTO, 0, width / 2], [0, -TELEPHOTO, height / 2], [0, 0, 1.0]])
         if self.view is None:
-            return View(K, facing(pixels), STILL)
+            return View(K, facing(self.given_normal(pixels), pixels.surface), STILL)
         pose = self.view.camera_to_world.copy()
         if motion is not None and self.depth is not None and self.depth.shape == depth.shape:
             pose[:3, 3] += pose[:3, 2] * depth_change(depth, self.depth, motion)
@@ -157,10 +162,10 @@ class Shot:
     def normals(self, pixels: Pixels, depth: Image, view: View, seen: Sighting | None) -> Image:
         """Unit normals (H, W, 3) in the world; 0 for background."""
         toward_viewer = -view.camera_to_world[:3, 2]
+        given = self.given_normal(pixels)
         normal: NDArray[Any]
-        if "normal" in pixels.arrays:
-            normal = pixels.arrays["normal"]
-            normal = 2 * normal - 1 if self.reading.normals_are_encoded else normal
+        if given is not None:
+            normal = given
             if self.reading.in_camera_space and seen and seen.own:
                 normal = normal @ (view.camera_to_world[:3, :3] @ seen.own.camera_to_world[:3, :3].T).T
         elif seen:
@@ -220,15 +225,12 @@ def rays_of(view: View, height: int, width: int) -> Array:
     return np.concatenate([(pixels - view.K[:2, 2]) / np.diag(view.K)[:2], np.ones((height, width, 1))], axis=-1)
 
 
-def facing(pixels: Pixels) -> Array:
+def facing(normal: Image | None, surface: NDArray[np.bool_]) -> Array:
     """A pose (4, 4) in the origin that looks against the mean of the visible normals, or along z without any.
 
     Depths are compared along this axis: no surface that is seen, but for grazing ones, must lie along it.
     """
-    normal = pixels.arrays.get("normal")
-    mean = (
-        normal[pixels.surface].mean(axis=0, dtype=np.float64) if normal is not None and pixels.surface.any() else None
-    )
+    mean = normal[surface].mean(axis=0, dtype=np.float64) if normal is not None and surface.any() else None
     pose = np.eye(4)
     if mean is not None and np.linalg.norm(mean) > 1e-3:
         forward = -mean / np.linalg.norm(mean)

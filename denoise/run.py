@@ -23,7 +23,7 @@ from denoise.pixels import open_passes, read_pixels
 from denoise.sequence import COLOUR, FrameFiles, files_of, gaps, numbered, sequence_of, shots
 from denoise.settings import claim
 from denoise.sources import Sources, find_sources
-from denoise.understanding import report, understand
+from denoise.understanding import Understanding, report, understand
 from errors import BadInput
 from eval.bench.memory import status_mb
 from eval.spec import DenoiserSpec, precision_in_use
@@ -88,7 +88,7 @@ def denoise(job: Job) -> None:
     peak = status_mb("VmHWM")
     print(f"; peak memory {peak / 1000:.2f} GB" if peak else "")
     if references:
-        print(compare(frames, references, job.out, work.exposure))
+        print(compare(frames, references, job.out, sources.target, work.exposure))
 
 
 def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
@@ -133,7 +133,7 @@ class Work:
     sources: Sources
 
     @cached_property
-    def understanding(self) -> Any:
+    def understanding(self) -> Understanding:
         stated = Meaning.parse(self.job.motion) if self.job.motion else None
         return understand(self.shots, self.sources, self.denoiser.reads, stated)
 
@@ -141,15 +141,13 @@ class Work:
     def exposure(self) -> float:
         """Of previews and metrics: what the first frame needs, its reference if there is one."""
         first = self.shots[0][0]
-        path = reference_files(self.job, [first])[0] if self.job.references else first.passes[COLOUR]
-        image = radiance(path) if self.job.references else None
-        pixels = image[0].permute(1, 2, 0).numpy() if image is not None else self.colour(first)
-        return clip_exposure(luminance(pixels.clip(0, None)))
-
-    def colour(self, files: FrameFiles) -> NDArray[np.float32]:
-        if self.sources.is_ours:
-            return np.nan_to_num(ExrImage(files.passes[COLOUR]).stacked(self.sources.target), posinf=0, neginf=0)
-        return read_pixels(files, self.sources).arrays[COLOUR]
+        if self.job.references:
+            image = radiance(reference_files(self.job, [first])[0], self.sources.target)
+        elif self.sources.is_ours:
+            image = radiance(first.passes[COLOUR], self.sources.target)
+        else:
+            image = read_pixels(first, self.sources).arrays[COLOUR]
+        return clip_exposure(luminance(image.clip(0, None)))
 
     def introduction(self) -> str:
         """What was found, what is derived, what is done without."""
@@ -163,13 +161,14 @@ class Work:
     def settings(self) -> dict[str, Any]:
         """All that the bytes of a frame follow from, but for the files themselves."""
         job = self.job
+        first = self.shots[0][0]
         return {
             "denoiser": job.denoiser,
             "weights": file_digest(job.weights) if job.weights else None,
             "precision": self.spec.precision,
             "quality": job.quality,
-            "patterns": {name: list(patterns) for name, patterns in job.patterns.items()},
-            "first frame": self.shots[0][0].number,
+            "passes": {name: str(path.parent.resolve()) for name, path in first.passes.items()},
+            "first frame": first.number,
             "reset-at": sorted(job.reset_at),
             "layers": sorted(job.layers),
             "motion": str(job.motion if self.sources.is_ours else self.understanding.reading.meaning),

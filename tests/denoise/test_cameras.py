@@ -43,6 +43,11 @@ def test_a_few_wrong_positions_do_no_harm():
     assert_same(view_of_positions(positions, SURFACE), view)
 
 
+def test_positions_rounded_to_half_tell_the_camera():
+    view = some_view(6)
+    assert_same(view_of_positions(points_of(view).astype(np.float16).astype(np.float32), SURFACE), view, 1e-2)
+
+
 def test_left_handed_worlds_project_alike():
     view = some_view(2)
     mirrored = points_of(view) * [1, 1, -1]

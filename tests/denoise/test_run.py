@@ -365,3 +365,18 @@ def test_one_pixel(spheres, tmp_path, name, layers):
     denoise(job(tmp_path / "in", tmp_path / "out", name, weights))
     layer = "ViewLayer.Combined." if layers is foreign.blender else ""
     assert all(torch.isfinite(image).all() for image in outputs(tmp_path / "out", layer))
+
+
+def test_normals_in_the_range_of_colours_are_recognised(box, tmp_path, capsys):
+    def encoded(frame: Frame) -> foreign.Layers:
+        layers = foreign.blender(frame)
+        return layers | {"ViewLayer.Normal.XYZ": layers["ViewLayer.Normal.XYZ"] / 2 + 0.5}
+
+    foreign.write_sequence(tmp_path / "plain", box, foreign.blender)
+    foreign.write_sequence(tmp_path / "in", box, encoded)
+    denoise(job(tmp_path / "plain", tmp_path / "expected"))
+    assert "scaled" not in capsys.readouterr().out
+    denoise(job(tmp_path / "in", tmp_path / "out"))
+    assert "normal        scaled from [0, 1] to [-1, 1]" in capsys.readouterr().out
+    layer = "ViewLayer.Combined."
+    assert error(outputs(tmp_path / "out", layer), outputs(tmp_path / "expected", layer)) < 1e-4
