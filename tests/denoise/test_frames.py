@@ -1,5 +1,6 @@
 """Frames made of foreign pixels hold what the renderer's own would: given, derived or done without."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def test_a_dolly_moves_the_camera_that_stands_far_away(box, tmp_path):
     """Without cameras, depths of the previous frame are expected where the median has moved."""
     foreign.write_sequence(tmp_path, box, foreign.blender)
     found = frames_of(tmp_path)
-    for before, now in zip(found, found[1:], strict=False):
+    for before, now in pairwise(found):
         assert now.follows(before.moment)
         step = now.now.camera_to_world[0, :3, 3] - now.previous.camera_to_world[0, :3, 3]
         forward = now.now.camera_to_world[0, :3, 2]

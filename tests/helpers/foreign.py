@@ -1,6 +1,10 @@
-"""Sequences of OpenEXR files as other renderers write them, made of Frames whose truth is known."""
+"""Sequences of OpenEXR files as other renderers write them, made of Frames whose truth is known.
 
-from collections.abc import Callable, Mapping, Sequence
+`python -m tests.helpers.foreign CLIP|WxH FOLDER` writes one under Blender's names.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +12,10 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from datasets.frame import Frame
+from datasets.clip import Clip
+from datasets.frame import Frame, read_frame
+from eval.bench.sizes import parse_size
+from eval.bench.synthetic_frames import synthetic_frame
 from scenes.camera import View, pixel_centres, unproject
 
 Image = NDArray[np.floating]
@@ -83,7 +90,7 @@ def pbrt(frame: Frame) -> Layers:
 
 
 def write_sequence(
-    folder: Path, frames: Sequence[Frame], layers: Callable[[Frame], Layers], first: int = 1, **options: Any
+    folder: Path, frames: Iterable[Frame], layers: Callable[[Frame], Layers], first: int = 1, **options: Any
 ) -> list[Path]:
     """Files folder/0001.exr and so on."""
     return [write(folder / f"{first + i:04d}.exr", layers(frame), **options) for i, frame in enumerate(frames)]
@@ -98,3 +105,20 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
 def header(path: Path) -> dict[str, Any]:
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return dict(file.header())
+
+
+def main(source: str, out: Path) -> None:
+    """Write a clip's folder, or three synthetic frames of a size "WxH", as Blender would; references beside them."""
+    if Path(source).is_dir():
+        clip = Clip(Path(source))
+        reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "motion")
+        frames: Iterable[Frame] = (read_frame(clip, index, reads) for index in range(clip.frames))
+        for index in range(clip.frames):
+            write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
+    else:
+        frames = (synthetic_frame(index, *parse_size(source)) for index in range(3))
+    write_sequence(out / "frames", frames, blender)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
