@@ -13,7 +13,7 @@ FEW = 12  # of them that are tried at first
 DRAWS = 32  # of that many: one is all but sure to be free of outliers where less than a tenth are
 LARGEST_ERROR = 1 / 200  # of the image: the median distance of fitted positions from their pixels, rounded to half
 FLAT = 1e-4  # thickness of the positions, of their extent, below which they leave the camera open
-ORIGIN = 1e-4  # of the positions' distance: a camera so close to (0, 0, 0) stands there
+ORIGIN = 0.01  # of the positions' distance: a camera so close to (0, 0, 0) stands there
 SQUARE = 0.01  # by how much focal lengths may differ
 
 STILL = np.eye(4)[None]  # object_to_world: what moves by itself is not known
@@ -126,15 +126,27 @@ def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View |
     return view
 
 
-def stands_at_origin(view: View, positions: NDArray[np.float32], surface: NDArray[np.bool_]) -> bool:
-    """Whether a camera fitted to `positions` stands where their coordinates begin: they may be the camera's own."""
-    distance = np.median(np.abs(positions[surface]).max(axis=-1))
-    return bool(np.linalg.norm(view.camera_to_world[:3, 3]) < ORIGIN * distance)
+def is_own_space(
+    view: View, header: Mapping[str, Any], positions: NDArray[np.float32], surface: NDArray[np.bool_]
+) -> bool:
+    """Whether the `positions` that a camera was fitted to are in its own coordinates: it stands where these begin.
+
+    Where the header has `worldToCamera`, that is where it would stand in the world instead.
+    """
+    eye = view.camera_to_world[:3, 3]
+    if "worldToCamera" in header:
+        return bool(np.linalg.norm(eye) <= np.linalg.norm(eye - to_world(header)[:3, 3]))
+    return bool(np.linalg.norm(eye) < ORIGIN * np.median(np.linalg.norm(positions[surface], axis=-1)))
+
+
+def to_world(header: Mapping[str, Any]) -> Array:
+    """The inverse (4, 4) of `worldToCamera`, which EXR has for row vectors."""
+    inverse: Array = np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T)
+    return inverse
 
 
 def in_the_world(view: View, header: Mapping[str, Any]) -> View | None:
     """A view fitted in the camera's own coordinates, moved to where `worldToCamera` says; None without it."""
     if "worldToCamera" not in header:
         return None
-    to_world = np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T)
-    return view._replace(camera_to_world=to_world @ view.camera_to_world)
+    return view._replace(camera_to_world=to_world(header) @ view.camera_to_world)

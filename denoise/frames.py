@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from datasets.exr import FACTS_ATTRIBUTE, channels_of, view_of_facts
 from datasets.frame import Cameras, Frame, to_tensor
 from denoise.cameras import (
     STILL,
     in_the_world,
-    stands_at_origin,
+    is_own_space,
     view_of_header,
     view_of_positions,
 )
@@ -82,8 +83,9 @@ def camera_kind(pixels: Pixels) -> Reading:
     """What tells the cameras of a sequence that begins with this frame. Positions are believed before the header."""
     if "position" in pixels.arrays:
         own = view_of_positions(pixels.arrays["position"], pixels.surface)
-        if own and stands_at_origin(own, pixels.arrays["position"], pixels.surface):
-            moved = in_the_world(own, pixels.image.header)
+        header = pixels.image.header
+        if own and is_own_space(own, header, pixels.arrays["position"], pixels.surface):
+            moved = in_the_world(own, header)
             return Reading(cameras="positions" if moved else None, in_camera_space=True)
         if own:
             return Reading(cameras="positions")
@@ -107,6 +109,8 @@ class Shot:
         if (seen is not None) != self.seen:  # cameras are lost or found again: nothing leads from one to the other
             self.view = None
             self.seen = seen is not None
+            if not self.seen:
+                tqdm.write(f"{pixels.image.path} tells no camera, unlike the frames before it: history begins anew")
         depth = depth_of(pixels, seen)
         given = self.given_motion(pixels)
         view = seen.world if seen else self.parallel_view(pixels, depth, given)
@@ -202,9 +206,8 @@ def depth_of(pixels: Pixels, seen: Sighting | None) -> Image:
     depth: NDArray[Any]
     if seen and seen.own:
         eye = seen.own.camera_to_world[:3, 3]
-        depth = (np.where(pixels.surface[..., None], pixels.arrays["position"], 0) - eye) @ seen.own.camera_to_world[
-            :3, 2
-        ]
+        forward = seen.own.camera_to_world[:3, 2]
+        depth = (np.where(pixels.surface[..., None], pixels.arrays["position"], 0) - eye) @ forward
     elif "depth" in pixels.arrays:
         depth = pixels.arrays["depth"][..., 0]
     elif "distance" in pixels.arrays:

@@ -1,6 +1,6 @@
 """`onespp denoise`: anybody's frames through a denoiser, one after another, and what came of them on disk."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -226,7 +226,7 @@ class Work:
     def has_history(self) -> bool:
         return self.sources.is_ours or self.understanding.reading.has_history
 
-    def player(self) -> Any:
+    def player(self) -> Callable[[FrameFiles], tuple[ExrImage, Frame, int]]:
         """What makes a frame of files: the image to write to, the Frame, and how many pixels were not finite."""
         if self.sources.is_ours:
             own = OwnShot(self.denoiser.reads)

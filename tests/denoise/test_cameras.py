@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from denoise.cameras import in_the_world, stands_at_origin, view_of_header, view_of_positions
+from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
 from scenes.camera import View, intrinsics, inverse_pose, look_at, pixel_centres, project, unproject
 
 HEIGHT, WIDTH = 36, 64
@@ -86,13 +86,17 @@ def test_headers_tell_the_camera(from_zero):
     assert view_of_header({"worldToNDC": stretched}, HEIGHT, WIDTH) is None  # oblong pixels
 
 
-def test_positions_in_the_cameras_own_space():
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_positions_in_the_cameras_own_space(dtype):
     view = some_view(5)
     world_to_camera = inverse_pose(view.camera_to_world)
-    positions = points_of(view) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    own = view_of_positions(positions.astype(np.float32), SURFACE)
-    assert own is not None and stands_at_origin(own, positions.astype(np.float32), SURFACE)
-    assert_same(in_the_world(own, {"worldToCamera": world_to_camera.T}), view)
-    assert in_the_world(own, {}) is None
-    in_world = view_of_positions(points_of(view), SURFACE)
-    assert in_world is not None and not stands_at_origin(in_world, points_of(view), SURFACE)
+    header = {"worldToCamera": world_to_camera.T}
+    in_camera = points_of(view) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    for positions, is_own in ((in_camera, True), (points_of(view), False)):
+        rounded = positions.astype(dtype).astype(np.float32)
+        fitted = view_of_positions(rounded, SURFACE)
+        assert fitted is not None
+        assert is_own_space(fitted, header, rounded, SURFACE) == is_own_space(fitted, {}, rounded, SURFACE) == is_own
+        found = in_the_world(fitted, header) if is_own else fitted
+        assert_same(found, view, 1e-3 if dtype == np.float32 else 1e-2)
+        assert in_the_world(fitted, {}) is None
