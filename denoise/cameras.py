@@ -141,8 +141,7 @@ def is_own_space(
 
 def to_world(header: Mapping[str, Any]) -> Array:
     """The inverse (4, 4) of `worldToCamera`, which EXR has for row vectors."""
-    inverse: Array = np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T)
-    return inverse
+    return np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T).astype(np.float64)
 
 
 def in_the_world(view: View, header: Mapping[str, Any]) -> View | None:

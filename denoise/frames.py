@@ -89,7 +89,8 @@ def camera_kind(pixels: Pixels) -> Reading:
             return Reading(cameras="positions" if moved else None, in_camera_space=True)
         if own:
             return Reading(cameras="positions")
-    return Reading(cameras="header" if view_of_header(pixels.image.header, *pixels.size) else None)
+    has_depth = "depth" in pixels.arrays or "distance" in pixels.arrays  # without, a camera tells nothing of surfaces
+    return Reading(cameras="header" if has_depth and view_of_header(pixels.image.header, *pixels.size) else None)
 
 
 class Shot:

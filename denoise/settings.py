@@ -20,6 +20,4 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     noted = read_json(path)
     changed = [key for key in sorted(settings.keys() | noted.keys()) if settings.get(key) != noted.get(key)]
     if changed:
-        raise BadInput(
-            f"{out} holds frames denoised with another {', '.join(changed)}: choose another --out, or delete it"
-        )
+        raise BadInput(f"{out} holds frames denoised with other settings ({', '.join(changed)}): choose another --out")

@@ -126,3 +126,12 @@ def test_cameras_are_taken_from_positions_before_the_header(box, tmp_path):
     files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
     pixels = read_pixels(files[0], find_sources(open_passes(files[0]), {}))
     assert camera_kind(pixels).cameras == "positions"
+
+
+def test_a_camera_without_depth_makes_up_no_motion(box, tmp_path):
+    for index, frame in enumerate(box[:2]):
+        foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)}, header_of(frame))
+    files = sequence_of({"colour": [str(tmp_path / "*.exr")]})
+    understood = understand([files], find_sources(open_passes(files[0]), {}), READS, None)
+    assert not understood.reading.has_history
+    assert ("motion", "none: no history, every frame by itself") in understood.words

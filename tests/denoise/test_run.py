@@ -275,7 +275,7 @@ def test_settings_are_never_mixed(spheres, tmp_path):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
     denoise(job(tmp_path / "in", tmp_path / "out"))
     for other in ({"denoiser": "eaw"}, {"reset_at": [2]}, {"stored_as": "half"}, {"motion": "XY,-x,+y,pixels"}):
-        with pytest.raises(BadInput, match="denoised with another"):
+        with pytest.raises(BadInput, match="denoised with other settings"):
             denoise(job(tmp_path / "in", tmp_path / "out", **other))
 
 
