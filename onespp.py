@@ -4,6 +4,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -356,7 +357,7 @@ Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
 
 def denoise(
     frames: Annotated[
-        Patterns, Positional, arg(metavar="PATTERN...", help="of files with the colour, and often all")
+        Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, often with all layers")
     ] = (),
     denoiser: Annotated[str, arg(metavar="DENOISER")] = "wskp6",
     out: Annotated[Path, arg(metavar="DIR", help="where denoised frames go, under their own names")] = Path("denoised"),
@@ -388,24 +389,23 @@ def denoise(
         layers: say yourself what is where, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
         motion: say yourself what motion vectors mean, such as XY,+x,-y,pixels, in the words that are printed.
     """
-    import torch
-
     from denoise.run import Job
     from denoise.run import denoise as denoise_sequence
     from eval.bench.sizes import threads_or_all
     from eval.selection import choose, untrained, weights_file
+    from timing import thread_count
 
     colour = (*frames, *hdr)
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
     if weights is None:
-        choose([denoiser], [], lambda name: untrained(runs, budget, name))
+        choose([denoiser], (), partial(untrained, runs, budget))
         weights = weights_file(denoiser, runs, budget)
-    torch.set_num_threads(threads_or_all(threads))
     passes = {"colour": colour, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)
-    denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png))
+    with thread_count(threads_or_all(threads)):
+        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png))
 
 
 Command = Callable[..., None]
