@@ -4,6 +4,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -370,6 +371,62 @@ def papers(runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     print(against_papers(runs, budget))
 
 
+Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
+
+
+def denoise(
+    frames: Annotated[
+        Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, often with all layers")
+    ] = (),
+    denoiser: Annotated[str, arg(metavar="DENOISER")] = "wskp6",
+    out: Annotated[Path, arg(metavar="DIR", help="where denoised frames go, under their own names")] = Path("denoised"),
+    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default RUNS/train/...")] = None,
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+    hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="the same as the colour's files")] = (),
+    alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in files of its own")] = (),
+    nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in files of their own")] = (),
+    mv: Annotated[Patterns, arg(metavar="PATTERN...", help="motion vectors in files of their own")] = (),
+    depth: Annotated[Patterns, arg(metavar="PATTERN...", help="depth in files of its own")] = (),
+    layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...")] = (),
+    motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT")] = None,
+    ref: Annotated[Patterns, arg(metavar="PATTERN...", aliases=["-r"], help="references to measure against")] = (),
+    frame_range: Annotated[
+        str | None, arg(name="frames", metavar="A-B", help="the numbers of those to denoise")
+    ] = None,
+    reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frames after a cut: no history leads there")] = (),
+    quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="OIDN's")] = None,
+    stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as they were")] = None,
+    png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
+    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+) -> None:
+    """Denoise a sequence of OpenEXR files from any renderer, or go on with it.
+
+    Layers are found by the names in use; what motion vectors mean is found out. All of it is printed at the start.
+
+    Args:
+        layers: say yourself what is where, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
+        motion: say yourself what motion vectors mean, such as XY,+x,-y,pixels, in the words that are printed.
+    """
+    from denoise.run import Job
+    from denoise.run import denoise as denoise_sequence
+    from eval.bench.sizes import threads_or_all
+    from eval.selection import choose, untrained, weights_file
+    from timing import thread_count
+
+    colour = (*frames, *hdr)
+    if not colour:
+        raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
+    if weights is None:
+        choose([denoiser], (), partial(untrained, runs, budget))
+        weights = weights_file(denoiser, runs, budget)
+    passes = {"colour": colour, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
+    patterns = {name: each for name, each in passes.items() if each}
+    selection = (layers, motion, ref, frame_range, reset_at)
+    with thread_count(threads_or_all(threads)):
+        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png))
+
+
 Command = Callable[..., None]
 Commands = dict[str, "Command | Commands"]
 
@@ -385,6 +442,9 @@ GROUPS: dict[str, Commands] = {
         "info": info,
         "verify": verify,
         "exr": exr,
+    },
+    "Your own frames": {
+        "denoise": denoise,
     },
     "A closer look": {
         "show": show,

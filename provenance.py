@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).parent
-FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval")
+FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval", "denoise")
 BESIDE_THEM = ("allocator", "errors", "files", "plotting", "provenance", "timing")
 
 # What decides the bytes of a data set, and the numbers of whatever denoises it.

@@ -1,6 +1,7 @@
 """OpenEXR exchange: one multi-layer file per frame, which other tools read, and back without loss."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,11 @@ def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]
             facts = json.loads(file.header()[FACTS_ATTRIBUTE])
     except (RuntimeError, KeyError, ValueError) as error:
         raise BadInput(f"{path} is missing, damaged or not written by onespp ({error})") from None
+    return channels_of(planes), view_of_facts(facts), facts
+
+
+def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Those of our channels, as `Clip.read` returns them, that EXR channels (H, W) hold: the inverse of layers_of."""
     channels: dict[str, NDArray[Any]] = {}
     for name, channel in CHANNELS.items():
         components = COMPONENTS.get(name, "RGB")
@@ -106,7 +112,12 @@ def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]
             images = [np.stack([planes[f"{layer}.{c}"] for c in components], axis=-1) for layer in layers]
             array = images[0] if len(images) == 1 else np.stack(images)
             channels[name] = array.astype(np.uint16) if channel.dtype == "<u2" else array
-    return channels, View._make(np.array(facts[key]) for key in View._fields), facts
+    return channels
+
+
+def view_of_facts(facts: Mapping[str, Any]) -> View:
+    """The exact view that the header's facts hold."""
+    return View._make(np.array(facts[key]) for key in View._fields)
 
 
 def export_clip(path: Path, out: Path) -> int:

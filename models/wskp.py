@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models.baselines import Accumulated, AccumulatedState, Accumulating
+from models.compiled.fusion import THREAD_ROWS
 from models.denoiser import State, as_it_is, matching_state
 from models.features import network_features, scaled_normal
 from models.fusion import fuse
@@ -20,6 +21,8 @@ from models.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.running_scale import RunningScale, running_scale
 
 WIDTH = 24  # ours: the widths drawn in the paper are not known
+LARGEST_WHOLE = 1920 * 1080  # px; the network's images of larger frames would take gigabytes: they are cut into strips
+STRIP_PIXELS = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class KernelPredictor(Accumulating):
     dispensable: ClassVar = {"albedo": as_it_is, "normal": scaled_normal}
     filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
     network: nn.Module
+    reach: int | None = None  # rows above and below that a pixel's result follows from; None for all
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -78,7 +82,32 @@ class KernelPredictor(Accumulating):
         return WSKPState(frame.moment, history, scale, None)
 
     def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
-        """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any."""
+        """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any.
+
+        Large images are filtered in strips of rows, with the same result.
+        """
+        height, width = frame.size
+        if self.reach is None or height * width <= LARGEST_WHOLE:
+            return self.filter_whole(frame, irradiance, scale)
+        rows = max(1, STRIP_PIXELS // width // THREAD_ROWS) * THREAD_ROWS
+        strips = [self.filter_rows(frame, irradiance, scale, top, top + rows) for top in range(0, height, rows)]
+        filtered, mixtures = zip(*strips, strict=True)
+        return torch.cat(filtered, dim=-2), None if mixtures[0] is None else torch.cat(mixtures, dim=-2)
+
+    def filter_rows(
+        self, frame: Frame, irradiance: Tensor, scale: RunningScale, top: int, bottom: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """What `filter_whole` returns, of the rows from `top` to before `bottom`."""
+        assert self.reach is not None
+        first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # the kernel rounds by its own strips: keep them
+        around = slice(first, bottom + self.reach)
+        inner = slice(top - first, bottom - first)
+        part = replace(frame, channels={name: frame.channels[name][..., around, :] for name in self.filter_reads})
+        filtered, mixture = self.filter_whole(part, irradiance[..., around, :], scale)
+        return filtered[..., inner, :], None if mixture is None else mixture[..., inner, :]
+
+    def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
+        """What `filter` returns, in one piece."""
         x = self.features(frame, irradiance, scale)
         predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
         return self.reconstruct(irradiance, predicted, frame.surface)
@@ -110,6 +139,7 @@ class WSKP(KernelPredictor):
         super().__init__(signal=signal)
         self.windows = tuple(windows)
         self.network = trunk(self.layers, 2 * len(windows), sizes)
+        self.reach = self.layers * (max(sizes) // 2) + max(windows) // 2
 
     def reconstruct(
         self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
@@ -132,6 +162,7 @@ class KP(KernelPredictor):
     def __init__(self, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         self.network = trunk(WSKP.layers, self.window**2, sizes)
+        self.reach = WSKP.layers * (max(sizes) // 2) + self.window // 2
 
     def reconstruct(
         self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None

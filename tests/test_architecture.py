@@ -22,6 +22,16 @@ MAY_IMPORT = {
     "models": {"models", "datasets.frame", "datasets.channels"},
     "train": {"train", "models", "datasets"},
     "eval": {"eval", "train", "models", "datasets"},
+    "denoise": {
+        "denoise",
+        "eval.comparison",
+        "eval.metrics",
+        "eval.spec",
+        "eval.bench.memory",
+        "models",
+        "datasets",
+        "scenes.camera",
+    },
 }
 GENERATION_JOB = {
     "adaptive_spp.py",

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from eval.bench.fusion import unfold_fuse
+from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, registry
 from models.accumulation import accumulate
 from models.compiled.exponential import exp, log
@@ -129,3 +130,21 @@ def test_pairs_of_pixels_are_convolved_as_pixels_are(dtype, size):
     x = torch.randn(2, 10, *size).to(dtype)
     for image in (x, x.contiguous(memory_format=torch.channels_last)):
         torch.testing.assert_close(layer(image), F.conv2d(x, layer.weight, layer.bias, padding=2))
+
+
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "kp"])
+@pytest.mark.parametrize("height", [70, 137])
+def test_large_frames_are_filtered_in_strips_bit_for_bit(name, height, monkeypatch):
+    torch.manual_seed(0)
+    frame = synthetic_frame(0, height, 90)
+    denoiser = registry.create(name)
+    denoiser.prepare()
+    with torch.inference_mode():
+        whole, state = denoiser(frame, None)
+        monkeypatch.setattr("models.wskp.LARGEST_WHOLE", 1)
+        monkeypatch.setattr("models.wskp.STRIP_PIXELS", 32 * 90)
+        strips, state_of_strips = denoiser(frame, None)
+    assert torch.equal(strips, whole)
+    assert all(
+        torch.equal(a, b) for a, b in zip(state.pictures().values(), state_of_strips.pictures().values(), strict=True)
+    )

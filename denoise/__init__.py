@@ -1,0 +1,1 @@
+"""Other renderers' frames: read, understood, denoised and written."""

@@ -1,0 +1,151 @@
+"""The camera of a foreign frame: from the header's matrices, or from where its pixels say that surfaces are."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.camera import Array, View, pixel_centres
+
+SAMPLES = 1 << 14  # positions that a camera is fitted to
+FEW = 12  # of them that are tried at first
+DRAWS = 32  # of that many: one is all but sure to be free of outliers where less than a tenth are
+LARGEST_ERROR = 1 / 200  # of the image: the median distance of fitted positions from their pixels, rounded to half
+FLAT = 1e-4  # thickness of the positions, of their extent, below which they leave the camera open
+ORIGIN = 0.01  # of the positions' distance: a camera so close to (0, 0, 0) stands there
+SQUARE = 0.01  # by how much focal lengths may differ
+
+STILL = np.eye(4)[None]  # object_to_world: what moves by itself is not known
+
+
+def view_of(projection: Array) -> View | None:
+    """The view of a projection (3, 4) from world to homogeneous pixels, of positive weight before the camera.
+
+    None where it is singular. World coordinates may be left-handed, and so is the camera's frame then.
+    """
+    if not np.isfinite(projection).all() or np.linalg.cond(projection[:, :3]) > 1e12:
+        return None
+    # RQ decomposition by a QR of the reversed matrix.
+    q, r = np.linalg.qr(projection[::-1, :3].T)
+    K = r.T[::-1, ::-1]
+    rotation = q.T[::-1]
+    signs = np.sign(np.diag(K)) * [-1, -1, 1]  # x left, y up, z forward; see scenes.camera
+    K = K * signs / (K[2, 2] * signs[2])
+    K[0, 1] = 0  # no camera here shears
+    camera_to_world = np.eye(4)
+    camera_to_world[:3, :3] = (signs[:, None] * rotation).T
+    camera_to_world[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    return View(K, camera_to_world, STILL)
+
+
+def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]) -> View | None:
+    """The view that sees `positions` (H, W, 3) at their pixels where there is a `surface` (H, W).
+
+    The direct linear transform (Hartley and Zisserman, §7.1), first of a few points (RANSAC, §4.7), then of all that
+    agree. None where there is no such pinhole camera, or more than one, as for points in a plane.
+    """
+    place = np.nonzero(surface & np.isfinite(positions).all(axis=-1))
+    stride = max(1, len(place[0]) // SAMPLES)
+    rows, columns = (index[::stride] for index in place)
+    points = positions[rows, columns].astype(np.float64)
+    pixels = pixel_centres(*surface.shape)[rows, columns]
+    if len(points) < FEW:
+        return None
+    middle = points.mean(axis=0)
+    thickness = np.linalg.svd(points - middle, compute_uv=False)
+    if thickness[2] < FLAT * thickness[0]:
+        return None
+
+    def median_error(fit: Array) -> float:
+        return float(np.median(reprojection_error(fit, points, pixels)))
+
+    rng = np.random.default_rng(0)
+    draws = (rng.choice(len(points), FEW, replace=False) for _ in range(DRAWS))
+    fit = min((linear_fit(points[few], pixels[few]) for few in draws), key=median_error)
+    for _ in range(2):
+        good = reprojection_error(fit, points, pixels) <= max(3 * median_error(fit), 1e-3)
+        fit = linear_fit(points[good], pixels[good])
+    return view_of(fit) if median_error(fit) <= LARGEST_ERROR * max(surface.shape) else None
+
+
+def linear_fit(points: Array, pixels: Array) -> Array:
+    """The projection (3, 4) that maps `points` (N, 3) to `pixels` (N, 2) with the least algebraic error."""
+    to_unit_3 = normalising(points)
+    to_unit_2 = normalising(pixels)
+    p = homogeneous(points) @ to_unit_3.T
+    x, y, _ = (homogeneous(pixels) @ to_unit_2.T).T
+    zero = np.zeros_like(p)
+    equations = np.concatenate([np.hstack([p, zero, -x[:, None] * p]), np.hstack([zero, p, -y[:, None] * p])])
+    unit = np.linalg.svd(np.linalg.qr(equations, mode="r"))[2][-1].reshape(3, 4)
+    projection: Array = np.linalg.inv(to_unit_2) @ unit @ to_unit_3
+    weight = homogeneous(points) @ projection[2]
+    return projection * np.sign(np.median(weight))
+
+
+def homogeneous(points: Array) -> Array:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def normalising(points: Array) -> Array:
+    """The homogeneous transform that moves `points` (N, D) to mean 0 and scales them to a standard deviation of 1."""
+    scale = 1 / max(float(points.std()), 1e-30)
+    matrix = np.diag([scale] * points.shape[1] + [1.0])
+    matrix[:-1, -1] = -scale * points.mean(axis=0)
+    return matrix
+
+
+def reprojection_error(projection: Array, points: Array, pixels: Array) -> Array:
+    """Distances (N,) in pixels."""
+    image = homogeneous(points) @ projection.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error: Array = np.linalg.norm(image[:, :2] / image[:, 2:] - pixels, axis=1)
+    return np.nan_to_num(error, nan=np.inf)
+
+
+def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View | None:
+    """The view of `worldToNDC`, None without.
+
+    OpenEXR means coordinates of [-1, 1] with y up; where the viewing axis meets the image at (1/2, 1/2), they are
+    [0, 1]. A matrix that makes pixels oblong is not believed: pbrt writes one for images that are not square.
+    """
+    if "worldToNDC" not in header:
+        return None
+    ndc = np.asarray(header["worldToNDC"], np.float64).T  # EXR has matrices for row vectors
+    axis = ndc @ [*ndc[3, :3], 0]
+    if not axis[3] > 0:
+        return None
+    centre = axis[:2] / axis[3]
+    from_zero = np.abs(centre - 0.5).max() < np.abs(centre).max()
+    scale, shift = ([width, -height], [0, height]) if from_zero else ([width / 2, -height / 2], [width / 2, height / 2])
+    to_pixels = np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]], [0, 0, 1.0]])
+    view = view_of(to_pixels @ ndc[[0, 1, 3]])
+    aspect = float(header.get("pixelAspectRatio", 1.0))
+    if view is None or abs(view.K[1, 1] / (view.K[0, 0] * aspect) - 1) > SQUARE:
+        return None
+    return view
+
+
+def is_own_space(
+    view: View, header: Mapping[str, Any], positions: NDArray[np.float32], surface: NDArray[np.bool_]
+) -> bool:
+    """Whether the `positions` that a camera was fitted to are in its own coordinates: it stands where these begin.
+
+    Where the header has `worldToCamera`, that is where it would stand in the world instead.
+    """
+    eye = view.camera_to_world[:3, 3]
+    if "worldToCamera" in header:
+        return bool(np.linalg.norm(eye) <= np.linalg.norm(eye - to_world(header)[:3, 3]))
+    return bool(np.linalg.norm(eye) < ORIGIN * np.median(np.linalg.norm(positions[surface], axis=-1)))
+
+
+def to_world(header: Mapping[str, Any]) -> Array:
+    """The inverse (4, 4) of `worldToCamera`, which EXR has for row vectors."""
+    return np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T).astype(np.float64)
+
+
+def in_the_world(view: View, header: Mapping[str, Any]) -> View | None:
+    """A view fitted in the camera's own coordinates, moved to where `worldToCamera` says; None without it."""
+    if "worldToCamera" not in header:
+        return None
+    return view._replace(camera_to_world=to_world(header) @ view.camera_to_world)

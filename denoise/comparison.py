@@ -1,0 +1,55 @@
+"""How far denoised frames are from references of the same frames."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tabulate import tabulate
+
+from datasets.frame import to_tensor
+from denoise.exr_image import ExrImage
+from denoise.sequence import COLOUR, FrameFiles
+from denoise.sources import find_sources
+from errors import BadInput
+from eval.comparison import Comparison
+from eval.metrics import METRICS
+from files import write_file
+
+MEASURED = ("rmse", "psnr", "ssim")
+FILE = "metrics.csv"
+
+
+def compare(
+    frames: Sequence[FrameFiles], references: Sequence[Path], out: Path, target: Sequence[str], exposure: float
+) -> str:
+    """Measure the `target` channels of frames on disk against references, as displayed; keep all in metrics.csv.
+
+    Returns a table of the means. Raises BadInput where a reference is of another size.
+    """
+    rows = []
+    for files, reference in zip(frames, references, strict=True):
+        halves = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)  # of one reference: its noise is not known
+        denoised = to_tensor(radiance(out / files.name, target))
+        if halves.shape[1:] != denoised.shape[1:]:
+            raise BadInput(f"{reference} is of another size than {out / files.name}")
+        comparison = Comparison(denoised, halves, exposure)
+        rows.append([files.number, *(METRICS[name].of(comparison) for name in MEASURED)])
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([["frame", *MEASURED], *rows])
+    write_file(out / FILE, text.getvalue().encode())
+    columns = zip(*(row[1:] for row in rows), strict=True)
+    means = [None if None in column else float(np.mean(column)) for column in columns]
+    cells = [
+        "-" if mean is None else METRICS[name].form.format(mean) for name, mean in zip(MEASURED, means, strict=True)
+    ]
+    return tabulate([cells], [f"mean {METRICS[name].title}" for name in MEASURED], disable_numparse=True)
+
+
+def radiance(path: Path, target: Sequence[str]) -> NDArray[np.float32]:
+    """The radiance (H, W, 3) of a finished image, finite: its `target` channels, or else those known to be radiance."""
+    image = ExrImage(path)
+    channels = target if all(name in image.channels for name in target) else find_sources({COLOUR: image}, {}).target
+    return np.nan_to_num(image.stacked(channels), nan=0.0, posinf=0.0, neginf=0.0)

@@ -1,0 +1,76 @@
+"""An OpenEXR file in memory, of whatever maker: its planes by name, its header, and how it is written with changes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from errors import BadInput
+from files import replacing
+
+LARGEST_HALF = 65504.0
+
+
+def plane_name(part: str, channel: str, several: bool) -> str:
+    """The channel's name with that of its part before it, unless it is the file's only part or begins with it."""
+    begins = channel.casefold().startswith(f"{part}.".casefold())
+    return f"{part}.{channel}" if several and part and not begins else channel
+
+
+class ExrImage:
+    """The planes (H, W) of all parts of a file. Raises BadInput where the file is missing, damaged or not an image."""
+
+    def __init__(self, path: Path, header_only: bool = False):
+        self.path = path
+        if not path.is_file():
+            raise BadInput(f"{path} is missing")
+        try:
+            headers = OpenEXR.File(str(path), header_only=True)
+            self.file = headers if header_only else OpenEXR.File(str(path), separate_channels=True)
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise BadInput(f"{path} is damaged or no OpenEXR image ({error}): render it again") from None
+        if len(self.file.parts) < len(headers.parts) or not headers.parts:  # OpenEXR leaves out what it cannot read
+            raise BadInput(f"{path} is damaged: render it again")
+        several = len(self.file.parts) > 1
+        self.header: dict[str, Any] = {key: value for part in self.file.parts for key, value in part.header.items()}
+        self.channels: dict[str, Any] = {
+            plane_name(part.name(), name, several): channel
+            for part in self.file.parts
+            for name, channel in (part.channels or {c.name: c for c in part.header["channels"]}).items()
+        }
+        low, high = self.header["dataWindow"]
+        self.width, self.height = (int(number) for number in high - low + 1)
+
+    def stacked(self, channels: Sequence[str]) -> NDArray[np.float32]:
+        """The named channels as one array (H, W, C). Raises BadInput where one is missing or of another size."""
+        planes = []
+        for name in channels:
+            if name not in self.channels:
+                raise BadInput(f"{self.path} has no channel '{name}', which the first frame has")
+            plane = self.channels[name].pixels
+            if plane.shape != (self.height, self.width):
+                raise BadInput(f"{self.path}: the channel '{name}' is subsampled or of another size than the others")
+            planes.append(plane.astype(np.float32))
+        return np.stack(planes, axis=-1)
+
+    def replace(self, channels: Sequence[str], image: NDArray[np.float32], dtype: type | None) -> None:
+        """Put `image` (H, W, C) in place of the named channels, in their own precision or in `dtype`."""
+        for index, name in enumerate(channels):
+            target = np.dtype(dtype or self.channels[name].pixels.dtype)
+            limit = LARGEST_HALF if target == np.float16 else np.inf
+            self.channels[name].pixels = np.ascontiguousarray(image[..., index].clip(-limit, limit), target)
+
+    def write(self, path: Path, note: str) -> None:
+        """Write all parts, layers and attributes atomically, with `note` as the attribute `denoised`.
+
+        Raises BadInput where the disk is full or the folder cannot be written.
+        """
+        self.file.parts[0].header["denoised"] = note
+        try:
+            with replacing(path) as temporary:
+                self.file.write(str(temporary))
+        except RuntimeError as error:  # what OpenEXR raises for a full or unwritable disk
+            raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None

@@ -1,0 +1,90 @@
+"""The pixels of one foreign frame, by quantity: read from its files, mended and counted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from denoise.exr_image import ExrImage
+from denoise.sequence import COLOUR, FrameFiles
+from denoise.sources import Sources
+from errors import BadInput
+
+Image = NDArray[np.float32]
+
+FARTHEST = 1e9  # depth; beyond it is background: Blender says 1e10
+MAY_BE_INFINITE = ("depth", "distance", "position")  # at the background
+
+
+@dataclass
+class Pixels:
+    """One frame.
+
+    Attributes:
+        image: the file that holds the colour.
+        arrays: (H, W, C) by quantity (layers.KNOWN), as the file means them; finite, albedo in [0, 1].
+        surface: where pixels show a surface, (H, W).
+        nonfinite: how many pixels were not finite and were set to 0.
+    """
+
+    image: ExrImage
+    arrays: dict[str, Image]
+    surface: NDArray[np.bool_]
+    nonfinite: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.image.height, self.image.width
+
+
+def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrImage]:
+    """The files of a frame by pass. Raises BadInput where one is damaged or of another size than the colour's."""
+    images = {name: ExrImage(path, header_only) for name, path in files.passes.items()}
+    colour = images[COLOUR]
+    for image in images.values():
+        if (image.height, image.width) != (colour.height, colour.width):
+            raise BadInput(
+                f"{image.path} is {image.width}x{image.height} and {colour.path} {colour.width}x{colour.height}: "
+                "the passes of a frame must have the same size"
+            )
+    return images
+
+
+def read_pixels(files: FrameFiles, sources: Sources) -> Pixels:
+    """All that a denoiser may need of a frame. Raises BadInput where a file lacks what the first frame's has."""
+    images = open_passes(files)
+    arrays = {
+        name: images[source.pass_name].stacked(source.layer.channels) for name, source in sources.quantities.items()
+    }
+    bad = np.zeros(next(iter(arrays.values())).shape[:2], bool)
+    for name, array in arrays.items():
+        wrong = np.isnan(array) if name in MAY_BE_INFINITE else ~np.isfinite(array)
+        if wrong.any():
+            there = wrong.any(axis=-1)
+            array[there] = 0  # a colour that lacks one component has another hue
+            bad |= there
+    if "albedo" in arrays:
+        arrays["albedo"].clip(0, 1, out=arrays["albedo"])
+    alpha = images[COLOUR].stacked([sources.alpha])[..., 0] if sources.alpha else None
+    return Pixels(images[COLOUR], arrays, surface_of(arrays, alpha), int(bad.sum()))
+
+
+def surface_of(arrays: dict[str, Image], alpha: Image | None) -> NDArray[np.bool_]:
+    """Where pixels show a surface, (H, W): told by distances, or positions, or normals and albedo; and by alpha.
+
+    An alpha channel that is 0 everywhere tells nothing.
+    """
+    ranges = [arrays[name][..., 0] for name in ("depth", "distance") if name in arrays]
+    if ranges:
+        surface = (ranges[0] > 0) & (ranges[0] < FARTHEST)
+    elif "position" in arrays:
+        position = arrays["position"]
+        surface = (position != 0).any(axis=-1) & (np.abs(position) < FARTHEST).all(axis=-1)
+    elif "normal" in arrays:
+        surface = (arrays["normal"] != 0).any(axis=-1)
+        if "albedo" in arrays:
+            surface |= (arrays["albedo"] != 0).any(axis=-1)
+    else:
+        surface = np.ones(arrays[COLOUR].shape[:2], bool)
+    return surface & (alpha > 0) if alpha is not None and (alpha > 0).any() else surface

@@ -1,0 +1,102 @@
+"""Cameras are recovered from positions and headers, and not where they cannot be."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
+from scenes.camera import View, intrinsics, inverse_pose, look_at, pixel_centres, project, unproject
+
+HEIGHT, WIDTH = 36, 64
+SURFACE = np.ones((HEIGHT, WIDTH), bool)
+
+
+def some_view(seed: int) -> View:
+    rng = np.random.default_rng(seed)
+    eye = rng.uniform(-3, 3, 3)
+    return View(intrinsics(rng.uniform(20, 100), HEIGHT, WIDTH), look_at(eye, rng.uniform(4, 6, 3)), np.eye(4)[None])
+
+
+def points_of(view: View, seed: int = 0) -> np.ndarray:
+    depth = np.random.default_rng(seed).uniform(2, 9, (HEIGHT, WIDTH))
+    return unproject(pixel_centres(HEIGHT, WIDTH), depth, view).astype(np.float32)
+
+
+def assert_same(found: View | None, view: View, tolerance: float = 1e-3) -> None:
+    assert found is not None
+    np.testing.assert_allclose(found.camera_to_world, view.camera_to_world, atol=tolerance)
+    np.testing.assert_allclose(found.K, view.K, atol=tolerance * WIDTH)
+
+
+@given(st.integers(0, 10**6))
+def test_positions_tell_the_camera(seed):
+    view = some_view(seed)
+    assert_same(view_of_positions(points_of(view), SURFACE), view)
+
+
+def test_a_few_wrong_positions_do_no_harm():
+    view = some_view(1)
+    positions = points_of(view)
+    positions[::9, ::7] = 100
+    positions[3, 4] = np.nan
+    assert_same(view_of_positions(positions, SURFACE), view)
+
+
+def test_positions_rounded_to_half_tell_the_camera():
+    view = some_view(6)
+    assert_same(view_of_positions(points_of(view).astype(np.float16).astype(np.float32), SURFACE), view, 1e-2)
+
+
+def test_left_handed_worlds_project_alike():
+    view = some_view(2)
+    mirrored = points_of(view) * [1, 1, -1]
+    found = view_of_positions(mirrored, SURFACE)
+    assert found is not None
+    np.testing.assert_allclose(project(mirrored, SURFACE, found), pixel_centres(HEIGHT, WIDTH), atol=1e-2)
+    identity = found.camera_to_world @ inverse_pose(found.camera_to_world)
+    np.testing.assert_allclose(identity, np.eye(4), atol=1e-9)
+
+
+def test_what_leaves_the_camera_open_tells_none():
+    view = some_view(3)
+    wall = unproject(pixel_centres(HEIGHT, WIDTH), np.full((HEIGHT, WIDTH), 3.0), view)  # a plane
+    noise = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3))
+    for positions in (wall, noise, np.zeros_like(noise)):
+        assert view_of_positions(positions.astype(np.float32), SURFACE) is None
+    assert view_of_positions(points_of(view), ~SURFACE) is None
+
+
+def ndc(view: View, from_zero: bool) -> np.ndarray:
+    """`worldToNDC` for row vectors, of a view."""
+    pixels = view.K @ inverse_pose(view.camera_to_world)[:3]
+    to_unit = np.array([[1 / WIDTH, 0, 0], [0, -1 / HEIGHT, 1], [0, 0, 1]])  # [0, 1], y up
+    x, y, w = to_unit @ pixels
+    rows = [x, y, w, w] if from_zero else [2 * x - w, 2 * y - w, w, w]
+    return np.array(rows, np.float32).T
+
+
+@pytest.mark.parametrize("from_zero", [True, False])
+def test_headers_tell_the_camera(from_zero):
+    view = some_view(4)
+    assert_same(view_of_header({"worldToNDC": ndc(view, from_zero)}, HEIGHT, WIDTH), view, 1e-4)
+    assert view_of_header({}, HEIGHT, WIDTH) is None
+    assert view_of_header({"worldToNDC": np.zeros((4, 4))}, HEIGHT, WIDTH) is None
+    stretched = ndc(view, from_zero) * [[0.5, 1, 1, 1]]
+    assert view_of_header({"worldToNDC": stretched}, HEIGHT, WIDTH) is None  # oblong pixels
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_positions_in_the_cameras_own_space(dtype):
+    view = some_view(5)
+    world_to_camera = inverse_pose(view.camera_to_world)
+    header = {"worldToCamera": world_to_camera.T}
+    in_camera = points_of(view) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    for positions, is_own in ((in_camera, True), (points_of(view), False)):
+        rounded = positions.astype(dtype).astype(np.float32)
+        fitted = view_of_positions(rounded, SURFACE)
+        assert fitted is not None
+        assert is_own_space(fitted, header, rounded, SURFACE) == is_own_space(fitted, {}, rounded, SURFACE) == is_own
+        found = in_the_world(fitted, header) if is_own else fitted
+        assert_same(found, view, 1e-3 if dtype == np.float32 else 1e-2)
+        assert in_the_world(fitted, {}) is None

@@ -1,0 +1,137 @@
+"""Frames made of foreign pixels hold what the renderer's own would: given, derived or done without."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.frame import Frame
+from denoise.frames import Shot, camera_kind
+from denoise.pixels import open_passes, read_pixels
+from denoise.sequence import sequence_of
+from denoise.sources import find_sources
+from denoise.understanding import understand
+from tests.helpers import foreign
+
+READS = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+
+
+def frames_of(folder: Path) -> list[Frame]:
+    files = sequence_of({"colour": [str(folder / "*.exr")]})
+    sources = find_sources(open_passes(files[0], header_only=True), {})
+    shot = Shot(understand([files], sources, READS, None).reading, READS, "test")
+    return [shot.frame(read_pixels(each, sources)) for each in files]
+
+
+def header_of(frame: Frame) -> dict[str, np.ndarray]:
+    """`worldToNDC` as OpenEXR means it: [-1, 1], y up."""
+    view = foreign.view(frame)
+    height, width = frame.size
+    to_unit = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
+    x, y, w = to_unit @ view.K @ np.linalg.inv(view.camera_to_world)[:3]
+    return {"worldToNDC": np.ascontiguousarray(np.array([x, y, w, w]).T, np.float32)}
+
+
+def share_alike(a: torch.Tensor, b: torch.Tensor) -> float:
+    """The share of pixels whose normals point the same way."""
+    return float(((a * b).sum(dim=1) > 0.99).float().mean())
+
+
+@pytest.mark.parametrize("kind", ["depth", "distance"])
+def test_depth_and_the_headers_camera_give_motion_and_normals(box, tmp_path, kind):
+    for index, frame in enumerate(box):
+        eye = foreign.view(frame).camera_to_world[:3, 3]
+        distance = np.linalg.norm(foreign.positions(frame) - eye, axis=-1, keepdims=True)
+        layer = {"Z": foreign.image(frame, "depth")} if kind == "depth" else {"distance.Y": distance}
+        foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)} | layer, header_of(frame))
+    for found, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
+        torch.testing.assert_close(found.depth, frame.depth, rtol=1e-4, atol=0)
+        torch.testing.assert_close(found.motion, frame.motion, rtol=0, atol=0.02)
+        assert share_alike(found.normal, frame.normal) > 0.95  # all but edges
+    first, second, *_ = frames_of(tmp_path)
+    assert second.follows(first.moment) and not first.follows(second.moment)
+
+
+def test_positions_give_the_same_cameras_as_ours(box, tmp_path):
+    foreign.write_sequence(tmp_path, box, foreign.pbrt)
+    for found, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
+        torch.testing.assert_close(found.now.camera_to_world, frame.now.camera_to_world, rtol=0, atol=1e-4)
+        torch.testing.assert_close(found.motion, frame.motion, rtol=0, atol=0.02)
+        torch.testing.assert_close(found.view_normal(), frame.view_normal(), rtol=0, atol=1e-2)
+
+
+def test_a_dolly_moves_the_camera_that_stands_far_away(box, tmp_path):
+    """Without cameras, depths of the previous frame are expected where the median has moved."""
+    foreign.write_sequence(tmp_path, box, foreign.blender)
+    found = frames_of(tmp_path)
+    for before, now in pairwise(found):
+        assert now.follows(before.moment)
+        step = now.now.camera_to_world[0, :3, 3] - now.previous.camera_to_world[0, :3, 3]
+        forward = now.now.camera_to_world[0, :3, 2]
+        expected = float((step * forward).sum())
+        assert abs(expected) == pytest.approx(float(step.norm()), abs=1e-9)
+        change = float(before.depth.median() - now.depth.median())
+        assert abs(expected - change) < 0.02 * float(now.depth.median())
+
+
+def test_what_is_background(tmp_path):
+    sky = np.zeros((3, 4, 1))
+    sky[0] = 1
+    colour = np.full((3, 4, 3), 2.0)
+    normal = np.where(sky > 0, 0, [0.0, 0, 1])
+    cases = {
+        "zero": {"Z": np.where(sky > 0, 0, 5.0)},
+        "infinite": {"Z": np.where(sky > 0, np.inf, 5.0)},
+        "blender": {"Z": np.where(sky > 0, 1e10, 5.0)},
+        "alpha": {"A": 1 - sky},
+        "normals": {"N.XYZ": normal, "albedo.RGB": 0.5 * np.abs(normal)},
+        "positions": {"P.XYZ": np.where(sky > 0, 0, [1.0, 2, 3])},
+    }
+    for name, layers in cases.items():
+        foreign.write(tmp_path / name / "1.exr", {"RGB": colour} | layers)
+        (frame,) = frames_of(tmp_path / name)
+        there = torch.from_numpy(sky[..., 0] == 0)
+        assert torch.equal(frame.depth[0, 0] > 0, there), name
+        assert torch.equal(frame.mesh_id[0, 0] == 1, there)
+        assert (frame.direct[0, 0] == 2 * there).all() and (frame.emission[0, 0] == 2 * ~there).all()
+        assert (frame.normal[0].norm(dim=0) == there).all()
+
+
+def test_emission_is_set_apart_on_surfaces(spheres, tmp_path):
+    lamp = np.zeros((40, 56, 3))
+    lamp[30:35, 10:20] = 7
+    layers = foreign.blender(spheres[0]) | {"ViewLayer.Emit.RGB": lamp}
+    layers["ViewLayer.Noisy Image.RGBA"][..., :3] += lamp
+    foreign.write(tmp_path / "1.exr", layers)
+    (frame,) = frames_of(tmp_path)
+    assert frame.emission[0, 0, 32, 15] == 7
+    torch.testing.assert_close(frame.direct[0, :, 32, 15], (spheres[0].direct + spheres[0].indirect)[0, :, 32, 15])
+
+
+def test_albedo_is_clamped_and_bad_motion_is_none(spheres, tmp_path):
+    layers = foreign.blender(spheres[1])
+    layers["ViewLayer.Denoising Albedo.RGB"][30, 20] = [-1, 0.5, 3]
+    layers["ViewLayer.Vector.XYZW"][30, 20] = np.inf
+    foreign.write(tmp_path / "1.exr", foreign.blender(spheres[0]))
+    foreign.write(tmp_path / "2.exr", layers)
+    frame = frames_of(tmp_path)[1]
+    assert frame.albedo[0, :, 30, 20].tolist() == [0, 0.5, 1]
+    assert frame.motion[0, :, 30, 20].tolist() == [0, 0]
+
+
+def test_cameras_are_taken_from_positions_before_the_header(box, tmp_path):
+    foreign.write(tmp_path / "1.exr", foreign.pbrt(box[0]), header_of(box[1]))
+    files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
+    pixels = read_pixels(files[0], find_sources(open_passes(files[0]), {}))
+    assert camera_kind(pixels).cameras == "positions"
+
+
+def test_a_camera_without_depth_makes_up_no_motion(box, tmp_path):
+    for index, frame in enumerate(box[:2]):
+        foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)}, header_of(frame))
+    files = sequence_of({"colour": [str(tmp_path / "*.exr")]})
+    understood = understand([files], find_sources(open_passes(files[0]), {}), READS, None)
+    assert not understood.reading.has_history
+    assert ("motion", "none: no history, every frame by itself") in understood.words

@@ -1,0 +1,82 @@
+"""Layers by the names in use, whatever stands before them, and by what the user states."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from denoise.layers import KNOWN, candidates, in_words, stated_layer, stated_layers
+from errors import BadInput
+
+
+def channels(*layers: str) -> list[str]:
+    """Names of channels from layers with their components: "Albedo.RGB"."""
+    names = []
+    for text in layers:
+        layer, dot, letters = text.rpartition(".")
+        names += [f"{layer}{dot}{letter}" for letter in letters]
+    return names
+
+
+EVERYDAY = {
+    "colour": ["RGB", "Combined.RGBA", "Noisy Image.RGB", "Beauty.RGB", "Composite.Combined.RGB", "rgba.RGBA"],
+    "albedo": ["albedo.RGB", "Denoising Albedo.RGB", "DiffCol.RGB", "VisibleDiffuse.RGB", "Albedo.RGB"],
+    "normal": ["N.XYZ", "Normals.XYZ", "Denoising Normal.XYZ", "VisibleNormals.RGB", "OptixNormals.RGB", "Ns.XYZ"],
+    "position": ["P.XYZ", "Position.XYZ"],
+    "depth": ["Z", "Depth.Z", "depth.V", "Denoising Depth.Z"],
+    "motion": ["Vector.XYZW", "motion.XY", "MotionVector.RG", "velocity.XYZ"],
+    "emission": ["Emit.RGB", "emission.RGB"],
+}
+PREFIXES = ["", "ViewLayer.", "Scene.View Layer.001."]
+CASES = [
+    (quantity, layer, prefix)
+    for quantity, layers in EVERYDAY.items()
+    for layer in layers
+    for prefix in PREFIXES
+    if "." in layer or not prefix  # plain channels have nothing before them
+]
+
+
+@pytest.mark.parametrize(("quantity", "layer", "prefix"), CASES)
+def test_names_in_use_are_found(quantity, layer, prefix):
+    names = channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer)
+    found = candidates(quantity, names)
+    assert len(found) == 1 and set(found[0].channels) <= set(channels(prefix + layer))
+    others = set(KNOWN) - {quantity}
+    assert not any(candidates(other, channels(prefix + layer)) for other in others)
+
+
+def test_the_best_name_comes_first():
+    names = channels("Composite.Combined.RGBA", "ViewLayer.Combined.RGBA", "ViewLayer.Noisy Image.RGBA")
+    assert [layer.name for layer in candidates("colour", names)] == [
+        "ViewLayer.Noisy Image",
+        "ViewLayer.Combined",
+        "Composite.Combined",
+    ]
+    assert candidates("motion", channels("Vector.XYZW"))[0].channels == tuple(channels("Vector.XYZW"))
+    assert candidates("normal", channels("N.XYZ", "Ns.XYZ"))[0].name == "Ns"
+
+
+def test_order_of_channels_in_the_file_does_not_matter():
+    assert candidates("colour", ["B", "G", "R", "A"])[0].channels == ("R", "G", "B")
+    assert candidates("normal", ["N.Z", "N.Y", "N.X"])[0].channels == ("N.X", "N.Y", "N.Z")
+
+
+def test_what_the_user_states():
+    names = channels("My.AOV.RGB", "uv.UV", "A.XYZW")
+    assert stated_layer("albedo", "My.AOV", names, "f").channels == ("My.AOV.R", "My.AOV.G", "My.AOV.B")
+    assert stated_layer("motion", "A.Z,A.W", names, "f").channels == ("A.Z", "A.W")
+    assert stated_layers(["albedo=My.AOV", "motion=A.Z,A.W"]) == {"albedo": "My.AOV", "motion": "A.Z,A.W"}
+    for wrong in ("Your.AOV", "My.AOV.R", "A.X,A.Q"):
+        with pytest.raises(BadInput, match=r"f has no layer .*it has My\.AOV\.RGB, uv\.UV, A\.XYZW"):
+            stated_layer("albedo", wrong, names, "f")
+    for wrong in ("albedo", "albedo=", "taste=A"):
+        with pytest.raises(BadInput, match="QUANTITY=LAYER"):
+            stated_layers([wrong])
+
+
+@given(st.lists(st.text(max_size=12), max_size=8))
+def test_any_names_can_be_looked_through(names):
+    for quantity in KNOWN:
+        for layer in candidates(quantity, names):
+            assert set(layer.channels) <= set(names)
+    assert in_words(names)

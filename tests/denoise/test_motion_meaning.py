@@ -1,0 +1,115 @@
+"""What motion vectors mean is found for every convention there is, and doubt is admitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from denoise.motion_meaning import PAIRS, SIGNS, UNITS, Evidence, Meaning, meanings
+from denoise.understanding import blurred
+from errors import BadInput
+from eval.bench.synthetic_frames import synthetic_frame
+from tests.helpers.foreign import image
+
+HEIGHT, WIDTH = 90, 160
+FAST = 12  # of the sequence's frames between two of these: a step of several pixels
+
+
+def said_as(meaning: Meaning, to_previous: np.ndarray, to_next: np.ndarray, components: int) -> np.ndarray:
+    """Vectors in a renderer's own terms; the pair that is not meant holds those to the next frame."""
+    size = {"pixels": (1, 1), "fractions": (WIDTH, HEIGHT), "half-fractions": (WIDTH / 2, HEIGHT / 2)}[meaning.unit]
+    scale = [SIGNS[meaning.x], SIGNS[meaning.y]] / np.array(size)
+    vectors = np.zeros((HEIGHT, WIDTH, components))
+    vectors[..., PAIRS[meaning.pair]] = to_previous * scale
+    if components == 4:
+        vectors[..., PAIRS["ZW" if meaning.pair == "XY" else "XY"]] = to_next * scale
+    return vectors.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Guides of three frames and the middle one's motion to the first and to the last, which are different."""
+    rng = np.random.default_rng(1)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    texture = rng.random((HEIGHT + 60, WIDTH + 60, 3), np.float32)
+
+    def shifted(dx: int, dy: int) -> np.ndarray:
+        return blurred(np.ascontiguousarray(texture[rows + 30 + dy, columns + 30 + dx]))
+
+    to_previous = np.broadcast_to([5.0, 3.0], (HEIGHT, WIDTH, 2))
+    to_next = np.broadcast_to([-4.0, 9.0], (HEIGHT, WIDTH, 2))
+    return shifted(-5, -3), shifted(0, 0), to_previous, to_next
+
+
+@pytest.mark.parametrize("components", [2, 4])
+def test_every_convention_is_found(moving, components):
+    before, now, to_previous, to_next = moving
+    tried = meanings(components)
+    assert len(tried) == 12 * components // 2
+    for meaning in tried:
+        evidence = Evidence(components)
+        evidence.add(now, before, said_as(meaning, to_previous, to_next, components))
+        finding = evidence.finding()
+        assert finding.meaning == meaning and finding.certain, finding.words
+        assert str(meaning) in finding.words
+
+
+def guides(index: int) -> np.ndarray:
+    frame = synthetic_frame(index, HEIGHT, WIDTH)
+    return blurred(np.concatenate([image(frame, "albedo"), image(frame, "normal")], axis=-1).astype(np.float32))
+
+
+def test_moving_objects_before_a_moving_camera():
+    for meaning in (Meaning(), Meaning("XY", "-", "+"), Meaning("XY", "+", "-", "fractions")):
+        evidence = Evidence(2)
+        for index in (1, 2, 3):
+            motion = image(synthetic_frame(index, HEIGHT, WIDTH), "motion")
+            evidence.add(guides(index), guides(index - 1), said_as(meaning, motion, motion, 2))
+        assert evidence.finding().meaning == meaning
+
+
+def test_steady_motion_is_read_from_the_first_pair():
+    rng = np.random.default_rng(2)
+    texture = rng.random((HEIGHT, 2 * WIDTH, 3), np.float32)
+    now, before = (blurred(np.ascontiguousarray(texture[:, start : start + WIDTH])) for start in (10, 6))
+    step = np.broadcast_to([4.0, 0.0], (HEIGHT, WIDTH, 2))
+    evidence = Evidence(4)
+    evidence.add(now, before, said_as(Meaning("XY", "+", "-"), step, -step, 4))
+    finding = evidence.finding()
+    assert finding.meaning.pair == "XY" and finding.meaning.x == "+"
+    assert not finding.certain  # nothing moves up or down
+
+
+def test_no_motion_and_senseless_motion_are_said():
+    still = guides(0)
+    evidence = Evidence(2)
+    evidence.add(still, still, np.zeros((HEIGHT, WIDTH, 2), np.float32))
+    assert evidence.finding() == replace(evidence.finding(), meaning=Meaning(), certain=False)
+    assert "nothing moves" in evidence.finding().words
+    rng = np.random.default_rng(3)
+    evidence.add(guides(20), still, rng.normal(0, 20, (HEIGHT, WIDTH, 2)).astype(np.float32))
+    assert not evidence.finding().certain and "no meaning warps well" in evidence.finding().words
+
+
+@given(st.sampled_from(meanings(4)))
+def test_words_lead_back(meaning):
+    assert Meaning.parse(str(meaning)) == meaning
+
+
+def test_other_words_are_refused():
+    for text in ("", "XY", "XY,+x,+y,inches", "AB,+x,+y,pixels"):
+        with pytest.raises(BadInput, match=", ".join(UNITS)):
+            Meaning.parse(text)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1)])
+def test_tiny_images_and_numbers_that_are_none(size):
+    evidence = Evidence(4)
+    motion = np.full((*size, 4), np.nan, np.float32)
+    motion[..., 1] = np.inf
+    motion[..., 2] = 1e30
+    guide = np.ones((*size, 3), np.float32)
+    evidence.add(guide, guide, motion)
+    assert np.isfinite(evidence.finding().meaning.pixels(motion)).all()

@@ -1,0 +1,61 @@
+"""Patterns become frames in order, with all passes or a clear error."""
+
+import pytest
+
+from denoise.sequence import gaps, sequence_of, shots
+from errors import BadInput
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def touch(*names: str) -> None:
+        for name in names:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).touch()
+
+    return touch
+
+
+def test_frames_are_in_the_order_of_their_numbers(folder):
+    folder("v2_10.exr", "v2_9.exr", "v2_100.exr")
+    frames = sequence_of({"colour": ["*.exr"]})
+    assert [frame.number for frame in frames] == [9, 10, 100]
+    assert [frame.name for frame in frames] == ["v2_9.exr", "v2_10.exr", "v2_100.exr"]
+    assert sequence_of({"colour": ["v2_9.exr", "v2_100.exr", "v2_10.exr"]}) == frames  # as the shell expands them
+    assert gaps(frames) == [100]
+    assert [[frame.number for frame in shot] for shot in shots(frames, [10])] == [[9], [10], [100]]
+
+
+def test_the_number_that_differs_is_the_frame(folder):
+    folder("0001_beauty_v2.exr", "0002_beauty_v2.exr")
+    assert [frame.number for frame in sequence_of({"colour": ["*.exr"]})] == [1, 2]
+
+
+def test_one_file_needs_no_number(folder):
+    folder("still.exr", "a.exr", "b.exr")
+    assert len(sequence_of({"colour": ["still.exr"]})) == 1
+    with pytest.raises(BadInput, match="tells their frames apart"):
+        sequence_of({"colour": ["?.exr"]})
+
+
+def test_passes_are_matched_by_number(folder):
+    folder("hdr/1.exr", "hdr/2.exr", "alb/0001.exr", "alb/0002.exr", "alb/0003.exr", "nrm/1.exr")
+    frames = sequence_of({"colour": ["hdr/*"], "albedo": ["alb/*"]})
+    assert [str(frame.passes["albedo"]) for frame in frames] == ["alb/0001.exr", "alb/0002.exr"]
+    with pytest.raises(BadInput, match=r"'nrm/\*' \(normal\) lacks frame 2"):
+        sequence_of({"colour": ["hdr/*"], "normal": ["nrm/*"]})
+    assert len(sequence_of({"colour": ["hdr/*"], "normal": ["nrm/*"]}, "1-1")) == 1
+
+
+def test_what_is_not_there_is_named(folder):
+    folder("1.exr")
+    with pytest.raises(BadInput, match=r"no file matches 'x\*'"):
+        sequence_of({"colour": ["x*"]})
+    with pytest.raises(BadInput, match="no frame within --frames 5-6"):
+        sequence_of({"colour": ["*.exr"]}, "5-6")
+    with pytest.raises(BadInput, match="'a-b' are no frames"):
+        sequence_of({"colour": ["*.exr"]}, "a-b")
+    with pytest.raises(BadInput, match="--reset-at 7"):
+        shots(sequence_of({"colour": ["*.exr"]}), [7])

@@ -1,0 +1,124 @@
+"""Sequences of OpenEXR files as other renderers write them, made of Frames whose truth is known.
+
+`python -m tests.helpers.foreign CLIP|WxH FOLDER` writes one under Blender's names.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from datasets.clip import Clip
+from datasets.frame import Frame, read_frame
+from eval.bench.sizes import parse_size
+from eval.bench.synthetic_frames import synthetic_frame
+from scenes.camera import View, pixel_centres, unproject
+
+Image = NDArray[np.floating]
+Layers = dict[str, Image]  # (H, W, C) by layer name with the components' letters: "Albedo.RGB"
+
+HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+
+def image(frame: Frame, channel: str) -> Image:
+    """A channel (H, W, C)."""
+    return frame.channels[channel][0].permute(1, 2, 0).double().numpy()
+
+
+def beauty(frame: Frame) -> Image:
+    return frame.radiance("total")[0].permute(1, 2, 0).double().numpy()
+
+
+def view(frame: Frame) -> View:
+    return View(*(getattr(frame.now, name)[0].numpy() for name in View._fields))
+
+
+def positions(frame: Frame) -> Image:
+    """Points in the world, 0 for background."""
+    depth = image(frame, "depth")
+    return np.where(depth > 0, unproject(pixel_centres(*frame.size), depth[..., 0], view(frame)), 0)
+
+
+def planes(layers: Layers, dtype: type = np.float32) -> dict[str, NDArray[Any]]:
+    """The channels of a file."""
+    found = {}
+    for name, array in layers.items():
+        layer, dot, letters = name.rpartition(".")
+        for index, letter in enumerate(letters):
+            found[f"{layer}{dot}{letter}"] = np.ascontiguousarray(array[..., index], dtype)
+    return found
+
+
+def write(path: Path, layers: Layers, header: Mapping[str, Any] | None = None, dtype: type = np.float32) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with OpenEXR.File({**HEADER, **(header or {})}, planes(layers, dtype)) as file:
+        file.write(str(path))
+    return path
+
+
+def blender(frame: Frame) -> Layers:
+    """Multi-layer files of Cycles; `Vector` is as its users describe it: positive where it came from."""
+    depth = image(frame, "depth")
+    alpha = np.ones_like(depth)
+    motion = image(frame, "motion")
+    return {
+        "ViewLayer.Combined.RGBA": np.concatenate([0.5 * beauty(frame), alpha], axis=-1),  # some other image
+        "ViewLayer.Noisy Image.RGBA": np.concatenate([beauty(frame), alpha], axis=-1),
+        "ViewLayer.Denoising Albedo.RGB": image(frame, "albedo"),
+        "ViewLayer.Normal.XYZ": image(frame, "normal"),
+        "ViewLayer.Depth.Z": np.where(depth > 0, depth, 1e10),
+        "ViewLayer.Vector.XYZW": np.concatenate([motion * [1, -1], motion * [-1, 1]], axis=-1),
+        "ViewLayer.Emit.RGB": image(frame, "emission") * (depth > 0),
+        "ViewLayer.Mist.Z": np.linspace(0, 1, depth.size).reshape(depth.shape),
+    }
+
+
+def pbrt(frame: Frame) -> Layers:
+    """What a GBufferFilm holds, in world space."""
+    return {
+        "RGB": beauty(frame),
+        "Albedo.RGB": image(frame, "albedo"),
+        "P.XYZ": positions(frame),
+        "N.XYZ": image(frame, "normal"),
+        "Ns.XYZ": image(frame, "normal"),
+        "Variance.RGB": np.ones_like(image(frame, "albedo")),
+    }
+
+
+def write_sequence(
+    folder: Path, frames: Iterable[Frame], layers: Callable[[Frame], Layers], first: int = 1, **options: Any
+) -> list[Path]:
+    """Files folder/0001.exr and so on."""
+    return [write(folder / f"{first + i:04d}.exr", layers(frame), **options) for i, frame in enumerate(frames)]
+
+
+def read(path: Path) -> dict[str, NDArray[Any]]:
+    """All channels of a file of one part."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def header(path: Path) -> dict[str, Any]:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return dict(file.header())
+
+
+def main(source: str, out: Path) -> None:
+    """Write a clip's folder, or three synthetic frames of a size "WxH", as Blender would; references beside them."""
+    if Path(source).is_dir():
+        clip = Clip(Path(source))
+        reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "motion")
+        frames: Iterable[Frame] = (read_frame(clip, index, reads) for index in range(clip.frames))
+        for index in range(clip.frames):
+            write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
+    else:
+        frames = (synthetic_frame(index, *parse_size(source)) for index in range(3))
+    write_sequence(out / "frames", frames, blender)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
