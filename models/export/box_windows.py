@@ -1,0 +1,75 @@
+"""Weight-shared kernels (models/fusion.py) in few operators: the box sums of all windows are two convolutions."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models.parameters import LEAST_EXPONENT, LEAST_WEIGHT, OUTSIDE, SAFE_RANGE
+
+SUMMED = 4  # channels of each window's sums: weighted red, green and blue, and the weights
+
+
+def box_kernels(windows: Sequence[int]) -> Tensor:
+    """Columns of ones in zeros, (SUMMED windows, 1, k, 1) with k the largest window: each channel's own box."""
+    largest = max(windows)
+    reach = torch.cat([torch.full((SUMMED,), window // 2) for window in windows])
+    offset = torch.arange(largest) - largest // 2
+    return (offset.abs() <= reach[:, None]).float()[:, None, :, None]
+
+
+def careful_sums(logits: Tensor, values: Tensor, window: int) -> Tensor:
+    """Box sums (C, 1, H, W) relative to the largest of the logits (1, 1, H, W) in every window.
+
+    `values` are (C, 1, H, W), 0 where the logit is OUTSIDE. First columns are summed, then rows of these.
+    """
+    margin = window // 2
+    each_tap = torch.eye(window)[:, None, :, None]  # the neighbours of a pixel become its channels
+    for kernel, padding in ((each_tap, (margin, 0)), (each_tap.transpose(2, 3), (0, margin))):
+        rows, columns = padding
+        entries = F.conv2d(F.pad(logits, (columns, columns, rows, rows), value=OUTSIDE), kernel)
+        logits = entries.amax(dim=1, keepdim=True)
+        weights = torch.exp((entries - logits).clamp(min=LEAST_EXPONENT)) * (entries > OUTSIDE)
+        values = (weights * F.conv2d(values, kernel, padding=padding)).sum(dim=1, keepdim=True)
+    return values
+
+
+class BoxWindows(nn.Module):
+    """models.fusion.fuse for B = 1, exact for any finite logits like that.
+
+    Logits that span at most SAFE_RANGE, as those of trained networks do, are shifted as a whole. Else a branch is taken
+    that is slower and takes memory for 13 images at once.
+    """
+
+    def __init__(self, windows: Sequence[int]):
+        super().__init__()
+        self.windows = tuple(windows)
+
+    def forward(self, irradiance: Tensor, importance: Tensor, mixture: Tensor, surface: Tensor) -> Tensor:
+        """Filtered irradiance (1, 3, H, W). `surface` (1, 1, H, W) is 1 for pixels that count, else 0."""
+        margin = max(self.windows) // 2
+        groups = SUMMED * len(self.windows)
+        height, width = irradiance.shape[-2:]
+        values = torch.cat([irradiance * surface, surface], dim=1)
+        high = importance.amax(dim=(2, 3), keepdim=True)
+        low = importance.amin(dim=(2, 3), keepdim=True)
+
+        def shifted(importance: Tensor, values: Tensor, surface: Tensor, high: Tensor, low: Tensor) -> Tensor:
+            weights = torch.exp(importance - (high + low) / 2)
+            products = (weights[:, :, None] * values[:, None]).flatten(1, 2)
+            columns = box_kernels(self.windows)
+            sums = F.conv2d(products, columns, padding=(margin, 0), groups=groups)
+            return F.conv2d(sums, columns.transpose(2, 3), padding=(0, margin), groups=groups)
+
+        def careful(importance: Tensor, values: Tensor, surface: Tensor, high: Tensor, low: Tensor) -> Tensor:
+            logits = torch.where(surface > 0, importance, OUTSIDE)
+            images = values.transpose(0, 1)
+            maps = zip(logits.split(1, dim=1), self.windows, strict=True)
+            return torch.cat([careful_sums(each, images, window).transpose(0, 1) for each, window in maps], dim=1)
+
+        within_range = (high - low).max() <= SAFE_RANGE
+        sums = torch.cond(within_range, shifted, careful, (importance, values, surface, high, low))
+        sums = sums.view(1, len(self.windows), SUMMED, height, width)
+        shares = torch.softmax(mixture, dim=1)[:, :, None] / sums[:, :, 3:].clamp(min=LEAST_WEIGHT)
+        return (shares * sums[:, :, :3]).sum(dim=1)
