@@ -120,7 +120,7 @@ class WSKPStep(Step):
         # Without a history its length is 0: the weight of the newest frame is 1.
         irradiance = past + (1 / length).clamp(min=SMALLEST_ALPHA) * (noisy - past)
         radiance = irradiance * divisor
-        state, scale = updated_scale(x["scale"], radiance, x["depth"], surface)
+        state, scale = updated_scale(x["scale"], radiance, x["depth"])
         predicted = self.network(self.features(x, radiance, scale).to(self.precision)).to(radiance)
         importance, mixture = predicted.chunk(2, dim=1)
         filtered = self.fusion(irradiance, importance, mixture, surface)
