@@ -71,5 +71,6 @@ class BoxWindows(nn.Module):
         within_range = (high - low).max() <= SAFE_RANGE
         sums = torch.cond(within_range, shifted, careful, (importance, values, surface, high, low))
         sums = sums.view(1, len(self.windows), SUMMED, height, width)
-        shares = torch.softmax(mixture, dim=1)[:, :, None] / sums[:, :, 3:].clamp(min=LEAST_WEIGHT)
-        return (shares * sums[:, :, :3]).sum(dim=1)
+        shares = torch.exp(mixture - mixture.amax(dim=1, keepdim=True))  # engines take softmax along channels slowly
+        factors = shares[:, :, None] / sums[:, :, 3:].clamp(min=LEAST_WEIGHT)
+        return (factors * sums[:, :, :3]).sum(dim=1) / shares.sum(dim=1, keepdim=True)

@@ -1,26 +1,77 @@
-"""Tracing a step: one program for images of any size."""
+"""Tracing a step, for images of any size, and writing it: ONNX, or PyTorch's pt2."""
 
+import logging
 import warnings
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
 
 import torch
-from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
 from datasets.frame import Frame
-from models import compiled
+from errors import BadInput
 from models.export.step import HEIGHT, MESHES, WIDTH, Step
+
+Format = Literal["onnx", "pt2"]
+OPSET = 20
+NEEDED = {"onnx": ("onnx", "onnxscript", "onnxruntime"), "pt2": ()}
+
+
+def check_installed(to: Format) -> None:
+    """Raises BadInput where a package is missing that a format needs."""
+    missing = [package for package in NEEDED[to] if find_spec(package) is None]
+    if missing:
+        raise BadInput(f"exporting to {to} needs {', '.join(missing)}: pip install 'onespp[export]'")
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the exporter's remarks on what it does not need."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(before)
 
 
 def trace(step: Step, frame: Frame) -> ExportedProgram:
-    """The step as a program of tensors by name. `frame` is an example, of more than 2 x 2 pixels and one mesh."""
+    """The step as a program of tensors by name. `frame` is an example, of at least 2 x 2 pixels and one mesh."""
     sizes = {HEIGHT: Dim(HEIGHT, min=2), WIDTH: Dim(WIDTH, min=2), MESHES: Dim(MESHES, min=2)}
     shapes = {
         port.name: {axis: sizes[size] for axis, size in enumerate(port.shape) if isinstance(size, str)}
         for port in step.inputs
     }
     inputs = {**step.feeds(frame), **step.initial(frame)}
-    with torch.no_grad(), compiled.disabled():
-        return torch.export.export(
-            step, ({port.name: inputs[port.name].clone() for port in step.inputs},), dynamic_shapes={"tensors": shapes}
+    with torch.no_grad(), quiet():
+        return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"tensors": shapes})
+
+
+def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, int]:
+    """Write one file with the weights in it. Returns how many operators of each kind run in a frame."""
+    with quiet():
+        written = torch.onnx.export(
+            program,
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=[port.name for port in step.inputs],
+            output_names=[port.name for port in step.outputs],
+            verbose=False,
         )
+        assert written is not None
+        written.save(path, external_data=False)
+    return Counter(node.op_type for node in written.model.graph)
+
+
+def write_pt2(program: ExportedProgram, path: Path) -> dict[str, int]:
+    """Write one file with the weights in it. Returns how many operators of each kind it has."""
+    with quiet():
+        torch.export.save(program, path)
+    return Counter(str(node.target) for node in program.graph.nodes if node.op == "call_function")

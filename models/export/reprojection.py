@@ -13,24 +13,24 @@ from models.surfaces import BACKGROUND_ID
 NOWHERE = -1.0  # mesh id around the image
 
 
-def pixel_centres(height: int, width: int) -> Tensor:
-    """x and y (2, n) of all pixels."""
-    x = (torch.arange(width) + 0.5).expand(height, width)
-    y = (torch.arange(height) + 0.5)[:, None].expand(height, width)
-    return torch.stack([x, y]).flatten(1)
+def places(height: int, width: int) -> Tensor:
+    """Columns and rows (2, n) of all pixels."""
+    columns = torch.arange(width, dtype=torch.float32).expand(height, width)
+    rows = torch.arange(height, dtype=torch.float32)[:, None].expand(height, width)
+    return torch.stack([columns, rows]).flatten(1)
 
 
-def points(depth: Tensor, K: Tensor, centres: Tensor) -> Tensor:
-    """What pixels show, (3, n) in the camera's frame. `depth` is (1, 1, H, W)."""
+def points(depth: Tensor, K: Tensor, pixels: Tensor) -> Tensor:
+    """What `pixels` (2, n) show, (3, n) in the camera's frame. `depth` is (1, 1, H, W)."""
     entries = K.flatten()
     focal = entries.index_select(0, torch.tensor([0, 4]))[:, None]
     middle = entries.index_select(0, torch.tensor([2, 5]))[:, None]
     along_axis = depth.view(1, -1)
-    return torch.cat([(centres - middle) / focal * along_axis, along_axis])
+    return torch.cat([(pixels + 0.5 - middle) / focal * along_axis, along_axis])
 
 
 def table_of(
-    history: Tensor, depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, centres: Tensor
+    history: Tensor, depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, pixels: Tensor
 ) -> Tensor:
     """Rows ((H + 2) (W + 2), 6 + C) of a frame's pixels and a border: what `taps` tests, and the history.
 
@@ -39,20 +39,20 @@ def table_of(
     """
     height, width = depth.shape[-2:]
     normals = rotation.T @ normal.view(3, -1)
-    offset = (normals * points(depth, K, centres)).sum(dim=0, keepdim=True).view(1, 1, height, width)
+    offset = (normals * points(depth, K, pixels)).sum(dim=0, keepdim=True).view(1, 1, height, width)
     normals = normals.view(1, 3, height, width)
     images = torch.cat([normals, offset, PLANE_TOLERANCE * depth, mesh_id.to(depth), history], dim=1)
     return F.pad(images, (1, 1, 1, 1), value=NOWHERE)[0].flatten(1).T.contiguous()
 
 
 def expectation(
-    depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, to_previous: Tensor, centres: Tensor
+    depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, to_previous: Tensor, pixels: Tensor
 ) -> Tensor:
     """Where the previous camera must have seen what pixels show, (7, n): point, normal, mesh id."""
     mesh = mesh_id.view(1, -1)
     matrices = to_previous[:, :3].flatten(1).index_select(0, mesh[0]).T.unflatten(0, (3, 4))
     turn, shift = matrices.split([3, 1], dim=1)
-    point = (turn * points(depth, K, centres)).sum(dim=1) + shift[:, 0]
+    point = (turn * points(depth, K, pixels)).sum(dim=1) + shift[:, 0]
     normals = (turn * (rotation.T @ normal.view(3, -1))).sum(dim=1)
     return torch.cat([point, normals, mesh.to(point)])
 
@@ -73,18 +73,16 @@ def taps(table: Tensor, expected: Tensor, at: Tensor, height: int, width: int) -
     return history, ((mesh == expected_mesh) & same_surface)[0].to(history)
 
 
-def fetch(table: Tensor, expected: Tensor, motion: Tensor, centres: Tensor) -> Tensor:
+def fetch(table: Tensor, expected: Tensor, motion: Tensor, pixels: Tensor) -> Tensor:
     """The history (1, C, H, W) of all pixels, 0 where none was found. `motion` is (1, 2, H, W).
 
     2 x 2 taps for every pixel, 3 x 3 for those that found none there.
     """
     height, width = motion.shape[-2:]
     # Far outside the image an index would overflow; any place outside is as good.
-    farthest = torch.sym_max(height, width) + 1
-    position = (centres + motion.view(2, -1)).clamp(-2, farthest)
-    corner = position - 0.5
-    floor = corner.floor()
-    fraction = corner - floor
+    position = (pixels + motion.view(2, -1)).clamp(-2, torch.sym_max(height, width) + 1)
+    floor = position.floor()
+    fraction = position - floor
     corners = torch.tensor([[0, 1, 0, 1], [0, 0, 1, 1]])[:, :, None]
     weight = (1 - corners - fraction[:, None]).abs().prod(dim=0)  # f where a corner is 1, 1 - f where it is 0
     history, consistent = taps(table, expected, floor.long()[:, None] + corners, height, width)
@@ -94,7 +92,7 @@ def fetch(table: Tensor, expected: Tensor, motion: Tensor, centres: Tensor) -> T
 
     lost = torch.nonzero(count == 0)[:, 0]
     around = torch.tensor([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3])[:, :, None]
-    middle = position.index_select(1, lost).floor().long()
+    middle = (position.index_select(1, lost) + 0.5).floor().long()
     nearby, consistent = taps(table, expected.index_select(1, lost), middle[:, None] + around, height, width)
     mean = (nearby * consistent).sum(dim=1) / consistent.sum(dim=0).clamp(min=1)
     history = history.scatter(1, lost.expand(len(history), -1), mean)
