@@ -26,8 +26,8 @@ def export(
 ) -> str:
     """Write the export to `out`, by default RUNS/export/NAME-TO. Returns what was written, in words.
 
-    `weights` are by default those trained in the budget. Raises BadInput where the denoiser cannot be exported or is not
-    trained, or packages are missing.
+    `weights` are by default those trained in the budget. Raises BadInput where the denoiser cannot be exported or has
+    no weights, and where packages are missing.
     """
     check_exportable(name)
     check_installed(to)

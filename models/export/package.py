@@ -15,7 +15,7 @@ from errors import BadInput
 from files import read_json, write_json
 from models.export.page import page
 from models.export.playing import play
-from models.export.program import OPSET, Format, check_installed, trace, write_onnx, write_pt2
+from models.export.program import OPSET, Format, Operators, check_installed, trace, write_onnx, write_pt2
 from models.export.registry import load_step
 from models.export.runtime import run_file
 from models.export.step import Port, Step, Tensors, Warp
@@ -80,7 +80,7 @@ def measured(export: Export, path: Path, step: Step, frames: Sequence[Frame], go
     return {"from_golden": from_golden, "from_onespp": from_ours}
 
 
-def manifest(export: Export, step: Step, operators: dict[str, int], differences: dict[str, float]) -> dict[str, Any]:
+def manifest(export: Export, step: Step, operators: Operators, differences: dict[str, float]) -> dict[str, Any]:
     """All that a caller has to know; the files' hashes are still to come."""
     return {
         "schema": 1,
@@ -97,7 +97,7 @@ def manifest(export: Export, step: Step, operators: dict[str, int], differences:
             for each in step.carried
         ],
         "weights_sha256": file_digest(export.weights),
-        "operators": {"total": sum(operators.values()), **dict(sorted(operators.items()))},
+        "operators": {"total": operators.total, "branches": operators.branches, "kinds": operators.kinds},
         "largest_difference": differences,
         "versions": versions(PACKAGES),
     }

@@ -68,7 +68,8 @@ for (;;) {
   std::swap(state, next_state);
 }
 """,
-    "pt2": """// Once, in Python: torch._inductor.aoti_compile_and_package(torch.export.load("FILE"), package_path="compiled.pt2")
+    "pt2": """// Once, in Python:
+// torch._inductor.aoti_compile_and_package(torch.export.load("FILE"), package_path="compiled.pt2")
 torch::inductor::AOTIModelPackageLoader step("compiled.pt2");
 std::vector<torch::Tensor> outputs = step.run(inputs);  // both in the order of the tables above
 """,
@@ -77,9 +78,9 @@ std::vector<torch::Tensor> outputs = step.run(inputs);  // both in the order of 
 INSIDE = """What is named `previous_…` is the input of the frame before: keep two buffers of each, and copy nothing. The
 transforms of `to_previous_camera` are products of matrices of large numbers: multiply in float64, then round."""
 
-OUTSIDE = """Before each frame but the first, move `history` along with the surfaces: at each pixel, what `new_history` held
-where its surface was in the frame before, and 0 in all channels where that surface was not seen. Its last channel is the
-number of frames in the mean, so 0 starts anew."""
+OUTSIDE = """Before each frame but the first, move `history` along with the surfaces: at each pixel, what `new_history`
+held where its surface was in the frame before, and 0 in all channels where that surface was not seen. Its last channel
+is the number of frames in the mean, so 0 starts anew."""
 
 
 def table(ports: Sequence[Mapping[str, Any]]) -> str:
@@ -93,7 +94,8 @@ def page(manifest: Mapping[str, Any]) -> str:
     state = "\n".join(f"- `{each['input']}` is `{each['from']}` of the frame before" for each in manifest["state"])
     return f"""# {manifest["denoiser"]} as {manifest["file"]}
 
-One frame in, one frame out, at any size from 2 × 2 pixels on. Images are (1, channels, height, width), rows from the top.
+One frame in, one frame out, at any size from 2 × 2 pixels on. Images are (1, channels, height, width), their rows from
+the top.
 `manifest.json` says the same to programs, with the SHA-256 of every file; `golden/` holds a sequence of frames as
 `input.NAME` and `output.NAME`, to test an integration with.
 

@@ -3,11 +3,12 @@
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch.export import Dim, ExportedProgram
@@ -54,8 +55,40 @@ def trace(step: Step, frame: Frame) -> ExportedProgram:
         return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"tensors": shapes})
 
 
-def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, int]:
-    """Write one file with the weights in it. Returns how many operators of each kind run in a frame."""
+@dataclass(frozen=True)
+class Operators:
+    """How many operators a file has: by kind, and in all of each branch, of which a frame takes one."""
+
+    kinds: dict[str, int]
+    branches: dict[str, int]
+
+    @property
+    def total(self) -> int:
+        """Outside of branches."""
+        return sum(self.kinds.values())
+
+    @staticmethod
+    def of_onnx(nodes: Iterable[Any]) -> "Operators":
+        nodes = list(nodes)
+        attributes = [attribute for node in nodes for attribute in node.attributes.values()]
+        branches = {each.name: len(each.value) for each in attributes if each.type.name == "GRAPH"}
+        return Operators(dict(Counter(sorted(node.op_type for node in nodes))), branches)
+
+    @staticmethod
+    def of_pt2(program: ExportedProgram) -> "Operators":
+        def calls(graph: torch.fx.Graph) -> list[str]:
+            return sorted(str(node.target) for node in graph.nodes if node.op == "call_function")
+
+        branches = program.graph_module.named_children()
+        inner = {name: len(calls(each.graph)) for name, each in branches if isinstance(each, torch.fx.GraphModule)}
+        return Operators(dict(Counter(calls(program.graph))), inner)
+
+
+def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
+    """Write one file with the weights in it. Raises BadInput where packages are missing."""
+    check_installed("onnx")
+    from onnxscript.optimizer import remove_unused_nodes
+
     with quiet():
         written = torch.onnx.export(
             program,
@@ -66,12 +99,13 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, in
             verbose=False,
         )
         assert written is not None
+        remove_unused_nodes(written.model)  # runtimes warn of constants in branches that the exporter leaves
         written.save(path, external_data=False)
-    return Counter(node.op_type for node in written.model.graph)
+    return Operators.of_onnx(written.model.graph)
 
 
-def write_pt2(program: ExportedProgram, path: Path) -> dict[str, int]:
-    """Write one file with the weights in it. Returns how many operators of each kind it has."""
+def write_pt2(program: ExportedProgram, path: Path) -> Operators:
+    """Write one file with the weights in it."""
     with quiet():
         torch.export.save(program, path)
-    return Counter(str(node.target) for node in program.graph.nodes if node.op == "call_function")
+    return Operators.of_pt2(program)

@@ -3,6 +3,8 @@
 Pixels are in one dimension of n = H W.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -13,6 +15,28 @@ from models.surfaces import BACKGROUND_ID
 NOWHERE = -1.0  # mesh id around the image
 
 
+class View(NamedTuple):
+    """A frame's G-buffer (1, C, H, W) and its camera."""
+
+    depth: Tensor
+    normal: Tensor
+    mesh_id: Tensor
+    K: Tensor  # (3, 3)
+    camera_to_world: Tensor  # (4, 4)
+
+    def points(self, pixels: Tensor) -> Tensor:
+        """What `pixels` (2, n) show, (3, n) in the camera's frame."""
+        entries = self.K.flatten()
+        focal = entries.index_select(0, torch.tensor([0, 4]))[:, None]
+        middle = entries.index_select(0, torch.tensor([2, 5]))[:, None]
+        along_axis = self.depth.view(1, -1)
+        return torch.cat([(pixels + 0.5 - middle) / focal * along_axis, along_axis])
+
+    def normals(self) -> Tensor:
+        """Normals (3, n) in the camera's frame."""
+        return self.camera_to_world[:3, :3].T @ self.normal.view(3, -1)
+
+
 def places(height: int, width: int) -> Tensor:
     """Columns and rows (2, n) of all pixels."""
     columns = torch.arange(width, dtype=torch.float32).expand(height, width)
@@ -20,40 +44,26 @@ def places(height: int, width: int) -> Tensor:
     return torch.stack([columns, rows]).flatten(1)
 
 
-def points(depth: Tensor, K: Tensor, pixels: Tensor) -> Tensor:
-    """What `pixels` (2, n) show, (3, n) in the camera's frame. `depth` is (1, 1, H, W)."""
-    entries = K.flatten()
-    focal = entries.index_select(0, torch.tensor([0, 4]))[:, None]
-    middle = entries.index_select(0, torch.tensor([2, 5]))[:, None]
-    along_axis = depth.view(1, -1)
-    return torch.cat([(pixels + 0.5 - middle) / focal * along_axis, along_axis])
+def table_of(history: Tensor, then: View, pixels: Tensor) -> Tensor:
+    """Rows ((H + 2) (W + 2), 6 + C) of the previous frame's pixels and a border: what `taps` tests, and the history.
 
-
-def table_of(
-    history: Tensor, depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, pixels: Tensor
-) -> Tensor:
-    """Rows ((H + 2) (W + 2), 6 + C) of a frame's pixels and a border: what `taps` tests, and the history.
-
-    That is the normal in the camera's frame, n · p of the point p, how far off its plane one may be, the mesh id.
-    Images are (1, C, H, W); `rotation` (3, 3) is the camera's, to the world.
+    That is the normal n in the camera's frame, n · p of the point p, how far off its plane one may be, the mesh id.
     """
-    height, width = depth.shape[-2:]
-    normals = rotation.T @ normal.view(3, -1)
-    offset = (normals * points(depth, K, pixels)).sum(dim=0, keepdim=True).view(1, 1, height, width)
-    normals = normals.view(1, 3, height, width)
-    images = torch.cat([normals, offset, PLANE_TOLERANCE * depth, mesh_id.to(depth), history], dim=1)
-    return F.pad(images, (1, 1, 1, 1), value=NOWHERE)[0].flatten(1).T.contiguous()
+    height, width = then.depth.shape[-2:]
+    normals = then.normals()
+    offset = (normals * then.points(pixels)).sum(dim=0).view(1, 1, height, width)
+    tested = [normals.view(1, 3, height, width), offset, PLANE_TOLERANCE * then.depth, then.mesh_id.to(offset)]
+    images = F.pad(torch.cat([*tested, history], dim=1), (1, 1, 1, 1), value=NOWHERE)
+    return images[0].flatten(1).T.contiguous()
 
 
-def expectation(
-    depth: Tensor, normal: Tensor, mesh_id: Tensor, K: Tensor, rotation: Tensor, to_previous: Tensor, pixels: Tensor
-) -> Tensor:
+def expectation(now: View, to_previous: Tensor, pixels: Tensor) -> Tensor:
     """Where the previous camera must have seen what pixels show, (7, n): point, normal, mesh id."""
-    mesh = mesh_id.view(1, -1)
+    mesh = now.mesh_id.view(1, -1)
     matrices = to_previous[:, :3].flatten(1).index_select(0, mesh[0]).T.unflatten(0, (3, 4))
     turn, shift = matrices.split([3, 1], dim=1)
-    point = (turn * points(depth, K, pixels)).sum(dim=1) + shift[:, 0]
-    normals = (turn * (rotation.T @ normal.view(3, -1))).sum(dim=1)
+    point = (turn * now.points(pixels)).sum(dim=1) + shift[:, 0]
+    normals = (turn * now.normals()).sum(dim=1)
     return torch.cat([point, normals, mesh.to(point)])
 
 

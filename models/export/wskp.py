@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import LARGEST, Frame
 from models.export.box_windows import BoxWindows
-from models.export.reprojection import expectation, fetch, places, table_of
+from models.export.reprojection import View, expectation, fetch, places, table_of
 from models.export.scale import Scale, updated_scale
 from models.export.step import MESHES, Carried, Port, Step, Warp, image
 from models.parameters import GAMMA, SMALLEST_ALPHA
@@ -97,12 +97,13 @@ class WSKPStep(Step):
         """The history (1, 4, H, W) where this frame's surfaces were, 0 where they were not."""
         if self.warp == "outside":
             return x["history"]
-        geometry = ("depth", "normal", "mesh_id", "K")
-        rotation, rotation_then = (x[name][:3, :3] for name in ("camera_to_world", "previous_camera_to_world"))
         pixels = places(*x["depth"].shape[-2:])
-        table = table_of(x["history"], *(x[f"previous_{name}"] for name in geometry), rotation_then, pixels)
-        expected = expectation(*(x[name] for name in geometry), rotation, x["to_previous_camera"], pixels)
-        return fetch(table, expected, x["motion"], pixels)
+        now, then = (
+            View(*(x[prefix + name] for name in ("depth", "normal", "mesh_id", "K", "camera_to_world")))
+            for prefix in ("", "previous_")
+        )
+        table = table_of(x["history"], then, pixels)
+        return fetch(table, expectation(now, x["to_previous_camera"], pixels), x["motion"], pixels)
 
     def features(self, x: dict[str, Tensor], radiance: Tensor, scale: Scale) -> Tensor:
         """models.features.network_features of accumulated `radiance`."""
