@@ -11,35 +11,41 @@ from models.parameters import LEAST_EXPONENT, LEAST_WEIGHT, OUTSIDE, SAFE_RANGE
 SUMMED = 4  # channels of each window's sums: weighted red, green and blue, and the weights
 
 
-def box_kernels(windows: Sequence[int]) -> Tensor:
-    """Columns of ones in zeros, (SUMMED windows, 1, k, 1) with k the largest window: each channel's own box."""
+def within(windows: Sequence[int]) -> Tensor:
+    """Whether a tap lies in a window, (M, k), k the largest of M windows. Computed, for branches hold no constants."""
     largest = max(windows)
-    reach = torch.cat([torch.full((SUMMED,), window // 2) for window in windows])
     offset = torch.arange(largest) - largest // 2
-    return (offset.abs() <= reach[:, None]).float()[:, None, :, None]
+    return torch.stack([offset.abs() <= window // 2 for window in windows])
 
 
-def careful_sums(logits: Tensor, values: Tensor, window: int) -> Tensor:
-    """Box sums (C, 1, H, W) relative to the largest of the logits (1, 1, H, W) in every window.
+def box_kernels(windows: Sequence[int]) -> Tensor:
+    """Columns of ones in zeros, (SUMMED M, 1, k, 1): each channel's own box."""
+    return within(windows).float()[:, None].expand(-1, SUMMED, -1).flatten(0, 1)[:, None, :, None]
 
-    `values` are (C, 1, H, W), 0 where the logit is OUTSIDE. First columns are summed, then rows of these.
+
+def careful_sums(logits: Tensor, values: Sequence[Tensor], windows: Sequence[int]) -> Tensor:
+    """Box sums (M, C, H, W) relative to the largest of the logits (M, 1, H, W) in every window.
+
+    `values` are C images (1, 1, H, W), 0 where the logits are OUTSIDE. Columns are summed, then rows of these.
     """
-    margin = window // 2
-    each_tap = torch.eye(window)[:, None, :, None]  # the neighbours of a pixel become its channels
-    for kernel, padding in ((each_tap, (margin, 0)), (each_tap.transpose(2, 3), (0, margin))):
-        rows, columns = padding
-        entries = F.conv2d(F.pad(logits, (columns, columns, rows, rows), value=OUTSIDE), kernel)
+    inside = within(windows)[..., None, None]
+    largest = max(windows)
+    margin = largest // 2
+    column = torch.eye(largest)[:, None, :, None]  # the neighbours of a pixel become its channels
+    for kernel, (y, x) in ((column, (margin, 0)), (column.transpose(2, 3), (0, margin))):
+        entries = F.conv2d(F.pad(logits, (x, x, y, y), value=OUTSIDE), kernel)
+        entries = torch.where(inside, entries, OUTSIDE)
         logits = entries.amax(dim=1, keepdim=True)
         weights = torch.exp((entries - logits).clamp(min=LEAST_EXPONENT)) * (entries > OUTSIDE)
-        values = (weights * F.conv2d(values, kernel, padding=padding)).sum(dim=1, keepdim=True)
-    return values
+        values = [(weights * F.conv2d(each, kernel, padding=(y, x))).sum(dim=1, keepdim=True) for each in values]
+    return torch.cat(list(values), dim=1)
 
 
 class BoxWindows(nn.Module):
     """models.fusion.fuse for B = 1, exact for any finite logits like that.
 
     Logits that span at most SAFE_RANGE, as those of trained networks do, are shifted as a whole. Else a branch is taken
-    that is slower and takes memory for 13 images at once.
+    that is slower and takes memory for some hundred images.
     """
 
     def __init__(self, windows: Sequence[int]):
@@ -63,10 +69,8 @@ class BoxWindows(nn.Module):
             return F.conv2d(sums, columns.transpose(2, 3), padding=(0, margin), groups=groups)
 
         def careful(importance: Tensor, values: Tensor, surface: Tensor, high: Tensor, low: Tensor) -> Tensor:
-            logits = torch.where(surface > 0, importance, OUTSIDE)
-            images = values.transpose(0, 1)
-            maps = zip(logits.split(1, dim=1), self.windows, strict=True)
-            return torch.cat([careful_sums(each, images, window).transpose(0, 1) for each, window in maps], dim=1)
+            logits = torch.where(surface > 0, importance, OUTSIDE).transpose(0, 1)
+            return careful_sums(logits, values.split(1, dim=1), self.windows).flatten(0, 1)[None]
 
         within_range = (high - low).max() <= SAFE_RANGE
         sums = torch.cond(within_range, shifted, careful, (importance, values, surface, high, low))

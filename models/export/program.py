@@ -43,13 +43,17 @@ def quiet() -> Iterator[None]:
         logger.setLevel(before)
 
 
+def dynamic(step: Step) -> dict[str, dict[int, str]]:
+    """The names of each input's sizes that may differ from call to call, by axis."""
+    return {
+        port.name: {axis: size for axis, size in enumerate(port.shape) if isinstance(size, str)} for port in step.inputs
+    }
+
+
 def trace(step: Step, frame: Frame) -> ExportedProgram:
     """The step as a program of tensors by name. `frame` is an example, of at least 2 x 2 pixels and one mesh."""
     sizes = {HEIGHT: Dim(HEIGHT, min=2), WIDTH: Dim(WIDTH, min=2), MESHES: Dim(MESHES, min=2)}
-    shapes = {
-        port.name: {axis: sizes[size] for axis, size in enumerate(port.shape) if isinstance(size, str)}
-        for port in step.inputs
-    }
+    shapes = {name: {axis: sizes[size] for axis, size in named.items()} for name, named in dynamic(step).items()}
     inputs = {**step.feeds(frame), **step.initial(frame)}
     with torch.no_grad(), quiet():
         return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"tensors": shapes})
@@ -96,6 +100,7 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
             opset_version=OPSET,
             input_names=[port.name for port in step.inputs],
             output_names=[port.name for port in step.outputs],
+            dynamic_shapes={"tensors": dynamic(step)},
             verbose=False,
         )
         assert written is not None
