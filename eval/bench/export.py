@@ -34,7 +34,7 @@ EXAMPLE_SIZE = (24, 32)
 Play = Callable[[], Tensor]  # the radiance of the sequence's next frame
 
 
-class Sequence:
+class TimedSequence:
     """A sequence that all play in step: `frame` is the one that is played now."""
 
     frame: Frame
@@ -74,14 +74,14 @@ def bench_export(
 ) -> str:
     """Milliseconds of a frame in float32, in turns: a table, and RUNS/bench/export.json.
 
-    Weights are fresh: they do not matter for the time. With `threads`, by default as many as PyTorch takes. Raises
+    Weights are fresh: they do not matter for the time. With the warp outside, its time is that of our reprojection. With `threads`, by default as many as PyTorch takes. Raises
     BadInput for a denoiser that cannot be exported, missing packages, and what is no size or number of threads.
     """
     check_exportable(name)
     check_installed("onnx")
     pixels = parse_size(size)
     count = threads_or_all(threads)
-    sequence = Sequence(pixels)
+    sequence = TimedSequence(pixels)
     operators: dict[str, int] = {}
     radiance: dict[str, Tensor] = {}
     with thread_count(count), TemporaryDirectory() as folder:

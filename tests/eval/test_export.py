@@ -4,6 +4,7 @@ import json
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +14,7 @@ from models.registry import create
 from models.weights import save_weights
 from onespp import main
 from provenance import ROOT
+from tests.helpers.exports import check_page
 from tests.test_cli import fails
 from train.task import run_folder
 
@@ -32,7 +34,7 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
     folder = run_folder(tmp_path, "wskp3", "tiny")
     folder.mkdir(parents=True)
     save_weights(create("wskp3"), "wskp3", {}, folder / "weights.safetensors")
-    call = ["export", "wskp3", "--to", "pt2", "--warp", "outside", "--runs", str(tmp_path), "--budget", "tiny"]
+    call = ["export", "wskp3", "--to", "pt2", "--runs", str(tmp_path), "--budget", "tiny"]
     export = tmp_path / "export" / "wskp3-pt2"
     export.mkdir(parents=True)
     (export / "manifest.json").write_text('{"sha256": {"old.pt2": "0"}}')
@@ -44,6 +46,7 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
     files = {str(path.relative_to(export)) for path in export.rglob("*") if path.is_file()}
     assert files == {"manifest.json", "README.md", "wskp3.pt2", *(f"golden/00{n}.npz" for n in range(4))}
     assert [path.name for path in (tmp_path / "export").iterdir()] == ["wskp3-pt2"]
+    check_page(export, lambda array: torch.from_numpy(np.ascontiguousarray(array)), 1e-4)
 
 
 def test_the_docs_have_the_calls_that_are_tested():
