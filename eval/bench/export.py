@@ -74,8 +74,9 @@ def bench_export(
 ) -> str:
     """Milliseconds of a frame in float32, in turns: a table, and RUNS/bench/export.json.
 
-    Weights are fresh: they do not matter for the time. With the warp outside, its time is that of our reprojection. With `threads`, by default as many as PyTorch takes. Raises
-    BadInput for a denoiser that cannot be exported, missing packages, and what is no size or number of threads.
+    Weights are fresh: they do not matter for the time. With the warp outside, its time is that of our reprojection.
+    With `threads`, by default as many as PyTorch takes. Raises BadInput for a denoiser that cannot be exported, missing
+    packages, and what is no size or number of threads.
     """
     check_exportable(name)
     check_installed("onnx")

@@ -25,11 +25,11 @@ FOR_WARP = (
     image("mesh_id", 1, "number of the mesh; 0 for background", torch.int32),
     image("motion", 2, "x and y from the pixel to where its surface was in the frame before, pixels"),
     Port("K", (3, 3), "projection of this camera: pixel = (K p) / p_z of a point p in the camera's frame"),
-    Port("camera_to_world", (4, 4), "pose of this camera; only its rotation is read"),
+    Port("camera_to_world", (4, 4), "rigid pose of this camera, whose z axis looks forward; only its rotation is read"),
     Port(
         "to_previous_camera",
         (MESHES, 4, 4),
-        "by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply in float64: "
+        "rigid, by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply in float64: "
         "inverse(previous camera_to_world) · previous object_to_world · inverse(object_to_world) · camera_to_world, "
         "and without the objects in row 0",
     ),
