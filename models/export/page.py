@@ -53,27 +53,20 @@ def step(frame, state):  # dictionaries of tensors: inputs that each frame bring
 """,
 }
 
-CPP = {
-    "onnx": """Ort::Env env;
+CPP = """Ort::Env env;
 Ort::Session session(env, "FILE", Ort::SessionOptions{});
 Ort::IoBinding step(session);
 step.BindInput("noisy", noisy);  // and so on: an Ort::Value for every input, made once over the renderer's buffers
 step.BindOutput("radiance", radiance);
 for (;;) {
-  for (size_t i = 0; i < state.size(); ++i) {  // two buffers each: the last frame's, and the next one's
+  for (size_t i = 0; i < state.size(); ++i) {  // history and scale, two buffers each: the last frame's, the next one's
     step.BindInput(state_inputs[i], state[i]);
     step.BindOutput(state_outputs[i], next_state[i]);
   }
   session.Run(Ort::RunOptions{}, step);
-  std::swap(state, next_state);
+  std::swap(state, next_state);  // and the buffers of depth, normal and so on with those of previous_depth, ...
 }
-""",
-    "pt2": """// Once, in Python:
-// torch._inductor.aoti_compile_and_package(torch.export.load("FILE"), package_path="compiled.pt2")
-torch::inductor::AOTIModelPackageLoader step("compiled.pt2");
-std::vector<torch::Tensor> outputs = step.run(inputs);  // both in the order of the tables above
-""",
-}
+"""
 
 INSIDE = """What is named `previous_…` is the input of the frame before: keep two buffers of each, and copy nothing. The
 transforms of `to_previous_camera` are products of matrices of large numbers: multiply in float64, then round."""
@@ -91,6 +84,7 @@ def table(ports: Sequence[Mapping[str, Any]]) -> str:
 def page(manifest: Mapping[str, Any]) -> str:
     """The page, in Markdown."""
     kind = manifest["format"]
+    cpp = f"```cpp\n{CPP.replace('FILE', manifest['file'])}```" if kind == "onnx" else "Take the ONNX file: `onespp export … --to onnx`."
     state = "\n".join(f"- `{each['input']}` is `{each['from']}` of the frame before" for each in manifest["state"])
     return f"""# {manifest["denoiser"]} as {manifest["file"]}
 
@@ -121,6 +115,5 @@ All state is 0 before the first frame and after a cut. {INSIDE if manifest["warp
 
 In terms of C++:
 
-```cpp
-{CPP[kind].replace("FILE", manifest["file"])}```
+{cpp}
 """

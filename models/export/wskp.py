@@ -29,9 +29,9 @@ FOR_WARP = (
     Port(
         "to_previous_camera",
         (MESHES, 4, 4),
-        "rigid, by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply in float64: "
-        "inverse(previous camera_to_world) · previous object_to_world · inverse(object_to_world) · camera_to_world, "
-        "and without the objects in row 0",
+        "rigid, by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply in "
+        "float64: inverse(previous camera_to_world) · previous object_to_world · inverse(object_to_world) · "
+        "camera_to_world, and without the objects in row 0",
     ),
 )
 HISTORY = image("history", 4, "accumulated irradiance, linear RGB, and its length in frames")

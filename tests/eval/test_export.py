@@ -51,7 +51,7 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
 
 def test_the_docs_have_the_calls_that_are_tested():
     page = Path(ROOT / "docs" / "export.md").read_text()
-    assert PYTHON["onnx"] in page and CPP["onnx"].replace("FILE", "wskp6.onnx") in page
+    assert PYTHON["onnx"] in page and CPP.replace("FILE", "wskp6.onnx") in page
 
 
 @onnx_only
