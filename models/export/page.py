@@ -84,7 +84,9 @@ def table(ports: Sequence[Mapping[str, Any]]) -> str:
 def page(manifest: Mapping[str, Any]) -> str:
     """The page, in Markdown."""
     kind = manifest["format"]
-    cpp = f"```cpp\n{CPP.replace('FILE', manifest['file'])}```" if kind == "onnx" else "Take the ONNX file: `onespp export … --to onnx`."
+    cpp = f"```cpp\n{CPP.replace('FILE', manifest['file'])}```"
+    if kind != "onnx":
+        cpp = "Take the ONNX file: `onespp export … --to onnx`."
     state = "\n".join(f"- `{each['input']}` is `{each['from']}` of the frame before" for each in manifest["state"])
     return f"""# {manifest["denoiser"]} as {manifest["file"]}
 
