@@ -234,6 +234,36 @@ def figure_unbiased(out: Png = Path("runs/unbiased.png")) -> None:
     print(out)
 
 
+def export(
+    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")],
+    to: Literal["onnx", "pt2"] = "onnx",
+    out: Annotated[Path | None, arg(metavar="DIR", help="by default RUNS/export/DENOISER-TO")] = None,
+    runs: Runs = Path("runs"),
+    budget: Budget = "quick",
+    weights: Annotated[Path | None, arg(metavar="FILE", help="by default those trained in this budget")] = None,
+    precision: Annotated[Literal["float32", "float16"], arg(help="of the network")] = "float32",
+    warp: Annotated[
+        Literal["inside", "outside"], arg(help="whether the file moves its history along with the surfaces itself")
+    ] = "inside",
+) -> None:
+    """Write a trained denoiser as one file for engines, with a manifest, golden frames and a page on how to call it."""
+    from eval.export import export as write
+
+    print(write(name, to, runs, budget, weights, precision, warp, out))
+
+
+def bench_export(
+    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")] = "wskp6",
+    runs: Runs = Path("runs"),
+    size: Size = "1280x720",
+    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+) -> None:
+    """An exported denoiser under onnxruntime, next to ours."""
+    from eval.bench.export import bench_export as bench
+
+    print(bench(runs, name, size, threads))
+
+
 def bench_denoisers(
     names: Denoisers = (),
     runs: Runs = Path("runs"),
@@ -455,11 +485,15 @@ GROUPS: dict[str, Commands] = {
         "papers": papers,
         "ablate": ablate,
     },
+    "Elsewhere": {
+        "export": export,
+    },
     "What it costs, what it stands": {
         "bench": {
             "denoisers": bench_denoisers,
             "scaling": bench_scaling,
             "fusion": bench_fusion,
+            "export": bench_export,
             "rendering": bench_rendering,
             "references": bench_references,
             "loading": bench_loading,
@@ -472,7 +506,7 @@ GROUPS: dict[str, Commands] = {
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
     "figure": "Draw a figure of the papers or of the docs: variance, unbiased.",
-    "bench": "Measure this machine: denoisers, scaling, fusion, rendering, loading, training.",
+    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, loading, training.",
 }
 
 

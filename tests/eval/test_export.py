@@ -1,0 +1,65 @@
+"""`onespp export` and its bench, from the command line on."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from eval.bench.export import EXPORTED, bench_export
+from models.export.page import CPP, PYTHON
+from models.registry import create
+from models.weights import save_weights
+from onespp import main
+from provenance import ROOT
+from tests.helpers.exports import check_page
+from tests.test_cli import fails
+from train.task import run_folder
+
+onnx_only = pytest.mark.skipif(find_spec("onnxruntime") is None, reason="needs pip install 'onespp[export]'")
+
+
+def test_untrained_and_unknown(capsys, tmp_path):
+    runs = ["--runs", str(tmp_path), "--to", "pt2"]
+    assert "wskp3: it has no weights at" in fails(capsys, "export", "wskp3", *runs)
+    assert "'svgf' cannot be exported; wskp3, wskp6 can" in fails(capsys, "export", "svgf", *runs)
+    assert "there are no weights at" in fails(capsys, "export", "wskp3", *runs, "--weights", str(tmp_path / "w"))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path):
+    torch.manual_seed(0)
+    folder = run_folder(tmp_path, "wskp3", "tiny")
+    folder.mkdir(parents=True)
+    save_weights(create("wskp3"), "wskp3", {}, folder / "weights.safetensors")
+    call = ["export", "wskp3", "--to", "pt2", "--runs", str(tmp_path), "--budget", "tiny"]
+    export = tmp_path / "export" / "wskp3-pt2"
+    export.mkdir(parents=True)
+    (export / "manifest.json").write_text('{"sha256": {"old.pt2": "0"}}')
+    (export / "old.pt2").write_bytes(b"")
+    main(call)
+    assert capsys.readouterr().out.startswith(f"{export}/wskp3.pt2: ")
+    manifest = json.loads((export / "manifest.json").read_text())
+    assert manifest["largest_difference"]["from_onespp"] < 1e-4
+    files = {str(path.relative_to(export)) for path in export.rglob("*") if path.is_file()}
+    assert files == {"manifest.json", "README.md", "wskp3.pt2", *(f"golden/00{n}.npz" for n in range(4))}
+    assert [path.name for path in (tmp_path / "export").iterdir()] == ["wskp3-pt2"]
+    check_page(export, lambda array: torch.from_numpy(np.ascontiguousarray(array)), 1e-4)
+
+
+def test_the_docs_have_the_calls_that_are_tested():
+    page = Path(ROOT / "docs" / "export.md").read_text()
+    assert PYTHON["onnx"] in page and CPP.replace("FILE", "wskp6.onnx") in page
+
+
+@onnx_only
+@pytest.mark.slow
+def test_bench_export(tmp_path):
+    table = bench_export(tmp_path, "wskp3", "48x32", threads=1, measured=2)
+    assert all(way in table for way in EXPORTED)
+    rows = json.loads((tmp_path / "bench" / "export.json").read_text())["rows"]
+    assert len(rows) == 4 and all(row["ms"] > 0 and row["largest difference"] < 1e-4 for row in rows)
+    inside, outside = (row["operators"] for row in rows if row["way"] in EXPORTED)
+    assert outside < inside
