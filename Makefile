@@ -8,7 +8,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-SOURCES := onespp.py allocator.py errors.py files.py plotting.py provenance.py timing.py scenes render datasets models train eval denoise tests
+SOURCES := onespp.py command_line.py allocator.py errors.py files.py plotting.py provenance.py timing.py scenes render datasets models train eval denoise tests
 LLVM := libllvm19
 
 .NOTPARALLEL:

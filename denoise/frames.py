@@ -25,6 +25,8 @@ from scenes.camera import Array, View, motion_vectors, pixel_centres, unproject
 
 Image = NDArray[np.float32]
 
+# The previous camera where it is not known what surfaces were in its image: no frame's history follows it.
+NOWHERE = View(np.full((3, 3), np.nan), np.full((4, 4), np.nan), np.full((1, 4, 4), np.nan))
 TELEPHOTO = 1e8  # px: a focal length that makes all rays parallel
 
 
@@ -35,7 +37,7 @@ class Reading:
     Attributes:
         meaning: of its motion vectors; None where there are none.
         normals_are_encoded: in [0, 1] instead of [-1, 1].
-        cameras: what tells them, "positions" or "header"; None where nothing does.
+        cameras: what tells them, "positions", "header" or "arrays" beside the pixels; None where nothing does.
         in_camera_space: whether positions and normals are in the camera's own coordinates.
     """
 
@@ -69,12 +71,14 @@ class Sighting:
 
 def sighting(pixels: Pixels, reading: Reading) -> Sighting | None:
     """The camera of a frame; None where it cannot be told."""
+    if pixels.view is not None:
+        return Sighting(pixels.view, None)
     if reading.cameras == "header":
-        view = view_of_header(pixels.image.header, *pixels.size)
+        view = view_of_header(pixels.header, *pixels.size)
         return Sighting(view, None) if view else None
     if reading.cameras == "positions":
         own = view_of_positions(pixels.arrays["position"], pixels.surface)
-        world = own and (in_the_world(own, pixels.image.header) if reading.in_camera_space else own)
+        world = own and (in_the_world(own, pixels.header) if reading.in_camera_space else own)
         return Sighting(world, own) if world else None
     return None
 
@@ -83,14 +87,14 @@ def camera_kind(pixels: Pixels) -> Reading:
     """What tells the cameras of a sequence that begins with this frame. Positions are believed before the header."""
     if "position" in pixels.arrays:
         own = view_of_positions(pixels.arrays["position"], pixels.surface)
-        header = pixels.image.header
+        header = pixels.header
         if own and is_own_space(own, header, pixels.arrays["position"], pixels.surface):
             moved = in_the_world(own, header)
             return Reading(cameras="positions" if moved else None, in_camera_space=True)
         if own:
             return Reading(cameras="positions")
     has_depth = "depth" in pixels.arrays or "distance" in pixels.arrays  # without, a camera tells nothing of surfaces
-    return Reading(cameras="header" if has_depth and view_of_header(pixels.image.header, *pixels.size) else None)
+    return Reading(cameras="header" if has_depth and view_of_header(pixels.header, *pixels.size) else None)
 
 
 class Shot:
@@ -111,7 +115,7 @@ class Shot:
             self.view = None
             self.seen = seen is not None
             if not self.seen:
-                tqdm.write(f"{pixels.image.path} tells no camera, unlike the frames before it: history begins anew")
+                tqdm.write(f"{pixels.source} tells no camera, unlike the frames before it: history begins anew")
         depth = depth_of(pixels, seen)
         given = self.given_motion(pixels)
         view = seen.world if seen else self.parallel_view(pixels, depth, given)
@@ -132,7 +136,7 @@ class Shot:
         return Frame(
             {name: to_tensor(channels[name]) for name in self.reads},
             now=Cameras.of(view),
-            previous=Cameras.of(before),
+            previous=Cameras.of(before if self.reading.has_history else NOWHERE),
             gain=torch.ones(1, 3, 1, 1),
             source=self.source,
         )

@@ -1,6 +1,8 @@
-"""The pixels of one foreign frame, by quantity: read from its files, mended and counted."""
+"""The pixels of one foreign frame, by quantity: mended and counted."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from denoise.exr_image import ExrImage
 from denoise.sequence import COLOUR, FrameFiles
 from denoise.sources import Sources
 from errors import BadInput
+from scenes.camera import View
 
 Image = NDArray[np.float32]
 
@@ -21,21 +24,26 @@ class Pixels:
     """One frame.
 
     Attributes:
-        image: the file that holds the colour.
-        arrays: (H, W, C) by quantity (layers.KNOWN), as the file means them; finite, albedo in [0, 1].
+        arrays: (H, W, C) by quantity (layers.KNOWN), as their maker means them; finite, albedo in [0, 1].
         surface: where pixels show a surface, (H, W).
         nonfinite: how many pixels were not finite and were set to 0.
+        source: what messages call it.
+        header: attributes of the file that holds the colour.
+        view: its camera, where that is known without asking the header.
     """
 
-    image: ExrImage
     arrays: dict[str, Image]
     surface: NDArray[np.bool_]
     nonfinite: int
+    source: str
+    header: Mapping[str, Any] = field(default_factory=dict)
+    view: View | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """(H, W)."""
-        return self.image.height, self.image.width
+        height, width = self.surface.shape
+        return height, width
 
 
 def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrImage]:
@@ -51,12 +59,23 @@ def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrIm
     return images
 
 
-def read_pixels(files: FrameFiles, sources: Sources) -> Pixels:
-    """All that a denoiser may need of a frame. Raises BadInput where a file lacks what the first frame's has."""
+def read_pixels(files: FrameFiles, sources: Sources) -> tuple[Pixels, ExrImage]:
+    """All that a denoiser may need of a frame, and the file that holds its colour.
+
+    Raises BadInput where a file lacks what the first frame's has.
+    """
     images = open_passes(files)
     arrays = {
         name: images[source.pass_name].stacked(source.layer.channels) for name, source in sources.quantities.items()
     }
+    colour = images[COLOUR]
+    alpha = colour.stacked([sources.alpha])[..., 0] if sources.alpha else None
+    nonfinite = mend(arrays)
+    return Pixels(arrays, surface_of(arrays, alpha), nonfinite, str(colour.path), colour.header), colour
+
+
+def mend(arrays: dict[str, Image]) -> int:
+    """Set pixels that are not finite to 0 and clip the albedo to [0, 1], in place. Returns how many pixels were not."""
     bad = np.zeros(next(iter(arrays.values())).shape[:2], bool)
     for name, array in arrays.items():
         wrong = np.isnan(array) if name in MAY_BE_INFINITE else ~np.isfinite(array)
@@ -66,8 +85,7 @@ def read_pixels(files: FrameFiles, sources: Sources) -> Pixels:
             bad |= there
     if "albedo" in arrays:
         arrays["albedo"].clip(0, 1, out=arrays["albedo"])
-    alpha = images[COLOUR].stacked([sources.alpha])[..., 0] if sources.alpha else None
-    return Pixels(images[COLOUR], arrays, surface_of(arrays, alpha), int(bad.sum()))
+    return int(bad.sum())
 
 
 def surface_of(arrays: dict[str, Image], alpha: Image | None) -> NDArray[np.bool_]:

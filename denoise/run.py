@@ -146,7 +146,7 @@ class Work:
         elif self.sources.is_ours:
             image = radiance(first.passes[COLOUR], self.sources.target)
         else:
-            image = read_pixels(first, self.sources).arrays[COLOUR]
+            image = read_pixels(first, self.sources)[0].arrays[COLOUR]
         return clip_exposure(luminance(image.clip(0, None)))
 
     def introduction(self) -> str:
@@ -210,7 +210,7 @@ class Work:
                     raise BadInput(
                         f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence"
                     )
-                output, state = self.denoiser(frame, state if self.has_history else None)
+                output, state = self.denoiser(frame, state)
                 if index >= start:
                     self.write(files, image, output[0].permute(1, 2, 0).numpy())
                     yield nonfinite
@@ -241,8 +241,8 @@ class Work:
         shot = Shot(self.understanding.reading, self.denoiser.reads, str(self.shots[0][0].passes[COLOUR]))
 
         def foreign(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-            pixels = read_pixels(files, self.sources)
-            return pixels.image, shot.frame(pixels), pixels.nonfinite
+            pixels, image = read_pixels(files, self.sources)
+            return image, shot.frame(pixels), pixels.nonfinite
 
         return foreign
 

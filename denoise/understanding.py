@@ -42,7 +42,7 @@ def understand(
         raise BadInput(
             "asvgf reads how samples shaded anew have changed, which only onespp's own renders have: use svgf"
         )
-    first = read_pixels(shots[0][0], sources)
+    first, _ = read_pixels(shots[0][0], sources)
     reading = camera_kind(first)
     words = [(quantity, found_in_words(sources, quantity)) for quantity in KNOWN if sources.has(quantity)]
     if sources.has("normal"):
@@ -108,7 +108,7 @@ def meaning_of(shots: Sequence[Sequence[FrameFiles]], sources: Sources, stated: 
         for files in shot:
             if looked_at == FRAMES or evidence.pairs == PAIRS:
                 break
-            pixels = read_pixels(files, sources)
+            pixels, _ = read_pixels(files, sources)
             now = guides(pixels)
             if before is not None:
                 evidence.add(now, before, pixels.arrays["motion"])

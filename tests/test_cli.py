@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
+from command_line import GROUPS, main
 from datasets.profiles import DATA_PROFILES
-from onespp import GROUPS, main
 from train.recipes import RECIPES
 
 

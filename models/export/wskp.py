@@ -55,6 +55,7 @@ class WSKPStep(Step):
     def __init__(self, denoiser: WSKP, warp: Warp):
         super().__init__()
         self.precision = denoiser.precision
+        self.inputs = tuple(denoiser.inputs)
         self.network = plain_convolutions(denoiser.network)
         self.fusion = BoxWindows(denoiser.windows)
         self.warp = warp
@@ -107,9 +108,13 @@ class WSKPStep(Step):
 
     def features(self, x: dict[str, Tensor], radiance: Tensor, scale: Scale) -> Tensor:
         """models.features.network_features of accumulated `radiance`."""
-        colour = (radiance * scale.exposure).clamp(0, 1) ** (1 / GAMMA)
-        depth = torch.where(x["depth"] > 0, x["depth"] / (x["depth"] + scale.depth), 1)
-        return torch.cat([colour, x["albedo"], x["normal"] / 2 + 0.5, depth], dim=1)
+        features = {
+            "colour": (radiance * scale.exposure).clamp(0, 1) ** (1 / GAMMA),
+            "albedo": x["albedo"],
+            "normal": x["normal"] / 2 + 0.5,
+            "depth": torch.where(x["depth"] > 0, x["depth"] / (x["depth"] + scale.depth), 1),
+        }
+        return torch.cat([features[name] for name in self.inputs], dim=1)
 
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors

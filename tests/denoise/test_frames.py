@@ -22,7 +22,7 @@ def frames_of(folder: Path) -> list[Frame]:
     files = sequence_of({"colour": [str(folder / "*.exr")]})
     sources = find_sources(open_passes(files[0], header_only=True), {})
     shot = Shot(understand([files], sources, READS, None).reading, READS, "test")
-    return [shot.frame(read_pixels(each, sources)) for each in files]
+    return [shot.frame(read_pixels(each, sources)[0]) for each in files]
 
 
 def header_of(frame: Frame) -> dict[str, np.ndarray]:
@@ -124,7 +124,7 @@ def test_albedo_is_clamped_and_bad_motion_is_none(spheres, tmp_path):
 def test_cameras_are_taken_from_positions_before_the_header(box, tmp_path):
     foreign.write(tmp_path / "1.exr", foreign.pbrt(box[0]), header_of(box[1]))
     files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
-    pixels = read_pixels(files[0], find_sources(open_passes(files[0]), {}))
+    pixels, _ = read_pixels(files[0], find_sources(open_passes(files[0]), {}))
     assert camera_kind(pixels).cameras == "positions"
 
 

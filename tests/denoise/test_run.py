@@ -13,6 +13,7 @@ import torch
 from PIL import Image as Picture
 from torch import Tensor
 
+from command_line import main
 from datasets.clip import Dataset
 from datasets.exr import export_clip
 from datasets.frame import Frame, read_frame
@@ -20,7 +21,6 @@ from denoise.run import Job, denoise
 from errors import BadInput
 from models.registry import create, load
 from models.weights import save_weights
-from onespp import main
 from tests.denoise.conftest import as_foreign
 from tests.helpers import foreign
 from tests.helpers.frames import run

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-import onespp
+import command_line
 from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
 from datasets.sequences import REFERENCES
@@ -71,7 +71,7 @@ def test_an_unknown_ablation_or_budget_is_refused(tiny, tmp_path):
 
 
 def test_the_command_line_knows_all_ablations():
-    literal = get_args(inspect.signature(onespp.ablate).parameters["what"].annotation)[0]
+    literal = get_args(inspect.signature(command_line.ablate).parameters["what"].annotation)[0]
     assert get_args(literal) == tuple(ABLATIONS)
 
 

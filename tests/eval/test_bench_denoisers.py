@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import eval.bench.denoisers
+from command_line import main
 from errors import BadInput
 from eval.bench.denoisers import bench_denoisers, cost, macs_per_pixel, measure_races, ways
 from eval.bench.race import FEWEST_FRAMES, TIMED_FRAMES, race
@@ -18,7 +19,6 @@ from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import WINDOW_SETS
 from eval.selection import cannot_run
 from eval.spec import DenoiserSpec, create_any, precision_in_use
-from onespp import main
 from provenance import device_in_words
 
 FIELDS = [

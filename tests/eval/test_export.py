@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from command_line import main
 from eval.bench.export import EXPORTED, bench_export
 from models.export.page import CPP, PYTHON
 from models.registry import create
 from models.weights import save_weights
-from onespp import main
 from provenance import ROOT
 from tests.helpers.exports import check_page
 from tests.test_cli import fails

@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from command_line import main
 from errors import BadInput
 from eval.disocclusion_crops import Crop, densest_crop
 from eval.metrics import METRICS, flip_map
@@ -20,7 +21,6 @@ from eval.report.page import report
 from eval.report.table_rows import TableRow, best_denoisers
 from eval.results import FLOOR, folder_of, load_picture, load_result
 from eval.tradeoff.pareto import Point, dominators
-from onespp import main
 
 NAMES = ["noisy", "accumulated", "eaw", "ntd"]
 

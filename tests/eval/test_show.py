@@ -10,13 +10,13 @@ import pytest
 from matplotlib import colormaps
 from matplotlib import image as png
 
+from command_line import main
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.figures.panel_grid import Panel, draw_grid
 from eval.figures.show import grids_of, show, view_clip
 from models.denoiser import Denoiser, State
 from models.registry import create
-from onespp import main
 from plotting import save_figure
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from command_line import main
 from eval.spec import DenoiserSpec
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
 from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
@@ -23,7 +24,6 @@ from eval.stress.tables import heat_map, verdict_text
 from models import registry
 from models.denoiser import Denoiser, State
 from models.weights import save_weights
-from onespp import main
 from plotting import plt
 
 NAMES = [case.name for case in STRESS_CASES]

@@ -11,7 +11,7 @@ from provenance import BESIDE_THEM, FOLDERS, ROOT
 
 PAGE = ROOT / "docs" / "architecture.md"
 HEADING = "## The map\n"
-SHARED = sorted(f"{name}.py" for name in ("onespp", *BESIDE_THEM))
+SHARED = sorted(f"{name}.py" for name in ("onespp", "command_line", *BESIDE_THEM))
 
 
 def modules() -> list[Path]:

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from command_line import main
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from models import registry
 from models.weights import save_weights
-from onespp import main
 from provenance import file_digest
 from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, metadata, short_task, tensors
