@@ -34,7 +34,7 @@ def load(name: str, weights: str | Path | None = None, precision: torch.dtype | 
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """The data set in a folder; its `clips("test")` are those of a split. Raises errors.BadInput where there is none."""
+    """The data set in a folder; its `clips("test")` are those of a split. BadInput where there is none."""
     from datasets.clip import Dataset
 
     return Dataset(Path(path))
