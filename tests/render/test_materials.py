@@ -7,8 +7,9 @@ import trimesh
 from errors import BadInput
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
+from render.loading import to_mitsuba
 from render.materials import MaterialTable, material_of
-from render.stage import Stage, to_mitsuba
+from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 
 
