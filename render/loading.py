@@ -122,15 +122,16 @@ class StockLoader:
     def __init__(self, unit: float = 1.0):
         self.unit = unit
         self.loaded: dict[int, tuple[object, object]] = {}  # by id: the description, which keeps the id its, and object
-        self.grouped: list[mi.Shape] = []  # shapes that instances repeat
+        self.groups: list[mi.Shape] = []  # that instances repeat, and
+        self.grouped: list[mi.Shape] = []  # the shapes in them
 
     def load(self, description: Mapping[str, Any]) -> Any:
         """The Mitsuba object of a dictionary, in whose place others may nest."""
         if id(description) not in self.loaded:
             loaded = mi.load_dict(self.resolved(description))
             self.loaded[id(description)] = (description, loaded)
-            if isinstance(loaded, mi.Shape) and loaded.class_name() != "ShapeGroup":
-                self.grouped.append(loaded)
+            if isinstance(loaded, mi.Shape):
+                (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
         return self.loaded[id(description)][1]
 
     def resolved(self, description: Mapping[str, Any]) -> dict[str, Any]:

@@ -193,7 +193,9 @@ def measured_material(bsdf: mi.BSDF) -> Material:
     si.n = mi.Normal3f(0, 0, 1)
     random = mi.PCG32(MEASURED_SAMPLES)
     uniform = [random.next_float32() for _ in range(3)]
-    sample, weight = bsdf.sample(mi.BSDFContext(), si, uniform[0], mi.Point2f(uniform[1], uniform[2]))
+    sample, weight = bsdf.sample(
+        mi.BSDFContext(mi.TransportMode.Importance), si, uniform[0], mi.Point2f(uniform[1], uniform[2])
+    )
     albedo = np.nan_to_num(np.array(weight, np.float32)).mean(axis=1)
     half = np.array(dr.normalize(sample.wo + si.wi))
     reflected = (np.array(sample.wo.z) > 0) & (np.array(sample.pdf) > 0)

@@ -15,6 +15,7 @@ Changes = dict[str, NDArray[np.float32]]  # by the parameter's name
 
 PLACES = ("to_world", "vertex_positions", "vertex_normals")
 BRIGHTNESS = ("radiance.value", "radiance.data", "intensity.value", "irradiance.value", "irradiance.data")
+POINTS = ("point", "spot", "projector")
 # Lights whose brightness has names of its own.
 SCALES = {"envmap": ("scale",), "projector": ("scale",), "sunsky": ("sun_scale", "sky_scale")}
 
@@ -52,16 +53,18 @@ class StockParameters:
             if not self.rest:
                 raise BadInput(f"shape '{name}' cannot move: it is of the kind {described.geometry['type']}")
         self.light: dict[str, Array] = {}
-        if described.gain.varies():
+        kind = described.emitter["type"] if described.emitter else "none"
+        # What shines from a point is seen by the square of its distance, which is measured in Mitsuba's units.
+        self.factor = unit**-2 if kind in POINTS else 1.0
+        if described.gain.varies() or self.factor != 1:
             prefix = f"{name}.emitter" if isinstance(described, StockShape) else name
-            kind = described.emitter["type"] if described.emitter else "none"
             self.light = at_rest(parameters, [f"{prefix}.{key}" for key in SCALES.get(kind, BRIGHTNESS)])
             if not self.light:
                 raise BadInput(f"the light of '{name}' cannot change: it is of the kind {kind}")
 
     def changes(self, frame: float) -> Changes:
         """Its parameters in a frame; none of a shape at rest under light that stays."""
-        values = {name: value * self.described.gain.at(frame) for name, value in self.light.items()}
+        values = {name: value * (self.factor * self.described.gain.at(frame)) for name, value in self.light.items()}
         if self.rest and isinstance(self.described, StockShape):
             matrix = self.described.motion.matrix(frame)
             matrix[:3, 3] /= self.unit
@@ -71,10 +74,13 @@ class StockParameters:
 
 def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array]:
     """The values of those of the named parameters that there are; none of a mesh's normals where it has none."""
-    values = {
-        name: np.array(getattr(parameters[name], "matrix", parameters[name])) for name in names if name in parameters
-    }
-    return {name: value.astype(np.float64) for name, value in values.items() if value.size}
+    values: dict[str, Array] = {}
+    for name in names:
+        if name in parameters:
+            value = parameters[name]
+            matrix = value.matrix if isinstance(value, mi.AffineTransform4f) else value
+            values[name] = np.array(matrix, np.float64)
+    return {name: value for name, value in values.items() if value.size}
 
 
 def moved(name: str, value: Array, matrix: Array) -> Array:
@@ -92,7 +98,7 @@ def as_parameter(value: NDArray[np.float32], parameter: Any) -> Any:
     if isinstance(parameter, mi.TensorXf):
         return mi.TensorXf(upload(value.ravel()), value.shape)
     if value.shape == (4, 4):
-        matrix = mi.Transform4f(value)
+        matrix = mi.AffineTransform4f(value)
         dr.make_opaque(matrix)
         return matrix
     if value.shape in ((3,), (3, 1)) and isinstance(parameter, mi.Color3f):

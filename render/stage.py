@@ -69,6 +69,7 @@ class Stage:
         content: dict[str, object] = {"type": "scene"}
         content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
         content |= {shape.name: instance for shape, instance in zip(scene.stock, loaded, strict=True)}
+        content |= {f"group {index}": group for index, group in enumerate(loader.groups)}
         content |= {light.name: loader.light(light) for light in scene.lights}
         if scene.sky is not None:
             content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}
