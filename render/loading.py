@@ -124,13 +124,31 @@ class StockLoader:
         self.loaded: dict[int, tuple[object, object]] = {}  # by id: the description, which keeps the id its, and object
         self.groups: list[mi.Shape] = []  # that instances repeat, and
         self.grouped: list[mi.Shape] = []  # the shapes in them
+        self.notes: list[str] = []  # what had to be left out
+
+    def made(self, description: dict[str, Any], what: str) -> Any:
+        """The Mitsuba object of a resolved dictionary, but for properties that mean nothing to it.
+
+        Raises BadInput, which begins with `what`, where it cannot be loaded.
+        """
+        try:
+            return mi.load_dict(description)
+        except RuntimeError as error:
+            unknown = unreferenced(error)
+            if not unknown & description.keys():
+                raise BadInput(f"{what} is empty, damaged or cannot be used: {reason(error)}") from None
+        names = ", ".join(f"'{name}'" for name in sorted(unknown))
+        self.notes.append(f"{what}: this Mitsuba does not know {names}: left out")
+        return self.made({key: value for key, value in description.items() if key not in unknown}, what)
 
     def load(self, description: Mapping[str, Any]) -> Any:
         """The Mitsuba object of a dictionary, in whose place others may nest."""
         if id(description) not in self.loaded:
-            loaded = mi.load_dict(self.resolved(description))
+            what = str(description.get("filename", f"a {description['type']}"))
+            loaded = self.made(self.resolved(description), what)
             self.loaded[id(description)] = (description, loaded)
             if isinstance(loaded, mi.Shape):
+                check_shape(loaded, what)
                 (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
         return self.loaded[id(description)][1]
 
@@ -159,11 +177,8 @@ class StockLoader:
         parts = {"bsdf": shape.bsdf, "emitter": shape.emitter}
         nested = {key: self.load(value) for key, value in parts.items() if value is not None}
         where = f"shape '{shape.name}'" + (f" ({shape.geometry['filename']})" if "filename" in shape.geometry else "")
-        try:
-            loaded = mi.load_dict(self.resolved(self.placed(shape.geometry)) | nested | {"id": shape.name})
-        except RuntimeError as error:
-            raise BadInput(f"{where} is empty or damaged: {reason(error)}") from None
-        check_mesh(loaded, where)
+        loaded = self.made(self.resolved(self.placed(shape.geometry)) | nested | {"id": shape.name}, where)
+        check_shape(loaded, where)
         return loaded
 
     def light(self, light: StockLight) -> mi.Emitter:
@@ -173,26 +188,41 @@ class StockLoader:
             emitter["position"] = [x / self.unit for x in emitter["position"]]
         else:
             emitter = self.placed(emitter)
-        try:
-            return mi.load_dict(self.resolved(emitter) | {"id": light.name})
-        except RuntimeError as error:
-            raise BadInput(f"light '{light.name}' cannot be loaded: {reason(error)}") from None
+        return self.made(self.resolved(emitter) | {"id": light.name}, f"light '{light.name}'")
 
 
-def reason(error: RuntimeError) -> str:
+def unreferenced(error: RuntimeError) -> set[str]:
+    """The properties that Mitsuba does not know, where this is its complaint."""
+    text = str(error)
+    return set(re.findall(r'^  - \w+ "([^"]+)":', text, re.MULTILINE)) if "unreferenced propert" in text else set()
+
+
+def reason(error: Exception) -> str:
     """What Mitsuba says, in one line, without the places in its own code."""
     text = " ".join(str(error).split())
-    return re.sub(r".*\[\w+(\.cpp:\d+)?\] ", "", text) or "it says no reason"
+    text = re.sub(r".*\[\w+(\.(cpp|h):\d+)?\] |Error while loading string ", "", text)
+    text = re.sub(r'^(At|While loading) dictionary node "\w*": |failed to instantiate .*?: ', "", text)
+    return "it cannot be read" if not text or text.startswith("jit_") else text
 
 
-def check_mesh(shape: mi.Shape, where: str) -> None:
-    """Raise BadInput, which begins with `where`, for a mesh that has no faces, or whose vertices are not finite."""
+LARGEST = 1e18  # units from the origin: its square is a finite float32
+
+
+def check_shape(shape: mi.Shape, where: str) -> None:
+    """Raise BadInput, which begins with `where`, for a shape that is nowhere, and a mesh that is empty or damaged."""
     parameters = mi.traverse(shape)
-    if "faces" not in parameters:
-        return
-    faces = np.array(parameters["faces"])
-    vertices = np.array(parameters["vertex_positions"])
-    if not len(faces) or 3 * faces.max() >= len(vertices):
-        raise BadInput(f"{where} is empty or damaged: it has {len(vertices) // 3} vertices and no sound faces")
-    if not np.isfinite(vertices).all():
-        raise BadInput(f"{where} is damaged: it has vertices that are not finite")
+    if "faces" in parameters:
+        faces = np.array(parameters["faces"])
+        vertices = np.array(parameters["vertex_positions"])
+        if not len(faces) or 3 * faces.max() >= len(vertices):
+            raise BadInput(f"{where} is empty or damaged: it has {len(vertices) // 3} vertices and no sound faces")
+        if not np.isfinite(vertices).all():
+            raise BadInput(f"{where} is damaged: it has vertices that are not finite")
+    box = shape.bbox()
+    if shape.class_name() != "ShapeGroupPlugin" and not reach_of(box) < LARGEST:
+        raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
+
+
+def reach_of(box: mi.BoundingBox3f) -> float:
+    """How far a box reaches from the origin along an axis; NaN for one that is nowhere."""
+    return float(np.abs([np.array(box.min), np.array(box.max)]).max())

@@ -161,20 +161,27 @@ MATERIAL_OF: dict[str, Callable[[BsdfParameters], Material | Mixture]] = {
 SMALLEST_PRINCIPLED_ALPHA = 0.001  # as in Mitsuba's plugin
 
 
-def material_of(bsdf: mi.BSDF) -> Material | Mixture:
-    """The material of a Mitsuba BSDF, whatever wraps it."""
+MOST_MIXED = 6  # mixtures within each other: each level doubles what is evaluated
+
+
+def material_of(bsdf: mi.BSDF, level: int = 0) -> Material | Mixture:
+    """The material of a Mitsuba BSDF, whatever wraps it. What lies below MOST_MIXED mixtures is measured."""
     parameters = BsdfParameters(bsdf)
     nested = [*parameters.nested.values()]
     kind = bsdf.class_name()
+    if level == MOST_MIXED and nested:
+        return measured_material(bsdf)
     if kind == "TwoSidedBRDF" and len(nested) == 2 and nested[0] is not nested[1]:
-        return Mixture(material_of(nested[0]), material_of(nested[1]), constant(0), sided=True)
+        return Mixture(material_of(nested[0], level + 1), material_of(nested[1], level + 1), constant(0), sided=True)
     if kind in ("TwoSidedBRDF", "NormalMap", "BumpMap"):
-        return material_of(nested[0])
+        return material_of(nested[0], level)
     if kind == "MaskBSDF":
-        inner = material_of(nested[0])
+        inner = material_of(nested[0], level + 1)
         return Mixture(null_material(parameters), inner, parameters.textures["opacity"])
     if kind == "BlendBSDF":
-        return Mixture(material_of(nested[0]), material_of(nested[1]), parameters.textures["weight"])
+        return Mixture(
+            material_of(nested[0], level + 1), material_of(nested[1], level + 1), parameters.textures["weight"]
+        )
     return MATERIAL_OF[kind](parameters) if kind in MATERIAL_OF else measured_material(bsdf)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.lights import Lights
-from render.loading import StockLoader, load_mesh, upload, with_placed_textures
+from render.loading import StockLoader, load_mesh, reach_of, upload, with_placed_textures
 from render.materials import MaterialTable, registry_index, registry_table
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
@@ -44,8 +44,7 @@ def size_of_mesh(shape: Shape) -> float:
 
 def size_of_stock(shape: mi.Shape) -> float:
     """The same of a shape that Mitsuba has loaded."""
-    box = shape.bbox()
-    return float(max(np.abs(np.array(box.min)).max(), np.abs(np.array(box.max)).max()))
+    return reach_of(shape.bbox())
 
 
 class Stage:
@@ -66,10 +65,11 @@ class Stage:
         if self.unit != 1:
             loader = StockLoader(self.unit)
             loaded = [loader.shape(shape) for shape in scene.stock]
+        self.notes = loader.notes
         content: dict[str, object] = {"type": "scene"}
         content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
         content |= {shape.name: instance for shape, instance in zip(scene.stock, loaded, strict=True)}
-        content |= {f"group {index}": group for index, group in enumerate(loader.groups)}
+        content |= {f"_group {index}": group for index, group in enumerate(loader.groups)}
         content |= {light.name: loader.light(light) for light in scene.lights}
         if scene.sky is not None:
             content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}

@@ -59,9 +59,13 @@ class Track:
 
 @dataclass(frozen=True)
 class KeyframedTrack(Track):
-    """A Track whose `keys` are those of the frames `times` (N,), which rise: the same spline over uneven intervals."""
+    """A Track whose `keys` are those of the frames `times` (N,), which rise: the same spline over uneven intervals.
+
+    Or straight lines, which go no higher and no lower than the keys.
+    """
 
     times: Array = field(default_factory=lambda: np.zeros(1))
+    straight: bool = False
 
     def at(self, frame: float) -> Array:
         """The value, (D,) or a scalar, in a `frame`, which may lie between whole ones."""
@@ -75,6 +79,8 @@ class KeyframedTrack(Track):
         width = times[k + 1] - times[k]
         u = (frame - times[k]) / width
         slope = (keys[k + 1] - keys[k]) / width
+        if self.straight:
+            return keys[k] + width * slope * u
         leaves = (keys[k + 1] - keys[k - 1]) / (times[k + 1] - times[k - 1]) if k > 0 else slope
         arrives = (keys[k + 2] - keys[k]) / (times[k + 2] - times[k]) if k + 2 < len(keys) else slope
         return (

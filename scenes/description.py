@@ -1,9 +1,10 @@
 """A user's own scene, described by a TOML file: which file it is, how the camera flies, what moves, what to render."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -91,6 +92,8 @@ def read_description(path: Path) -> Description:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md shows what it may say") from None
+    if not finite(msgspec.to_builtins(described)):
+        raise BadInput(f"{path}: a number is infinite or not a number")
     unknown = set(described.splits) - set(SPLITS)
     if unknown:
         raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
@@ -100,9 +103,19 @@ def read_description(path: Path) -> Description:
     for times in times_of_all:
         if times != sorted(set(times)):
             raise BadInput(f"{path}: the times {times} of keyframes do not rise: put them in order, each time once")
+    for names in ([motion.shape for motion in described.motion], [change.light for change in described.light]):
+        if len(set(names)) < len(names):
+            raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: put them into one table")
     if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
         raise BadInput(f"{path}: a split flies by keyframes, but there are none: add [[camera]] tables")
     return described
+
+
+def finite(value: Any) -> bool:
+    """Whether all numbers in plain data are."""
+    if isinstance(value, dict | list | tuple):
+        return all(map(finite, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:
@@ -132,5 +145,5 @@ def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
 
 
 def gain_of(keys: list[GainKey], frames: int) -> KeyframedTrack:
-    """What a light is multiplied by."""
-    return spline([key.gain for key in keys], [key.time for key in keys], frames)
+    """What a light is multiplied by: along straight lines, for a spline could fall below 0."""
+    return replace(spline([key.gain for key in keys], [key.time for key in keys], frames), straight=True)

@@ -15,6 +15,7 @@ from errors import BadInput
 from scenes.animation import Camera, Shape, Track
 from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
 from scenes.camera import Array
+from scenes.names import Names
 from scenes.sky import sky
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply")
@@ -155,10 +156,11 @@ def load_mesh_file(path: Path) -> MeshFile:
     """
     scene = load_scene(path)
     found = MeshFile(camera=camera_of(scene))
+    names = Names()
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
         mesh = scene.geometry[geometry]
-        name = str(node).replace(".", "_")
+        name = names.unique(str(node))
         if not isinstance(mesh, trimesh.Trimesh):
             found.notes.append(f"{name}: no mesh, but a {type(mesh).__name__}: left out")
             continue
@@ -166,7 +168,7 @@ def load_mesh_file(path: Path) -> MeshFile:
         mesh.apply_transform(transform)
         found.shapes.append(shape_of(mesh, name, found.notes))
     if not found.shapes:
-        raise BadInput(f"{path} has no mesh to render; {'; '.join(found.notes)}")
+        raise BadInput("; ".join([f"{path} has no mesh to render", *found.notes]))
     if not any(shape.radiance for shape in found.shapes):
         found.notes.append("nothing shines: a clear sky with the sun, y up")
         found.sky = sky(np.random.default_rng(0), SUN)

@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from errors import BadInput
 from render.backend import mi
+from render.loading import reason
 from scenes.animation import Camera, Track
 from scenes.camera import Array
 
@@ -14,13 +16,19 @@ FOV_WITHOUT_CAMERA = 50.0  # degrees
 def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[Camera, list[str]]:
     """The camera at rest of a perspective sensor's dictionary, for images of this size, and what it cannot do.
 
-    Where the sensor states its field of view for another axis than x, it holds for that axis here too.
+    Where the sensor states its field of view for another axis than x, it holds for that axis here too. Raises BadInput
+    where it has none.
     """
     film = {"type": "hdrfilm", "width": width, "height": height}
     lens = {key: value for key, value in sensor.items() if key in ("fov", "fov_axis", "focal_length")}
-    loaded = mi.load_dict({"type": "perspective", "film": film, **lens})
+    try:
+        loaded = mi.load_dict({"type": "perspective", "film": film, **lens})
+    except RuntimeError as error:
+        raise BadInput(f"the camera cannot be used: {reason(error)}") from None
     x_fov = float(np.array(mi.traverse(loaded)["x_fov"]).ravel()[0])
     to_world = np.asarray(sensor.get("to_world", np.eye(4)), np.float64)
+    if not abs(np.linalg.det(to_world[:3, :3])) > 0 or not np.isfinite(to_world).all():
+        raise BadInput(f"the camera cannot be used: its to_world is {to_world.tolist()}")
     axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, :3], axis=0)
     eye = to_world[:3, 3]
     notes = []

@@ -1,6 +1,5 @@
 """The nodes of a scene file as plain data: shapes, lights and a camera as Mitsuba's dictionaries."""
 
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,9 +8,19 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.scene_file.stand_ins import GREY, Properties, plugins, stand_in
+from render.scene_file.stand_ins import (
+    GREY,
+    SKIES,
+    WHITE_SKY,
+    Properties,
+    plugins,
+    repaired,
+    stand_in,
+    turned_to_y,
+)
 from render.scene_file.xml import inside, parse
 from scenes.animation import StockLight, StockShape
+from scenes.names import Names
 
 RENDERER_SETTINGS = ("Sampler", "Film", "ReconstructionFilter")  # of other renderers: frames here follow the TOML
 OWN_INTEGRATORS = ("path", "direct")  # whose light transport is what is rendered here
@@ -34,10 +43,10 @@ class Converter:
 
     def __init__(self, path: Path):
         self.root = path.resolve().parent
-        self.state, notes = parse(path)
+        self.state, self.searched, notes = parse(path)
         self.made: dict[int, Properties | None] = {}
         self.file = SceneFile(path.resolve(), notes=notes)
-        self.names: Counter[str] = Counter()
+        self.names = Names()
 
     def note(self, text: str) -> None:
         self.file.notes.append(text)
@@ -65,18 +74,26 @@ class Converter:
     def describe(self, index: int) -> Properties | None:
         node = self.state.nodes[index]
         kind = self.kind(index)
-        described: Properties = {"type": node.props.plugin_name()}
+        plugin = node.props.plugin_name()
+        described: Properties | None = {"type": plugin}
         for key in node.props:
             value = self.value(node, key)
-            if value is not None:
+            if key == "type":  # in dictionaries this is the plugin's name
+                self.note(f"{self.name_of(node)}: a property called 'type' is left out")
+            elif value is not None:
                 described[key.lstrip("_")] = value
-        if node.props.plugin_name() not in plugins():
-            replaced, words = stand_in(kind, described)
-            self.note(
-                f"{self.name_of(node)}: this Mitsuba has no {kind.lower()} '{described['type']}': {words} instead"
-            )
-            return replaced
-        return self.with_files(node, kind, described)
+        if plugin in ("sky", "sun", "sunsky") and str(self.state.versions[node.file_index]).startswith("0."):
+            described = turned_to_y(described)
+        if plugin not in plugins():
+            described, words = stand_in(kind, described)
+            self.note(f"{self.name_of(node)}: this Mitsuba has no {kind.lower()} '{plugin}': {words} instead")
+        else:
+            described = self.with_files(node, kind, described)
+        repair = described and repaired(described)
+        if not repair:
+            return described
+        self.note(f"{self.name_of(node)}: {repair[1]}")
+        return repair[0]
 
     def value(self, node: mi.parser.SceneNode, key: str) -> Any:
         """A property as plain data; None for what is left out."""
@@ -85,10 +102,8 @@ class Converter:
         match props.type(key).name:
             case "ResolvedReference":
                 kind = self.kind(value.index())
-                if kind in ("Medium", "Volume", "PhaseFunction"):
-                    self.note(
-                        f"{self.name_of(node)}: a {kind.lower()} ('{key}') is left out: only surfaces are rendered"
-                    )
+                if kind in ("Medium", "PhaseFunction") or (kind == "Volume" and props.plugin_name() != "volume"):
+                    self.note(f"{self.name_of(node)}: a {kind.lower()} is left out: only surfaces are rendered")
                     return None
                 return self.described(value.index())
             case "Color":
@@ -98,7 +113,8 @@ class Converter:
             case "Vector":
                 return np.array(value).tolist()
             case "Spectrum":
-                self.note(f"{self.name_of(node)}: the spectrum '{key}' is rendered as red, green and blue")
+                if not value.is_uniform():
+                    self.note(f"{self.name_of(node)}: the spectrum '{key}' is rendered as red, green and blue")
                 return value
             case _:
                 return value
@@ -107,16 +123,18 @@ class Converter:
         """The dictionary with the full path of its file, or what stands in where that is missing."""
         if "filename" not in described:
             return described
-        path = inside(self.root, described["filename"], self.file.path)
-        if path.is_file():
-            return described | {"filename": str(path)}
+        inside(self.root, described["filename"], self.file.path)
+        for folder in self.searched:
+            path = inside(self.root, str(folder / described["filename"]), self.file.path)
+            if path.is_file():
+                return described | {"filename": str(path)}
         missing = f"{self.name_of(node)}: the file {described['filename']} is missing"
         if kind == "Texture":
             self.note(f"{missing}: grey instead of this texture")
             return GREY
         if kind == "Emitter":
             self.note(f"{missing}: an even white sky instead")
-            return {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+            return WHITE_SKY
         if kind == "BSDF":
             self.note(f"{missing}: a grey diffuse surface instead")
             return {"type": "diffuse", "reflectance": GREY}
@@ -127,15 +145,17 @@ class Converter:
         """A shape's or light's id, or the name of its file or plugin, numbered where it is not the first of them."""
         props = node.props
         plain = props.id() if not props.id().startswith("_") else ""
-        name = (plain or Path(str(props.get("filename", ""))).stem or props.plugin_name()).replace(".", "_")
-        self.names[name] += 1
-        return name if self.names[name] == 1 else f"{name}-{self.names[name]}"
+        return self.names.unique(plain or Path(str(props.get("filename", ""))).stem or props.plugin_name())
 
     def add_shape(self, index: int) -> None:
         """Take a shape in, with its material and its light."""
         node = self.state.nodes[index]
         if node.props.plugin_name() == "shapegroup":
             return  # instances refer to it
+        if node.props.plugin_name() == "merge":
+            for _, child in self.children(node):
+                self.add_shape(child)
+            return
         described = self.described(index)
         if described is None:
             return
@@ -158,14 +178,30 @@ class Converter:
             return
         described = self.described(index)
         if described is None or described["type"] not in ("perspective", "thinlens"):
-            self.note(f"{self.name_of(node)}: not a perspective camera: one that sees the whole scene instead")
+            self.note(f"{self.name_of(node)}: not a perspective camera: left out")
             return
         if described["type"] == "thinlens":
             self.note(f"{self.name_of(node)}: a lens: a pinhole instead, without depth of field")
+        if "near_clip" in described or "far_clip" in described:
+            self.note(f"{self.name_of(node)}: near_clip and far_clip: nothing is cut off")
         self.file.sensor = described
+
+    def add_light(self, index: int) -> None:
+        """Take a light in that is on no shape."""
+        light = self.described(index)
+        if light is None:
+            return
+        if light["type"] in SKIES and any(other.emitter["type"] in SKIES for other in self.file.lights):
+            self.note(f"{self.name_of(self.state.nodes[index])}: a second sky is left out: there can be one")
+            return
+        self.file.lights.append(StockLight(self.unique_name(self.state.nodes[index]), light))
 
     def add_integrator(self, index: int) -> None:
         props = self.state.nodes[index].props
+        for _, inner in self.children(self.state.nodes[index]):
+            self.add_integrator(inner)
+        if props.get("hide_emitters", False):
+            self.note("hide_emitters: lights are seen all the same")
         if props.plugin_name() not in OWN_INTEGRATORS:
             self.note(f"the integrator '{props.plugin_name()}': path tracing instead")
         depth = props.get("max_depth", None)
@@ -186,15 +222,16 @@ class Converter:
             elif kind == "Integrator":
                 self.add_integrator(index)
             elif kind == "Emitter":
-                light = self.described(index)
-                if light is not None:
-                    self.file.lights.append(StockLight(self.unique_name(node), light))
+                self.add_light(index)
             elif kind not in ("BSDF", "Texture", *RENDERER_SETTINGS):
                 self.note(f"{self.name_of(node)}: a {kind.lower()} is left out")
         if not self.file.shapes:
-            raise BadInput(f"{self.file.path} has no shape to render; {'; '.join(self.file.notes)}")
+            raise BadInput("; ".join([f"{self.file.path} has no shape to render", *self.file.notes]))
         if len(self.file.shapes) > 65535:
             raise BadInput(f"{self.file.path} has {len(self.file.shapes)} shapes: at most 65535 can be told apart")
+        if not self.file.lights and not any(shape.emitter for shape in self.file.shapes):
+            self.note("nothing shines: an even white sky instead")
+            self.file.lights.append(StockLight(self.names.unique("white-sky"), WHITE_SKY))
         return self.file
 
 

@@ -39,7 +39,7 @@ class Space:
         box = stage.mitsuba_scene.bbox()
         self.low = np.array(box.min, np.float64).ravel() * stage.unit
         self.high = np.array(box.max, np.float64).ravel() * stage.unit
-        self.size = float(np.linalg.norm(self.high - self.low))
+        self.size = float(np.linalg.norm(self.high - self.low)) or 1.0  # of a single point
 
     def distances(self, origins: Array, towards: Array) -> Array:
         """How far (N,) it is from `origins` (N, 3) along the directions `towards` (N, 3); infinite where nothing is."""

@@ -12,8 +12,8 @@ from render.scene_file.camera import camera_of_sensor, camera_that_sees
 from render.scene_file.convert import convert
 from render.scene_file.flight import Space, fly
 from render.stage import Stage
-from scenes.animation import KeyframedTrack, Scene, Shape
-from scenes.camera import Array
+from scenes.animation import Camera, KeyframedTrack, Scene, Shape
+from scenes.camera import Array, look_at
 from scenes.description import camera_of, gain_of, motion_of, read_description
 from scenes.mesh_file import load_mesh_file
 
@@ -39,6 +39,15 @@ class OwnScene:
         depth = scene.max_depth if self.described.bounces is None else self.described.bounces + 1
         self.scene = replace(scene, max_depth=depth)
         self.check_names()
+        try:
+            self.stage = Stage(self.scene, self.height, self.width)  # at rest, to fly through
+        except BadInput as error:
+            raise BadInput(f"{self.file}: {error}") from None
+        self.notes += self.stage.notes
+        if not self.has_camera:
+            self.notes.append("there is no camera: one that sees the whole scene instead")
+            space = Space(self.stage)
+            self.scene = replace(self.scene, camera=camera_that_sees(space.low, space.high))
 
     def from_xml(self) -> tuple[Scene, list[str]]:
         """The scene of a Mitsuba file, whose camera stands still, and what is not honoured."""
@@ -46,7 +55,10 @@ class OwnScene:
         camera, notes = WITHOUT_CAMERA, [*found.notes]
         self.has_camera = found.sensor is not None
         if found.sensor:
-            camera, more = camera_of_sensor(found.sensor, self.height, self.width)
+            try:
+                camera, more = camera_of_sensor(found.sensor, self.height, self.width)
+            except BadInput as error:
+                raise BadInput(f"{self.file}: {error}") from None
             notes += more
         depth = min(found.max_depth or DEFAULT_DEPTH, MOST_DEPTH)
         return Scene((), camera, depth, stock=tuple(found.shapes), lights=tuple(found.lights)), notes
@@ -76,23 +88,19 @@ class OwnScene:
 
         Where not `from_here`, the flight begins at another place that can be reached from there.
         """
-        stage = Stage(self.scene, self.height, self.width)  # loaded once more to be rendered: this one is let go
-        camera = self.scene.camera
-        if not self.has_camera:
-            space = Space(stage)
-            camera = camera_that_sees(space.low, space.high)
         if by_keyframes:
-            camera = camera_of(self.described.camera, camera, frames)
+            camera = camera_of(self.described.camera, self.scene.camera, frames)
+            check_camera(camera, frames, self.path)
         else:
-            camera = fly(stage, camera, frames, seed, from_here)
-        return replace(self.animated(stage, frames), camera=camera)
+            camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
+        return replace(self.animated(frames), camera=camera)
 
-    def animated(self, stage: Stage, frames: int) -> Scene:
+    def animated(self, frames: int) -> Scene:
         """The scene with the motion and the changing lights of the TOML."""
         scene = self.scene
-        by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, stage.shapes, strict=True)}
+        by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
         motions = {
-            each.shape: motion_of(each.keyframes, centre_of(by_name[each.shape]) * stage.unit, frames)
+            each.shape: motion_of(each.keyframes, centre_of(by_name[each.shape]) * self.stage.unit, frames)
             for each in self.described.motion
         }
         gains = {each.light: gain_of(each.keyframes, frames) for each in self.described.light}
@@ -104,6 +112,17 @@ class OwnScene:
             stock=tuple(replace(shape, gain=gains.get(shape.name, shape.gain)) for shape in stock),
             lights=tuple(replace(light, gain=gains.get(light.name, light.gain)) for light in scene.lights),
         )
+
+
+def check_camera(camera: Camera, frames: int, path: Path) -> None:
+    """Raise BadInput, naming the TOML, where a camera that flies by keyframes cannot see."""
+    for frame in range(frames):
+        pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
+        if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
+            raise BadInput(
+                f"{path}: in frame {frame} the camera is where it looks, looks along its up, or sees 180 degrees or more: "
+                "change its keyframes"
+            )
 
 
 def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:

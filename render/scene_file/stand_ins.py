@@ -13,6 +13,9 @@ Properties = dict[str, Any]  # a Mitsuba dictionary
 StandIn = tuple[Properties | None, str]  # None is nothing; and in words what stands there
 
 GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
+WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+TEXTURES = ("rgb", "spectrum", "bitmap", "checkerboard", "mesh_attribute", "volume", "uniform", "srgb", "rawconstant")
+SKIES = ("constant", "envmap", "sunsky", "timed_sunsky")  # of which a scene has one at most
 
 
 @cache
@@ -62,10 +65,18 @@ def coated(described: Properties) -> StandIn:
     return (inner[0], "what is under the coat") if inner else (plain_bsdf(described), "a diffuse surface")
 
 
+def numbers(text: Any) -> list[float]:
+    """The numbers in a list as scene files write it; none where it is no such list."""
+    try:
+        return [float(number) for number in str(text).replace(",", " ").split()]
+    except ValueError:
+        return []
+
+
 def mixture(described: Properties) -> StandIn:
     """Two at a time, as blendbsdf mixes them."""
     inner = [value for value in nested(described) if value["type"] in plugins()]
-    weights = [float(w) for w in str(described.get("weights", "")).replace(",", " ").split()]
+    weights = numbers(described.get("weights", ""))
     if not inner or len(weights) != len(inner):
         return plain_bsdf(described), "a diffuse surface"
     mixed, total = inner[0], weights[0]
@@ -141,3 +152,93 @@ OTHERS: dict[str, Callable[[Properties], StandIn]] = {"BSDF": any_bsdf, "Texture
 def stand_in(kind: str, described: Properties) -> StandIn:
     """What takes the place of an object whose plugin this Mitsuba does not have."""
     return KNOWN.get(described["type"], OTHERS.get(kind, nothing))(described)
+
+
+def without_relief(described: Properties) -> StandIn | None:
+    """Of bump and normal maps, where there is nothing to tell slopes from."""
+    bsdfs = [value for value in described.values() if isinstance(value, dict) and value["type"] not in TEXTURES]
+    maps = [value["type"] for value in described.values() if isinstance(value, dict) and value["type"] in TEXTURES]
+    fits = "bitmap" in maps if described["type"] == "bumpmap" else maps and "rgb" not in maps
+    if fits and bsdfs:
+        return None
+    return (bsdfs[0] if bsdfs else plain_bsdf(described)), f"no {described['type']}, whose texture is no bitmap: it is flat"
+
+
+def empty_volume(described: Properties) -> StandIn | None:
+    return None if nested(described) else (GREY, "grey, for its volume is missing")
+
+
+def bare_spot(described: Properties) -> StandIn | None:
+    """A spot that shines through a picture, where that is missing."""
+    if described.get("texture") != GREY:
+        return None
+    return {key: value for key, value in described.items() if key != "texture"}, "a spot without its picture"
+
+
+def dark_group(described: Properties) -> StandIn | None:
+    """Shapes that instances repeat may not shine, in Mitsuba; and there must be some."""
+    shapes = {key: value for key, value in described.items() if isinstance(value, dict)}
+    if not shapes:
+        return None, "a group without shapes is left out"
+    dark = {key: without_emitters(value) for key, value in shapes.items()}
+    return None if dark == shapes else (described | dark, "shapes that instances repeat do not shine")
+
+
+def without_emitters(shape: Properties) -> Properties:
+    lights = ("area", "directionalarea", "projector")
+    return {key: v for key, v in shape.items() if not (isinstance(v, dict) and v["type"] in lights)}
+
+
+def lone_instance(described: Properties) -> StandIn | None:
+    return None if nested(described) else (None, "an instance of nothing is left out")
+
+
+def tabulated(wavelengths: Any, values: Any) -> StandIn:
+    """A spectrum as Mitsuba makes colours of it."""
+    table = [(float(nm), float(value)) for nm, value in zip(wavelengths, values, strict=False)]
+    return {"type": "spectrum", "value": table}, "the spectrum is rendered as red, green and blue"
+
+
+def irregular(described: Properties) -> StandIn:
+    return tabulated(numbers(described.get("wavelengths")), numbers(described.get("values")))
+
+
+def regular(described: Properties) -> StandIn:
+    values = numbers(described.get("values"))
+    first, last = (number_of(described, f"wavelength_{end}", nm) for end, nm in (("min", 360), ("max", 830)))
+    return tabulated(np.linspace(first, last, len(values)), values)
+
+
+def black_body(described: Properties) -> StandIn:
+    """Planck's law, in W / (m² sr nm), as Mitsuba's spectral variants have it."""
+    kelvin = max(number_of(described, "temperature", 5000), 100)
+    nm = np.arange(360.0, 831.0, 10.0)
+    h, c, k = 6.62607015e-34, 299792458.0, 1.380649e-23
+    metres = nm * 1e-9
+    radiance = 2e-9 * h * c**2 / metres**5 / np.expm1(h * c / (metres * k * kelvin))
+    return tabulated(nm, radiance * number_of(described, "scale", 1))
+
+
+# By the name of a plugin that this Mitsuba has: what stands in where it cannot be rendered as described, else None.
+REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
+    "bumpmap": without_relief,
+    "normalmap": without_relief,
+    "volume": empty_volume,
+    "spot": bare_spot,
+    "shapegroup": dark_group,
+    "instance": lone_instance,
+    "irregular": irregular,
+    "regular": regular,
+    "blackbody": black_body,
+}
+
+
+def repaired(described: Properties) -> StandIn | None:
+    """What takes the place of an object that cannot be rendered as described; None where it can."""
+    return REPAIRS[described["type"]](described) if described["type"] in REPAIRS else None
+
+
+def turned_to_y(described: Properties) -> Properties:
+    """A sky of versions before 3, whose zenith was y; today's is z."""
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    return described | {"to_world": described.get("to_world", np.eye(4)) @ turn}
