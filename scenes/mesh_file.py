@@ -1,6 +1,11 @@
 """Meshes of other programs, glTF, OBJ and PLY, with their materials, lit by themselves or by a sky."""
 
+import json
+import logging
+import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +25,7 @@ from scenes.sky import sky
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply")
 GREY = rgb([0.5, 0.5, 0.5])
+LARGEST = 1e18  # units from the origin: its square is a finite float32
 SUN = np.array([0.4, 0.8, 0.45])  # the direction to it, y up
 
 
@@ -36,12 +42,53 @@ class MeshFile:
 class InsideResolver(FilePathResolver):
     """Reads what a file of meshes refers to, from its own folder alone."""
 
+    def __init__(self, path: Path):
+        super().__init__(str(path))
+        self.strangers: list[str] = []  # names that leave the folder; trimesh goes on without some files
+        self.missing: list[str] = []
+
     def get(self, name: str) -> bytes:
-        """Raises BadInput where the name leaves the folder."""
+        """Raises OSError for a name that leaves the folder, and a file that is missing."""
         folder = Path(self.parent).resolve()
         if not (folder / name.strip()).resolve().is_relative_to(folder):
-            raise BadInput(f"{folder}: '{name}' leaves the scene's folder: move it into that folder")
-        return super().get(name)
+            self.strangers.append(name)
+            raise FileNotFoundError(name)
+        try:
+            return super().get(name)
+        except OSError:
+            self.missing.append(name)
+            raise
+
+
+class Complaints(logging.Handler):
+    """What trimesh could not do, and logs for its makers only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Called by trimesh for each message."""
+        said = record.getMessage()
+        if record.levelno >= logging.WARNING or re.match("unable to|failed to|skipping|face|specified", said):
+            self.heard.append(f"trimesh: {said[:200]}")
+
+
+@contextmanager
+def overheard() -> Iterator[Complaints]:
+    """While trimesh's complaints are kept, and not printed."""
+    log = logging.getLogger("trimesh")
+    before = log.level, log.propagate
+    complaints = Complaints()
+    log.addHandler(complaints)
+    log.setLevel(logging.DEBUG)
+    log.propagate = False
+    try:
+        yield complaints
+    finally:
+        log.removeHandler(complaints)
+        log.setLevel(before[0])
+        log.propagate = before[1]
 
 
 def linear(image: Any) -> Array:
@@ -93,6 +140,17 @@ def simple_bsdf(material: SimpleMaterial) -> Bsdf:
     return {"type": "twosided", "bsdf": diffuse_bsdf(colour)}
 
 
+OPAQUE = ([], [0.0, 0.0, 0.0], [1.0])  # what a material without gloss and transparency says
+
+
+def plain_numbers(words: Any) -> list[float]:
+    """The numbers that a line of a material has; none where they are no numbers."""
+    try:
+        return [float(word) for word in words]
+    except (TypeError, ValueError):
+        return [np.nan]
+
+
 def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, Array | None]:
     """(material, emitted radiance or None) of a mesh."""
     material = getattr(mesh.visual, "material", None)
@@ -104,58 +162,94 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
         shines = None if material.emissiveFactor is None else np.asarray(material.emissiveFactor, np.float64)
         return pbr_bsdf(material), shines if shines is not None and shines.any() else None
     if isinstance(material, SimpleMaterial):
-        return simple_bsdf(material), None
+        said = material.kwargs
+        left_out = {"ks": "gloss", "d": "transparency", "tr": "transparency", "map_bump": "relief", "map_ke": "light"}
+        left_out = {key: what for key, what in left_out.items() if key in said and plain_numbers(said[key]) not in OPAQUE}
+        notes += [f"{name}: its {what} ({key}) is left out" for key, what in left_out.items()]
+        shines = np.array(plain_numbers(said.get("ke", [])))
+        return simple_bsdf(material), shines if shines.shape == (3,) and shines.any() else None
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind in ("vertex", "face"):
         colour = colour_factor(np.asarray(mesh.visual.main_color))
-        notes.append(f"{name}: colours of its {mesh.visual.kind}s: the most frequent one everywhere instead")
+        places = {"vertex": "vertices", "face": "faces"}[mesh.visual.kind]
+        notes.append(f"{name}: colours of its {places}: the most frequent one everywhere instead")
         return {"type": "twosided", "bsdf": diffuse_bsdf(rgb(colour.tolist()))}, None
     notes.append(f"{name}: has no material: grey instead")
     return {"type": "twosided", "bsdf": diffuse_bsdf(GREY)}, None
 
 
 def shape_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> Shape:
-    """Raises BadInput for a mesh that is damaged or empty."""
-    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
-        raise BadInput(f"mesh '{name}' is empty or damaged: it has no faces, or vertices that are not finite")
+    """The mesh with its material and light."""
     bsdf, radiance = bsdf_of(mesh, name, notes)
     if not isinstance(mesh.visual, TextureVisuals):
         mesh.visual = TextureVisuals()
     return Shape(name, mesh, bsdf, None if radiance is None else Track.constant(radiance), smooth=True)
 
 
-def load_scene(path: Path) -> trimesh.Scene:
-    """Raises BadInput, naming the file, where it is missing, of another format or damaged."""
+def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
+    """A file's scene, and what is not honoured.
+
+    Raises BadInput, naming the file, where it is missing, of another format or damaged, or where it leaves its folder.
+    """
     if path.suffix.lower() not in FORMATS:
         raise BadInput(f"{path} is no scene file: Mitsuba's .xml, or one of {', '.join(FORMATS)}")
     if not path.is_file():
         raise BadInput(f"{path} is missing")
+    resolver = InsideResolver(path)
+    scene = None
+    damage = ""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), overheard() as complaints:
             warnings.simplefilter("ignore")
-            return trimesh.load_scene(path, resolver=InsideResolver(str(path)), process=False)
-    except BadInput:
-        raise
+            scene = trimesh.load_scene(path, resolver=resolver, process=False)
     except Exception as error:  # of whatever kind its many readers raise for a file that is damaged
-        raise BadInput(f"{path} is empty or damaged: {error}") from None
+        damage = " ".join(f"{type(error).__name__}: {error}"[:200].split())
+    if resolver.strangers:
+        raise BadInput(f"{path}: '{resolver.strangers[0]}' leaves the scene's folder: move it into that folder")
+    if scene is None:
+        missing = f": {resolver.missing[0]} is missing" if resolver.missing else f" is empty or damaged ({damage})"
+        raise BadInput(f"{path}{missing}")
+    notes = [f"the file {name} is missing: what it says is left out" for name in dict.fromkeys(resolver.missing)]
+    return scene, notes + list(dict.fromkeys(complaints.heard)) + notes_of_gltf(path)
 
 
-def camera_of(scene: trimesh.Scene) -> Camera | None:
-    """The file's camera at rest, which looks along its -z; None where it has none."""
+def notes_of_gltf(path: Path) -> list[str]:
+    """What a glTF says beyond meshes, materials and a camera, in words; nothing of other formats."""
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return []
+    content = path.read_bytes()
+    if content[:4] == b"glTF":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    said = json.loads(content)
+    notes = [f"its {what} are left out: meshes stand as they are" for what in ("animations", "skins") if said.get(what)]
+    notes += [f"the extension {name} may not be honoured" for name in said.get("extensionsUsed", [])]
+    if len(said.get("cameras", [])) > 1:
+        notes.append("it has several cameras: one is taken")
+    return notes
+
+
+def camera_of(scene: trimesh.Scene, aspect: float) -> Camera | None:
+    """The file's camera at rest, which looks along its -z; None where it has none.
+
+    Its field of view is the vertical one, as in glTF, of images `aspect` times as wide as high.
+    """
     if not scene.has_camera:
         return None
     pose = np.asarray(scene.camera_transform, np.float64)
     eye = pose[:3, 3]
-    x_fov = Track.constant(float(scene.camera.fov[0]))
-    return Camera(Track.constant(eye), Track.constant(eye - pose[:3, 2]), x_fov, Track.constant(pose[:3, 1]))
+    x_fov = np.degrees(2 * np.arctan(aspect * np.tan(np.radians(scene.camera.fov[1]) / 2)))
+    axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
+    return Camera(
+        Track.constant(eye), Track.constant(eye - axes[:, 2]), Track.constant(float(x_fov)), Track.constant(axes[:, 1])
+    )
 
 
-def load_mesh_file(path: Path) -> MeshFile:
-    """All meshes of a file, where its scene puts them. Under a clear sky where nothing shines.
+def load_mesh_file(path: Path, aspect: float) -> MeshFile:
+    """All meshes of a file, where its scene puts them, for images of that `aspect`. Where nothing shines, a clear sky.
 
     Raises BadInput, naming the file, where it is missing, damaged or empty.
     """
-    scene = load_scene(path)
-    found = MeshFile(camera=camera_of(scene))
+    scene, notes = load_scene(path)
+    found = MeshFile(camera=camera_of(scene, aspect), notes=notes)
     names = Names()
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
@@ -166,6 +260,8 @@ def load_mesh_file(path: Path) -> MeshFile:
             continue
         mesh = mesh.copy(include_cache=True)
         mesh.apply_transform(transform)
+        if not len(mesh.faces) or not np.abs(mesh.vertices).max() < LARGEST:
+            raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces, or vertices that are not finite")
         found.shapes.append(shape_of(mesh, name, found.notes))
     if not found.shapes:
         raise BadInput("; ".join([f"{path} has no mesh to render", *found.notes]))

@@ -27,7 +27,7 @@ def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[C
         raise BadInput(f"the camera cannot be used: {reason(error)}") from None
     x_fov = float(np.array(mi.traverse(loaded)["x_fov"]).ravel()[0])
     to_world = np.asarray(sensor.get("to_world", np.eye(4)), np.float64)
-    if not abs(np.linalg.det(to_world[:3, :3])) > 0 or not np.isfinite(to_world).all():
+    if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) == 0:
         raise BadInput(f"the camera cannot be used: its to_world is {to_world.tolist()}")
     axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, :3], axis=0)
     eye = to_world[:3, 3]

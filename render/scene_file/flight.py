@@ -133,7 +133,7 @@ def elsewhere(space: Space, camera: Camera, start: Place, rng: Rng) -> Place:
         """Whether enough is seen, and not too near; and how near its distance is to that of the file's view."""
         seen = space.seen(eye, eye + forward, camera)
         distance = distance_of(seen, space.size)
-        enough = np.isfinite(seen).mean() >= wanted and np.quantile(seen, 0.1) > 2 * start.clearance
+        enough = np.isfinite(seen).mean() >= wanted and np.quantile(seen, 0.1, method="lower") > 2 * start.clearance
         return bool(enough), -abs(float(np.log(distance / start.distance)))
 
     forward = max((turned(rng, up, 0.25) for _ in range(LOOKS)), key=quality)

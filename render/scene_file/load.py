@@ -65,7 +65,7 @@ class OwnScene:
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
         """The scene of a glTF, OBJ or PLY file, and what is not honoured."""
-        found = load_mesh_file(self.file)
+        found = load_mesh_file(self.file, self.width / self.height)
         self.has_camera = found.camera is not None
         scene = Scene(tuple(found.shapes), found.camera or WITHOUT_CAMERA, DEFAULT_DEPTH, sky=found.sky)
         return scene, found.notes
