@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-TAKEN = ("type", "sky")  # what a Mitsuba scene's dictionary begins with
+TAKEN = ("type", "id", "sky")  # what a Mitsuba scene's dictionary begins with
 
 
 class Names:
