@@ -156,11 +156,17 @@ def own_profile(path: Path) -> DataProfile:
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:
-    """The files that a user's own scene comes from, with the crc32 of each; none of built-in scenes."""
+    """The files that a user's own scene comes from, with the crc32 of each; none of built-in scenes.
+
+    Raises BadInput, naming the file, where one cannot be read.
+    """
     if profile.own is None:
         return {}
     files = [profile.own, profile.own.parent / read_description(profile.own).file]
-    return {str(file): f"{zlib.crc32(file.read_bytes()):08x}" for file in files}
+    try:
+        return {str(file): f"{zlib.crc32(file.read_bytes()):08x}" for file in files}
+    except OSError as error:
+        raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
 
 
 def notes_of(profile: DataProfile) -> list[str]:

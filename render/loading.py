@@ -223,6 +223,6 @@ def check_shape(shape: mi.Shape, where: str) -> None:
         raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
 
 
-def reach_of(box: mi.BoundingBox3f) -> float:
+def reach_of(box: mi.ScalarBoundingBox3f) -> float:
     """How far a box reaches from the origin along an axis; NaN for one that is nowhere."""
     return float(np.abs([np.array(box.min), np.array(box.max)]).max())

@@ -140,7 +140,16 @@ def simple_bsdf(material: SimpleMaterial) -> Bsdf:
     return {"type": "twosided", "bsdf": diffuse_bsdf(colour)}
 
 
-OPAQUE = ([], [0.0, 0.0, 0.0], [1.0])  # what a material without gloss and transparency says
+# Of an OBJ's materials: by keyword what it means, and what it says where there is nothing of the kind.
+LEFT_OUT: dict[str, tuple[str, list[float]]] = {
+    "ks": ("gloss", [0.0, 0.0, 0.0]),
+    "d": ("transparency", [1.0]),
+    "tr": ("transparency", [0.0]),
+    "map_d": ("transparency", []),
+    "map_bump": ("relief", []),
+    "bump": ("relief", []),
+    "map_ke": ("light", []),
+}
 
 
 def plain_numbers(words: Any) -> list[float]:
@@ -163,9 +172,9 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
         return pbr_bsdf(material), shines if shines is not None and shines.any() else None
     if isinstance(material, SimpleMaterial):
         said = material.kwargs
-        left_out = {"ks": "gloss", "d": "transparency", "tr": "transparency", "map_bump": "relief", "map_ke": "light"}
-        left_out = {key: what for key, what in left_out.items() if key in said and plain_numbers(said[key]) not in OPAQUE}
-        notes += [f"{name}: its {what} ({key}) is left out" for key, what in left_out.items()]
+        for key, (what, none) in LEFT_OUT.items():
+            if key in said and plain_numbers(said[key]) != none:
+                notes.append(f"{name}: its {what} ({key}) is left out")
         shines = np.array(plain_numbers(said.get("ke", [])))
         return simple_bsdf(material), shines if shines.shape == (3,) and shines.any() else None
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind in ("vertex", "face"):
@@ -261,7 +270,9 @@ def load_mesh_file(path: Path, aspect: float) -> MeshFile:
         mesh = mesh.copy(include_cache=True)
         mesh.apply_transform(transform)
         if not len(mesh.faces) or not np.abs(mesh.vertices).max() < LARGEST:
-            raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces, or vertices that are not finite")
+            raise BadInput(
+                f"{path}: mesh '{name}' is empty or damaged: it has no faces, or vertices that are not finite"
+            )
         found.shapes.append(shape_of(mesh, name, found.notes))
     if not found.shapes:
         raise BadInput("; ".join([f"{path} has no mesh to render", *found.notes]))

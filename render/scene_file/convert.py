@@ -75,7 +75,7 @@ class Converter:
         node = self.state.nodes[index]
         kind = self.kind(index)
         plugin = node.props.plugin_name()
-        described: Properties | None = {"type": plugin}
+        described: Properties = {"type": plugin}
         for key in node.props:
             value = self.value(node, key)
             if key == "type":  # in dictionaries this is the plugin's name
@@ -85,13 +85,13 @@ class Converter:
         if plugin in ("sky", "sun", "sunsky") and str(self.state.versions[node.file_index]).startswith("0."):
             described = turned_to_y(described)
         if plugin not in plugins():
-            described, words = stand_in(kind, described)
+            found, words = stand_in(kind, described)
             self.note(f"{self.name_of(node)}: this Mitsuba has no {kind.lower()} '{plugin}': {words} instead")
         else:
-            described = self.with_files(node, kind, described)
-        repair = described and repaired(described)
-        if not repair:
-            return described
+            found = self.with_files(node, kind, described)
+        repair = repaired(found) if found else None
+        if repair is None:
+            return found
         self.note(f"{self.name_of(node)}: {repair[1]}")
         return repair[0]
 

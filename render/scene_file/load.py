@@ -120,8 +120,8 @@ def check_camera(camera: Camera, frames: int, path: Path) -> None:
         pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
         if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
             raise BadInput(
-                f"{path}: in frame {frame} the camera is where it looks, looks along its up, or sees 180 degrees or more: "
-                "change its keyframes"
+                f"{path}: in frame {frame} the camera is where it looks, looks along its up, or sees 180 degrees or "
+                "more: change its keyframes"
             )
 
 

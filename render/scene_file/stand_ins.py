@@ -161,7 +161,9 @@ def without_relief(described: Properties) -> StandIn | None:
     fits = "bitmap" in maps if described["type"] == "bumpmap" else maps and "rgb" not in maps
     if fits and bsdfs:
         return None
-    return (bsdfs[0] if bsdfs else plain_bsdf(described)), f"no {described['type']}, whose texture is no bitmap: it is flat"
+    return (
+        bsdfs[0] if bsdfs else plain_bsdf(described)
+    ), f"no {described['type']}, whose texture is no bitmap: it is flat"
 
 
 def empty_volume(described: Properties) -> StandIn | None:

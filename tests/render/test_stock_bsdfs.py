@@ -103,7 +103,7 @@ def test_albedo_is_what_the_material_does_not_absorb(buffer, name):
 def test_roughness_is_how_far_reflections_spread(buffer, name):
     """GGX half vectors at normal incidence: the median of tan² is alpha², in the mean of both directions."""
     _, towards, valid = samples_of(BSDFS[name])
-    half = (towards + [0, 0, 1])[valid & (towards[:, 2] > 0)]
+    half = np.add(towards, [0, 0, 1])[valid & (towards[:, 2] > 0)]
     spread = np.median((half[:, :2] ** 2).sum(axis=1) / half[:, 2] ** 2)
     roughness = buffer["roughness"][0, list(BSDFS).index(name), 0]
     assert roughness == pytest.approx(np.sqrt(spread), rel=0.1)

@@ -1,11 +1,15 @@
 """The TOML of a user's own scene: what it may say, what is refused, and the curves that its keyframes mean."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from datasets.profiles import OWN_CLIPS, OWN_QUALITY
 from errors import BadInput
+from provenance import ROOT
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Track
 from scenes.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
 
@@ -52,6 +56,21 @@ def test_all_that_it_may_say(tmp_path):
     assert said.camera[1].fov == 50 and said.camera[0].up is None
     assert said.motion[0].keyframes[1].rotation == (0, 90, 0) and said.light[0].keyframes[1].gain == 0.5
     assert said.splits["test"].most_spp == 128
+
+
+def test_the_example_of_the_docs(tmp_path):
+    """It says what it means, and every default that it writes out is one."""
+    (example,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL)
+    said = described(tmp_path, example)
+    assert (
+        [key.time for key in said.camera] == [0, 1] and said.motion[0].shape == "ball" and said.light[0].light == "lamp"
+    )
+    plain = described(tmp_path, "file = 'a.xml'")
+    assert (said.resolution, said.frames) == (plain.resolution, plain.frames)
+    for split, wanted in said.splits.items():
+        quality = OWN_QUALITY[split]._asdict() | {"clips": OWN_CLIPS[split]}
+        for key, default in quality.items():
+            assert getattr(wanted, key, None) in (None, default)
 
 
 REFUSED = {
@@ -142,14 +161,16 @@ def test_motion_is_rigid_and_turns_about_its_pivot():
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(turn) == pytest.approx(1)
     end = motion.matrix(4)
-    np.testing.assert_allclose(end @ [*pivot, 1], [*pivot + [5, 0, 0], 1], atol=1e-12)
+    np.testing.assert_allclose(end @ [*pivot, 1], [*np.add(pivot, [5, 0, 0]), 1], atol=1e-12)
     np.testing.assert_allclose(end[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # as a right hand turns about y
     both = motion_of([PoseKey(0, (0, 0, 0), (90, 90, 0))], np.zeros(3), 1).matrix(0)
     np.testing.assert_allclose(both[:3, :3] @ [0, 1, 0], [1, 0, 0], atol=1e-12)  # about x, to z; then about y
 
 
 def test_a_camera_of_one_frame_and_one_key_takes_the_rest_from_the_file():
-    file = Camera(Track.constant([0.0, 0, 1]), Track.constant([0.0, 0, 0]), Track.constant(33.0), Track.constant([0.0, 0, 1]))
+    file = Camera(
+        Track.constant([0.0, 0, 1]), Track.constant([0.0, 0, 0]), Track.constant(33.0), Track.constant([0.0, 0, 1])
+    )
     camera = camera_of([CameraKey(0.5, (1, 2, 3), (0, 0, 0))], file, 1)
     np.testing.assert_array_equal(camera.eye.at(0), [1, 2, 3])
     assert camera.x_fov.at(0) == 33

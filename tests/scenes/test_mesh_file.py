@@ -54,7 +54,9 @@ def gltf(folder, change, **material):
 def test_materials_of_gltf(tmp_path):
     found = loaded(
         tmp_path,
-        world(baseColorTexture=picture(), metallicRoughnessTexture=picture(1), metallicFactor=0.5, roughnessFactor=0.25),
+        world(
+            baseColorTexture=picture(), metallicRoughnessTexture=picture(1), metallicFactor=0.5, roughnessFactor=0.25
+        ),
     )
     (box,) = found.shapes
     assert box.name == "box" and box.smooth and box.radiance is None
@@ -72,8 +74,14 @@ def test_materials_of_gltf(tmp_path):
 def test_factors_relief_and_light_of_gltf(tmp_path):
     found = loaded(
         tmp_path,
-        world(baseColorFactor=[1.0, 0.5, 0.25, 0.5], normalTexture=picture(), emissiveFactor=[1.0, 0.5, 0.2],
-              emissiveTexture=picture(), alphaMode="BLEND", metallicFactor=0.0),
+        world(
+            baseColorFactor=[1.0, 0.5, 0.25, 0.5],
+            normalTexture=picture(),
+            emissiveFactor=[1.0, 0.5, 0.2],
+            emissiveTexture=picture(),
+            alphaMode="BLEND",
+            metallicFactor=0.0,
+        ),
     )
     (box,) = found.shapes
     assert found.sky is None
@@ -179,7 +187,9 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
     with pytest.raises(BadInput, match="leaves the scene's folder"):
         path = gltf(folder, lambda said: said.update(images=[{"uri": "../tex.png"}]), baseColorTexture=picture())
         load_mesh_file(path, 1.0)
-    ply = "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+    ply = (
+        "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\nproperty float x\nproperty float y\n"
+    )
     ply += "property float z\nproperty float s\nproperty float t\nelement face 1\n"
     ply += "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
     (folder / "scene.ply").write_text(ply)
@@ -191,7 +201,11 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
 @pytest.mark.parametrize("suffix", ["glb", "gltf", "obj", "ply"])
 def test_damaged_files(tmp_path, suffix):
     path = tmp_path / f"scene.{suffix}"
-    whole = world().export(file_type="glb") if suffix == "glb" else trimesh.creation.box().export(file_type=suffix if suffix != "gltf" else "ply")
+    whole = (
+        world().export(file_type="glb")
+        if suffix == "glb"
+        else trimesh.creation.box().export(file_type=suffix if suffix != "gltf" else "ply")
+    )
     whole = whole if isinstance(whole, bytes) else whole.encode()
     for content in (b"", b"\xff" * 99, bytes(range(256)) * 4, whole[:40], whole[: len(whole) * 2 // 3]):
         if suffix == "obj" and content.startswith(b"#"):

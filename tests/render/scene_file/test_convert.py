@@ -18,8 +18,14 @@ def test_names_are_unique_and_usable(tmp_path):
     ids = ("a.b c/ü", "sky", "type", "group 0", "_group 0", "id", "to_world", "sphere-2")
     cubes = "".join(f'<shape type="cube" id="{name}"/>' for name in ids)
     parts = (cubes, '<shape type="sphere"/>' * 3, '<emitter type="point" id="constant-2"/>', '<emitter type="point"/>')
-    scene = own(tmp_path, xml(*parts, '<shape type="shapegroup" id="g"><shape type="disk"/></shape>',
-                              '<shape type="instance"><ref id="g"/></shape>'))
+    scene = own(
+        tmp_path,
+        xml(
+            *parts,
+            '<shape type="shapegroup" id="g"><shape type="disk"/></shape>',
+            '<shape type="instance"><ref id="g"/></shape>',
+        ),
+    )
     names = [shape.name for shape in scene.scene.stock] + [light.name for light in scene.scene.lights]
     assert len(names) == 1 + len(ids) + 3 + 1 + 3 and len(set(names)) == len(names)
     assert "a_b c/ü" in names and "group 0" in names and not {"sky", "type", "id"} & set(names)
@@ -40,7 +46,9 @@ def test_a_material_of_many_shapes_is_loaded_once(tmp_path, monkeypatch):
 def test_files_lie_in_the_folder_or_where_paths_say(tmp_path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "in.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
-    found = converted(tmp_path, xml('<path value="sub"/><shape type="obj"><string name="filename" value="in.obj"/></shape>'))
+    found = converted(
+        tmp_path, xml('<path value="sub"/><shape type="obj"><string name="filename" value="in.obj"/></shape>')
+    )
     assert found.shapes[1].name == "in" and found.shapes[1].geometry["filename"] == str(tmp_path / "sub" / "in.obj")
     assert found.notes == []
     for name in ("../x.obj", "/etc/hostname", "sub/../../x.obj"):

@@ -131,7 +131,7 @@ def test_z_may_be_up():
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 0.0), (0.0, 0.5, 0.5), (1e3, 1e3, 1e3)])
 def test_odd_places_are_survived(eye):
     """Inside a box, on its edge and far away from all."""
-    camera = replace(CAMERA, eye=Track.constant(eye), target=Track.constant(np.array(eye) + [0.0, 0.1, -1.0]))
+    camera = replace(CAMERA, eye=Track.constant(eye), target=Track.constant(np.add(eye, [0.0, 0.1, -1.0])))
     stage = stage_of(scene(BOXES, camera))
     for from_here in (True, False):
         flown = fly(stage, camera, FRAMES, 3, from_here)

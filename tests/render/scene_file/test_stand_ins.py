@@ -42,68 +42,133 @@ CASES = {
     "coating": (old('<bsdf type="coating"><bsdf type="roughconductor"/></bsdf>'), "under the coat", 1, 1),
     "roughcoating": (old('<bsdf type="roughcoating"/>'), "diffuse surface", 1, 1),
     "mixture": (
-        old('<bsdf type="mixturebsdf"><string name="weights" value="0.7, 0.3"/><bsdf type="plastic"/>'
-            '<bsdf type="diffuse"/></bsdf>'),
-        "blendbsdf", 1, 1,
+        old(
+            '<bsdf type="mixturebsdf"><string name="weights" value="0.7, 0.3"/><bsdf type="plastic"/>'
+            '<bsdf type="diffuse"/></bsdf>'
+        ),
+        "blendbsdf",
+        1,
+        1,
     ),
     "mixture of what": (old('<bsdf type="mixturebsdf"><string name="weights" value="x"/></bsdf>'), "diffuse", 1, 1),
     "bump": (old(f'<bsdf type="bump">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "bumpmap", 1, 1),
     "bumps of checks": (new(f'<bsdf type="bumpmap">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "flat", 1, 1),
     "lost normals": (
         new(f'<bsdf type="normalmap">{named("texture", "bitmap", "no.png", "normalmap")}<bsdf type="diffuse"/></bsdf>'),
-        "flat", 1, 1,
+        "flat",
+        1,
+        1,
     ),
     "unknown material": (old('<bsdf type="irawan"/>'), "diffuse surface", 1, 1),
     "grid": (old('<bsdf type="diffuse"><texture type="gridtexture" name="reflectance"/></bsdf>'), "checkerboard", 1, 1),
     "scale": (old('<bsdf type="diffuse"><texture type="scale" name="reflectance"/></bsdf>'), "grey", 1, 1),
     "wireframe": (old('<bsdf type="diffuse"><texture type="wireframe" name="reflectance"/></bsdf>'), "grey", 1, 1),
-    "lost texture": (new(f'<bsdf type="diffuse">{named("texture", "bitmap", "no.png", "reflectance")}</bsdf>'),
-                     "no.png is missing: grey", 1, 1),
+    "lost texture": (
+        new(f'<bsdf type="diffuse">{named("texture", "bitmap", "no.png", "reflectance")}</bsdf>'),
+        "no.png is missing: grey",
+        1,
+        1,
+    ),
     "lost volume": (new('<bsdf type="diffuse"><texture type="volume" name="reflectance"/></bsdf>'), "volume", 1, 1),
     "lost measurements": (new(named("bsdf", "measured", "no.bsdf")), "grey diffuse", 1, 1),
     "lost mesh": (xml(shape("obj", '<string name="filename" value="no.obj"/>')), "no.obj is missing", 1, 1),
     "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "even white sky", 1, 1),
-    "lost spectrum": (new('<bsdf type="diffuse"><spectrum name="reflectance" filename="no.spd"/></bsdf>'),
-                      "no.spd of a spectrum is missing", 1, 1),
+    "lost spectrum": (
+        new('<bsdf type="diffuse"><spectrum name="reflectance" filename="no.spd"/></bsdf>'),
+        "no.spd of a spectrum is missing",
+        1,
+        1,
+    ),
     "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no.hair is missing", 1, 1),
     "unknown shape": (old_xml(shape("heightfield")), "has no shape 'heightfield': nothing", 1, 1),
-    "old sky": (old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'), "sky of sunsky", 1, 1),
-    "old sun": (old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
-                "sun of sunsky", 1, 1),
+    "old sky": (
+        old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'),
+        "sky of sunsky",
+        1,
+        1,
+    ),
+    "old sun": (
+        old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
+        "sun of sunsky",
+        1,
+        1,
+    ),
     "unknown light": (old_xml('<emitter type="collimated"/>'), "has no emitter 'collimated': nothing", 1, 1),
     "no light": (xml(light=""), "nothing shines: an even white sky", 1, 1),
     "two skies": (xml(SKY), "a second sky is left out", 1, 1),
-    "spot without picture": (xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
-                             "without its picture", 1, 2),
+    "spot without picture": (
+        xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
+        "without its picture",
+        1,
+        2,
+    ),
     "medium": (xml(shape("cube", '<medium type="homogeneous" name="interior"/>')), "a medium is left out", 2, 1),
     "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m: a medium is left out", 1, 1),
     "subsurface": (old('<subsurface type="dipole"/><bsdf type="plastic"/>'), "surface alone", 1, 1),
-    "spectrum": (new('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.9"/></bsdf>'),
-                 "red, green and blue", 1, 1),
+    "spectrum": (
+        new('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.9"/></bsdf>'),
+        "red, green and blue",
+        1,
+        1,
+    ),
     "irregular": (
-        new('<bsdf type="diffuse"><spectrum type="irregular" name="reflectance"><string name="wavelengths" '
-            'value="400, 700"/><string name="values" value="0.1, 0.2"/></spectrum></bsdf>'),
-        "red, green and blue", 1, 1,
+        new(
+            '<bsdf type="diffuse"><spectrum type="irregular" name="reflectance"><string name="wavelengths" '
+            'value="400, 700"/><string name="values" value="0.1, 0.2"/></spectrum></bsdf>'
+        ),
+        "red, green and blue",
+        1,
+        1,
     ),
     "black body": (xml(shape("disk", f'<emitter type="area">{BLACK_BODY}</emitter>')), "red, green and blue", 2, 1),
     "integrator": (old_xml('<integrator type="bdpt"/>'), "'bdpt': path tracing", 1, 1),
-    "volpath": (xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
-                "hide_emitters", 1, 1),
+    "volpath": (
+        xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
+        "hide_emitters",
+        1,
+        1,
+    ),
     "two cameras": (xml(CAMERA), "a further sensor is left out", 1, 1),
-    "lens": (xml(camera=CAMERA.replace("perspective", "thinlens").replace(
-        "<transform", '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/><transform')),
-        "a pinhole instead", 1, 1),
-    "clipping": (xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
-                 "near_clip", 1, 1),
-    "orthographic": (xml(camera=CAMERA.replace("perspective", "orthographic").replace('name="fov"', 'name="near_clip"')),
-                     "sees the whole scene", 1, 1),
+    "lens": (
+        xml(
+            camera=CAMERA.replace("perspective", "thinlens").replace(
+                "<transform",
+                '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/><transform',
+            )
+        ),
+        "a pinhole instead",
+        1,
+        1,
+    ),
+    "clipping": (
+        xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
+        "near_clip",
+        1,
+        1,
+    ),
+    "orthographic": (
+        xml(camera=CAMERA.replace("perspective", "orthographic").replace('name="fov"', 'name="near_clip"')),
+        "sees the whole scene",
+        1,
+        1,
+    ),
     "no camera": (xml(camera=""), "there is no camera: one that sees the whole scene", 1, 1),
     "sensor on a shape": (xml(shape("disk", '<sensor type="irradiancemeter"/>')), "a sensor on a shape", 2, 1),
     "shining group": (xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')), "do not shine", 2, 1),
-    "empty group": (xml(GROUP.format('<shape type="obj"><string name="filename" value="no.obj"/></shape>')),
-                    "an instance of nothing", 1, 1),
-    "unknown property": (xml(shape("cube", '<float name="wobble" value="3"/><bsdf type="diffuse">'
-                                   '<float name="jolt" value="3"/></bsdf>')), "does not know 'wobble'", 2, 1),
+    "empty group": (
+        xml(GROUP.format('<shape type="obj"><string name="filename" value="no.obj"/></shape>')),
+        "an instance of nothing",
+        1,
+        1,
+    ),
+    "unknown property": (
+        xml(
+            shape("cube", '<float name="wobble" value="3"/><bsdf type="diffuse"><float name="jolt" value="3"/></bsdf>')
+        ),
+        "does not know 'wobble'",
+        2,
+        1,
+    ),
     "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
     "animation": (old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')), "held", 2, 1),
 }
@@ -143,8 +208,8 @@ def test_phong_is_as_sharp_as_its_plastic():
 
 
 def test_mixtures_weigh_as_they_say():
-    colours = np.eye(3)
-    parts = {f"b{i}": {"type": "diffuse", "reflectance": {"type": "rgb", "value": c.tolist()}} for i, c in enumerate(colours)}
+    colours = [{"type": "rgb", "value": colour} for colour in np.eye(3).tolist()]
+    parts = {str(i): {"type": "diffuse", "reflectance": colour} for i, colour in enumerate(colours)}
     mixed, _ = mixture({"type": "mixturebsdf", "weights": "0.5, 0.3, 0.2", **parts})
     bsdf = mi.load_dict(mixed)
     si = mi.SurfaceInteraction3f()
