@@ -184,7 +184,7 @@ class StockLoader:
     def light(self, light: StockLight) -> mi.Emitter:
         """Raises BadInput, naming the light, where it cannot be loaded."""
         emitter = dict(light.emitter)
-        if "position" in emitter:
+        if isinstance(emitter.get("position"), list):
             emitter["position"] = [x / self.unit for x in emitter["position"]]
         else:
             emitter = self.placed(emitter)
@@ -210,6 +210,8 @@ LARGEST = 1e18  # units from the origin: its square is a finite float32
 
 def check_shape(shape: mi.Shape, where: str) -> None:
     """Raise BadInput, which begins with `where`, for a shape that is nowhere, and a mesh that is empty or damaged."""
+    if not isinstance(shape, mi.Shape):
+        raise BadInput(f"{where} is no shape")
     parameters = mi.traverse(shape)
     if "faces" in parameters:
         faces = np.array(parameters["faces"])

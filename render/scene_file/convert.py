@@ -11,6 +11,7 @@ from render.backend import mi
 from render.scene_file.stand_ins import (
     GREY,
     SKIES,
+    SURFACE_LIGHTS,
     WHITE_SKY,
     Properties,
     plugins,
@@ -23,6 +24,13 @@ from scenes.animation import StockLight, StockShape
 from scenes.names import Names
 
 RENDERER_SETTINGS = ("Sampler", "Film", "ReconstructionFilter")  # of other renderers: frames here follow the TOML
+# By kind of object: what may be nested in it. Mitsuba crashes on some others.
+PARTS = {
+    "Shape": ("BSDF", "Emitter", "Sensor", "Shape", "Texture"),
+    "BSDF": ("BSDF", "Texture"),
+    "Emitter": ("Texture",),
+    "Texture": ("Texture", "Volume"),
+}
 OWN_INTEGRATORS = ("path", "direct")  # whose light transport is what is rendered here
 
 
@@ -84,7 +92,7 @@ class Converter:
                 described[key.lstrip("_")] = value
         if plugin in ("sky", "sun", "sunsky") and str(self.state.versions[node.file_index]).startswith("0."):
             described = turned_to_y(described)
-        if plugin not in plugins():
+        if plugin not in plugins() or (kind == "Shape" and plugin == "hair"):  # today that is a material
             found, words = stand_in(kind, described)
             self.note(f"{self.name_of(node)}: this Mitsuba has no {kind.lower()} '{plugin}': {words} instead")
         else:
@@ -100,10 +108,16 @@ class Converter:
         props = node.props
         value = props[key]
         match props.type(key).name:
+            case form if key == "to_world" and form != "Transform":
+                self.note(f"{self.name_of(node)}: its to_world is no transform: left out")
+                return None
             case "ResolvedReference":
                 kind = self.kind(value.index())
-                if kind in ("Medium", "PhaseFunction") or (kind == "Volume" and props.plugin_name() != "volume"):
+                if kind in ("Medium", "PhaseFunction"):
                     self.note(f"{self.name_of(node)}: a {kind.lower()} is left out: only surfaces are rendered")
+                    return None
+                if kind not in PARTS.get(str(node.type).rpartition(".")[2], ()):
+                    self.note(f"{self.name_of(node)}: a {kind.lower()} means nothing here: left out")
                     return None
                 return self.described(value.index())
             case "Color":
@@ -123,12 +137,12 @@ class Converter:
         """The dictionary with the full path of its file, or what stands in where that is missing."""
         if "filename" not in described:
             return described
-        inside(self.root, described["filename"], self.file.path)
+        name = str(described["filename"])
         for folder in self.searched:
-            path = inside(self.root, str(folder / described["filename"]), self.file.path)
+            path = inside(self.root, str(folder / name), self.file.path)
             if path.is_file():
                 return described | {"filename": str(path)}
-        missing = f"{self.name_of(node)}: the file {described['filename']} is missing"
+        missing = f"{self.name_of(node)}: the file {name} is missing"
         if kind == "Texture":
             self.note(f"{missing}: grey instead of this texture")
             return GREY
@@ -154,7 +168,10 @@ class Converter:
             return  # instances refer to it
         if node.props.plugin_name() == "merge":
             for _, child in self.children(node):
-                self.add_shape(child)
+                if self.kind(child) == "Shape":
+                    self.add_shape(child)
+                else:
+                    self.note(f"{self.name_of(node)}: a {self.kind(child).lower()} of merged shapes is left out")
             return
         described = self.described(index)
         if described is None:
@@ -166,6 +183,8 @@ class Converter:
                 value = described.pop(key.lstrip("_"), None)
                 if kind == "Sensor":
                     self.note(f"{self.name_of(node)}: a sensor on a shape is left out")
+                elif kind == "Emitter" and value is not None and value["type"] not in SURFACE_LIGHTS:
+                    self.note(f"{self.name_of(node)}: a light of the kind {value['type']} on a shape is left out")
                 elif value is not None:
                     parts[kind] = value
         name = self.unique_name(node)
@@ -190,6 +209,9 @@ class Converter:
         """Take a light in that is on no shape."""
         light = self.described(index)
         if light is None:
+            return
+        if light["type"] in SURFACE_LIGHTS:
+            self.note(f"{self.name_of(self.state.nodes[index])}: a light of a surface, but on none: left out")
             return
         if light["type"] in SKIES and any(other.emitter["type"] in SKIES for other in self.file.lights):
             self.note(f"{self.name_of(self.state.nodes[index])}: a second sky is left out: there can be one")

@@ -15,7 +15,8 @@ StandIn = tuple[Properties | None, str]  # None is nothing; and in words what st
 GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
 WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
 TEXTURES = ("rgb", "spectrum", "bitmap", "checkerboard", "mesh_attribute", "volume", "uniform", "srgb", "rawconstant")
-SKIES = ("constant", "envmap", "sunsky", "timed_sunsky")  # of which a scene has one at most
+SURFACE_LIGHTS = ("area", "directionalarea")  # which are on shapes; all others are on none
+SKIES = ("constant", "envmap", "sunsky")  # of which a scene has one at most
 
 
 @cache
@@ -167,7 +168,14 @@ def without_relief(described: Properties) -> StandIn | None:
 
 
 def empty_volume(described: Properties) -> StandIn | None:
-    return None if nested(described) else (GREY, "grey, for its volume is missing")
+    """Mitsuba crashes where a texture has no volume."""
+    found = [value["type"] for value in nested(described)]
+    return None if "gridvolume" in found or "constvolume" in found else (GREY, "grey, for its volume is missing")
+
+
+def lone_bitmap(described: Properties) -> StandIn | None:
+    """Mitsuba crashes where a bitmap has neither a file nor values."""
+    return None if "filename" in described else (GREY, "grey, for its file is not named")
 
 
 def bare_spot(described: Properties) -> StandIn | None:
@@ -187,12 +195,16 @@ def dark_group(described: Properties) -> StandIn | None:
 
 
 def without_emitters(shape: Properties) -> Properties:
-    lights = ("area", "directionalarea", "projector")
-    return {key: v for key, v in shape.items() if not (isinstance(v, dict) and v["type"] in lights)}
+    return {key: v for key, v in shape.items() if not (isinstance(v, dict) and v["type"] in SURFACE_LIGHTS)}
 
 
 def lone_instance(described: Properties) -> StandIn | None:
     return None if nested(described) else (None, "an instance of nothing is left out")
+
+
+def still_sun(described: Properties) -> StandIn | None:
+    """Mitsuba cannot trace a moving sun symbolically, as our path tracer does."""
+    return described | {"type": "sunsky"}, "sunsky, whose sun stands still"
 
 
 def tabulated(wavelengths: Any, values: Any) -> StandIn:
@@ -226,9 +238,11 @@ REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     "bumpmap": without_relief,
     "normalmap": without_relief,
     "volume": empty_volume,
+    "bitmap": lone_bitmap,
     "spot": bare_spot,
     "shapegroup": dark_group,
     "instance": lone_instance,
+    "timed_sunsky": still_sun,
     "irregular": irregular,
     "regular": regular,
     "blackbody": black_body,

@@ -188,7 +188,8 @@ def test_it_is_said_and_rendered(tmp_path, case):
 def test_a_plain_scene_needs_no_words(tmp_path):
     parts = (
         '<integrator type="path"><integer name="max_depth" value="4"/></integrator>',
-        f'<shape type="disk"><bsdf type="twosided"><bsdf type="diffuse">{CHECKS.format("reflectance")}</bsdf></bsdf></shape>',
+        f'<bsdf type="twosided" id="b"><bsdf type="diffuse">{CHECKS.format("reflectance")}</bsdf></bsdf>',
+        '<shape type="disk"><ref id="b"/></shape>',
         f'<shape type="cube"><emitter type="area">{CHECKS.format("radiance")}</emitter></shape>',
         '<shape type="merge"><shape type="cube"/><shape type="disk"/></shape>',
         GROUP.format('<shape type="sphere"/><shape type="cube"/>'),
