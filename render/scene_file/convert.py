@@ -116,7 +116,9 @@ class Converter:
                 if kind in ("Medium", "PhaseFunction"):
                     self.note(f"{self.name_of(node)}: a {kind.lower()} is left out: only surfaces are rendered")
                     return None
-                if kind not in PARTS.get(str(node.type).rpartition(".")[2], ()):
+                if kind in RENDERER_SETTINGS:
+                    return None
+                if kind not in PARTS.get(str(node.type).rpartition(".")[2], (kind,)):
                     self.note(f"{self.name_of(node)}: a {kind.lower()} means nothing here: left out")
                     return None
                 return self.described(value.index())

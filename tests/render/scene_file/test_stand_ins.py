@@ -178,7 +178,8 @@ CASES = {
     ),
     "wrong parts": (
         new(
-            '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="diffuse"/></texture></bsdf>'
+            '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="plastic"/></texture>'
+            "</bsdf>"
         ),
         "a bsdf means nothing here",
         1,
@@ -202,6 +203,12 @@ def test_it_is_said_and_rendered(tmp_path, case):
     assert not any("\n" in note or ".cpp" in note for note in scene.notes)
     image = rendered(scene)
     assert np.isfinite(image).all() and image.max() > 0
+
+
+@pytest.mark.parametrize("make", [xml, old_xml])
+def test_films_and_samplers_are_the_renderers_own(tmp_path, make):
+    film = '<film type="ldrfilm"><rfilter type="gaussian"/></film><sampler type="halton"/></sensor>'
+    assert own(tmp_path, make().replace("</sensor>", film)).notes == []
 
 
 def test_hair_is_no_shape_today(tmp_path):
