@@ -187,7 +187,9 @@ def profile_of(name: str) -> DataProfile:
     if rooms:
         return rooms_profile(int(rooms[1]), int(rooms[2]))
     if name not in DATA_PROFILES:
-        raise BadInput(f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}")
+        raise BadInput(
+            f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}; a scene of your own is a .toml"
+        )
     return DATA_PROFILES[name]
 
 

@@ -37,6 +37,12 @@ def lets_through(bsdf: mi.BSDF | None) -> bool:
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
 
 
+def shines_by_picture(shape: StockShape) -> bool:
+    """Whether a shape emits what a texture says, place by place."""
+    radiance = (shape.emitter or {}).get("radiance")
+    return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
+
+
 def size_of_mesh(shape: Shape) -> float:
     """How far a mesh reaches from the origin, at most, in frame 0."""
     return float(np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max())
@@ -50,8 +56,9 @@ def size_of_stock(shape: mi.Shape) -> float:
 class Stage:
     """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
 
-    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. Raises BadInput, naming the
-    shape, for a material that is not supported.
+    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. `notes` say which properties of
+    stock shapes and lights mean nothing to Mitsuba. Raises BadInput, naming the shape or light, where one cannot be
+    loaded, moved or changed.
     """
 
     def __init__(self, scene: Scene, height: int, width: int):
@@ -86,6 +93,7 @@ class Stage:
         self.has_holes = any(lets_through(shape.bsdf()) for shape in (*self.shapes, *loader.grouped))
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
         self.has_instances = bool(loader.grouped)
+        self.has_pictured_lights = any(map(shines_by_picture, scene.stock))
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)

@@ -116,7 +116,9 @@ class Converter:
                 if kind in ("Medium", "PhaseFunction"):
                     self.note(f"{self.name_of(node)}: a {kind.lower()} is left out: only surfaces are rendered")
                     return None
-                if kind not in PARTS.get(str(node.type).rpartition(".")[2], ()):
+                if kind in RENDERER_SETTINGS:
+                    return None
+                if kind not in PARTS.get(str(node.type).rpartition(".")[2], (kind,)):
                     self.note(f"{self.name_of(node)}: a {kind.lower()} means nothing here: left out")
                     return None
                 return self.described(value.index())
@@ -249,8 +251,6 @@ class Converter:
                 self.note(f"{self.name_of(node)}: a {kind.lower()} is left out")
         if not self.file.shapes:
             raise BadInput("; ".join([f"{self.file.path} has no shape to render", *self.file.notes]))
-        if len(self.file.shapes) > 65535:
-            raise BadInput(f"{self.file.path} has {len(self.file.shapes)} shapes: at most 65535 can be told apart")
         if not self.file.lights and not any(shape.emitter for shape in self.file.shapes):
             self.note("nothing shines: an even white sky instead")
             self.file.lights.append(StockLight(self.names.unique("white-sky"), WHITE_SKY))

@@ -19,6 +19,7 @@ from scenes.mesh_file import load_mesh_file
 
 DEFAULT_DEPTH = 3  # path edges, where neither file says: one indirect bounce
 WITHOUT_CAMERA = camera_that_sees(np.zeros(3), np.ones(3))  # until the size of the scene is known
+MOST_SHAPES = 65535  # mesh ids are 16 bits
 MOST_DEPTH = 64  # where the file asks for endless paths; Russian roulette ends them before
 
 
@@ -39,6 +40,8 @@ class OwnScene:
         depth = scene.max_depth if self.described.bounces is None else self.described.bounces + 1
         self.scene = replace(scene, max_depth=depth)
         self.check_names()
+        if len(self.scene.meshes) > MOST_SHAPES:
+            raise BadInput(f"{self.file} has {len(self.scene.meshes)} shapes: at most {MOST_SHAPES} can be told apart")
         try:
             self.stage = Stage(self.scene, self.height, self.width)  # at rest, to fly through
         except BadInput as error:

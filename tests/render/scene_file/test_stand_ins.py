@@ -79,7 +79,7 @@ CASES = {
         1,
         1,
     ),
-    "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no.hair is missing", 1, 1),
+    "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no shape 'hair': nothing", 1, 1),
     "unknown shape": (old_xml(shape("heightfield")), "has no shape 'heightfield': nothing", 1, 1),
     "old sky": (
         old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'),
@@ -169,6 +169,26 @@ CASES = {
         2,
         1,
     ),
+    "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun stands still", 1, 1),
+    "bitmap of nothing": (
+        new('<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>'),
+        "its file is not named",
+        1,
+        1,
+    ),
+    "wrong parts": (
+        new(
+            '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="plastic"/></texture>'
+            "</bsdf>"
+        ),
+        "a bsdf means nothing here",
+        1,
+        1,
+    ),
+    "sky on a shape": (xml(shape("cube", SKY)), "a light of the kind constant on a shape", 2, 1),
+    "light of no shape": (xml('<emitter type="area"/>'), "on none: left out", 1, 1),
+    "no place": (xml(shape("cube", '<float name="to_world" value="2"/>')), "its to_world is no transform", 2, 1),
+    "material merged": (xml('<shape type="merge"><bsdf type="diffuse"/></shape>'), "merged shapes", 1, 1),
     "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
     "animation": (old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')), "held", 2, 1),
 }
@@ -183,6 +203,36 @@ def test_it_is_said_and_rendered(tmp_path, case):
     assert not any("\n" in note or ".cpp" in note for note in scene.notes)
     image = rendered(scene)
     assert np.isfinite(image).all() and image.max() > 0
+
+
+@pytest.mark.parametrize("make", [xml, old_xml])
+def test_films_and_samplers_are_the_renderers_own(tmp_path, make):
+    film = '<film type="ldrfilm"><rfilter type="gaussian"/></film><sampler type="halton"/></sensor>'
+    assert own(tmp_path, make().replace("</sensor>", film)).notes == []
+
+
+def test_hair_is_no_shape_today(tmp_path):
+    (tmp_path / "h.hair").write_text("0 0 0\n1 1 1\n")
+    scene = own(tmp_path, old_xml(shape("hair", '<string name="filename" value="h.hair"/>')))
+    assert any("no shape 'hair'" in note for note in scene.notes) and len(scene.scene.stock) == 1
+
+
+def test_files_of_pictures(tmp_path):
+    """A texture, a bump map, a shining picture and a sky, each of a file."""
+    values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    mi.Bitmap(values).write(str(tmp_path / "sky.exr"))
+    mi.Bitmap(np.uint8(255 * values)).write(str(tmp_path / "tex.png"))
+    texture = named("texture", "bitmap", "tex.png", "{}")
+    parts = (
+        shape("cube", f'<bsdf type="bumpmap">{texture.format("t")}<bsdf type="plastic"/></bsdf>'),
+        f'<shape type="disk"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
+        f'<shape type="cube"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
+    )
+    ball = painted(f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>')
+    scene = own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
+    assert scene.notes == [] and len(scene.scene.stock) == 4
+    assert scene.scene.stock[1].bsdf["type"] == "bumpmap"
+    assert np.isfinite(rendered(scene)).all()
 
 
 def test_a_plain_scene_needs_no_words(tmp_path):
