@@ -235,7 +235,8 @@ def plan(
     test clips get all, because metrics read them. Raises BadInput for an unknown profile or a negative seed.
     """
     check_seed(seed)
-    splits = {split: clips_of(profile_of(profile), split, seed, needed_spp) for split in SPLITS}
+    described = profile_of(profile)
+    splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     train = rendered_channels(reads)
     return {
         "schema": SCHEMA,
@@ -248,8 +249,8 @@ def plan(
         "channels": {"train": train, "val": train, "test": list(CHANNELS)},
         "splits": splits,
         "needed_spp": dict(needed_spp),
-        "source": source_of(profile_of(profile)),
-        "notes": notes_of(profile_of(profile)),
+        "source": source_of(described),
+        "notes": notes_of(described),
     }
 
 

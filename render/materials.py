@@ -9,7 +9,7 @@ is measured at normal incidence: one albedo and one roughness for all of its sur
 # In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
 # mypy: disable-error-code="arg-type, assignment, operator, return-value"
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -230,6 +230,11 @@ def registry_table(pointers: Sequence[mi.BSDFPtr | mi.ShapePtr], first: int = 0)
     return mi.UInt32(table)
 
 
+def bsdfs_of(shapes: Iterable[mi.Shape]) -> dict[int, mi.BSDF]:
+    """The BSDFs of Mitsuba shapes by their registry index, those that several share once."""
+    return {registry_number(mi.BSDFPtr(bsdf)): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
+
+
 ColumnT = TypeVar("ColumnT", bound=dr.AnyArray)
 
 
@@ -240,7 +245,7 @@ class MaterialTable:
         # Objects live as long as the table does: pointers do not keep them.
         self.materials: list[Material] = []
         self.mixtures: dict[int, tuple[mi.Texture, int, int, bool]] = {}  # by row: weight, rows of both, sided
-        bsdfs = {registry_number(mi.BSDFPtr(bsdf)): bsdf for bsdf in (s.bsdf() for s in shapes) if bsdf is not None}
+        bsdfs = bsdfs_of(shapes)
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
         self.depth = max(map(depth_of, trees), default=0)
         rows = [self.add(tree) for tree in trees]

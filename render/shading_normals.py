@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from render.backend import dr, mi
-from render.materials import BsdfParameters, registry_index, registry_number
+from render.materials import BsdfParameters, bsdfs_of, registry_index
 
 
 class Relief(NamedTuple):
@@ -48,8 +48,7 @@ class ShadingNormals:
     """The shading normals of Mitsuba shapes."""
 
     def __init__(self, shapes: Iterable[mi.Shape]):
-        bsdfs = {registry_number(mi.BSDFPtr(bsdf)): bsdf for bsdf in (s.bsdf() for s in shapes) if bsdf is not None}
-        reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs.items()}
+        reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs_of(shapes).items()}
         self.reliefs = {number: relief for number, relief in reliefs.items() if relief is not None}
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> mi.Vector3f:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from render.backend import dr, mi
 from render.lights import Lights
 from render.loading import StockLoader, load_mesh, reach_of, upload, with_placed_textures
-from render.materials import MaterialTable, registry_index, registry_table
+from render.materials import MaterialTable, bsdfs_of, registry_index, registry_table
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
@@ -32,9 +32,9 @@ def unit_of(sizes: list[float]) -> float:
     return float(2.0 ** np.round(np.log2(extent)))
 
 
-def lets_through(bsdf: mi.BSDF | None) -> bool:
+def lets_through(bsdf: mi.BSDF) -> bool:
     """Whether light may go straight through, as through the holes of a mask (but also through thin glass)."""
-    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
+    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
 
 
 def shines_by_picture(shape: StockShape) -> bool:
@@ -88,9 +88,10 @@ class Stage:
         self.shapes = [by_name[shape.name] for shape in scene.meshes]
         moving: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
         self.stock = [StockParameters(each, self.parameters, self.unit) for each in moving]
-        self.materials = MaterialTable([*self.shapes, *loader.grouped])
-        self.normals = ShadingNormals([*self.shapes, *loader.grouped])
-        self.has_holes = any(lets_through(shape.bsdf()) for shape in (*self.shapes, *loader.grouped))
+        visible = [*self.shapes, *loader.grouped]
+        self.materials = MaterialTable(visible)
+        self.normals = ShadingNormals(visible)
+        self.has_holes = any(map(lets_through, bsdfs_of(visible).values()))
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
         self.has_instances = bool(loader.grouped)
         self.has_pictured_lights = any(map(shines_by_picture, scene.stock))
