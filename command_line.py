@@ -35,7 +35,9 @@ Budget = Annotated[
     ),
 ]
 Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default those named above")]
-Scenes = Annotated[tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box or room-3")]
+Scenes = Annotated[
+    tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box, room-3 or my-scene.toml")
+]
 ClipFolder = Annotated[Path, Positional, arg(metavar="CLIP", help="its folder")]
 Size = Annotated[str, arg(metavar="WxH", help="of the images")]
 Sizes = Annotated[tuple[str, ...], arg(metavar="WxH...", help="of the images")]
@@ -59,6 +61,7 @@ def preview(names: Scenes = (), out: Png = Path("runs/preview.png"), seed: int =
 def dataset(
     data: Data = None,
     profile: Profile = "quick",
+    scene: Annotated[Path | None, arg(metavar="TOML")] = None,
     seed: int = 0,
     reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
     part: Annotated[str | None, arg(metavar="K/N")] = None,
@@ -66,9 +69,11 @@ def dataset(
     halton: Annotated[bool, FlagCreatePairsOff] = False,
     regularise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
-    """Render the clips of a profile that are not there yet.
+    """Render the clips of a profile that are not there yet, or of a scene of your own.
 
     Args:
+        scene: instead of a profile, a scene of your own, as docs/scenes.md describes it. What of its file is not
+            honoured is listed first.
         reads: render for training only what these denoisers read, or else all known ones.
         part: render only the K-th of N disjoint shares, to spread the work over machines.
         ray: render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach
@@ -82,11 +87,13 @@ def dataset(
 
     if ray:
         from datasets.cluster import render_on_cluster
-    folder = data_folder(data, profile)
+    folder = data_folder(data, scene.stem if scene else profile)
     share = Share.parse(part or "1/1")
     options = Options(halton, regularise)
     render = render_on_cluster if ray else render_here
-    rendered = generate(folder, profile, seed, share, channels_read(reads), options, render)
+    rendered = generate(
+        folder, str(scene.resolve()) if scene else profile, seed, share, channels_read(reads), options, render
+    )
     print(f"{folder}: {rendered} clips rendered")
 
 

@@ -1,6 +1,7 @@
 """The data set card: what a data set is, how it was made, how clean its references are, its licence and hashes."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 from tabulate import tabulate
@@ -12,7 +13,8 @@ from files import write_file
 
 CARD_FILE = "card.json"
 PAGE_FILE = "README.md"
-LICENCE = "CC0-1.0"  # of scenes built in; a data set of others names its own in dataset.json
+LICENCE = "CC0-1.0"  # of scenes built in
+LICENCE_OF_OTHERS = "that of its scene file"
 
 PAGE = """# {profile}, seed {seed}
 
@@ -22,7 +24,7 @@ has all of this page for programs.
 
 - Made by `{command}`, with {versions}; generator version {generator}.{reads}
 - Options of rendering: {options}.
-- Licence: {licence}.
+- Licence: {licence}.{notes}
 
 ## Splits
 
@@ -65,13 +67,15 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
     clips = {str(path.relative_to(dataset.path)): clip_facts(Clip(path)) for path in dataset.planned()}
     used = [split for split, names in facts["splits"].items() if names]
     return {
-        "profile": facts["profile"],
+        "profile": Path(facts["profile"]).name,
         "seed": facts["seed"],
         "command": command_of(facts),
         "generator": facts["generator"],
         "versions": facts["versions"],
         "options": facts["options"],
-        "licence": facts.get("licence", LICENCE),
+        "licence": LICENCE_OF_OTHERS if facts.get("source") else LICENCE,
+        "source": {Path(path).name: crc32 for path, crc32 in facts.get("source", {}).items()},
+        "notes": facts.get("notes", []),
         "scenes": facts["scenes"],
         "bytes": sum(clip["bytes"] for clip in clips.values()),
         "splits": {split: split_facts([clips[f"{split}/{name}"] for name in facts["splits"][split]]) for split in used},
@@ -90,7 +94,8 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
 def command_of(facts: dict[str, Any]) -> str:
     """What renders such a data set, given what dataset.json says of it."""
     options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
-    return f"onespp dataset --profile {facts['profile']} --seed {facts['seed']}{options}"
+    what = f"--scene {Path(facts['profile']).name}" if facts.get("source") else f"--profile {facts['profile']}"
+    return f"onespp dataset {what} --seed {facts['seed']}{options}"
 
 
 def clip_facts(clip: Clip) -> dict[str, Any]:
@@ -140,6 +145,7 @@ def page_of(card: dict[str, Any]) -> str:
         versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),
         reads=f" `--reads` left out {', '.join(left_out)}, but for tests." if left_out else "",
         options=", ".join(options) or "none",
+        notes="".join(f"\n- Not as in the scene file: {note}." for note in card["notes"]),
         splits=tabulate(splits, "keys", "github", disable_numparse=True),
         channels=tabulate(channels, ["channel", "axes", "unit", "in"], "github"),
         rows=tabulate(rows, "keys", "github", disable_numparse=True),

@@ -70,7 +70,7 @@ def render_to_folder(
     split, scene_name, clip_name = folder.parts[-3:]
     noisy_spp = ClipKind.of(clip_name).noisy_spp
     quality = profile.quality[split]
-    scene, seed = scene_of_clip(folder, profile.frames, dataset_seed)
+    scene, seed = scene_of_clip(folder, profile, dataset_seed)
     clock = StepTimer()
     if needed_spp is None:
         needed_spp = samples_needed(scene, profile.frames, profile.height, profile.width, quality, seed, options)
@@ -88,6 +88,6 @@ def render_to_folder(
         facts = {
             "noisy_spp": noisy_spp,
             "reference_spp": spp // 2 * 2,
-            "meshes": [shape.name for shape in scene.shapes],
+            "meshes": [shape.name for shape in scene.meshes],
         }
         writer.finish(facts, derived)

@@ -77,6 +77,8 @@ def generate(
     else:
         needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
     wanted = plan(profile, seed, reads, options, needed_spp)
+    for note in wanted["notes"]:
+        tqdm.write(note)
     root.mkdir(parents=True, exist_ok=True)
     write_or_check_plan(root, wanted)
     dataset = Dataset(root)
@@ -109,8 +111,8 @@ def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
         write_json(root / "dataset.json", wanted)
         return
     present = read_json(root / "dataset.json")
-    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options"):
-        if present.get(key) != wanted[key]:
+    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options", "source"):
+        if present.get(key, {}) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
 
 

@@ -15,7 +15,7 @@ MOST_TRIED = 32  # rooms for each that is wanted
 
 def needed_for(profile: DataProfile, room: str, seed: int, options: Options) -> int:
     """Samples a pixel that the references of a room, given as SPLIT/SCENE/CLIP, need."""
-    scene, seed_of_clip = scene_of_clip(Path(room), profile.frames, seed)
+    scene, seed_of_clip = scene_of_clip(Path(room), profile, seed)
     quality = profile.quality[room.split("/")[0]]
     return samples_needed(scene, profile.frames, profile.height, profile.width, quality, seed_of_clip, options)
 

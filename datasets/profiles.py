@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
+from render.scene_file.load import own_scene
+from scenes.description import Split, read_description
 
 GENERATOR = 6  # raise it when the same seed renders different bytes
 
@@ -42,6 +45,7 @@ class DataProfile:
     rooms: dict[str, int]  # rooms, of one clip each
     quality: dict[str, SamplingQuality]
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
+    own: Path | None = None  # the TOML of a user's own scene, whose clips all are
 
 
 NeededSpp = Mapping[str, int]  # SPLIT/SCENE/CLIP: samples a pixel that its references need, where a pilot found out
@@ -123,15 +127,69 @@ def rooms_profile(rooms: int, spp: int) -> DataProfile:
     )
 
 
+# Of a user's own scene, where its TOML does not say.
+OWN_CLIPS = {"train": 4, "val": 1, "test": 1}
+OWN_QUALITY = {
+    "train": SamplingQuality(realisations=4, reference_spp=128),
+    "val": SamplingQuality(realisations=1, reference_spp=256),
+    "test": SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048),
+}
+
+
+def own_profile(path: Path) -> DataProfile:
+    """What the TOML of a user's own scene asks for. Raises BadInput, naming the file, where it cannot be used."""
+    described = read_description(path)
+    width, height = described.resolution
+    name = re.sub(r"[^\w-]", "_", path.stem)
+    clips: dict[str, list[str]] = {}
+    quality: dict[str, SamplingQuality] = {}
+    for split in SPLITS:
+        wanted = described.splits.get(split, Split())
+        count = OWN_CLIPS[split] if wanted.clips is None else wanted.clips
+        clips[split] = [f"{name}/{number:03d}" for number in range(count)]
+        said = {key: getattr(wanted, key) for key in ("realisations", "reference_spp", "floor", "most_spp")}
+        quality[split] = OWN_QUALITY[split]._replace(**{key: value for key, value in said.items() if value is not None})
+    if not any(clips.values()):
+        raise BadInput(f"{path}: no split has any clips")
+    none = dict.fromkeys(SPLITS, 0)
+    return DataProfile(height, width, described.frames, none, none, quality, special=clips, own=path)
+
+
+def source_of(profile: DataProfile) -> dict[str, str]:
+    """The files that a user's own scene comes from, with the crc32 of each; none of built-in scenes.
+
+    Raises BadInput, naming the file, where one cannot be read.
+    """
+    if profile.own is None:
+        return {}
+    files = [profile.own, profile.own.parent / read_description(profile.own).file]
+    try:
+        return {str(file): f"{zlib.crc32(file.read_bytes()):08x}" for file in files}
+    except OSError as error:
+        raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
+
+
+def notes_of(profile: DataProfile) -> list[str]:
+    """What of a user's own scene is not honoured, and what stands in for it, in words."""
+    return [] if profile.own is None else own_scene(profile.own).notes
+
+
 def profile_of(name: str) -> DataProfile:
-    """The data profile of that name, or for `rooms-NxS` N rooms of S spp. Raises BadInput for an unknown one."""
+    """The data profile of that name; for `rooms-NxS` N rooms of S spp, for a path of a TOML a user's own scene.
+
+    Raises BadInput for an unknown one.
+    """
+    if name.endswith(".toml"):
+        return own_profile(Path(name))
     rooms = re.fullmatch(r"rooms-(\d+)x(\d+)", name)
     if rooms and (int(rooms[1]) < 1 or int(rooms[2]) < 2):
         raise BadInput(f"profile '{name}': name 1 room or more, and 2 spp or more for the two halves of a reference")
     if rooms:
         return rooms_profile(int(rooms[1]), int(rooms[2]))
     if name not in DATA_PROFILES:
-        raise BadInput(f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}")
+        raise BadInput(
+            f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}; a scene of your own is a .toml"
+        )
     return DATA_PROFILES[name]
 
 
@@ -177,7 +235,8 @@ def plan(
     test clips get all, because metrics read them. Raises BadInput for an unknown profile or a negative seed.
     """
     check_seed(seed)
-    splits = {split: clips_of(profile_of(profile), split, seed, needed_spp) for split in SPLITS}
+    described = profile_of(profile)
+    splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     train = rendered_channels(reads)
     return {
         "schema": SCHEMA,
@@ -190,6 +249,8 @@ def plan(
         "channels": {"train": train, "val": train, "test": list(CHANNELS)},
         "splits": splits,
         "needed_spp": dict(needed_spp),
+        "source": source_of(described),
+        "notes": notes_of(described),
     }
 
 

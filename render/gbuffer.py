@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.stage import Stage, columns
+from render.loading import columns
+from render.stage import Stage
 from scenes.camera import Array, View
 
 
@@ -14,7 +15,11 @@ def depth_along_axis(stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, v
     """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored."""
     distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64) * stage.unit
     cosine = columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2]
-    return (distance * cosine).astype(np.float32)
+    depth = distance * cosine
+    if stage.has_holes:  # rays begin behind what they have passed through
+        begins = columns(ray.o).astype(np.float64) * stage.unit - view.camera_to_world[:3, 3]
+        depth += np.where(distance > 0, begins @ view.camera_to_world[:3, 2], 0)
+    return depth.astype(np.float32)
 
 
 class VisibleSurface(NamedTuple):
@@ -52,10 +57,11 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     hit = si.is_valid()
-    normal = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+    normal = stage.normals.evaluate(si, hit)
+    normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
     albedo, roughness = stage.materials.evaluate(si, hit)
-    channels = {
-        "normal": dr.select(hit, normal, 0),
+    channels: dict[str, dr.AnyArray] = {
+        "normal": dr.select(hit, normal, mi.Vector3f(0)),
         "albedo": albedo,
         "roughness": roughness,
         "emission": stage.lights.at(si).eval(si),

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from render.backend import mi
 from render.gbuffer import trace_visible
+from render.loading import aligned, columns
 from render.motion import same_surface
 from render.path import PathTracer
-from render.stage import aligned, columns
 from scenes.camera import Array, View, move, project, unproject
 
 STRATUM = 3  # px, the side of the squares of which each has one sample

@@ -143,9 +143,9 @@ class PathTracer:
         self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        # Dr.Jit 1.5 refuses to freeze the rest: Halton points, regularised paths, and scenes without shapes (these only
-        # while another scene is loaded).
-        self.freezes = bool(stage.shapes) and not halton and not regularise
+        # Dr.Jit 1.5 refuses to freeze the rest: Halton points, regularised paths, surfaces that shine by a picture, and
+        # scenes without shapes (these only while another scene is loaded).
+        self.freezes = bool(stage.shapes) and not halton and not regularise and not stage.has_pictured_lights
 
     def samples(
         self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0

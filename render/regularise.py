@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from render.backend import dr, mi
+from render.loading import to_mitsuba
 from render.materials import registry_index, registry_table
-from render.stage import Stage, to_mitsuba
+from render.stage import Stage
 
 LEAST_ALPHA = 0.3
 
@@ -51,9 +52,10 @@ class BlurredTable:
     """The blurred version of every BSDF of a stage, looked up by the BSDF's registry index."""
 
     def __init__(self, stage: Stage):
-        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape in stage.shapes])
+        described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
+        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape, _ in described])
         # Objects live as long as the table does: pointers do not keep them.
-        self.bsdfs = [mi.load_dict(to_mitsuba(blurred(shape.bsdf))) for shape in stage.scene.shapes]
+        self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 
     def after_first(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> mi.BSDFPtr:

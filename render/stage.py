@@ -1,187 +1,127 @@
 """An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
 
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.visual import TextureVisuals
 
 from render.backend import dr, mi
 from render.lights import Lights
-from render.materials import MaterialTable, registry_index, registry_table
+from render.loading import StockLoader, load_mesh, reach_of, upload, with_placed_textures
+from render.materials import MaterialTable, bsdfs_of, registry_index, registry_table
 from render.palette import palette
-from scenes.animation import Scene, Shape
-from scenes.bsdf import Bsdf
+from render.posing import Changes, StockParameters, as_parameter, mesh_changes
+from render.shading_normals import ShadingNormals
+from scenes.animation import Scene, Shape, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
-T = TypeVar("T", np.float32, np.uint32)
+MOST_HOLES = 32  # that a ray from the eye goes through
+HOLE = 0.999  # of all light goes through
 
 
-def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba dictionary with its numpy arrays, the values and placement of bitmaps, as Mitsuba's types."""
-
-    def convert(key: str, value: Any) -> object:
-        if isinstance(value, dict):
-            return to_mitsuba(value)
-        if key == "to_uv":
-            return mi.ScalarTransform3f(value)
-        if isinstance(value, np.ndarray):
-            return mi.TensorXf(upload(np.float32(value).ravel()), value.shape)
-        return value
-
-    return {key: convert(key, value) for key, value in description.items()}
-
-
-def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
-    """The bitmaps in a material's dictionary, at any depth."""
-    nested = [value for value in bsdf.values() if isinstance(value, dict)]
-    own = [bsdf] if bsdf["type"] == "bitmap" else []
-    return own + [bitmap for value in nested for bitmap in bitmaps_of(value)]
-
-
-def without_placement(bsdf: Bsdf) -> Bsdf:
-    """The material with all its bitmaps where the texture coordinates put them."""
-    return {
-        key: without_placement(value) if isinstance(value, dict) else value
-        for key, value in bsdf.items()
-        if key != "to_uv"
-    }
-
-
-def with_placed_textures(shape: Shape) -> Shape:
-    """The same shape with its bitmaps' common placement in its texture coordinates.
-
-    Mitsuba compiles a bitmap's placement into kernels, while texture coordinates are data: so all textures share a
-    program. Bitmaps of one material that are placed differently stay as they are.
-    """
-    placements = [bitmap.get("to_uv", np.eye(3)) for bitmap in bitmaps_of(shape.bsdf)]
-    uv = getattr(shape.mesh.visual, "uv", None)
-    if uv is None or not placements or any((other != placements[0]).any() for other in placements):
-        return shape
-    mesh = shape.mesh.copy(include_cache=True)  # without it the authored normals are lost
-    assert isinstance(mesh.visual, TextureVisuals)
-    mesh.visual.uv = uv @ placements[0][:2, :2].T + placements[0][:2, 2]
-    return replace(shape, mesh=mesh, bsdf=without_placement(shape.bsdf))
-
-
-def load_mesh(shape: Shape) -> mi.Mesh:
-    """The shape in its rest pose, with its material, and lit as in frame 0."""
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
-    if shape.radiance is not None:
-        light = {"type": "area", "radiance": {"type": "rgb", "value": shape.radiance.at(0).tolist()}}
-        properties["emitter"] = mi.load_dict(light)
-    uv = getattr(shape.mesh.visual, "uv", None)
-    mesh = mi.Mesh(
-        shape.name,
-        vertex_count=len(shape.mesh.vertices),
-        face_count=len(shape.mesh.faces),
-        has_vertex_normals=shape.smooth,
-        has_vertex_texcoords=uv is not None,
-        props=properties,
-    )
-    parameters = mi.traverse(mesh)
-    parameters["faces"] = np.uint32(shape.mesh.faces).ravel()
-    parameters["vertex_positions"] = upload(shape.mesh.vertices.ravel())
-    if shape.smooth:
-        parameters["vertex_normals"] = upload(shape.mesh.vertex_normals.ravel())
-    if uv is not None:
-        parameters["vertex_texcoords"] = upload(uv.ravel())
-    parameters.update()
-    return mesh
-
-
-def aligned(values: NDArray[T]) -> NDArray[T]:
-    """`values` (N,), of 4 bytes each, where a kernel for any other such array can read them.
-
-    On the CPU Dr.Jit borrows numpy's memory and compiles its alignment into kernels.
-    """
-    spare = 64 // 4
-    buffer = np.empty(len(values) + spare, values.dtype)
-    start = -(buffer.ctypes.data // 4) % spare
-    buffer[start : start + len(values)] = values
-    return buffer[start : start + len(values)]
-
-
-def upload(values: NDArray[np.floating]) -> mi.Float:
-    """`values` (N,) as data for kernels: Python numbers would be compiled into them."""
-    return mi.Float(aligned(values.astype(np.float32)))
-
-
-def columns(vector: dr.AnyArray) -> NDArray[Any]:
-    """(N, C) of a Dr.Jit vector of C components and N lanes; its own dtype.
-
-    Taken at once they would be put together by a kernel that is compiled for this N.
-    """
-    return np.stack([np.array(component) for component in vector], axis=-1)
-
-
-def unit_of(scene: Scene) -> float:
+def unit_of(sizes: list[float]) -> float:
     """How many world units a unit of Mitsuba's is: 1, or a power of two for very small and very large scenes.
 
-    Mitsuba keeps a ray from hitting the surface it leaves by a step that suits scenes of human size.
+    `sizes` are how far its shapes reach from the origin. Mitsuba keeps a ray from hitting the surface it leaves by a
+    step that suits scenes of human size.
     """
-    sizes = [np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max() for shape in scene.shapes]
-    extent = float(max(sizes, default=1))
+    extent = max(sizes, default=1.0)
     if extent == 0 or 1 / 16 < extent < 1024:
         return 1.0
     return float(2.0 ** np.round(np.log2(extent)))
 
 
+def lets_through(bsdf: mi.BSDF) -> bool:
+    """Whether light may go straight through, as through the holes of a mask (but also through thin glass)."""
+    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
+
+
+def shines_by_picture(shape: StockShape) -> bool:
+    """Whether a shape emits what a texture says, place by place."""
+    radiance = (shape.emitter or {}).get("radiance")
+    return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
+
+
+def size_of_mesh(shape: Shape) -> float:
+    """How far a mesh reaches from the origin, at most, in frame 0."""
+    return float(np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max())
+
+
+def size_of_stock(shape: mi.Shape) -> float:
+    """The same of a shape that Mitsuba has loaded."""
+    return reach_of(shape.bbox())
+
+
 class Stage:
     """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
 
-    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. Raises BadInput, naming the
-    shape, for a material that is not supported.
+    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. `notes` say which properties of
+    stock shapes and lights mean nothing to Mitsuba. Raises BadInput, naming the shape or light, where one cannot be
+    loaded, moved or changed.
     """
 
     def __init__(self, scene: Scene, height: int, width: int):
         self.scene = scene = replace(scene, shapes=tuple(map(with_placed_textures, scene.shapes)))
         self.height = height
         self.width = width
-        self.unit = unit_of(scene)
         palette()
+        loader = StockLoader()
+        loaded = [loader.shape(shape) for shape in scene.stock]
+        self.unit = unit_of([*map(size_of_mesh, scene.shapes), *map(size_of_stock, loaded)])
+        if self.unit != 1:
+            loader = StockLoader(self.unit)
+            loaded = [loader.shape(shape) for shape in scene.stock]
+        self.notes = loader.notes
         content: dict[str, object] = {"type": "scene"}
         content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
+        content |= {shape.name: instance for shape, instance in zip(scene.stock, loaded, strict=True)}
+        content |= {f"_group {index}": group for index, group in enumerate(loader.groups)}
+        content |= {light.name: loader.light(light) for light in scene.lights}
         if scene.sky is not None:
             content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}
         # Without optimize=False meshes that share a material are merged, and their ids vanish.
         self.mitsuba_scene = mi.load_dict(content, optimize=False)
         self.lights = Lights(self.mitsuba_scene)
         self.parameters = mi.traverse(self.mitsuba_scene)
-        loaded = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
-        self.shapes = [loaded[shape.name] for shape in scene.shapes]
-        self.materials = MaterialTable(self.shapes)
+        by_name = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
+        self.shapes = [by_name[shape.name] for shape in scene.meshes]
+        moving: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
+        self.stock = [StockParameters(each, self.parameters, self.unit) for each in moving]
+        visible = [*self.shapes, *loader.grouped]
+        self.materials = MaterialTable(visible)
+        self.normals = ShadingNormals(visible)
+        self.has_holes = any(map(lets_through, bsdfs_of(visible).values()))
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
+        self.has_instances = bool(loader.grouped)
+        self.has_pictured_lights = any(map(shines_by_picture, scene.stock))
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """Which of the scene's shapes a surface interaction lies on: its index + 1, or 0 for none."""
-        return dr.gather(mi.UInt32, self.mesh_id_of_shape, registry_index(si.shape), si.is_valid())
+        shape = registry_index(si.shape)
+        if self.has_instances:
+            instance = registry_index(si.instance)
+            shape = dr.select(instance != 0, instance, shape)
+        return dr.gather(mi.UInt32, self.mesh_id_of_shape, shape, si.is_valid())
 
     def pose(self, frame: float) -> None:
         """Move the meshes and set the lights as in `frame`. All changes enter the kernels as data."""
-        changes: dict[str, NDArray[np.float32]] = {}
+        first = not self.posed
+        changes: Changes = {}
         for shape in self.scene.shapes:
-            if shape.motion.varies() or not self.posed:
-                matrix = shape.motion.matrix(frame)
-                vertices = (shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]) / self.unit
-                changes[f"{shape.name}.vertex_positions"] = np.float32(vertices).ravel()
-                if shape.smooth:  # in the same update: positions alone would recompute the authored normals
-                    normals = shape.mesh.vertex_normals @ matrix[:3, :3].T
-                    changes[f"{shape.name}.vertex_normals"] = np.float32(normals).ravel()
-            if shape.radiance is not None:
-                changes[f"{shape.name}.emitter.radiance.value"] = shape.radiance.at(frame).astype(np.float32)
+            changes |= mesh_changes(shape, frame, self.unit, moves=first or shape.motion.varies())
+        for stock in self.stock:
+            changes |= stock.changes(frame)
         changes = {
             name: value
             for name, value in changes.items()
             if name not in self.posed or not np.array_equal(value, self.posed[name])
         }
         for name, value in changes.items():
-            self.parameters[name] = mi.Color3f(*map(mi.Float, value[:, None])) if value.shape == (3,) else upload(value)
+            self.parameters[name] = as_parameter(value, self.parameters[name])
         if changes:
             self.parameters.update()  # once a pose: every update rebuilds the top level of the ray-tracing structure
             self.posed.update(changes)
@@ -198,7 +138,10 @@ class Stage:
         return self.scene.view(frame, self.height, self.width)
 
     def rays(self, view: View, pixels: Array | None = None) -> mi.Ray3f:
-        """Rays through `pixels` (N, 2) of `view`; without them through all pixel centres, row by row."""
+        """Rays through `pixels` (N, 2) of `view`; without them through all pixel centres, row by row.
+
+        They begin at the eye, or behind the holes in surfaces (of masks) that they have passed through.
+        """
         if pixels is None:
             pixels = pixel_centres(self.height, self.width).reshape(-1, 2)
         towards = directions(pixels, view)
@@ -206,4 +149,16 @@ class Stage:
         origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:] / self.unit))
         ray = mi.Ray3f(origin, mi.Vector3f(*map(upload, towards.T)))
         dr.eval(ray)
+        return self.past_holes(ray) if self.has_holes else ray
+
+    def past_holes(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """The rays from behind the last of the first MOST_HOLES surfaces that let all light through where they hit."""
+        for _ in range(MOST_HOLES):
+            si = self.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+            hit = si.is_valid()
+            hole = hit & (dr.min(si.bsdf().eval_null_transmission(si, hit)) > HOLE)
+            if not dr.any(hole):
+                break
+            ray.o = dr.select(hole, si.spawn_ray(ray.d).o, ray.o)
+            dr.eval(ray)
         return ray

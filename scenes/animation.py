@@ -1,6 +1,7 @@
 """Animated scenes as data: shapes, lights and a camera that move and change, and what they are in any frame."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -57,6 +58,40 @@ class Track:
 
 
 @dataclass(frozen=True)
+class KeyframedTrack(Track):
+    """A Track whose `keys` are those of the frames `times` (N,), which rise: the same spline over uneven intervals.
+
+    Or straight lines, which go no higher and no lower than the keys.
+    """
+
+    times: Array = field(default_factory=lambda: np.zeros(1))
+    straight: bool = False
+
+    def at(self, frame: float) -> Array:
+        """The value, (D,) or a scalar, in a `frame`, which may lie between whole ones."""
+        keys = self.keys
+        times = self.times
+        if len(keys) == 1 or frame <= times[0]:
+            return keys[0]
+        if frame >= times[-1]:
+            return keys[-1]
+        k = int(np.searchsorted(times, frame, side="right")) - 1
+        width = times[k + 1] - times[k]
+        u = (frame - times[k]) / width
+        slope = (keys[k + 1] - keys[k]) / width
+        if self.straight:
+            return keys[k] + width * slope * u
+        leaves = (keys[k + 1] - keys[k - 1]) / (times[k + 1] - times[k - 1]) if k > 0 else slope
+        arrives = (keys[k + 2] - keys[k]) / (times[k + 2] - times[k]) if k + 2 < len(keys) else slope
+        return (
+            keys[k]
+            + width * leaves * u
+            + width * (3 * slope - 2 * leaves - arrives) * u**2
+            + width * (leaves + arrives - 2 * slope) * u**3
+        )
+
+
+@dataclass(frozen=True)
 class RigidMotion:
     """A turn by `angle` radians about the vertical axis through the shape's rest origin, then a shift."""
 
@@ -75,6 +110,43 @@ class RigidMotion:
         """Whether it ever moves or turns anything."""
         return self.position.varies() or self.angle.varies()
 
+    def held(self) -> "RigidMotion":
+        """The pose of frame 0, for ever."""
+        return RigidMotion(self.position.held(), self.angle.held())
+
+
+@dataclass(frozen=True)
+class FreeMotion:
+    """Turns about the x, then the y, then the z axis through `pivot`, and then a shift."""
+
+    pivot: Array  # (3,) world units
+    position: Track  # (3,) world units, the shift
+    rotation: Track  # (3,) radians
+
+    def matrix(self, frame: float) -> Array:
+        """object_to_world (4, 4), rigid."""
+        turn = np.eye(3)
+        for axis, angle in enumerate(self.rotation.at(frame)):
+            i = (axis + 1) % 3
+            j = (axis + 2) % 3
+            about = np.eye(3)
+            about[[i, j], [i, j]] = np.cos(angle)
+            about[j, i] = np.sin(angle)
+            about[i, j] = -np.sin(angle)
+            turn = about @ turn
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn
+        matrix[:3, 3] = self.pivot + self.position.at(frame) - turn @ self.pivot
+        return matrix
+
+    def varies(self) -> bool:
+        """Whether it ever moves or turns anything."""
+        return self.position.varies() or self.rotation.varies()
+
+    def held(self) -> "FreeMotion":
+        """The pose of frame 0, for ever."""
+        return FreeMotion(self.pivot, self.position.held(), self.rotation.held())
+
 
 def still(place: ArrayLike, angle: float) -> RigidMotion:
     """At rest at `place` (3,), turned by `angle` radians about the vertical axis."""
@@ -92,8 +164,47 @@ class Shape:
     mesh: trimesh.Trimesh  # with texture coordinates in visual.uv where the material has a texture
     bsdf: Bsdf
     radiance: Track | None = None  # emitted radiance (3,), linear RGB; None does not emit
-    motion: RigidMotion = STILL
+    motion: RigidMotion | FreeMotion = STILL
     smooth: bool = False  # shade with the mesh's vertex normals instead of its faces'
+
+    def held(self) -> "Shape":
+        """As in frame 0, for ever."""
+        return replace(self, radiance=self.radiance and self.radiance.held(), motion=self.motion.held())
+
+
+UNCHANGED = Track.constant(1.0)
+
+
+@dataclass(frozen=True)
+class StockShape:
+    """A shape as a scene file describes it: Mitsuba's dictionaries, of whichever plugins.
+
+    Dictionaries that are the same object are loaded once. Bitmaps and meshes may be names of files.
+    """
+
+    name: str
+    geometry: dict[str, Any]
+    bsdf: dict[str, Any] | None  # None where shapes within the geometry (of an instance) have their own
+    emitter: dict[str, Any] | None = None
+    gain: Track = UNCHANGED  # scalar, times the light that it emits
+    motion: RigidMotion | FreeMotion = STILL  # from where it stands in the file
+
+    def held(self) -> "StockShape":
+        """As in frame 0, for ever."""
+        return replace(self, gain=self.gain.held(), motion=self.motion.held())
+
+
+@dataclass(frozen=True)
+class StockLight:
+    """A light without a shape, such as a point or a sky, as Mitsuba's dictionary."""
+
+    name: str
+    emitter: dict[str, Any]
+    gain: Track = UNCHANGED  # scalar
+
+    def held(self) -> "StockLight":
+        """As in frame 0, for ever."""
+        return replace(self, gain=self.gain.held())
 
 
 @dataclass(frozen=True)
@@ -103,38 +214,50 @@ class Camera:
     eye: Track  # (3,) world units
     target: Track  # (3,) world units
     x_fov: Track = field(default_factory=lambda: Track.constant(60.0))  # horizontal field of view, degrees
+    up: Track = field(default_factory=lambda: Track.constant([0.0, 1.0, 0.0]))  # (3,), any length
+
+    def held(self) -> "Camera":
+        """As in frame 0, for ever."""
+        return Camera(self.eye.held(), self.target.held(), self.x_fov.held(), self.up.held())
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that a renderer needs in any frame. A mesh's id is its index in `shapes` plus one; 0 is the background."""
+    """All that a renderer needs in any frame.
+
+    The id of a mesh is its index in `shapes`, followed by `stock`, plus one; 0 is the background.
+    """
 
     shapes: tuple[Shape, ...]
     camera: Camera
     max_depth: int = 3  # path edges from the camera to a light: 3 is one indirect bounce
     sky: Array | None = None  # radiance (H, W, 3) from all directions, latitude-longitude, y up; None is black
+    stock: tuple[StockShape, ...] = ()
+    lights: tuple[StockLight, ...] = ()
+
+    @property
+    def meshes(self) -> tuple[Shape | StockShape, ...]:
+        """Whatever has a mesh id, in its order."""
+        return (*self.shapes, *self.stock)
 
     def view(self, frame: float, height: int, width: int) -> View:
         """The projection and the objects' poses in a `frame`, for an image of `height` x `width` pixels."""
         return View(
             K=intrinsics(float(self.camera.x_fov.at(frame)), height, width),
-            camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame)),
-            object_to_world=np.array([shape.motion.matrix(frame) for shape in self.shapes]).reshape(-1, 4, 4),
+            camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame), self.camera.up.at(frame)),
+            object_to_world=np.array([shape.motion.matrix(frame) for shape in self.meshes]).reshape(-1, 4, 4),
         )
 
     def still(self) -> "Scene":
         """The scene of frame 0 for ever: nothing moves or changes, the camera included."""
-        shapes = [
-            replace(
-                shape,
-                radiance=shape.radiance and shape.radiance.held(),
-                motion=RigidMotion(shape.motion.position.held(), shape.motion.angle.held()),
-            )
-            for shape in self.shapes
-        ]
-        camera = Camera(self.camera.eye.held(), self.camera.target.held(), self.camera.x_fov.held())
-        return replace(self, shapes=tuple(shapes), camera=camera)
+        return replace(
+            self,
+            shapes=tuple(shape.held() for shape in self.shapes),
+            stock=tuple(shape.held() for shape in self.stock),
+            camera=self.camera.held(),
+            lights=tuple(light.held() for light in self.lights),
+        )
 
     def moves(self) -> bool:
         """Whether any object moves (the camera may move in any scene)."""
-        return any(shape.motion.varies() for shape in self.shapes)
+        return any(shape.motion.varies() for shape in self.meshes)

@@ -28,10 +28,13 @@ def intrinsics(x_fov: float, height: int, width: int) -> Array:
     return np.array([[-focal, 0, width / 2], [0, -focal, height / 2], [0, 0, 1.0]])
 
 
-def look_at(eye: Array, target: Array) -> Array:
-    """camera_to_world (4, 4) of a camera at `eye` (3,) with `target` (3,) in its centre and the world's y axis up."""
+Y_UP = np.array([0.0, 1.0, 0.0])
+
+
+def look_at(eye: Array, target: Array, up: Array = Y_UP) -> Array:
+    """camera_to_world (4, 4) of a camera at `eye` (3,) with `target` (3,) in its centre and `up` (3,) upwards."""
     forward = (target - eye) / np.linalg.norm(target - eye)
-    left = np.cross([0.0, 1.0, 0.0], forward)
+    left = np.cross(up, forward)
     left /= np.linalg.norm(left)
     matrix = np.eye(4)
     matrix[:3] = np.stack([left, np.cross(forward, left), forward, eye], axis=1)

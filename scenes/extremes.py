@@ -54,6 +54,7 @@ def rescaled(scene: Scene, factor: float) -> Scene:
     def larger(shape: Shape) -> Shape:
         mesh = shape.mesh.copy()
         mesh.apply_scale(factor)
+        assert isinstance(shape.motion, RigidMotion)
         return replace(shape, mesh=mesh, motion=RigidMotion(grow(shape.motion.position), shape.motion.angle))
 
     camera = replace(scene.camera, eye=grow(scene.camera.eye), target=grow(scene.camera.target))

@@ -224,7 +224,7 @@ def texture(rng: Rng) -> NDArray[np.float32]:
 
 
 def gray_texture(rng: Rng, low: float, high: float) -> NDArray[np.float32]:
-    """A random bitmap (S, S, 1) of values from `low` to `high`, such as roughnesses."""
+    """A random bitmap (S, S, 1) of values from `low` to `high`, such as roughnesses; `low` alone in a few of them."""
     values = painted(rng, rng.permutation(np.linspace(0.2, 1, PALETTE_SIZE))[:, None])
     values -= values.min()
     return (low + (high - low) * values / max(values.max(), 1e-9)).astype(np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from datasets.clip_scene import clip_of_own_scene
 from datasets.tonemap import clip_exposure, display, luminance
 from plotting import DPI, plt, save_figure
 from render.shot import Shot
@@ -22,9 +23,11 @@ def displayed_frame(
 ) -> NDArray[np.float64]:
     """One frame of a scene as displayed, (H, W, 3) in [0, 1], with an exposure of its own.
 
-    Raises BadInput for an unknown scene.
+    `name` is that of a built-in scene or the path of a TOML. Raises BadInput for an unknown scene.
     """
-    shot = Shot(Stage(build_scene(name, seed, frames), height, width), frame)
+    own = name.endswith(".toml")
+    scene = clip_of_own_scene(Path(name), "test", 0, frames, seed) if own else build_scene(name, seed, frames)
+    shot = Shot(Stage(scene, height, width), frame)
     reflected = shot.reflected(seed, spp)
     return display(reflected + shot.emission, clip_exposure(luminance(reflected)))
 

@@ -13,7 +13,7 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_scene import scene_of_clip
 from datasets.generate import check_versions
-from datasets.profiles import GENERATOR, profile_of
+from datasets.profiles import GENERATOR, profile_of, source_of
 from datasets.writer import to_storage
 from errors import BadInput
 from files import locked, read_json, write_json
@@ -35,7 +35,10 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
     check_versions(dataset)
-    return scene_of_clip(clip.path, profile_of(dataset.facts["profile"]).frames, dataset.facts["seed"])
+    profile = profile_of(dataset.facts["profile"])
+    if source_of(profile) != dataset.facts.get("source", {}):
+        raise BadInput(f"{dataset.path} was rendered from another {profile.own}: render it again with `onespp dataset`")
+    return scene_of_clip(clip.path, profile, dataset.facts["seed"])
 
 
 def averaged(clip: Clip, count: int) -> Iterator[NoisyFrame]:

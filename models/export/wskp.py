@@ -55,7 +55,7 @@ class WSKPStep(Step):
     def __init__(self, denoiser: WSKP, warp: Warp):
         super().__init__()
         self.precision = denoiser.precision
-        self.inputs = tuple(denoiser.inputs)
+        self.seen = tuple(denoiser.inputs)
         self.network = plain_convolutions(denoiser.network)
         self.fusion = BoxWindows(denoiser.windows)
         self.warp = warp
@@ -114,7 +114,7 @@ class WSKPStep(Step):
             "normal": x["normal"] / 2 + 0.5,
             "depth": torch.where(x["depth"] > 0, x["depth"] / (x["depth"] + scale.depth), 1),
         }
-        return torch.cat([features[name] for name in self.inputs], dim=1)
+        return torch.cat([features[name] for name in self.seen], dim=1)
 
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors

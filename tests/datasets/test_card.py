@@ -58,12 +58,20 @@ def test_options_and_what_was_left_out_are_told(tiny_copy):
     facts = json.loads(path.read_text())
     facts["options"]["halton"] = True
     facts["channels"]["train"].remove("gradient")
-    facts["licence"] = "CC-BY-4.0"
     path.write_text(json.dumps(facts))
     card = card_of(Dataset(tiny_copy))
-    assert card["command"].endswith(" --halton") and card["licence"] == "CC-BY-4.0"
+    assert card["command"].endswith(" --halton") and "left out gradient" in page_of(card)
+
+
+def test_a_scene_of_ones_own_keeps_its_licence_and_tells_what_was_not_honoured(tiny_copy):
+    path = tiny_copy / "dataset.json"
+    facts = json.loads(path.read_text())
+    own = {"profile": "/home/me/attic.toml", "source": {"/home/me/attic.toml": "0badcafe"}, "notes": ["fog: left out"]}
+    path.write_text(json.dumps(facts | own))
+    card = card_of(Dataset(tiny_copy))
     page = page_of(card)
-    assert "left out gradient" in page and "Licence: CC-BY-4.0" in page and "CC0" not in page
+    assert card["command"] == "onespp dataset --scene attic.toml --seed 0" and "/home" not in page
+    assert "CC0" not in page and "Not as in the scene file: fog: left out." in page
 
 
 def test_it_comes_with_the_last_clip_and_harms_nothing(tiny, tiny_copy):

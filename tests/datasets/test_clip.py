@@ -29,7 +29,10 @@ def test_plan_and_layout(tiny):
         "channels",
         "splits",
         "needed_spp",
+        "source",
+        "notes",
     }
+    assert facts["source"] == {} and facts["notes"] == []
     for path in Dataset(tiny).planned():
         names = {file.name for file in path.iterdir()}
         assert {"clip.json", "timing.json", "direct.npy", "depth.npy"} <= names
@@ -41,7 +44,7 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     """Render one clip again, in this process, and compare with the disk."""
     clip = Dataset(tiny).clips("test")[1]
     profile = profile_of("tiny")
-    scene, seed = scene_of_clip(clip.path, profile.frames, 0)
+    scene, seed = scene_of_clip(clip.path, profile, 0)
     sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
     frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
     for index, (channels, _) in enumerate(frames):

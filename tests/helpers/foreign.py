@@ -49,7 +49,8 @@ def planes(layers: Layers, dtype: type = np.float32) -> dict[str, NDArray[Any]]:
     for name, array in layers.items():
         layer, dot, letters = name.rpartition(".")
         for index, letter in enumerate(letters):
-            found[f"{layer}{dot}{letter}"] = np.ascontiguousarray(array[..., index], dtype)
+            with np.errstate(over="ignore"):  # distances to the sky are infinite in half precision
+                found[f"{layer}{dot}{letter}"] = np.ascontiguousarray(array[..., index], dtype)
     return found
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from errors import BadInput
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
-from render.materials import MaterialTable, material_of
-from render.stage import Stage, to_mitsuba
+from render.loading import to_mitsuba
+from render.materials import MaterialTable
+from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 
 
@@ -123,10 +123,3 @@ def test_every_shape_has_its_own_material():
     buffer = render_gbuffer(stage, stage.view(0))
     np.testing.assert_allclose(buffer["roughness"][0, :, 0], [1, 0, 0.25, 1])
     np.testing.assert_allclose(buffer["albedo"][0, :, 0], [0.1, 0.3, 0.5 + (0.49 / 2.49) ** 2, 0.9], rtol=2e-3)
-
-
-def test_unsupported_material_names_the_shape():
-    with pytest.raises(BadInput, match=r"'square'.*RoughConductor"):
-        Stage(textured_square({"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.2}), 2, 2)
-    with pytest.raises(BadInput, match=r"'x'.*not supported"):
-        material_of(mi.load_dict({"type": "hair"}), "x")

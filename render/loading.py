@@ -1,0 +1,230 @@
+"""Shapes and lights as Mitsuba's objects, from their descriptions."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from trimesh.visual import TextureVisuals
+
+from errors import BadInput
+from render.backend import dr, mi
+from scenes.animation import Shape, StockLight, StockShape
+from scenes.bsdf import Bsdf
+
+T = TypeVar("T", np.float32, np.uint32)
+
+
+def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
+    """A Mitsuba dictionary with its numpy arrays, the values and placement of bitmaps, as Mitsuba's types."""
+
+    def convert(key: str, value: Any) -> object:
+        if isinstance(value, dict):
+            return to_mitsuba(value)
+        if key == "to_uv":
+            return mi.ScalarTransform3f(value)
+        if isinstance(value, np.ndarray):
+            return mi.TensorXf(upload(np.float32(value).ravel()), value.shape)
+        return value
+
+    return {key: convert(key, value) for key, value in description.items()}
+
+
+def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
+    """The bitmaps in a material's dictionary, at any depth."""
+    nested = [value for value in bsdf.values() if isinstance(value, dict)]
+    own = [bsdf] if bsdf["type"] == "bitmap" else []
+    return own + [bitmap for value in nested for bitmap in bitmaps_of(value)]
+
+
+def without_placement(bsdf: Bsdf) -> Bsdf:
+    """The material with all its bitmaps where the texture coordinates put them."""
+    return {
+        key: without_placement(value) if isinstance(value, dict) else value
+        for key, value in bsdf.items()
+        if key != "to_uv"
+    }
+
+
+def with_placed_textures(shape: Shape) -> Shape:
+    """The same shape with its bitmaps' common placement in its texture coordinates.
+
+    Mitsuba compiles a bitmap's placement into kernels, while texture coordinates are data: so all textures share a
+    program. Bitmaps of one material that are placed differently stay as they are.
+    """
+    placements = [bitmap.get("to_uv", np.eye(3)) for bitmap in bitmaps_of(shape.bsdf)]
+    uv = getattr(shape.mesh.visual, "uv", None)
+    if uv is None or not placements or any((other != placements[0]).any() for other in placements):
+        return shape
+    mesh = shape.mesh.copy(include_cache=True)  # without it the authored normals are lost
+    assert isinstance(mesh.visual, TextureVisuals)
+    mesh.visual.uv = uv @ placements[0][:2, :2].T + placements[0][:2, 2]
+    return replace(shape, mesh=mesh, bsdf=without_placement(shape.bsdf))
+
+
+def load_mesh(shape: Shape) -> mi.Mesh:
+    """The shape in its rest pose, with its material, and lit as in frame 0."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
+    if shape.radiance is not None:
+        light = {"type": "area", "radiance": {"type": "rgb", "value": shape.radiance.at(0).tolist()}}
+        properties["emitter"] = mi.load_dict(light)
+    uv = getattr(shape.mesh.visual, "uv", None)
+    mesh = mi.Mesh(
+        shape.name,
+        vertex_count=len(shape.mesh.vertices),
+        face_count=len(shape.mesh.faces),
+        has_vertex_normals=shape.smooth,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = np.uint32(shape.mesh.faces).ravel()
+    parameters["vertex_positions"] = upload(shape.mesh.vertices.ravel())
+    if shape.smooth:
+        parameters["vertex_normals"] = upload(shape.mesh.vertex_normals.ravel())
+    if uv is not None:
+        parameters["vertex_texcoords"] = upload(uv.ravel())
+    parameters.update()
+    return mesh
+
+
+def aligned(values: NDArray[T]) -> NDArray[T]:
+    """`values` (N,), of 4 bytes each, where a kernel for any other such array can read them.
+
+    On the CPU Dr.Jit borrows numpy's memory and compiles its alignment into kernels.
+    """
+    spare = 64 // 4
+    buffer = np.empty(len(values) + spare, values.dtype)
+    start = -(buffer.ctypes.data // 4) % spare
+    buffer[start : start + len(values)] = values
+    return buffer[start : start + len(values)]
+
+
+def upload(values: NDArray[np.floating]) -> mi.Float:
+    """`values` (N,) as data for kernels: Python numbers would be compiled into them."""
+    return mi.Float(aligned(values.astype(np.float32)))
+
+
+def columns(vector: dr.AnyArray) -> NDArray[Any]:
+    """(N, C) of a Dr.Jit vector of C components and N lanes; its own dtype.
+
+    Taken at once they would be put together by a kernel that is compiled for this N.
+    """
+    return np.stack([np.array(component) for component in vector], axis=-1)
+
+
+class StockLoader:
+    """Loads descriptions from scene files, `unit` world units to one of Mitsuba's; what they share is loaded once."""
+
+    def __init__(self, unit: float = 1.0):
+        self.unit = unit
+        self.loaded: dict[int, tuple[object, object]] = {}  # by id: the description, which keeps the id its, and object
+        self.groups: list[mi.Shape] = []  # that instances repeat, and
+        self.grouped: list[mi.Shape] = []  # the shapes in them
+        self.notes: list[str] = []  # what had to be left out
+
+    def made(self, description: dict[str, Any], what: str) -> Any:
+        """The Mitsuba object of a resolved dictionary, but for properties that mean nothing to it.
+
+        Raises BadInput, which begins with `what`, where it cannot be loaded.
+        """
+        try:
+            return mi.load_dict(description)
+        except RuntimeError as error:
+            unknown = unreferenced(error)
+            if not unknown & description.keys():
+                raise BadInput(f"{what} is empty, damaged or cannot be used: {reason(error)}") from None
+        names = ", ".join(f"'{name}'" for name in sorted(unknown))
+        self.notes.append(f"{what}: this Mitsuba does not know {names}: left out")
+        return self.made({key: value for key, value in description.items() if key not in unknown}, what)
+
+    def load(self, description: Mapping[str, Any]) -> Any:
+        """The Mitsuba object of a dictionary, in whose place others may nest."""
+        if id(description) not in self.loaded:
+            what = str(description.get("filename", f"a {description['type']}"))
+            loaded = self.made(self.resolved(description), what)
+            self.loaded[id(description)] = (description, loaded)
+            if isinstance(loaded, mi.Shape):
+                check_shape(loaded, what)
+                (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
+        return self.loaded[id(description)][1]
+
+    def resolved(self, description: Mapping[str, Any]) -> dict[str, Any]:
+        """The dictionary with Mitsuba's objects and types in place of nested dictionaries and arrays."""
+
+        def resolve(key: str, value: Any) -> object:
+            if isinstance(value, dict) and value["type"] in ("rgb", "spectrum"):
+                return value
+            if isinstance(value, dict):
+                return self.load(value)
+            if isinstance(value, np.ndarray) and value.shape == (4, 4):
+                return mi.ScalarTransform4f(value)
+            return to_mitsuba({key: value})[key]
+
+        return {key: resolve(key, value) for key, value in description.items()}
+
+    def placed(self, geometry: Mapping[str, Any]) -> dict[str, Any]:
+        """The description of a shape or light, scaled from world units."""
+        if self.unit == 1:
+            return dict(geometry)
+        return {**geometry, "to_world": np.diag([1 / self.unit] * 3 + [1.0]) @ geometry.get("to_world", np.eye(4))}
+
+    def shape(self, shape: StockShape) -> mi.Shape:
+        """Raises BadInput, naming the shape and its file, where it cannot be loaded or is damaged."""
+        parts = {"bsdf": shape.bsdf, "emitter": shape.emitter}
+        nested = {key: self.load(value) for key, value in parts.items() if value is not None}
+        where = f"shape '{shape.name}'" + (f" ({shape.geometry['filename']})" if "filename" in shape.geometry else "")
+        loaded = self.made(self.resolved(self.placed(shape.geometry)) | nested | {"id": shape.name}, where)
+        check_shape(loaded, where)
+        return loaded
+
+    def light(self, light: StockLight) -> mi.Emitter:
+        """Raises BadInput, naming the light, where it cannot be loaded."""
+        emitter = dict(light.emitter)
+        if isinstance(emitter.get("position"), list):
+            emitter["position"] = [x / self.unit for x in emitter["position"]]
+        else:
+            emitter = self.placed(emitter)
+        return self.made(self.resolved(emitter) | {"id": light.name}, f"light '{light.name}'")
+
+
+def unreferenced(error: RuntimeError) -> set[str]:
+    """The properties that Mitsuba does not know, where this is its complaint."""
+    text = str(error)
+    return set(re.findall(r'^  - \w+ "([^"]+)":', text, re.MULTILINE)) if "unreferenced propert" in text else set()
+
+
+def reason(error: Exception) -> str:
+    """What Mitsuba says, in one line, without the places in its own code."""
+    text = " ".join(str(error).split())
+    text = re.sub(r".*\[\w+(\.(cpp|h):\d+)?\] |Error while loading string ", "", text)
+    text = re.sub(r'^(At|While loading) dictionary node "\w*": |failed to instantiate .*?: ', "", text)
+    return "it cannot be read" if not text or text.startswith("jit_") else text
+
+
+LARGEST = 1e18  # units from the origin: its square is a finite float32
+
+
+def check_shape(shape: mi.Shape, where: str) -> None:
+    """Raise BadInput, which begins with `where`, for a shape that is nowhere, and a mesh that is empty or damaged."""
+    if not isinstance(shape, mi.Shape):
+        raise BadInput(f"{where} is no shape")
+    parameters = mi.traverse(shape)
+    if "faces" in parameters:
+        faces = np.array(parameters["faces"])
+        vertices = np.array(parameters["vertex_positions"])
+        if not len(faces) or 3 * faces.max() >= len(vertices):
+            raise BadInput(f"{where} is empty or damaged: it has {len(vertices) // 3} vertices and no sound faces")
+        if not np.isfinite(vertices).all():
+            raise BadInput(f"{where} is damaged: it has vertices that are not finite")
+    box = shape.bbox()
+    if shape.class_name() != "ShapeGroupPlugin" and not reach_of(box) < LARGEST:
+        raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
+
+
+def reach_of(box: mi.ScalarBoundingBox3f) -> float:
+    """How far a box reaches from the origin along an axis; NaN for one that is nowhere."""
+    return float(np.abs([np.array(box.min), np.array(box.max)]).max())

@@ -1,0 +1,1 @@
+"""Other people's scenes: read safely, and what cannot be honoured said in plain words."""

@@ -1,0 +1,61 @@
+"""Shading normals as materials see them: normal and bump maps bend those of a surface."""
+
+# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
+# mypy: disable-error-code="arg-type, assignment, misc, operator, return-value"
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from render.backend import dr, mi
+from render.materials import BsdfParameters, bsdfs_of, registry_index
+
+
+class Relief(NamedTuple):
+    """What bends the normals of one BSDF. On the back of a two-sided one the relief is that of the front, mirrored."""
+
+    texture: mi.Texture
+    bump: float | None  # the scale of heights; None where the texture holds normals
+    two_sided: bool
+
+    def local_normal(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Vector3f:
+        """The normal (3,) in the shading frame at `si`."""
+        if self.bump is None:
+            normal = dr.normalize(2 * mi.Vector3f(self.texture.eval_3(si, active)) - 1)
+        else:
+            slope = self.bump * self.texture.eval_1_grad(si, active)
+            n = si.sh_frame.n
+            along_u = si.dp_du + n * (slope.x - dr.dot(n, si.dp_du))
+            along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
+            raised = dr.normalize(dr.cross(along_u, along_v))
+            normal = si.to_local(dr.select(dr.dot(si.n, raised) < 0, -raised, raised))
+        behind = mi.Bool(self.two_sided) & (si.wi.z < 0)
+        return mi.Vector3f(normal.x, normal.y, dr.select(behind, -normal.z, normal.z))
+
+
+def relief_of(bsdf: mi.BSDF, two_sided: bool = False) -> Relief | None:
+    """What bends the normals of a BSDF, or of the first that it wraps; None where nothing does."""
+    parameters = BsdfParameters(bsdf)
+    kind = bsdf.class_name()
+    if kind == "NormalMap":
+        return Relief(parameters.textures["normalmap"], None, two_sided)
+    if kind == "BumpMap":
+        return Relief(parameters.textures["nested_texture"], parameters.number("scale", 1.0), two_sided)
+    nested = [*parameters.nested.values()]
+    return relief_of(nested[0], two_sided or kind == "TwoSidedBRDF") if nested else None
+
+
+class ShadingNormals:
+    """The shading normals of Mitsuba shapes."""
+
+    def __init__(self, shapes: Iterable[mi.Shape]):
+        reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs_of(shapes).items()}
+        self.reliefs = {number: relief for number, relief in reliefs.items() if relief is not None}
+
+    def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> mi.Vector3f:
+        """The shading normal (3,) in the world at `si`, of unit length, on whichever side."""
+        normal = mi.Vector3f(si.sh_frame.n)
+        number = registry_index(si.bsdf())
+        for index, relief in self.reliefs.items():  # one after the other: a call by pointer would trace all textures
+            here = hit & (number == index)
+            normal = dr.select(here, si.to_world(relief.local_normal(si, here)), normal)
+        return normal

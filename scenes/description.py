@@ -1,0 +1,149 @@
+"""A user's own scene, described by a TOML file: which file it is, how the camera flies, what moves, what to render."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from errors import BadInput
+from scenes.animation import Camera, FreeMotion, KeyframedTrack
+from scenes.camera import Array
+
+SPLITS = ("train", "val", "test")
+Vector = tuple[float, float, float]
+Positive = Annotated[int, Meta(ge=1)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame, 1 its last
+Even = Annotated[int, Meta(ge=2, multiple_of=2)]
+
+
+class CameraKey(msgspec.Struct, forbid_unknown_fields=True):
+    """Where the camera is at a time, what it looks at, which way is up, and its horizontal field of view in degrees."""
+
+    time: Fraction
+    position: Vector
+    target: Vector
+    up: Vector | None = None  # the file's where none is given
+    fov: Annotated[float, Meta(gt=0, lt=180)] | None = None
+
+
+class PoseKey(msgspec.Struct, forbid_unknown_fields=True):
+    """How far a shape is, at a time, from where it stands in the file; degrees about x, then y, then z."""
+
+    time: Fraction
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+
+
+class GainKey(msgspec.Struct, forbid_unknown_fields=True):
+    """How bright a light is at a time, times what the file says."""
+
+    time: Fraction
+    gain: Annotated[float, Meta(ge=0)]
+
+
+class Motion(msgspec.Struct, forbid_unknown_fields=True):
+    """The keyframes of one shape."""
+
+    shape: str
+    keyframes: Annotated[list[PoseKey], Meta(min_length=1)]
+
+
+class LightChange(msgspec.Struct, forbid_unknown_fields=True):
+    """The keyframes of one light."""
+
+    light: str
+    keyframes: Annotated[list[GainKey], Meta(min_length=1)]
+
+
+class Split(msgspec.Struct, forbid_unknown_fields=True):
+    """The clips of a split. What is left out is as docs/scenes.md says."""
+
+    clips: Annotated[int, Meta(ge=0)] | None = None
+    camera: Literal["auto", "keyframes"] | None = None
+    realisations: Positive | None = None
+    reference_spp: Even | None = None
+    floor: Annotated[float, Meta(gt=0)] | None = None  # dB
+    most_spp: Even | None = None
+
+
+class Description(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of the TOML file."""
+
+    file: str  # a Mitsuba XML, glTF, OBJ or PLY; relative to the TOML
+    resolution: tuple[Positive, Positive] = (256, 144)  # width, height
+    frames: Positive = 16
+    bounces: Positive | None = None  # of light, 1 is direct light alone; the file's own where it says
+    camera: list[CameraKey] = []
+    motion: list[Motion] = []
+    light: list[LightChange] = []
+    splits: dict[str, Split] = {}  # train, val, test
+
+
+def read_description(path: Path) -> Description:
+    """Raises BadInput, naming the file and the place in it, where it is missing or says what cannot be."""
+    try:
+        described = msgspec.toml.decode(path.read_bytes(), type=Description)
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read: {error.strerror}") from None
+    except (msgspec.DecodeError, ValueError) as error:
+        raise BadInput(f"{path}: {error}; docs/scenes.md shows what it may say") from None
+    if not finite(msgspec.to_builtins(described)):
+        raise BadInput(f"{path}: a number is infinite or not a number")
+    unknown = set(described.splits) - set(SPLITS)
+    if unknown:
+        raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
+    times_of_all = [[key.time for key in described.camera]]
+    times_of_all += [[key.time for key in motion.keyframes] for motion in described.motion]
+    times_of_all += [[key.time for key in change.keyframes] for change in described.light]
+    for times in times_of_all:
+        if times != sorted(set(times)):
+            raise BadInput(f"{path}: the times {times} of keyframes do not rise: put them in order, each time once")
+    for names in ([motion.shape for motion in described.motion], [change.light for change in described.light]):
+        if len(set(names)) < len(names):
+            raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: put them into one table")
+    if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
+        raise BadInput(f"{path}: a split flies by keyframes, but there are none: add [[camera]] tables")
+    return described
+
+
+def finite(value: Any) -> bool:
+    """Whether all numbers in plain data are."""
+    if isinstance(value, dict | list | tuple):
+        return all(map(finite, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:
+    """The track through `values` at `times`, fractions of a clip of so many frames."""
+    return KeyframedTrack(np.array(values, np.float64), times=np.array(times) * (frames - 1))
+
+
+def camera_of(keys: list[CameraKey], file: Camera, frames: int) -> Camera:
+    """The camera that flies by `keys`; what they leave out is as in the `file`."""
+    times = [key.time for key in keys]
+    x, y, z = file.up.at(0).tolist()
+    fov = float(file.x_fov.at(0))
+    return Camera(
+        eye=spline([key.position for key in keys], times, frames),
+        target=spline([key.target for key in keys], times, frames),
+        x_fov=spline([fov if key.fov is None else key.fov for key in keys], times, frames),
+        up=spline([key.up or (x, y, z) for key in keys], times, frames),
+    )
+
+
+def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
+    """The motion of a shape that turns about `pivot` (3,), its centre in the file."""
+    times = [key.time for key in keys]
+    turns = spline([key.rotation for key in keys], times, frames)
+    turns = replace(turns, keys=np.radians(turns.keys))
+    return FreeMotion(pivot, spline([key.position for key in keys], times, frames), turns)
+
+
+def gain_of(keys: list[GainKey], frames: int) -> KeyframedTrack:
+    """What a light is multiplied by: along straight lines, for a spline could fall below 0."""
+    return replace(spline([key.gain for key in keys], [key.time for key in keys], frames), straight=True)

@@ -1,0 +1,132 @@
+"""`onespp dataset --scene`: a user's own scene as a data set like any other."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from command_line import main
+from datasets.clip import Dataset
+from datasets.profiles import OWN_CLIPS, OWN_QUALITY, own_profile, profile_of
+from errors import BadInput
+from eval.tradeoff.resampled_clips import scene_of
+from render.scene_file.load import own_scene
+from tests.helpers.datasets import digest
+from tests.helpers.scene_files import old_xml, write
+from tests.test_cli import fails
+
+SPLITS = """
+[splits.train]
+clips = 1
+realisations = 1
+reference_spp = 4
+[splits.val]
+clips = 0
+[splits.test]
+clips = 2
+reference_spp = 4
+most_spp = 4
+"""
+CONTENT = old_xml('<shape type="cube" id="lost"><bsdf type="phong"/></shape>', '<emitter type="collimated"/>')
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A data set of an old Mitsuba file. Read only."""
+    root = tmp_path_factory.mktemp("own")
+    own_scene.cache_clear()
+    toml = write(root, CONTENT, SPLITS)
+    main(["dataset", "--scene", str(toml), "--data", str(root / "data"), "--reads", "wskp6"])
+    return root
+
+
+def test_it_is_a_data_set_like_any_other(made, capsys):
+    dataset = Dataset(made / "data")
+    assert len(dataset.clips("train")) == 1
+    clip, _ = dataset.clips("test")
+    assert (clip.height, clip.width, clip.frames) == (24, 32, 2)
+    reference = clip.read("direct_reference", 1)
+    assert np.isfinite(reference).all() and reference.max() > 0
+    main(["verify", "--data", str(made / "data")])
+    main(["info", "--data", str(made / "data")])
+    out = capsys.readouterr().out
+    assert "everything is as it was written" in out and "my" in out
+
+
+def test_its_first_test_clip_begins_with_the_files_camera(made):
+    clips = Dataset(made / "data").clips("test")
+    expected = np.diag([-1.0, 1, -1, 1])
+    expected[2, 3] = 5
+    np.testing.assert_allclose(clips[0].view(0).camera_to_world, expected, atol=1e-6)
+    assert np.abs(clips[1].view(0).camera_to_world - expected).max() > 0.01
+    K = clips[0].view(0).K
+    assert 16 / abs(K[0, 0]) == pytest.approx(np.tan(np.radians(20)), rel=1e-5)
+
+
+def test_what_is_not_honoured_is_kept_with_the_data(made):
+    facts = json.loads((made / "data" / "dataset.json").read_text())
+    assert facts["profile"] == str(made / "my.toml")
+    assert len(facts["notes"]) == 2 and "phong" in facts["notes"][0] and "collimated" in facts["notes"][1]
+    assert set(facts["source"]) == {str(made / "my.toml"), str(made / "scene.xml")}
+
+
+def test_resuming_gives_the_same_bytes(made, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(made / "data", copy)
+    shutil.rmtree(copy / "test" / "my" / "001")
+    main(["dataset", "--scene", str(made / "my.toml"), "--data", str(copy), "--reads", "wskp6"])
+    captured = capsys.readouterr()
+    assert "1 clips rendered" in captured.out and "phong" in captured.out + captured.err
+    assert digest(copy) == digest(made / "data")
+
+
+@pytest.mark.parametrize("changed", ["my.toml", "scene.xml"])
+def test_a_changed_file_is_another_scene(made, tmp_path, capsys, changed):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    facts = (copy / "data" / "dataset.json").read_text().replace(str(made), str(copy))
+    (copy / "data" / "dataset.json").write_text(facts)
+    dataset = Dataset(copy / "data")
+    clip = dataset.clips("test")[0]
+    scene, _ = scene_of(clip, dataset)
+    assert [shape.name for shape in scene.meshes] == ["ball", "lost"]
+    with (copy / changed).open("a") as file:
+        file.write("\n")
+    with pytest.raises(BadInput, match="render it again"):
+        scene_of(clip, dataset)
+    refused = fails(
+        capsys, "dataset", "--scene", str(copy / "my.toml"), "--data", str(copy / "data"), "--reads", "wskp6"
+    )
+    assert "another source" in refused
+
+
+def test_refusals_leave_nothing_behind(tmp_path, capsys):
+    def refused(*arguments: str) -> str:
+        return fails(capsys, "dataset", "--data", str(tmp_path / "data"), "--scene", *arguments)
+
+    assert "gone.toml cannot be read" in refused(str(tmp_path / "gone.toml"))
+    toml = write(tmp_path, "", SPLITS)
+    assert "scene.xml is empty or damaged" in refused(str(toml))
+    (tmp_path / "scene.xml").unlink()
+    assert "scene.xml cannot be read" in refused(str(toml))
+    (tmp_path / "empty.ply").write_bytes(b"")
+    mesh = '<shape type="ply"><string name="filename" value="empty.ply"/></shape>'
+    assert "empty.ply" in refused(str(write(tmp_path, old_xml(mesh), SPLITS)))
+    assert "no split has any clips" in refused(
+        str(write(tmp_path, CONTENT, "[splits]\ntrain.clips=0\nval.clips=0\ntest.clips=0"))
+    )
+    assert not (tmp_path / "data").exists()
+
+
+def test_defaults_and_names(tmp_path):
+    toml = write(tmp_path, CONTENT).rename(tmp_path / "größe 1.b.toml")
+    profile = own_profile(toml)
+    assert profile == profile_of(str(toml))
+    assert profile.quality == OWN_QUALITY
+    assert {split: len(clips) for split, clips in profile.special.items()} == OWN_CLIPS
+    assert profile.special["test"] == ["größe_1_b/000"]
+
+
+def test_preview(made, tmp_path):
+    main(["preview", str(made / "my.toml"), "--out", str(tmp_path / "sheet.png"), "--spp", "2"])
+    assert (tmp_path / "sheet.png").stat().st_size > 1000

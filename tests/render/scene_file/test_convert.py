@@ -1,0 +1,82 @@
+"""Nodes of scene files as plain data: everything is there, under its own name, and what is shared is shared."""
+
+import numpy as np
+import pytest
+
+from errors import BadInput
+from render.loading import StockLoader
+from render.scene_file.convert import convert
+from tests.helpers.scene_files import own, write, xml
+
+
+def converted(folder, content: str):
+    write(folder, content)
+    return convert(folder / "scene.xml")
+
+
+def test_names_are_unique_and_usable(tmp_path):
+    ids = ("a.b c/ü", "sky", "type", "group 0", "_group 0", "id", "to_world", "sphere-2")
+    cubes = "".join(f'<shape type="cube" id="{name}"/>' for name in ids)
+    parts = (cubes, '<shape type="sphere"/>' * 3, '<emitter type="point" id="constant-2"/>', '<emitter type="point"/>')
+    scene = own(
+        tmp_path,
+        xml(
+            *parts,
+            '<shape type="shapegroup" id="g"><shape type="disk"/></shape>',
+            '<shape type="instance"><ref id="g"/></shape>',
+        ),
+    )
+    names = [shape.name for shape in scene.scene.stock] + [light.name for light in scene.scene.lights]
+    assert len(names) == 1 + len(ids) + 3 + 1 + 3 and len(set(names)) == len(names)
+    assert "a_b c/ü" in names and "group 0" in names and not {"sky", "type", "id"} & set(names)
+    assert {shape.id() for shape in scene.stage.shapes} == set(names[:-3])
+
+
+def test_a_material_of_many_shapes_is_loaded_once(tmp_path, monkeypatch):
+    material = '<bsdf type="diffuse" id="d"><texture type="checkerboard" name="reflectance"/></bsdf>'
+    found = converted(tmp_path, xml(material, '<shape type="cube"><ref id="d"/></shape>' * 100))
+    cubes = [shape for shape in found.shapes if shape.geometry["type"] == "cube"]
+    assert len(cubes) == 100 and all(shape.bsdf is cubes[0].bsdf for shape in cubes)
+    loader = StockLoader()
+    for shape in cubes:
+        loader.shape(shape)
+    assert len(loader.loaded) == 2  # the checkerboard and what it is on
+
+
+def test_files_lie_in_the_folder_or_where_paths_say(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "in.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
+    found = converted(
+        tmp_path, xml('<path value="sub"/><shape type="obj"><string name="filename" value="in.obj"/></shape>')
+    )
+    assert found.shapes[1].name == "in" and found.shapes[1].geometry["filename"] == str(tmp_path / "sub" / "in.obj")
+    assert found.notes == []
+    for name in ("../x.obj", "/etc/hostname", "sub/../../x.obj"):
+        with pytest.raises(BadInput, match="leaves the scene's folder"):
+            converted(tmp_path, xml(f'<shape type="obj"><string name="filename" value="{name}"/></shape>'))
+    with pytest.raises(BadInput, match="cannot be the name"):
+        converted(tmp_path, xml(f'<shape type="obj"><string name="filename" value="{"x" * 5000}"/></shape>'))
+
+
+def test_depth_is_that_of_the_innermost_integrator(tmp_path):
+    inner = '<integrator type="path"><integer name="max_depth" value="{}"/></integrator>'
+    assert converted(tmp_path, xml(inner.format(7))).max_depth == 7
+    assert converted(tmp_path, xml(inner.format(-1))).max_depth is None
+    assert converted(tmp_path, xml('<integrator type="direct"/>')).max_depth == 2
+    aov = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{inner.format(5)}</integrator>'
+    found = converted(tmp_path, xml(aov))
+    assert found.max_depth == 5 and len(found.notes) == 1
+
+
+def test_nothing_to_render(tmp_path):
+    with pytest.raises(BadInput, match="no shape to render"):
+        converted(tmp_path, xml(shape=""))
+    with pytest.raises(BadInput, match=r"no shape to render; gone.obj: the file gone.obj is missing"):
+        converted(tmp_path, xml(shape='<shape type="obj"><string name="filename" value="gone.obj"/></shape>'))
+
+
+def test_more_lights_than_shapes(tmp_path):
+    points = '<emitter type="point"><rgb name="intensity" value="1, 2, 3"/></emitter>' * 30
+    found = converted(tmp_path, xml(points))
+    assert len(found.lights) == 31 and len(found.shapes) == 1
+    np.testing.assert_allclose(found.lights[7].emitter["intensity"]["value"], [1, 2, 3])

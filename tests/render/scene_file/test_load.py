@@ -1,0 +1,173 @@
+"""A user's own scene as a whole: refusals in one line, what its TOML changes, and glTF in motion."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from errors import BadInput
+from render.gbuffer import render_gbuffer
+from render.scene_file.load import OwnScene
+from render.shot import Shot
+from render.stage import Stage
+from scenes.camera import motion_vectors, pixel_centres
+from tests.helpers.scene_files import own, painted, xml
+
+PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+PLY += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+SOUND = PLY + "0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
+DAMAGED = {
+    "empty.ply": b"",
+    "short.ply": SOUND[:-14].encode(),
+    "nan.ply": SOUND.replace("1 1 0", "nan 1 0").encode(),
+    "far.ply": SOUND.replace("1 1 0", "1e30 1 0").encode(),
+    "wild.ply": SOUND.replace("3 0 1 2", "3 0 1 9").encode(),
+    "faceless.ply": SOUND.replace("face 1", "face 0").replace("3 0 1 2\n", "").encode(),
+    "nan.obj": b"v nan 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n",
+    "wild.obj": b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 9\n",
+    "empty.serialized": b"",
+    "junk.serialized": bytes(range(256)),
+}
+
+
+def refusal(folder, content, **arguments) -> str:
+    with pytest.raises(BadInput) as error:
+        own(folder, content, **arguments)
+    text = str(error.value)
+    assert "\n" not in text and ".cpp" not in text and "Traceback" not in text
+    return text
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_meshes_are_refused(tmp_path, name, grouped):
+    (tmp_path / name).write_bytes(DAMAGED[name])
+    mesh = f'<shape type="{name.partition(".")[2]}" id="thing"><string name="filename" value="{name}"/></shape>'
+    if grouped:
+        mesh = f'<shape type="shapegroup" id="g">{mesh}</shape><shape type="instance"><ref id="g"/></shape>'
+    text = refusal(tmp_path, xml(mesh))
+    assert "scene.xml" in text and name in text
+
+
+def test_damaged_pictures_are_refused(tmp_path):
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\nno picture")
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="bad.png"/></texture>'
+    assert "bad.png" in refusal(tmp_path, xml(shape=painted(f'<bsdf type="diffuse">{texture}</bsdf>')))
+    sky = '<emitter type="envmap"><string name="filename" value="bad.png"/></emitter>'
+    assert "light 'bad'" in refusal(tmp_path, xml(light=sky))
+
+
+NOWHERE = '<point name="center" x="{}" y="0" z="0"/>'
+UNUSABLE = {
+    "radius": painted('<string name="radius" value="wide"/>'),
+    "range [0, 1]": painted('<bsdf type="diffuse"><rgb name="reflectance" value="7, 0, 0"/></bsdf>'),
+    "transmission": painted('<bsdf type="twosided"><bsdf type="dielectric"/></bsdf>'),
+    "too far away": painted(NOWHERE.format("nan")),
+    "too large": painted(NOWHERE.format("1e30")),
+}
+
+
+@pytest.mark.parametrize("words", UNUSABLE)
+def test_what_mitsuba_refuses_is_said_in_a_line(tmp_path, words):
+    assert words in refusal(tmp_path, xml(shape=UNUSABLE[words]))
+
+
+def test_files_of_no_known_kind(tmp_path):
+    assert "is no scene file" in refusal(tmp_path, b"", name="scene.blend")
+    assert "empty or damaged" in refusal(tmp_path, b"", name="scene.XML")
+    (tmp_path / "my.toml").write_text('file = "gone.xml"')
+    with pytest.raises(BadInput, match=r"gone\.xml cannot be read"):
+        OwnScene(tmp_path / "my.toml")
+    (tmp_path / "my.toml").write_text('file = ""')
+    with pytest.raises(BadInput, match="is no scene file"):
+        OwnScene(tmp_path / "my.toml")
+
+
+LAMP = '<shape type="cube" id="lamp"><emitter type="area"/></shape>'
+
+
+def test_names_that_are_not_there(tmp_path):
+    motion = '[[motion]]\nshape = "bell"\nkeyframes = [{ time = 0 }]\n'
+    assert "there is no shape 'bell'; there are ball" in refusal(tmp_path, xml(), toml=motion)
+    light = '[[light]]\nlight = "ball"\nkeyframes = [{ time = 0, gain = 1 }]\n'
+    assert "no light 'ball'; there are constant, lamp" in refusal(tmp_path, xml(LAMP), toml=light)
+
+
+@pytest.mark.parametrize("key", ["target = [1, 0, 5]", "target = [1, 9, 5]"])
+def test_a_camera_that_cannot_see(tmp_path, key):
+    """It is where it looks, or looks straight up."""
+    scene = own(tmp_path, xml(), f"[[camera]]\ntime = 0\nposition = [1, 0, 5]\n{key}\n")
+    with pytest.raises(BadInput, match=r"my\.toml: in frame 0 the camera"), np.errstate(invalid="ignore"):
+        scene.clip(2, 0, by_keyframes=True, from_here=True)
+
+
+def test_keyframes_move_and_brighten(tmp_path):
+    toml = """bounces = 1
+    [[camera]]
+    time = 0
+    position = [0, 0, 5]
+    target = [0, 0, 0]
+    [[motion]]
+    shape = "ball"
+    keyframes = [{ time = 0 }, { time = 1, position = [0.5, 0, 0] }]
+    [[light]]
+    light = "constant"
+    keyframes = [{ time = 0, gain = 1 }, { time = 1, gain = 3 }]
+    """
+    scene = own(tmp_path, xml(), toml)
+    clip = scene.clip(2, 0, by_keyframes=True, from_here=True)
+    assert clip.max_depth == 2
+    stage = Stage(clip, 24, 32)
+    first, last = (Shot(stage, frame).emission.max() for frame in (0, 1))
+    assert last == pytest.approx(3 * first)
+    centres = []
+    for frame in (0, 1):
+        stage.pose(frame)
+        columns = np.nonzero(render_gbuffer(stage, stage.view(frame))["mesh_id"][..., 0])[1]
+        centres.append(columns.mean())
+    expected = 0.5 / 5 * abs(stage.view(0).K[0, 0])  # a right shift of half a unit, five units away
+    assert centres[1] - centres[0] == pytest.approx(expected, abs=0.3)
+
+
+def test_meshes_of_gltf_move_as_their_vectors_say(tmp_path):
+    box = trimesh.creation.box((1.5, 1.5, 0.5))
+    world = trimesh.Scene()
+    world.add_geometry(box, node_name="box")
+    behind = trimesh.transformations.translation_matrix([0, 0, -1])
+    world.add_geometry(trimesh.creation.box((9, 9, 0.1)), node_name="wall", transform=behind)
+    world.camera = trimesh.scene.Camera(fov=(40, 40))
+    world.camera_transform = trimesh.transformations.translation_matrix([0, 0, 5])
+    toml = """
+    [[motion]]
+    shape = "box"
+    keyframes = [{ time = 0 }, { time = 1, position = [0.2, 0.1, 0], rotation = [0, 0, 10] }]
+    """
+    scene = own(tmp_path, world.export(file_type="glb"), toml, name="scene.glb")
+    clip = scene.clip(2, 0, by_keyframes=False, from_here=True)
+    stage = Stage(clip, 48, 64)
+    before = render_gbuffer(stage, stage.view(0))["mesh_id"][..., 0]
+    stage.pose(1)
+    now = render_gbuffer(stage, stage.view(1))
+    mesh_id = now["mesh_id"][..., 0].astype(int)
+    centres = pixel_centres(48, 64)
+    vectors = motion_vectors(centres, now["depth"][..., 0].astype(float), mesh_id, stage.view(1), stage.view(0))
+    box_id = 1 + [shape.name for shape in clip.meshes].index("box")
+    there = np.floor(centres + vectors).astype(int)
+    inside = (there >= 0).all(axis=-1) & (there < [64, 48]).all(axis=-1) & (mesh_id == box_id)
+    assert inside.sum() > 100 and np.abs(vectors[inside]).max() > 1
+    assert (before[there[inside][:, 1], there[inside][:, 0]] == box_id).mean() > 0.9  # else hidden, or on an edge
+
+
+def test_the_smallest_images_and_clips(tmp_path):
+    scene = own(tmp_path, xml(), "")
+    scene.described.resolution = (1, 1)
+    for frames in (1, 2):
+        clip = scene.clip(frames, 0, False, False)
+        assert np.isfinite(Shot(Stage(clip, 1, 1), frames - 1).radiance(0, 2)).all()
+
+
+def test_points_of_no_size_and_deep_mixtures(tmp_path):
+    point = own(tmp_path, xml(shape=painted('<float name="radius" value="0"/>'), camera=""))
+    assert np.isfinite(Shot(Stage(point.clip(2, 0, False, False), 4, 4), 1).radiance(0, 2)).all()
+    blends = '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse"/>'
+    deep = own(tmp_path, xml(shape=painted(blends * 30 + '<bsdf type="plastic"/>' + "</bsdf>" * 30)))
+    assert deep.stage.materials.depth == 6

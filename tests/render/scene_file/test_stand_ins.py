@@ -1,0 +1,289 @@
+"""What stands in for all that is not honoured: it renders, it is said in plain words, and nothing else is lost."""
+
+import numpy as np
+import pytest
+
+from render.backend import mi
+from render.scene_file.stand_ins import black_body, mixture, phong, sky_alone, turned_to_y
+from render.shot import Shot
+from render.stage import Stage
+from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
+
+
+def rendered(scene) -> np.ndarray:
+    """A frame's light (H, W, 3), with what is seen directly."""
+    shot = Shot(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
+    return np.add(*shot.tracer.radiance(shot.ray, 0, 2)) + shot.emission
+
+
+def old(bsdf: str) -> str:
+    return old_xml(shape=painted(bsdf))
+
+
+def new(bsdf: str) -> str:
+    return xml(shape=painted(bsdf))
+
+
+def shape(plugin: str, content: str = "") -> str:
+    return f'<shape type="{plugin}" id="thing">{content}</shape>'
+
+
+def named(tag: str, plugin: str, file: str, name: str = "") -> str:
+    return f'<{tag} type="{plugin}" name="{name}"><string name="filename" value="{file}"/></{tag}>'
+
+
+CHECKS = '<texture type="checkerboard" name="{}"/>'
+GROUP = '<shape type="shapegroup" id="g">{}</shape><shape type="instance"><ref id="g"/></shape>'
+BLACK_BODY = '<spectrum type="blackbody" name="radiance"><float name="temperature" value="5000"/></spectrum>'
+# content: (words of its note, how many shapes and lights are left)
+CASES = {
+    "phong": (old('<bsdf type="phong"><float name="exponent" value="50"/></bsdf>'), "rough plastic", 1, 1),
+    "ward": (old('<bsdf type="ward"/>'), "rough plastic", 1, 1),
+    "coating": (old('<bsdf type="coating"><bsdf type="roughconductor"/></bsdf>'), "under the coat", 1, 1),
+    "roughcoating": (old('<bsdf type="roughcoating"/>'), "diffuse surface", 1, 1),
+    "mixture": (
+        old(
+            '<bsdf type="mixturebsdf"><string name="weights" value="0.7, 0.3"/><bsdf type="plastic"/>'
+            '<bsdf type="diffuse"/></bsdf>'
+        ),
+        "blendbsdf",
+        1,
+        1,
+    ),
+    "mixture of what": (old('<bsdf type="mixturebsdf"><string name="weights" value="x"/></bsdf>'), "diffuse", 1, 1),
+    "bump": (old(f'<bsdf type="bump">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "bumpmap", 1, 1),
+    "bumps of checks": (new(f'<bsdf type="bumpmap">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "flat", 1, 1),
+    "lost normals": (
+        new(f'<bsdf type="normalmap">{named("texture", "bitmap", "no.png", "normalmap")}<bsdf type="diffuse"/></bsdf>'),
+        "flat",
+        1,
+        1,
+    ),
+    "unknown material": (old('<bsdf type="irawan"/>'), "diffuse surface", 1, 1),
+    "grid": (old('<bsdf type="diffuse"><texture type="gridtexture" name="reflectance"/></bsdf>'), "checkerboard", 1, 1),
+    "scale": (old('<bsdf type="diffuse"><texture type="scale" name="reflectance"/></bsdf>'), "grey", 1, 1),
+    "wireframe": (old('<bsdf type="diffuse"><texture type="wireframe" name="reflectance"/></bsdf>'), "grey", 1, 1),
+    "lost texture": (
+        new(f'<bsdf type="diffuse">{named("texture", "bitmap", "no.png", "reflectance")}</bsdf>'),
+        "no.png is missing: grey",
+        1,
+        1,
+    ),
+    "lost volume": (new('<bsdf type="diffuse"><texture type="volume" name="reflectance"/></bsdf>'), "volume", 1, 1),
+    "lost measurements": (new(named("bsdf", "measured", "no.bsdf")), "grey diffuse", 1, 1),
+    "lost mesh": (xml(shape("obj", '<string name="filename" value="no.obj"/>')), "no.obj is missing", 1, 1),
+    "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "even white sky", 1, 1),
+    "lost spectrum": (
+        new('<bsdf type="diffuse"><spectrum name="reflectance" filename="no.spd"/></bsdf>'),
+        "no.spd of a spectrum is missing",
+        1,
+        1,
+    ),
+    "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no shape 'hair': nothing", 1, 1),
+    "unknown shape": (old_xml(shape("heightfield")), "has no shape 'heightfield': nothing", 1, 1),
+    "old sky": (
+        old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'),
+        "sky of sunsky",
+        1,
+        1,
+    ),
+    "old sun": (
+        old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
+        "sun of sunsky",
+        1,
+        1,
+    ),
+    "unknown light": (old_xml('<emitter type="collimated"/>'), "has no emitter 'collimated': nothing", 1, 1),
+    "no light": (xml(light=""), "nothing shines: an even white sky", 1, 1),
+    "two skies": (xml(SKY), "a second sky is left out", 1, 1),
+    "spot without picture": (
+        xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
+        "without its picture",
+        1,
+        2,
+    ),
+    "medium": (xml(shape("cube", '<medium type="homogeneous" name="interior"/>')), "a medium is left out", 2, 1),
+    "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m: a medium is left out", 1, 1),
+    "subsurface": (old('<subsurface type="dipole"/><bsdf type="plastic"/>'), "surface alone", 1, 1),
+    "spectrum": (
+        new('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.9"/></bsdf>'),
+        "red, green and blue",
+        1,
+        1,
+    ),
+    "irregular": (
+        new(
+            '<bsdf type="diffuse"><spectrum type="irregular" name="reflectance"><string name="wavelengths" '
+            'value="400, 700"/><string name="values" value="0.1, 0.2"/></spectrum></bsdf>'
+        ),
+        "red, green and blue",
+        1,
+        1,
+    ),
+    "black body": (xml(shape("disk", f'<emitter type="area">{BLACK_BODY}</emitter>')), "red, green and blue", 2, 1),
+    "integrator": (old_xml('<integrator type="bdpt"/>'), "'bdpt': path tracing", 1, 1),
+    "volpath": (
+        xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
+        "hide_emitters",
+        1,
+        1,
+    ),
+    "two cameras": (xml(CAMERA), "a further sensor is left out", 1, 1),
+    "lens": (
+        xml(
+            camera=CAMERA.replace("perspective", "thinlens").replace(
+                "<transform",
+                '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/><transform',
+            )
+        ),
+        "a pinhole instead",
+        1,
+        1,
+    ),
+    "clipping": (
+        xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
+        "near_clip",
+        1,
+        1,
+    ),
+    "orthographic": (
+        xml(camera=CAMERA.replace("perspective", "orthographic").replace('name="fov"', 'name="near_clip"')),
+        "sees the whole scene",
+        1,
+        1,
+    ),
+    "no camera": (xml(camera=""), "there is no camera: one that sees the whole scene", 1, 1),
+    "sensor on a shape": (xml(shape("disk", '<sensor type="irradiancemeter"/>')), "a sensor on a shape", 2, 1),
+    "shining group": (xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')), "do not shine", 2, 1),
+    "empty group": (
+        xml(GROUP.format('<shape type="obj"><string name="filename" value="no.obj"/></shape>')),
+        "an instance of nothing",
+        1,
+        1,
+    ),
+    "unknown property": (
+        xml(
+            shape("cube", '<float name="wobble" value="3"/><bsdf type="diffuse"><float name="jolt" value="3"/></bsdf>')
+        ),
+        "does not know 'wobble'",
+        2,
+        1,
+    ),
+    "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun stands still", 1, 1),
+    "bitmap of nothing": (
+        new('<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>'),
+        "its file is not named",
+        1,
+        1,
+    ),
+    "wrong parts": (
+        new(
+            '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="plastic"/></texture>'
+            "</bsdf>"
+        ),
+        "a bsdf means nothing here",
+        1,
+        1,
+    ),
+    "sky on a shape": (xml(shape("cube", SKY)), "a light of the kind constant on a shape", 2, 1),
+    "light of no shape": (xml('<emitter type="area"/>'), "on none: left out", 1, 1),
+    "no place": (xml(shape("cube", '<float name="to_world" value="2"/>')), "its to_world is no transform", 2, 1),
+    "material merged": (xml('<shape type="merge"><bsdf type="diffuse"/></shape>'), "merged shapes", 1, 1),
+    "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
+    "animation": (old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')), "held", 2, 1),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_said_and_rendered(tmp_path, case):
+    content, words, shapes, lights = CASES[case]
+    scene = own(tmp_path, content)
+    assert any(words in note for note in scene.notes), scene.notes
+    assert len(scene.scene.stock) == shapes and len(scene.scene.lights) == lights
+    assert not any("\n" in note or ".cpp" in note for note in scene.notes)
+    image = rendered(scene)
+    assert np.isfinite(image).all() and image.max() > 0
+
+
+@pytest.mark.parametrize("make", [xml, old_xml])
+def test_films_and_samplers_are_the_renderers_own(tmp_path, make):
+    film = '<film type="ldrfilm"><rfilter type="gaussian"/></film><sampler type="halton"/></sensor>'
+    assert own(tmp_path, make().replace("</sensor>", film)).notes == []
+
+
+def test_hair_is_no_shape_today(tmp_path):
+    (tmp_path / "h.hair").write_text("0 0 0\n1 1 1\n")
+    scene = own(tmp_path, old_xml(shape("hair", '<string name="filename" value="h.hair"/>')))
+    assert any("no shape 'hair'" in note for note in scene.notes) and len(scene.scene.stock) == 1
+
+
+def test_files_of_pictures(tmp_path):
+    """A texture, a bump map, a shining picture and a sky, each of a file."""
+    values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    mi.Bitmap(values).write(str(tmp_path / "sky.exr"))
+    mi.Bitmap(np.uint8(255 * values)).write(str(tmp_path / "tex.png"))
+    texture = named("texture", "bitmap", "tex.png", "{}")
+    parts = (
+        shape("cube", f'<bsdf type="bumpmap">{texture.format("t")}<bsdf type="plastic"/></bsdf>'),
+        f'<shape type="disk"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
+        f'<shape type="cube"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
+    )
+    ball = painted(f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>')
+    scene = own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
+    assert scene.notes == [] and len(scene.scene.stock) == 4
+    assert scene.scene.stock[1].bsdf["type"] == "bumpmap"
+    assert np.isfinite(rendered(scene)).all()
+
+
+def test_a_plain_scene_needs_no_words(tmp_path):
+    parts = (
+        '<integrator type="path"><integer name="max_depth" value="4"/></integrator>',
+        f'<bsdf type="twosided" id="b"><bsdf type="diffuse">{CHECKS.format("reflectance")}</bsdf></bsdf>',
+        '<shape type="disk"><ref id="b"/></shape>',
+        f'<shape type="cube"><emitter type="area">{CHECKS.format("radiance")}</emitter></shape>',
+        '<shape type="merge"><shape type="cube"/><shape type="disk"/></shape>',
+        GROUP.format('<shape type="sphere"/><shape type="cube"/>'),
+        '<emitter type="point"/>',
+    )
+    scene = own(tmp_path, xml(*parts))
+    assert scene.notes == [] and scene.scene.max_depth == 4
+    assert [shape.name for shape in scene.scene.stock] == ["ball", "disk", "cube", "cube-2", "disk-2", "instance"]
+
+
+def test_phong_is_as_sharp_as_its_plastic():
+    """The lobe of exponent n has half its height where cosⁿ is a half; Beckmann's where exp(-tan² / α²) is."""
+    for exponent in (30, 100, 1000):
+        made, _ = phong({"type": "phong", "exponent": exponent})
+        half = np.arccos(0.5 ** (1 / exponent))  # of the normal's angle, in a Phong distribution of normals
+        assert np.exp(-((np.tan(half) / made["alpha"]) ** 2)) == pytest.approx(0.5, abs=0.06)
+
+
+def test_mixtures_weigh_as_they_say():
+    colours = [{"type": "rgb", "value": colour} for colour in np.eye(3).tolist()]
+    parts = {str(i): {"type": "diffuse", "reflectance": colour} for i, colour in enumerate(colours)}
+    mixed, _ = mixture({"type": "mixturebsdf", "weights": "0.5, 0.3, 0.2", **parts})
+    bsdf = mi.load_dict(mixed)
+    si = mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f(0, 0, 1)
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))).ravel() * np.pi
+    np.testing.assert_allclose(value, [0.5, 0.3, 0.2], atol=1e-6)
+
+
+def test_black_bodies_shine_as_planck_says():
+    """The peak of 5000 K lies at Wien's 579.6 nm, and is 12.8 kW / (m² sr nm)."""
+    table = np.array(black_body({"type": "blackbody", "temperature": 5000.0})[0]["value"])
+    assert table[table[:, 1].argmax(), 0] == pytest.approx(579.6, abs=5)
+    assert table[:, 1].max() == pytest.approx(12.8e3, rel=0.01)
+
+
+def test_old_skies_have_their_zenith_at_y():
+    made, _ = sky_alone(turned_to_y({"type": "sky", "turbidity": 3.0, "sun_direction": [0.0, 1.0, 0.2]}))
+    made["to_world"] = mi.ScalarTransform4f(made["to_world"])
+    sky = mi.load_dict({"type": "scene", "sky": made}).emitters()[0]
+    si = mi.SurfaceInteraction3f()
+
+    def seen(*direction: float) -> float:
+        si.wi = -mi.Vector3f(*direction)
+        return float(np.array(sky.eval(si)).max())
+
+    assert seen(0, 0.9, 0.3) > 0 and seen(0.9, 0.1, 0) > 0 and seen(0, -0.9, 0.1) == 0

@@ -1,0 +1,124 @@
+"""Scene files of strangers: nothing outside of their folder is read, nothing endless is parsed."""
+
+import pytest
+
+from errors import BadInput
+from render.scene_file.xml import DEEPEST_INCLUDE, MOST_INCLUDES, linear, parse
+from tests.helpers.scene_files import old_xml, xml
+
+
+def kinds(state) -> list[str]:
+    return [node.props.plugin_name() for node in state.nodes]
+
+
+def refusal(folder, content: str | bytes, name: str = "scene.xml") -> str:
+    """The one line that refuses a file."""
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(BadInput) as error:
+        parse(folder / name)
+    text = str(error.value)
+    assert "\n" not in text and ".cpp" not in text and len(text) < 600
+    return text
+
+
+def included(name: str) -> str:
+    return xml(f'<include filename="{name}"/>')
+
+
+def test_what_is_damaged(tmp_path):
+    for path in (tmp_path / "gone.xml", tmp_path):
+        with pytest.raises(BadInput, match="cannot be read"):
+            parse(path)
+    assert "empty or damaged" in refusal(tmp_path, "")
+    assert "empty or damaged" in refusal(tmp_path, xml()[:-20])
+    assert "empty or damaged" in refusal(tmp_path, b"\x89PNG\r\n\x1a\n" + bytes(range(1, 256)))
+    assert "banana" in refusal(tmp_path, xml("<banana/>"))
+    assert "version" in refusal(tmp_path, "<scene/>")
+    assert "version" in refusal(tmp_path, xml().replace("3.0.0", "new"))
+    assert "$r" in refusal(tmp_path, xml('<shape type="sphere"><float name="radius" value="$r"/></shape>'))
+    assert 'id="gone"' in refusal(tmp_path, xml('<shape type="cube"><ref id="gone"/></shape>'))
+    assert "ball" in refusal(tmp_path, xml('<shape type="cube" id="ball"/>'))
+    assert "abc" in refusal(tmp_path, xml('<shape type="sphere"><float name="radius" value="abc"/></shape>'))
+    assert "cannot be read" in refusal(tmp_path, old_xml('<bsdf type="diffuse"><srgb name="x" value="red"/></bsdf>'))
+
+
+OUTSIDE = [
+    '<include filename="../other.xml"/>',
+    '<include filename="/etc/hostname"/>',
+    '<path value=".."/>',
+    '<path value="/"/>',
+    '<bsdf type="diffuse"><spectrum name="reflectance" filename="../x.spd"/></bsdf>',
+    '<bsdf type="diffuse"><spectrum name="reflectance" filename="/etc/passwd"/></bsdf>',
+    '<include filename="link.xml"/>',
+]
+
+
+@pytest.mark.parametrize("part", OUTSIDE)
+def test_nothing_outside_of_its_folder_is_read(tmp_path, part):
+    (tmp_path / "other.xml").write_text(xml())
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "link.xml").symlink_to(tmp_path / "other.xml")
+    text = refusal(folder, xml(part))
+    assert "leaves the scene's folder" in text and "root:" not in text
+
+
+def test_names_that_depend_on_parameters(tmp_path):
+    for tag in ('<include filename="$x"/>', '<path value="$x"/>'):
+        assert "depends on a parameter" in refusal(tmp_path, xml('<default name="x" value="/etc"/>', tag))
+
+
+def test_bombs(tmp_path):
+    for name, next_ in (("a", "b"), ("b", "a")):
+        (tmp_path / f"{name}.xml").write_text(included(f"{next_}.xml"))
+    assert str(DEEPEST_INCLUDE) in refusal(tmp_path, included("a.xml"))
+    (tmp_path / "wide.xml").write_text(xml(*['<include filename="leaf.xml"/>'] * 40))
+    (tmp_path / "leaf.xml").write_text(xml())
+    assert str(MOST_INCLUDES) in refusal(tmp_path, xml(*['<include filename="wide.xml"/>'] * 40))
+    laughs = "<!DOCTYPE s [<!ENTITY a 'ha'><!ENTITY b '&a;&a;&a;'>]>" + xml("&b;")
+    assert "entities" in refusal(tmp_path, laughs)
+    assert "UTF-8" in refusal(tmp_path, laughs.encode("utf-16"))
+    deep = '<bsdf type="mask">' * 100_000 + "</bsdf>" * 100_000
+    assert "within each other" in refusal(tmp_path, xml(deep))
+    assert "cannot be the name of a file" in refusal(tmp_path, included("x" * 5000))
+
+
+def test_includes_defaults_aliases_and_comments(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "part.xml").write_text('<scene version="3.0.0"><shape type="disk" id="included"/></scene>')
+    parts = (
+        '<include filename="sub/part.xml"/>',
+        "<!-- a comment -->",
+        '<default name="r" value="0.25"/><shape type="sphere"><float name="radius" value="$r"/></shape>',
+        '<bsdf type="plastic" id="a"/><alias id="a" as="b"/><shape type="cube"><ref id="b"/></shape>',
+    )
+    path = tmp_path / "scene.xml"
+    path.write_text(xml(*parts))
+    state, searched, notes = parse(path)
+    assert {"disk", "sphere", "cube", "plastic"} <= set(kinds(state))
+    assert 0.25 in [node.props.get("radius", None) for node in state.nodes]
+    assert searched == [tmp_path.resolve()] and notes == []
+
+
+def test_elements_of_old_files(tmp_path):
+    light = '<shape type="disk"><subsurface type="dipole"/><emitter type="area">{}</emitter></shape>'
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        old_xml(
+            light.format('<blackbody name="radiance" temperature="5000K"/>'),
+            '<shape type="cube"><subsurface type="dipole"><float name="scale" value="3"/></subsurface></shape>',
+            '<shape type="cube"><animation name="toWorld"><transform time="0"><translate x="7"/></transform>'
+            '<transform time="1"><translate x="8"/></transform></animation></shape>',
+            '<bsdf type="diffuse" id="d"><srgb name="reflectance" value="#ff8000"/></bsdf>',
+        )
+    )
+    state, _, notes = parse(path)
+    assert "blackbody" in kinds(state)
+    moved = [node.props["to_world"] for node in state.nodes if "to_world" in node.props]
+    assert any(transform.matrix[0, 3] == 7 for transform in moved)
+    assert len(notes) == 2 and "2 times subsurface" in notes[0] and "animation" in notes[1]
+
+
+def test_colours_of_old_files_become_linear():
+    assert [float(x) for x in linear("#ff8000").split(",")] == pytest.approx([1, 0.2158605, 0], abs=1e-6)
+    assert [float(x) for x in linear("0.5, 0 1").split(",")] == pytest.approx([0.2140411, 0, 1], abs=1e-6)
