@@ -21,6 +21,7 @@ class Augmentation:
     reverse: bool = False  # half of the sequences are played backward
     stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
     rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
+    exposure: bool = False  # every sequence is brighter or darker to the network, by 2^-1.5 to 2^1.5
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
 
 
@@ -94,6 +95,8 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         deal = rng.permutation(clip.realisations)
         turns = int(rng.integers(4)) if self.augmentation.rotate else 0
         gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.augmentation.gain else None
+        if self.augmentation.exposure:
+            gain = torch.full((1, 3, 1, 1), 2 ** float(rng.uniform(-1.5, 1.5)))
 
         frames = []
         for t, position in enumerate(playback):

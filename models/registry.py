@@ -15,6 +15,7 @@ from models.eaw import EAW
 from models.fastest import bfloat16_pays
 from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
+from models.one import One
 from models.rae import RAE
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
@@ -40,6 +41,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,
     "ntd-mean": NTDMean,
+    "one": One,
 }
 
 

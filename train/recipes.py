@@ -6,6 +6,7 @@ from typing import Any
 from datasets.sequences import Augmentation
 from errors import BadInput
 from train.losses.ntd import NTDTerms
+from train.losses.one import OneTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipe import Recipe
@@ -43,6 +44,20 @@ NTD_RECIPE = Recipe(
 )
 NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDTerms(occlusion=0.0))  # §6.3, experiments A and B
 
+# Ours: time enough to learn what to carry, and all exposures.
+ONE_RECIPE = Recipe(
+    loss=OneTerms(),
+    rate=2e-3,
+    batch=4,
+    crop=64,
+    length=8,
+    epochs=40,
+    anneal=True,
+    average=0.02,
+    clip=1.0,
+    augmentation=Augmentation(stop=True, rotate=True, exposure=True),
+)
+
 # Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.
 SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 
@@ -67,6 +82,12 @@ NTD_BUDGETS = {
     "paper": {},
 }
 
+ONE_BUDGETS: dict[str, dict[str, Any]] = {
+    "tiny": {"epochs": 15, "crop": 32, "length": 4},
+    "quick": {},
+    "release": {},
+}
+
 PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
     "rae": (RAE_RECIPE, RAE_BUDGETS),
     "wskp3": (WSKP_RECIPE, WSKP_BUDGETS),
@@ -77,6 +98,7 @@ PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
     "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd": (NTD_RECIPE, NTD_BUDGETS),
     "ntd-mean": (NTD_RECIPE, NTD_BUDGETS),
+    "one": (ONE_RECIPE, ONE_BUDGETS),
 }
 
 RECIPES: dict[tuple[str, str], Recipe] = {
