@@ -18,7 +18,7 @@ from render.clip import NO_OPTIONS, Options
 from render.scene_file.load import own_scene
 from scenes.description import Split, read_description
 
-GENERATOR = 6  # raise it when the same seed renders different bytes
+GENERATOR = 7  # raise it when the same seed renders different bytes
 
 # Without these a clip has no picture, no reference or no geometry that other channels could be derived from.
 ESSENTIAL_CHANNELS = {"direct", "indirect", *REFERENCES, "emission", "albedo", "depth", "mesh_id", *CAMERA_CHANNELS}
@@ -120,8 +120,8 @@ def rooms_profile(rooms: int, spp: int) -> DataProfile:
         boxes=dict.fromkeys(SPLITS, 0),
         rooms={"train": rooms, "val": 3, "test": 0},
         quality={
-            "train": SamplingQuality(realisations=4, reference_spp=spp),
-            "val": SamplingQuality(realisations=1, reference_spp=64),
+            "train": SamplingQuality(realisations=8, reference_spp=spp),
+            "val": SamplingQuality(realisations=8, reference_spp=64),
             "test": SamplingQuality(realisations=1, reference_spp=64),
         },
     )

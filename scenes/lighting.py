@@ -5,12 +5,12 @@ decided when all are known.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
 
-from scenes.animation import STILL, RigidMotion, Shape, Track, still
+from scenes.animation import STILL, KeyframedTrack, RigidMotion, Shape, Track, still
 from scenes.boxes import transformed_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
@@ -221,11 +221,21 @@ HIDDEN: tuple[Fixture, ...] = (cove, behind_opening, above_furniture, standing_l
 
 
 def brightness(layout: Layout) -> Track:
-    """A factor over time: 1 for most lamps; one in eight fades, some of these several times."""
+    """A factor over time: 1 for most lamps; one in eight fades, some of these several times; one in eight is switched."""
     rng = layout.rng
-    if rng.random() > 1 / 8:
-        return Track.constant(1.0)
-    return Track(rng.uniform(0.3, 1.0, int(rng.integers(2, 5))), 0, layout.last_frame)
+    kind = rng.random()
+    if kind < 1 / 8:
+        return Track(rng.uniform(0.3, 1.0, int(rng.integers(2, 5))), 0, layout.last_frame)
+    if kind < 1 / 4 and layout.frames > 1:
+        return switched(rng, layout.frames)
+    return Track.constant(1.0)
+
+
+def switched(rng: np.random.Generator, frames: int) -> Track:
+    """From one frame to the next, a lamp that is on goes nearly out, or comes on."""
+    before = int(rng.integers(frames - 1))
+    levels = rng.permutation([1.0, log_uniform(rng, 0.01, 0.2)])
+    return KeyframedTrack(levels, times=np.array([before, before + 1.0]), straight=True)
 
 
 def shine(layout: Layout, lamps: list[Lamp], flux: float) -> list[Shape]:
@@ -236,6 +246,5 @@ def shine(layout: Layout, lamps: list[Lamp], flux: float) -> list[Shape]:
     for number, (lamp, share) in enumerate(zip(lamps, shares / shares.sum(), strict=True)):
         strength = brightness(layout)
         radiance = light_colour(rng) * share * flux / (np.pi * lamp.mesh.area)
-        keys = np.outer(strength.keys, radiance)
-        shapes.append(lamp.shape(number, Track(keys, strength.first, strength.last)))
+        shapes.append(lamp.shape(number, replace(strength, keys=np.outer(strength.keys, radiance))))
     return shapes
