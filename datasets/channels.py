@@ -55,4 +55,5 @@ CHANNELS: dict[str, Channel] = {
 MOTION_CHANNELS = ("motion", "dual_motion")
 TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
+NOISY = ("direct", "indirect")
 REFERENCES = ("direct_reference", "indirect_reference")

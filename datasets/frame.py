@@ -14,6 +14,7 @@ from datasets.channels import (
     CAMERA_CHANNELS,
     CHANNELS,
     MOTION_CHANNELS,
+    NOISY,
     REFERENCES,
     TEMPORAL_CHANNELS,
 )
@@ -52,6 +53,15 @@ class Cameras:
             torch.from_numpy(view.camera_to_world)[None],
             torch.from_numpy(view.object_to_world)[None],
         )
+
+    def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
+        """The frame with the means of its noisy channels and those of `others`, further realisations of it."""
+        frames = [self, *others]
+        noisy = {
+            name: torch.stack([frame.channels[name] for frame in frames]).mean(dim=0)
+            for name in self.channels.keys() & set(NOISY)
+        }
+        return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Cameras":
         """The cameras with `function` of every matrix."""
@@ -99,7 +109,8 @@ class Frame:
     `direct_reference` and `indirect_reference` are (B, 2, 3, H, W). Using a channel that was not read raises BadInput.
     Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
     networks multiply their exposure by it, while radiance stays as rendered. `whole` belongs to training crops: what
-    models.running_scale measures in the whole frame, (B, 2); None where this is the whole frame.
+    models.running_scale measures in the whole frame, (B, 2); None where this is the whole frame. `spp` are the samples
+    a pixel of the noisy channels; None where that is not known.
     """
 
     channels: dict[str, Tensor]
@@ -108,6 +119,7 @@ class Frame:
     gain: Tensor  # (B, 3, 1, 1)
     source: str = ""  # names the clip in messages
     whole: Tensor | None = None
+    spp: Tensor | None = None  # (B, 1, 1, 1)
 
     def __getattr__(self, name: str) -> Tensor:
         if name not in CHANNELS:
@@ -144,6 +156,11 @@ class Frame:
         )
 
     @property
+    def samples(self) -> Tensor:
+        """Samples a pixel of the noisy channels, (B, 1, 1, 1); 1 where that is not known."""
+        return torch.ones_like(self.gain[:, :1]) if self.spp is None else self.spp
+
+    @property
     def divisor(self) -> Tensor:
         """What demodulation divides by: max(albedo, 0.01), (B, 3, H, W)."""
         return self.albedo.clamp(min=ALBEDO_FLOOR)
@@ -165,6 +182,15 @@ class Frame:
             for name in bad
         }
         return replace(self, channels=self.channels | mended) if bad else self
+
+    def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
+        """The frame with the means of its noisy channels and those of `others`, further realisations of it."""
+        frames = [self, *others]
+        noisy = {
+            name: torch.stack([frame.channels[name] for frame in frames]).mean(dim=0)
+            for name in self.channels.keys() & set(NOISY)
+        }
+        return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
         """The frame with `function` of every channel; cameras and gain stay."""
@@ -220,10 +246,9 @@ class Frame:
             return tensor.to(device)
 
         moved = self.map(move)
-        whole = None if self.whole is None else move(self.whole)
-        return replace(
-            moved, now=self.now.map(move), previous=self.previous.map(move), gain=move(self.gain), whole=whole
-        )
+        whole, spp = (None if tensor is None else move(tensor) for tensor in (self.whole, self.spp))
+        cameras = {"now": self.now.map(move), "previous": self.previous.map(move)}
+        return replace(moved, **cameras, gain=move(self.gain), whole=whole, spp=spp)
 
     @staticmethod
     def stack(frames: Sequence["Frame"]) -> "Frame":
@@ -236,6 +261,7 @@ class Frame:
             gain=torch.cat([frame.gain for frame in frames]),
             source=frames[0].source,
             whole=torch.cat(wholes) if wholes else None,
+            spp=torch.cat([frame.samples for frame in frames]),
         )
 
 
@@ -273,6 +299,7 @@ def read_frame(
         previous=Cameras.of(clip.view(previous), window),
         gain=torch.ones(1, 3, 1, 1),
         source=str(clip.path),
+        spp=torch.full((1, 1, 1, 1), float(clip.facts["noisy_spp"])),
     )
 
 

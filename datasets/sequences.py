@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
-from datasets.channels import REFERENCES
+from datasets.channels import NOISY, REFERENCES
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
 from errors import BadInput
@@ -22,6 +22,7 @@ class Augmentation:
     stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
     rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
     exposure: bool = False  # every sequence is brighter or darker to the network, by 2^-1.5 to 2^1.5
+    samples: bool = False  # half of the sequences are means of 2, 4, 8, ... realisations
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
 
 
@@ -98,11 +99,17 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         if self.augmentation.exposure:
             gain = torch.full((1, 3, 1, 1), 2 ** float(rng.uniform(-1.5, 1.5)))
 
+        stopped = len(set(playback)) < self.length
+        together = self._realisations_together(len(deal), rng) if self.augmentation.samples and not stopped else 1
+
         frames = []
         for t, position in enumerate(playback):
-            realisation = int(deal[t % len(deal)])
+            chosen = [int(deal[(together * t + i) % len(deal)]) for i in range(together)]
+            realisation = chosen[0]
             previous = playback[max(t - 1, 0)]
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
+            if together > 1:
+                frame = frame.with_more_samples([read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]])
             for _ in range(turns):
                 frame = frame.rot90()
             if gain is not None:
@@ -111,6 +118,12 @@ class TrainingSequences(TorchDataset[list[Frame]]):
                 frame = replace(frame, whole=self.measure(clip, position, realisation))
             frames.append(frame)
         return frames
+
+    @staticmethod
+    def _realisations_together(count: int, rng: np.random.Generator) -> int:
+        """1 in half of the cases, else 2, 4, 8, ... of `count`."""
+        most = int(np.log2(count))
+        return 1 if rng.random() < 0.5 else 2 ** int(rng.integers(1, max(most, 1) + 1))
 
     def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:
         """Frame numbers in the order in which they are played."""

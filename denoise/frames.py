@@ -304,4 +304,5 @@ class OwnShot:
             previous=Cameras.of(before),
             gain=torch.ones(1, 3, 1, 1),
             source=str(image.path),
+            spp=torch.full((1, 1, 1, 1), float(facts["noisy_spp"])),
         )

@@ -1,11 +1,14 @@
 """Where this frame's surfaces were in the previous frame, and what its images held there (SVGF §4.1)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import reprojection as kernels
+from models.compiled.jit import match_threads
 from models.parameters import NORMAL_TOLERANCE, PLANE_TOLERANCE
 from models.surfaces import BACKGROUND_ID, Surfaces, rays, to_previous_camera
 
@@ -96,12 +99,31 @@ class Reprojection:
         return (history * found).view(-1, self.height, self.width), found.view(1, self.height, self.width)
 
 
-@compiled.by(kernels.reproject)
+class CompiledReprojection(torch.autograd.Function):
+    """Both directions by kernels for the processor."""
+
+    @staticmethod
+    def forward(ctx: Any, history: Tensor, frame: Frame, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
+        fetched, found = kernels.reproject(frame, history, surfaces)
+        ctx.frame = frame
+        ctx.surfaces = surfaces
+        ctx.mark_non_differentiable(found)
+        return fetched, found
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return kernels.reproject_back(gradients[0], ctx.frame, ctx.surfaces), None, None
+
+
 def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
     """The previous frame's `history` (B, C, H, W) where this frame's surfaces find it, and where (B, 1, H, W).
 
     `surfaces` is the previous frame's G-buffer. The frame must have depth, normal, mesh_id and motion. The history is 0
     where none is found.
     """
+    if history.device.type == "cpu" and history.dtype == torch.float32 and compiled.enabled:
+        match_threads()
+        result: tuple[Tensor, Tensor] = CompiledReprojection.apply(history, frame, surfaces)
+        return result
     fetched = [Reprojection(frame, history, surfaces, item).fetch() for item in range(len(history))]
     return torch.stack([value for value, _ in fetched]), torch.stack([found for _, found in fetched])

@@ -55,7 +55,7 @@ ONE_RECIPE = Recipe(
     anneal=True,
     average=0.02,
     clip=1.0,
-    augmentation=Augmentation(stop=True, rotate=True, exposure=True),
+    augmentation=Augmentation(stop=True, rotate=True, exposure=True, samples=True),
 )
 
 # Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.

@@ -450,3 +450,62 @@ def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor
         past = Past.of(frame, surfaces, item)
         fetch_image(fetched[item].numpy(), found[item, 0].numpy(), array(history[item]), *past)
     return fetched, found
+
+
+# --- The gradient of the history --------------------------------------------------------------------------------------
+
+
+@jit_with_reciprocals
+def add_product(total: Any, weight: Any, line: Any) -> None:
+    for i in range(total.size):
+        total[i] += weight[i] * line[i]
+
+
+@jit_with_reciprocals
+def give_back(plane: Any, line: Any, y: Any, search: Search) -> None:
+    """Add to `plane` (H, W) what `fetch` has taken from it, line (W): its transpose."""
+    height, width = plane.shape
+    for run in range(search.counts[0]):
+        first = np.int64(search.runs[run, 0])
+        last = np.int64(search.runs[run, 1])
+        low = np.int64(search.runs[run, 2])
+        high = np.int64(search.runs[run, 3])
+        for tap in range(4):
+            left = np.int64(search.shift[0, first]) + (tap & 1)
+            weight = search.weight[tap]
+            to = plane[min(max(y + np.int64(search.shift[1, first]) + (tap >> 1), 0), height - 1)]
+            if high > low:
+                add_product(to[low + left : high + left], weight[low:high], line[low:high])
+            for begin, end in ((first, low), (high, last)):
+                for x in range(begin, end):
+                    to[min(max(x + left, 0), width - 1)] += weight[x] * line[x]
+    for box in range(search.counts[1]):
+        column = np.int64(search.boxes[box, 1])
+        row = np.int64(search.boxes[box, 2])
+        bits = search.boxes[box, 3]
+        count = 0
+        for tap in range(9):
+            count += bits >> tap & 1
+        share = line[search.boxes[box, 0]] / np.float32(count)
+        for tap in range(9):
+            if bits >> tap & 1:
+                plane[row + tap // 3 - 1, column + tap % 3 - 1] += share
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def give_back_image(given: Any, gradient: Any, motion: Any, now: Buffers, then: Buffers, views: Views) -> None:
+    """given (C, H, W) from the gradient (C, H, W) of what was fetched. Rows meet where they come from: one by one."""
+    width = gradient.shape[2]
+    search = new_search(width)
+    for y in range(gradient.shape[1]):
+        find_row(search, y, Past(motion, now, then, views))
+        for c in range(gradient.shape[0]):
+            give_back(given[c], gradient[c, y], y, search)
+
+
+def reproject_back(gradient: Tensor, frame: Frame, surfaces: Surfaces) -> Tensor:
+    """The gradient of the history from that of what was fetched of it, both (B, C, H, W)."""
+    given = torch.zeros_like(gradient, memory_format=torch.contiguous_format)
+    for item in range(len(gradient)):
+        give_back_image(given[item].numpy(), array(gradient[item]), *Past.of(frame, surfaces, item))
+    return given

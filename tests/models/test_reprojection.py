@@ -139,3 +139,19 @@ def test_compiled_reprojection_equals_pytorch_s(tiny):
         assert (found != expected).float().mean() < 1e-3
         close = torch.isclose(fast, slow, rtol=1e-3, atol=1e-3).all(dim=1)
         assert close.float().mean() > 0.999
+
+
+def test_the_gradient_is_the_transpose(tiny):
+    """What is fetched is linear in the history: products with it on either side agree."""
+    clip = Dataset(tiny).clips("test")[1]
+    names = ("normal", "depth", "mesh_id", "motion")
+    generator = torch.Generator().manual_seed(0)
+    for index, previous in ((1, 0), (4, 3), (7, 0)):
+        frame = read_frame(clip, index, names, previous=previous)
+        then = Surfaces.of(read_frame(clip, previous, names))
+        history = torch.randn(1, 2, 64, 64, generator=generator, requires_grad=True)
+        other = torch.randn(1, 2, 64, 64, generator=generator)
+        weight = torch.randn(1, 2, 64, 64, generator=generator)
+        (gradient,) = torch.autograd.grad(reproject(frame, history, then)[0], history, weight)
+        fetched, _ = reproject(frame, other, then)
+        torch.testing.assert_close((fetched * weight).double().sum(), (other * gradient).double().sum())

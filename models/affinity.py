@@ -1,0 +1,59 @@
+"""A filter whose weights compare learned features of pixels: one level of an à-trous transform (Işık et al. 2021)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from models import compiled
+from models.compiled import affinity as kernels
+from models.neighbours import shifted
+
+LEAST_EXPONENT = -40.0  # of a weight; what is below counts as that much
+
+
+def plain_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """See affinity_level: the way that PyTorch takes."""
+    count = features.shape[1]
+    taps = shifted(torch.cat([features, importance, surface, image], dim=1), step)
+    distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
+    exponent = (taps[:, count] - sharpness * distance).clamp(min=LEAST_EXPONENT)
+    weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
+    total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
+    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=1e-30), 0)
+
+
+class AffinityLevel(torch.autograd.Function):
+    """Both directions by kernels for the processor."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Any) -> Tensor:
+        *images, step = tensors
+        out, total = kernels.filter_level(*images, step)
+        ctx.step = step
+        ctx.save_for_backward(*images, out, total)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        return *kernels.pull_level(gradients[0], *ctx.saved_tensors, ctx.step), None, None
+
+
+def affinity_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """A convex mean over 3 x 3 taps `step` pixels apart (Işık et al. 2021, Eq. 4, with two weights more).
+
+    The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p). Only
+    pixels that show a surface count; the others become 0.
+
+    image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
+    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
+    """
+    tensors = (image, features, sharpness, own, importance, surface)
+    if image.device.type == "cpu" and image.dtype == torch.float32 and compiled.enabled:
+        out: Tensor = AffinityLevel.apply(*tensors, step)
+        return out
+    return plain_level(*tensors, step)
