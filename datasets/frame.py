@@ -224,11 +224,15 @@ class Frame:
             reflected = torch.where(surface > 0, reflected, 0)
         return reflected + self.emission if signal == "total" else reflected
 
+    @property
+    def to_view(self) -> Tensor:
+        """From world space to view space, (B, 3, 3): x right, y up, z toward the viewer."""
+        flip = torch.tensor([-1.0, 1.0, -1.0])  # Mitsuba's camera looks along +z with x to the left
+        return flip.to(self.normal)[:, None] * self.now.camera_to_world[:, :3, :3].mT.to(self.normal)
+
     def view_normal(self) -> Tensor:
-        """Shading normals (B, 3, H, W) in view space: x right, y up, z toward the viewer."""
-        rotation = self.now.camera_to_world[:, :3, :3].to(self.normal)
-        flip = torch.tensor([-1.0, 1.0, -1.0]).to(self.normal)  # Mitsuba's camera looks along +z with x to the left
-        return torch.einsum("bij,bihw,j->bjhw", rotation, self.normal, flip)
+        """Shading normals (B, 3, H, W) in view space."""
+        return torch.einsum("bji,bihw->bjhw", self.to_view, self.normal)
 
     def rot90(self) -> "Frame":
         """The frame turned by 90° counter-clockwise: images, motion vectors and cameras alike."""

@@ -8,10 +8,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
+from models import compiled
 from models.affinity import affinity_level
+from models.compiled import one as kernels
 from models.denoiser import Denoiser, State, matching_state
 from models.neighbours import mesh_sums
 from models.operators import image_luminance, pad_to_multiple
+from models.parameters import BRIGHTEST
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
@@ -21,7 +24,6 @@ FEATURES = 8  # that pixels are compared by
 STEPS = (1, 2, 4, 8, 16, 32)  # px between the taps of the filter's levels
 LARGEST_LOGIT = 10.0  # of the weights of taps
 MULTIPLE = 8  # of the sides of an image that the network takes
-LARGEST_LOG = 30.0  # of compressed irradiance: what is brighter looks alike to the network
 
 
 def conv(inputs: int, outputs: int) -> nn.Sequential:
@@ -95,6 +97,28 @@ class Evidence:
     found: Tensor
 
 
+@compiled.by(kernels.network_inputs)
+def network_inputs(
+    frame: Frame,
+    scale: RunningScale,
+    images: Tensor,
+    deviation: Tensor,
+    length: Tensor,
+    found: Tensor,
+    latent: Tensor,
+) -> Tensor:
+    """What the network sees, (B, ·, H, W): logarithms of exposed irradiance, numbers of the history, surfaces.
+
+    `images` (B, I, 3, H, W) of irradiance; the others as in Evidence.
+    """
+    exposed = images.clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
+    colours = torch.log1p(exposed.clamp(max=BRIGHTEST)).flatten(1, 2)
+    newest = (1 / frame.samples).expand_as(length)
+    numbers = (torch.log1p(deviation), newest, 1 / (length + frame.samples), found)
+    surfaces = (frame.albedo, frame.view_normal(), scale.normalised_depth(frame.depth), frame.roughness)
+    return torch.cat([colours, *numbers, latent, *surfaces], dim=1)
+
+
 class One(Denoiser):
     """Recurrent kernel prediction. Where no surface vouches for history, there is none: the weight of the frame is 1."""
 
@@ -120,10 +144,6 @@ class One(Denoiser):
         self.split = (FEATURES, levels, levels, levels, 2, LATENT)
         self.trunk = Trunk(inputs, sum(self.split), self.widths)
 
-    def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
-        """Irradiance (B, 3, H, W) into the range of logarithms: log(1 + gain · exposure · irradiance)."""
-        return torch.log1p((irradiance.clamp(min=0) * (scale.exposure() * frame.gain))).clamp(max=LARGEST_LOG)
-
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
         surface = (frame.depth > 0).to(noisy)
         luminance = image_luminance(noisy)
@@ -147,14 +167,6 @@ class One(Denoiser):
             latent = past[:, 7:] * found
         return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
 
-    def network_inputs(self, frame: Frame, known: Evidence, scale: RunningScale) -> Tensor:
-        images = (known.noisy, known.near, known.around, known.output, known.accumulated)
-        newest = (1 / frame.samples).expand_as(known.length)
-        numbers = (torch.log1p(known.deviation), newest, 1 / (known.length + frame.samples), known.found)
-        surfaces = (frame.albedo, frame.view_normal(), scale.normalised_depth(frame.depth), frame.roughness)
-        compressed = [self.compress(image, scale, frame) for image in images]
-        return torch.cat([*compressed, *numbers, known.latent, *surfaces], dim=1)
-
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
@@ -163,7 +175,9 @@ class One(Denoiser):
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         known = self.evidence(frame, noisy, before)
         height, width = frame.size
-        x = pad_to_multiple(self.network_inputs(frame, known, scale), MULTIPLE)
+        images = torch.stack([known.noisy, known.near, known.around, known.output, known.accumulated], dim=1)
+        seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)
+        x = pad_to_multiple(seen, MULTIPLE)
         said = self.trunk(x.to(self.precision, memory_format=torch.channels_last))
         said = said[..., :height, :width].to(noisy, memory_format=torch.contiguous_format)
         features, sharpness, own, importance, alphas, latent = said.split(self.split, dim=1)

@@ -30,3 +30,7 @@ SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither ov
 LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35
 OUTSIDE = -1e30  # logit of a tap outside the image, or without a surface
 LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0
+
+# --- one --------------------------------------------------------------------------------------------------------------
+
+BRIGHTEST = 1e13  # exposed irradiance that `one` tells apart; what is brighter looks alike to the network

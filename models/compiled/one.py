@@ -1,0 +1,148 @@
+"""What `one` does around its network, for the processor: its inputs and what it says, each in one pass over memory.
+
+Networks take and give pixels with their channels side by side; all other loops here run along lines of one channel.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from datasets.frame import Frame
+from models import parameters
+from models.compiled.exponential import log
+from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.running_scale import RunningScale
+
+ONE = np.float32(1)
+ZERO = np.float32(0)
+BRIGHTEST = np.float32(parameters.BRIGHTEST)
+LONE_INPUTS = 12  # besides images and latent channels
+BLOCK_ROWS = 8  # that share one piece of scratch memory
+
+
+@jit_in_any_order
+def compress(line: Any, image: Any, gain: Any) -> None:
+    for x in range(line.size):
+        line[x] = log(ONE + min(max(image[x], ZERO) * gain, BRIGHTEST))
+
+
+@jit_in_any_order
+def log_of_one_more(line: Any, image: Any) -> None:
+    for x in range(line.size):
+        line[x] = log(ONE + image[x])
+
+
+@jit_in_any_order
+def one_over(line: Any, length: Any, samples: Any) -> None:
+    for x in range(line.size):
+        line[x] = ONE / (length[x] + samples)
+
+
+@jit_in_any_order
+def copy(line: Any, image: Any) -> None:
+    for x in range(line.size):
+        line[x] = image[x]
+
+
+@jit_in_any_order
+def turn(line: Any, nx: Any, ny: Any, nz: Any, axis: Any) -> None:
+    ax, ay, az = axis[0], axis[1], axis[2]
+    for x in range(line.size):
+        line[x] = ax * nx[x] + ay * ny[x] + az * nz[x]
+
+
+@jit_in_any_order
+def scale_depth(line: Any, depth: Any, scale: Any) -> None:
+    for x in range(line.size):
+        line[x] = depth[x] / (depth[x] + scale) if depth[x] > ZERO else ONE
+
+
+@jit_in_any_order
+def interleave(out: Any, lines: Any) -> None:
+    """out (n, C) = lines (C, n), transposed."""
+    for x in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            out[x, c] = lines[c, x]
+
+
+@jit_parallel
+def write_inputs(
+    out: Any,
+    images: Any,
+    gain: Any,
+    deviation: Any,
+    length: Any,
+    samples: Any,
+    found: Any,
+    latent: Any,
+    albedo: Any,
+    normal: Any,
+    to_view: Any,
+    depth: Any,
+    depth_scale: Any,
+    roughness: Any,
+) -> None:
+    """out (H, W, C) from images (I, 3, H, W) and others (c, H, W) or (H, W)."""
+    height, width = depth.shape
+    for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
+        lines = np.empty((out.shape[2], width), np.float32)
+        start = np.int64(block) * BLOCK_ROWS
+        for y in range(start, min(start + BLOCK_ROWS, height)):
+            k = 0
+            for image in range(images.shape[0]):
+                for c in range(3):
+                    compress(lines[k], images[image, c, y], gain[c])
+                    k += 1
+            log_of_one_more(lines[k], deviation[y])
+            lines[k + 1] = ONE / samples
+            one_over(lines[k + 2], length[y], samples)
+            copy(lines[k + 3], found[y])
+            k += 4
+            for channel in range(latent.shape[0]):
+                copy(lines[k], latent[channel, y])
+                k += 1
+            for c in range(3):
+                copy(lines[k + c], albedo[c, y])
+                turn(lines[k + 3 + c], normal[0, y], normal[1, y], normal[2, y], to_view[c])
+            scale_depth(lines[k + 6], depth[y], depth_scale)
+            copy(lines[k + 7], roughness[y])
+            interleave(out[y], lines)
+
+
+def network_inputs(
+    frame: Frame,
+    scale: RunningScale,
+    images: Tensor,
+    deviation: Tensor,
+    length: Tensor,
+    found: Tensor,
+    latent: Tensor,
+) -> Tensor:
+    """See models.one.network_inputs; channels come last in memory."""
+    batch = len(images)
+    channels = 3 * images.shape[1] + LONE_INPUTS + latent.shape[1]
+    out = torch.empty(batch, *frame.size, channels)
+    gains = array((scale.exposure() * frame.gain).flatten(1))
+    depth_scales = array(scale.log_depth.value.exp())
+    to_view = array(frame.to_view)
+    for item in range(batch):
+        write_inputs(
+            out[item].numpy(),
+            array(images[item]),
+            gains[item],
+            array(deviation[item, 0]),
+            array(length[item, 0]),
+            np.float32(frame.samples[item].item()),
+            array(found[item, 0]),
+            array(latent[item]),
+            array(frame.albedo[item]),
+            array(frame.normal[item]),
+            to_view[item],
+            array(frame.depth[item, 0]),
+            depth_scales[item],
+            array(frame.roughness[item, 0]),
+        )
+    return out.permute(0, 3, 1, 2)
