@@ -49,7 +49,7 @@ class Trunk(nn.Module):
         self.up_a = nn.ConvTranspose2d(b, a, 2, stride=2)
         self.join_a = conv(a, a)
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
-        self.detail = nn.Conv2d(inputs, outputs, 1, bias=False)
+        self.detail = nn.Linear(inputs, outputs, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
@@ -58,7 +58,7 @@ class Trunk(nn.Module):
         c = self.down_c(b)
         b = self.join_b(b + self.up_b(c))
         a = self.join_a(a + self.up_a(b))
-        return self.leave(a) + self.detail(x)
+        return self.leave(a) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
 
 
 @dataclass(frozen=True)
