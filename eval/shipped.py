@@ -22,15 +22,7 @@ LICENCE = "Apache-2.0"  # that of onespp
 COMPARED = ("noisy", "accumulated", "svgf", "oidn")  # whom cards show beside the network
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
-TOLD_APART = (
-    "profile",
-    "seed",
-    "data",
-    "parameters",
-    "step",
-    "validation",
-    "from",
-)  # of the facts in metadata, beside the recipe itself
+TOLD_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # by cards, from the recipe
 
 FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
 - Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
