@@ -4,7 +4,6 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -105,7 +104,7 @@ def train(
     seed: int = 0,
     precision: Literal["float32", "bfloat16"] | None = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
-    from_: Annotated[Path | None, arg(name="from", metavar="WEIGHTS")] = None,
+    from_: Annotated[str | None, arg(name="from", metavar="weights|FILE")] = None,
     specialise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
     """Train wskp6, in other budgets than quick rae and ntd-mean too, or the networks named; or go on with that.
@@ -116,17 +115,18 @@ def train(
     Args:
         precision: by default the fastest on this machine.
         micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
-        from_: weights of the same network to begin with, to fit them to the scenes of this data set; what comes out
-            takes another --runs.
+        from_: weights of the same network to begin with, "weights" for the shipped ones, to fit them to the scenes of
+            this data set; what comes out takes another --runs.
         specialise: leave out of the network's inputs what does not vary in this data set, such as a white albedo.
     """
     from train.loop import train_network
     from train.recipes import trained_by_default
-    from train.registry import task_for
+    from train.registry import start_file, task_for
 
     folder = data_folder(data, budget)
     for name in names or trained_by_default(budget):
-        train_network(task_for(name, folder, runs, budget, seed, precision, micro_batch, from_, specialise))
+        start = start_file(name, from_)
+        train_network(task_for(name, folder, runs, budget, seed, precision, micro_batch, start, specialise))
 
 
 def evaluate(
@@ -138,7 +138,8 @@ def evaluate(
 ) -> None:
     """Judge all denoisers that can run, or those named, on the test clips: table, pictures, results.json.
 
-    What has been judged before, of the same clips, weights and code, is kept.
+    Networks have the weights that are shipped (`onespp weights`), and beside them, as NETWORK@BUDGET, those trained in
+    this budget; or else those alone. What has been judged before, of the same clips, weights and code, is kept.
     """
     from eval.harness import evaluate as evaluate_on
 
@@ -242,12 +243,11 @@ def figure_unbiased(out: Png = Path("runs/unbiased.png")) -> None:
 
 
 def export(
-    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")],
+    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6; trained here: wskp6@BUDGET")],
     to: Literal["onnx", "pt2"] = "onnx",
     out: Annotated[Path | None, arg(metavar="DIR", help="by default RUNS/export/DENOISER-TO")] = None,
     runs: Runs = Path("runs"),
-    budget: Budget = "quick",
-    weights: Annotated[Path | None, arg(metavar="FILE", help="by default those trained in this budget")] = None,
+    weights: Annotated[Path | None, arg(metavar="FILE", help="by default those shipped")] = None,
     precision: Annotated[Literal["float32", "float16"], arg(help="of the network")] = "float32",
     warp: Annotated[
         Literal["inside", "outside"], arg(help="whether the file moves its history along with the surfaces itself")
@@ -256,7 +256,7 @@ def export(
     """Write a trained denoiser as one file for engines, with a manifest, golden frames and a page on how to call it."""
     from eval.export import export as write
 
-    print(write(name, to, runs, budget, weights, precision, warp, out))
+    print(write(name, to, runs, weights, precision, warp, out))
 
 
 def bench_export(
@@ -354,7 +354,8 @@ def stress(
 ) -> None:
     """Put all denoisers that can run, or those named, to the extremes: tables, results.json, a picture.
 
-    Networks have the weights trained in this budget, or else fresh ones. Exits with 1 if a requirement is broken.
+    Networks have their shipped weights, or else those trained in this budget, or else fresh ones. Exits with 1 if a
+    requirement is broken.
     """
     from eval.stress.run import stress as put_to_the_extremes
 
@@ -415,11 +416,10 @@ def denoise(
     frames: Annotated[
         Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, often with all layers")
     ] = (),
-    denoiser: Annotated[str, arg(metavar="DENOISER")] = "wskp6",
+    denoiser: Annotated[str, arg(metavar="DENOISER", help="of networks trained here NETWORK@BUDGET")] = "wskp6",
     out: Annotated[Path, arg(metavar="DIR", help="where denoised frames go, under their own names")] = Path("denoised"),
-    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default RUNS/train/...")] = None,
+    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default those shipped")] = None,
     runs: Runs = Path("runs"),
-    budget: Budget = "quick",
     hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="the same as the colour's files")] = (),
     alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in files of its own")] = (),
     nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in files of their own")] = (),
@@ -448,20 +448,38 @@ def denoise(
     from denoise.run import Job
     from denoise.run import denoise as denoise_sequence
     from eval.bench.sizes import threads_or_all
-    from eval.selection import choose, untrained, weights_file
+    from eval.selection import weights_of
     from timing import thread_count
 
     colour = (*frames, *hdr)
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
-    if weights is None:
-        choose([denoiser], (), partial(untrained, runs, budget))
-        weights = weights_file(denoiser, runs, budget)
+    weights = weights or weights_of(denoiser, runs)
     passes = {"colour": colour, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)
     with thread_count(threads_or_all(threads)):
         denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png))
+
+
+def weights(
+    name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="whose card to show")] = None,
+    card: Annotated[Path | None, arg(metavar="RUNS")] = None,
+) -> None:
+    """List the networks whose trained weights are shipped, which is all that they need; or show the card of one.
+
+    Args:
+        card: write the facts of its card anew, or of all cards: those of its weights, and what `onespp eval` has left
+            in RUNS.
+    """
+    from eval.shipped import card_file, table, write_card
+    from models.shipped_weights import shipped_names
+
+    if card:
+        for each in [name] if name else shipped_names():
+            print(write_card(each, card))
+    else:
+        print(card_file(name).read_text().strip() if name else table())
 
 
 Command = Callable[..., None]
@@ -482,6 +500,7 @@ GROUPS: dict[str, Commands] = {
     },
     "Your own frames": {
         "denoise": denoise,
+        "weights": weights,
     },
     "A closer look": {
         "show": show,

@@ -23,14 +23,16 @@ __all__ = ["camera", "denoise", "frames", "load", "open_dataset", "read_frames"]
 
 
 def load(name: str, weights: str | Path | None = None, precision: torch.dtype | None = None) -> Denoiser:
-    """A denoiser ready to use, by any name that `onespp eval` takes: svgf, wskp6+adaptive, oidn+taa, ...
+    """A denoiser ready to use, by its name: svgf, wskp6+adaptive, oidn+taa, ...
 
-    Networks need the file of their `weights`. `precision` is by default the fastest on this machine. Raises
-    errors.BadInput where the name is unknown, or the file missing, damaged or another network's.
+    The file of a network's `weights` is by default the one that is shipped (`onespp weights` lists them). `precision`
+    is by default the fastest on this machine. Raises errors.BadInput where the name is unknown, the file missing,
+    damaged or another network's, and for a network that has neither.
     """
     from models.registry import load as load_denoiser
+    from models.shipped_weights import shipped_weights
 
-    return load_denoiser(name, Path(weights) if weights else None, precision)
+    return load_denoiser(name, Path(weights) if weights else shipped_weights(name), precision)
 
 
 def open_dataset(path: str | Path) -> Dataset:

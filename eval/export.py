@@ -1,10 +1,10 @@
 """`onespp export`: a trained denoiser as one file, with golden frames of a synthetic sequence."""
 
-from functools import partial
 from pathlib import Path
 
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.selection import choose, untrained, weights_file
+from eval.selection import weights_of
+from eval.spec import split_name
 from models.export.package import Export, write_export
 from models.export.program import Format, check_installed
 from models.export.registry import check_exportable
@@ -18,7 +18,6 @@ def export(
     name: str,
     to: Format,
     runs: Path,
-    budget: str,
     weights: Path | None = None,
     precision: str = "float32",
     warp: Warp = "inside",
@@ -26,18 +25,17 @@ def export(
 ) -> str:
     """Write the export to `out`, by default RUNS/export/NAME-TO. Returns what was written, in words.
 
-    `weights` are by default those trained in the budget. Raises BadInput where the denoiser cannot be exported or has
-    no weights, and where packages are missing.
+    `weights` are by default those shipped, or of NAME@BUDGET those in RUNS. Raises BadInput where the denoiser cannot
+    be exported or has no weights, and where packages are missing.
     """
-    check_exportable(name)
+    denoiser, _ = split_name(name)
+    check_exportable(denoiser)
     check_installed(to)
-    if weights is None:
-        choose([name], [], partial(untrained, runs, budget))
-        weights = weights_file(name, runs, budget)
-        assert weights is not None
+    weights = weights or weights_of(name, runs)
+    assert weights is not None
     folder = out or runs / "export" / f"{name}-{to}"
     frames = [synthetic_frame(index, *GOLDEN_SIZE) for index in range(GOLDEN_FRAMES)]
-    written = write_export(Export(name, weights, to, precision, warp), frames, folder)
+    written = write_export(Export(denoiser, weights, to, precision, warp), frames, folder)
     difference = written["largest_difference"]["from_onespp"]
     return (
         f"{folder / written['file']}: {written['operators']['total']} operators; differs from onespp by at most "

@@ -1,18 +1,21 @@
 """Who can run, and why not: the one way in which commands choose denoisers."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from errors import BadInput
 from eval.extra_denoisers import WINDOW_SETS, windows_label
-from eval.spec import DenoiserSpec, class_of, precision_in_use
+from eval.spec import DenoiserSpec, class_of, precision_in_use, split_name, with_budget
 from models.registry import ADAPTIVE, DENOISERS, plain_name
+from models.shipped_weights import shipped_weights
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 
 BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
+
+USUAL_BUDGET = "quick"  # of commands that do not ask for one
 
 WORTH_ADAPTING = ("oidn-accumulated", "wskp6")  # these are judged with adaptive accumulation as well
 
@@ -45,12 +48,17 @@ def cannot_run(name: str) -> str | None:
 
 
 def weights_file(name: str, runs: Path, budget: str) -> Path | None:
-    """Where the weights of a network belong; None for a denoiser without."""
+    """Where the weights of a network are, or belong; None for a denoiser without.
+
+    Those of NAME@BUDGET are in RUNS; those of a name alone are shipped, or else in RUNS those of `budget`.
+    """
     if not class_of(name).is_network:
         return None
     if name in WINDOW_SETS:
         return runs / "ablation" / "wskp-windows" / f"{windows_label(WINDOW_SETS[name])}-0" / WEIGHTS_FILE
-    return run_folder(runs, plain_name(name), budget) / WEIGHTS_FILE
+    denoiser, named = split_name(name)
+    shipped = None if named else shipped_weights(denoiser)
+    return shipped or run_folder(runs, plain_name(denoiser), named or budget) / WEIGHTS_FILE
 
 
 def untrained(runs: Path, budget: str, name: str) -> str | None:
@@ -58,19 +66,35 @@ def untrained(runs: Path, budget: str, name: str) -> str | None:
     path = weights_file(name, runs, budget)
     if path is None or path.exists():
         return None
-    training = "ablate wskp-windows" if name in WINDOW_SETS else f"train {plain_name(name)}"
-    trainable = name in WINDOW_SETS or plain_name(name) in TRAINABLE
-    remedy = f": train them with `onespp {training} --budget {budget} --runs {runs}`" if trainable else ""
+    denoiser, named = split_name(name)
+    network = plain_name(denoiser)
+    training = "ablate wskp-windows" if name in WINDOW_SETS else f"train {network}"
+    trainable = name in WINDOW_SETS or network in TRAINABLE
+    remedy = f": train them with `onespp {training} --budget {named or budget} --runs {runs}`" if trainable else ""
     return f"it has no weights at {path}{remedy}"
 
 
+def weights_of(name: str, runs: Path) -> Path | None:
+    """The weights of a denoiser that is named; None for one without. Raises BadInput where it has none yet."""
+    choose([name], (), partial(untrained, runs, USUAL_BUDGET))
+    return weights_file(name, runs, USUAL_BUDGET)
+
+
+def everyone(runs: Path, budget: str) -> Iterator[str]:
+    """All denoisers, some with adaptive accumulation as well; beside shipped weights those that RUNS holds."""
+    for name in (*DENOISERS, *(name + ADAPTIVE for name in WORTH_ADAPTING if name in DENOISERS)):
+        yield name
+        trained = with_budget(name, budget)
+        if shipped_weights(name) and not untrained(runs, budget, trained):
+            yield trained
+
+
 def evaluated(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
-    """The named denoisers, or all that can run and are trained, as `onespp eval` runs them.
+    """The named denoisers, or everyone who can run and is trained, as `onespp eval` runs them.
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
-    adapted = [name + ADAPTIVE for name in WORTH_ADAPTING if name in DENOISERS]
-    chosen = choose(names, [*DENOISERS, *adapted], cannot_run, partial(untrained, runs, budget))
+    chosen = choose(names, everyone(runs, budget), cannot_run, partial(untrained, runs, budget))
     return [
         DenoiserSpec(name, precision=precision_in_use(name), weights=weights_file(name, runs, budget))
         for name in chosen

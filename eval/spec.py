@@ -1,5 +1,6 @@
 """A denoiser to run, described before anything is built: which, with what weights, and how it computes."""
 
+import re
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import torch
 
 from datasets.frame import Signal
+from errors import BadInput
 from eval.extra_denoisers import EXTRA, WINDOW_SETS, windows_label
 from models import compiled, registry
 from models.denoiser import Denoiser
@@ -16,18 +18,36 @@ from models.weights import load_weights
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 AROUND = {registry.ADAPTIVE: "models.adaptive", registry.TAA: "models.taa"}  # where the parts of a name are defined
+OF_BUDGET = re.compile(r"([^@+]+)@([^@+]+)(\+.*)?")  # NAME@BUDGET
+
+
+def split_name(name: str) -> tuple[str, str | None]:
+    """A denoiser, and the budget whose weights it is to have: wskp6+taa and quick of "wskp6@quick+taa"."""
+    match = OF_BUDGET.fullmatch(name)
+    return (match[1] + (match[3] or ""), match[2]) if match else (name, None)
+
+
+def with_budget(name: str, budget: str) -> str:
+    """The same the other way round."""
+    plain = registry.plain_name(name)
+    return f"{plain}@{budget}{name.removeprefix(plain)}"
 
 
 def class_of(name: str) -> type[Denoiser]:
     """The class of a denoiser, which knows all that can be asked of it. Raises BadInput for an unknown name."""
-    return EXTRA[name].kind if name in EXTRA else registry.denoiser_class(name)
+    denoiser, budget = split_name(name)
+    kind = EXTRA[denoiser].kind if denoiser in EXTRA else registry.denoiser_class(denoiser)
+    if budget and (denoiser in EXTRA or not kind.is_network):
+        raise BadInput(f"unknown denoiser '{name}': '{denoiser}' has no weights of a budget")
+    return kind
 
 
 def create_any(name: str, signal: Signal | None = None) -> Denoiser:
     """A denoiser of the registry or of EXTRA, with fresh weights. Raises BadInput for an unknown name."""
-    if name in EXTRA:
-        return EXTRA[name].kind(signal=signal, **EXTRA[name].arguments)
-    return registry.create(name, signal)
+    denoiser, _ = split_name(name)
+    if denoiser in EXTRA:
+        return EXTRA[denoiser].kind(signal=signal, **EXTRA[denoiser].arguments)
+    return registry.create(denoiser, signal)
 
 
 def precisions_of(name: str) -> list[str]:
@@ -46,6 +66,8 @@ class DenoiserSpec:
     """One way to run a denoiser.
 
     Attributes:
+        name: one of the registry or of EXTRA, or NAME@BUDGET: a network as it was trained in a budget, where NAME
+            alone has shipped weights. Suffixes come last: wskp6@quick+adaptive.
         signal: what it returns; None for what it usually does.
         precision: of its network, a key of PRECISIONS.
         weights: the file of a network's weights; without one they are fresh, and always the same.
@@ -91,8 +113,9 @@ class DenoiserSpec:
         torch.manual_seed(0)
         denoiser = create_any(self.name, self.signal)
         if self.weights:
-            name = windows_label(WINDOW_SETS[self.name]) if self.name in WINDOW_SETS else self.name
-            load_weights(inner_denoiser(denoiser), registry.plain_name(name), self.weights)
+            name, _ = split_name(self.name)
+            label = windows_label(WINDOW_SETS[name]) if name in WINDOW_SETS else registry.plain_name(name)
+            load_weights(inner_denoiser(denoiser), label, self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         return denoiser.to(self.device)
 

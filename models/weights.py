@@ -28,6 +28,13 @@ def save_weights(
     write_file(path, save(tensors, metadata))
 
 
+def read_metadata(path: Path) -> dict[str, Any]:
+    """What a file says of its weights, as `save_weights` was told: "denoiser", "recipe", "made_by", and "constants"."""
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
+    return {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
+
+
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
     """Fill `denoiser` from a file, specialised as that says.
 

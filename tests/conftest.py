@@ -9,6 +9,7 @@ import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
 from datasets.generate import generate
+from models import shipped_weights
 from models.registry import channels_read
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
@@ -26,6 +27,14 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("data") / "tiny"
     generate(root, "tiny", seed=0, reads=channels_read())
     return root
+
+
+@pytest.fixture
+def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of shipped weights, empty here: no test that takes it depends on what is shipped."""
+    folder = tmp_path_factory.mktemp("shipped")
+    monkeypatch.setattr(shipped_weights, "FOLDER", folder)
+    return folder
 
 
 @pytest.fixture(scope="session", params=["cornell_box", "cornell_box_moving"])

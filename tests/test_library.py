@@ -8,6 +8,8 @@ import torch
 
 import onespp
 from errors import BadInput
+from models.registry import create
+from models.weights import save_weights
 from provenance import ROOT
 from scenes.camera import intrinsics, look_at
 
@@ -22,6 +24,21 @@ def test_examples_run_as_written(example, tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "docs/library.md", "exec"), {"__name__": "example"})
     assert capsys.readouterr().out
+
+
+def test_networks_have_the_weights_that_are_shipped(shipped, tmp_path):
+    with pytest.raises(BadInput, match="'wskp3' needs trained weights"):
+        onespp.load("wskp3")
+    for path in (shipped / "wskp3.safetensors", tmp_path / "others"):
+        save_weights(create("wskp3"), "wskp3", {}, path)
+    given = onespp.load("wskp3", shipped / "wskp3.safetensors", torch.float32).state_dict()
+    for name, weights, same in (
+        ("wskp3", None, True),
+        ("wskp3+taa", None, True),
+        ("wskp3", tmp_path / "others", False),
+    ):
+        found = list(onespp.load(name, weights, torch.float32).state_dict().values())
+        assert all(map(torch.equal, found, given.values())) == same
 
 
 def arrays(index: int, size: tuple[int, int] = (24, 32)) -> dict:

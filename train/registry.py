@@ -5,8 +5,18 @@ from pathlib import Path
 
 from datasets.clip import Dataset
 from models.registry import create
+from models.shipped_weights import require_shipped
 from train.recipes import recipe_for
 from train.task import Task, run_folder
+
+SHIPPED = "weights"  # in place of a file: those that are shipped
+
+
+def start_file(name: str, start: str | None) -> Path | None:
+    """The weights that a training of a network is to begin with. Raises BadInput where SHIPPED are not there."""
+    if start == SHIPPED:
+        return require_shipped(name)
+    return Path(start) if start else None
 
 
 def task_for(

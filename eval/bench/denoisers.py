@@ -20,7 +20,7 @@ from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
 from eval.selection import BASELINES, cannot_run, choose
-from eval.spec import DenoiserSpec, create_any, precisions_of
+from eval.spec import DenoiserSpec, create_any, precisions_of, split_name
 from files import read_json, write_json
 from models.oidn import OIDN
 from models.registry import DENOISERS
@@ -62,7 +62,8 @@ def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
     everyone = (*DENOISERS, *(name for name in EXTRA if name not in (ALL_WINDOWS, FAST_OIDN)))
     baseline = [] if cannot_run(BASELINE) else [BASELINE]
     found: list[DenoiserSpec] = []
-    for name in choose([*names, *baseline] if names else [], everyone, cannot_run):
+    named = [split_name(name)[0] for name in names]  # weights make no difference
+    for name in choose([*named, *baseline] if names else [], everyone, cannot_run):
         found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
         if name in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(DenoiserSpec(name, compiled=False))

@@ -10,6 +10,7 @@ from eval.metrics import METRICS, Quantity
 from eval.papers.measurements import Measurements, measurements
 from eval.papers.tables import TABLES, PaperTable
 from eval.text_table import LEGEND, NEAR
+from models.shipped_weights import shipped_weights
 from train.recipes import TRAINABLE
 
 PAPER_QUANTITIES = {metric: METRICS[metric] for metric in ("rmse", "psnr", "ssim", "l1", "mse")} | {
@@ -94,7 +95,8 @@ def table_text(table: PaperTable, runs: Path, budget: str) -> str:
     parts += [f"  * {note}" for note in table.notes]
     parts += [f"  - {order_verdict(table, order, here)}" for order in orders(table)]
     if absent := unmeasured(table, here):
-        untrained = [name for name in absent if name in TRAINABLE and table.where == "eval"]
+        trainable = [name for name in absent if name in TRAINABLE and table.where == "eval"]
+        untrained = [name for name in trainable if not shipped_weights(name)]
         first = f"`onespp train {' '.join(untrained)} --budget {budget} --runs {runs}` and " if untrained else ""
         parts.append(f"  not measured: {', '.join(absent)}; get them with {first}`{here.command}`")
     return "\n".join(parts)

@@ -9,8 +9,8 @@ import torch
 from tqdm import tqdm
 
 from errors import BadInput
-from eval.selection import cannot_run, choose, weights_file
-from eval.spec import DenoiserSpec, create_any, precisions_of
+from eval.selection import cannot_run, choose, untrained, weights_file
+from eval.spec import DenoiserSpec, create_any, precisions_of, split_name
 from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
 from eval.stress.check import StressCheck
 from eval.stress.logits import last_layers
@@ -27,10 +27,14 @@ from timing import thread_count
 def stressed(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
     """The named denoisers, or all that can run here, with trained weights where there are any, else fresh ones.
 
-    Raises BadInput where a named one is unknown or cannot run.
+    Raises BadInput where a named one is unknown or cannot run, and for NAME@BUDGET without its weights.
     """
+
+    def lacks_its_own(name: str) -> str | None:
+        return untrained(runs, budget, name) if split_name(name)[1] else None
+
     specs = []
-    for name in choose(names, DENOISERS, cannot_run):
+    for name in choose(names, DENOISERS, cannot_run, lacks_its_own):
         file = weights_file(name, runs, budget)
         specs.append(DenoiserSpec(name, weights=file if file and file.exists() else None))
     return specs
@@ -72,7 +76,7 @@ def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> lis
             build = cache(partial(build_in, spec))
             for case in ours:
                 progress.set_postfix_str(f"{spec.name}: {case.name}")
-                outcome = StressCheck(spec.name, build, case).outcome()
+                outcome = StressCheck(split_name(spec.name)[0], build, case).outcome()
                 rows.append(StressRow(spec.name, weights_label(spec), case.name, outcome))
                 progress.update()
     return rows

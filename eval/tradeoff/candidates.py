@@ -1,17 +1,15 @@
 """What can be traded: every denoiser, in each precision and size of network that there are weights for."""
 
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-
-from safetensors import safe_open
 
 from eval.extra_denoisers import EXTRA, WINDOW_SETS
 from eval.selection import cannot_run, choose, untrained, weights_file
 from eval.spec import DenoiserSpec, precisions_of
 from files import read_json
 from models.registry import DENOISERS
+from models.weights import read_metadata
 
 
 def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
@@ -42,6 +40,5 @@ def trained_epochs(spec: DenoiserSpec) -> int | None:
     """How long the network was trained; None where its weights do not say so or there are none."""
     if spec.weights is None:
         return None
-    with safe_open(spec.weights, framework="pt") as file:
-        recipe = json.loads((file.metadata() or {}).get("recipe", "{}"))
+    recipe = read_metadata(spec.weights).get("recipe", {})
     return int(recipe["epochs"]) if "epochs" in recipe else None

@@ -7,7 +7,7 @@ from errors import BadInput
 from eval.bench.denoisers import results_file
 from eval.bench.sizes import Size, size_name
 from eval.extra_denoisers import ALL_WINDOWS
-from eval.spec import DenoiserSpec
+from eval.spec import DenoiserSpec, split_name
 from files import read_json
 
 TIMED_AS = {ALL_WINDOWS: "wskp6", "ntd-b": "ntd"}  # the same computation: another training of a network
@@ -15,7 +15,8 @@ TIMED_AS = {ALL_WINDOWS: "wskp6", "ntd-b": "ntd"}  # the same computation: anoth
 
 def timed_as(spec: DenoiserSpec) -> str:
     """What the bench calls whatever computes the same."""
-    return replace(spec, name=TIMED_AS.get(spec.name, spec.name)).way
+    name, _ = split_name(spec.name)  # weights make no difference
+    return replace(spec, name=TIMED_AS.get(name, name)).way
 
 
 class Times:

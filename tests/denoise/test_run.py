@@ -1,6 +1,8 @@
 """Whole sequences under other people's names, from files to files."""
 
 import csv
+import hashlib
+import json
 import math
 import os
 import shutil
@@ -243,6 +245,26 @@ def test_radiance_is_not_clamped_and_precision_is_the_inputs_or_stated(tmp_path)
         assert plane.dtype == dtype and (plane == value).all()
 
 
+def test_the_command_takes_shipped_weights_or_a_budgets_or_a_file(spheres, tmp_path, shipped):
+    foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
+    ours = fresh_weights("wskp3", shipped / "wskp3.safetensors")
+    trained = tmp_path / "runs" / "train" / "wskp3-tiny" / "weights.safetensors"
+    trained.parent.mkdir(parents=True)
+    others = {key: 2 * tensor for key, tensor in create("wskp3").state_dict().items()}
+    network = create("wskp3")
+    network.load_state_dict(others)
+    save_weights(network, "wskp3", {}, trained)
+    call = ["denoise", str(tmp_path / "in" / "*.exr"), "--frames", "1-2", "--runs", str(tmp_path / "runs")]
+    main([*call, "--denoiser", "wskp3", "--out", str(tmp_path / "ours")])
+    main([*call, "--denoiser", "wskp3@tiny", "--out", str(tmp_path / "trained")])
+    main([*call, "--denoiser", "wskp3", "-w", str(trained), "--out", str(tmp_path / "file")])
+    for out, weights in (("ours", ours), ("trained", trained), ("file", trained)):
+        noted = json.loads((tmp_path / out / "denoise.json").read_text())
+        assert noted["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
+    a, b, c = (outputs(tmp_path / out, "ViewLayer.Combined.")[-1] for out in ("ours", "trained", "file"))
+    assert torch.equal(b, c) and not torch.equal(a, b)
+
+
 @pytest.mark.parametrize("name", ["svgf", "noisy"])
 def test_an_interrupted_run_goes_on_to_the_same(spheres, tmp_path, name):
     foreign.write_sequence(tmp_path / "in", [*spheres, *spheres[::-1]], foreign.blender)
@@ -346,7 +368,7 @@ def test_the_command_takes_patterns_files_and_oidns_flags(spheres, tmp_path, cap
     assert all(torch.equal(a, b) for a, b in zip(outputs(tmp_path / "a"), outputs(tmp_path / "b"), strict=True))
     for arguments, complaint in (
         ([], "name the frames"),
-        ([names[0], "--denoiser", "wskp6", "--runs", str(tmp_path / "none")], "onespp train wskp6"),
+        ([names[0], "--denoiser", "wskp6@tiny", "--runs", str(tmp_path / "none")], "onespp train wskp6 --budget tiny"),
         ([names[0], "--denoiser", "magic"], "unknown denoiser 'magic'"),
         ([names[0], "--denoiser", "wskp6", "-w", names[0]], "not a safetensors file"),
     ):

@@ -145,6 +145,7 @@ def test_networks_of_other_sizes_are_measured_too():
     assert {"wskp6-1w", "wskp6-5w"} <= names and "wskp6-6w" not in names  # that is wskp6
     assert macs_per_pixel(DenoiserSpec("wskp6-1w")) < macs_per_pixel(DenoiserSpec("wskp6"))
     assert not any(spec.name in WINDOW_SETS for spec in in_use(()))
+    assert ways(["kp@quick", "kp"]) == ways(["kp"])  # weights make no difference
     assert all(spec.compiled for spec in ways(["svgf"], "cuda"))
 
 

@@ -125,7 +125,7 @@ def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expec
     assert len(entrants) == len(expected)
 
 
-def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch):
+def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch, shipped):
     with pytest.raises(BadInput, match="onespp train rae"):
         evaluate(tiny, tmp_path, "tiny", ["rae"])
     few = {name: registry.DENOISERS[name] for name in ("noisy", "accumulated", "rae")}

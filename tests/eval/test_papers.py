@@ -187,7 +187,7 @@ def test_all_sources_are_read(tmp_path):
     assert measurements(WSKP_TABLE_5, tmp_path).value("kp", "psnr") == 30.5
 
 
-def test_what_is_missing_comes_with_its_command(tmp_path):
+def test_what_is_missing_comes_with_its_command(tmp_path, shipped):
     text = against_papers(tmp_path, "tiny")
     for table in TABLES:
         assert table.source in text and all(note in text for note in table.notes)

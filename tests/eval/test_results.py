@@ -18,7 +18,7 @@ from models.registry import create
 from models.weights import save_weights
 from train.task import run_folder
 
-NAMES = ["noisy", "accumulated", "rae"]
+NAMES = ["noisy", "accumulated", "rae@tiny"]
 
 
 def save_fresh(runs: Path, seed: int) -> None:
@@ -101,7 +101,7 @@ def test_what_is_there_is_kept(once, runs, tiny, played):
 def test_only_what_changed_is_done_again(runs, tiny, played):
     save_fresh(runs, 1)
     evaluate(tiny, runs, "tiny", [*NAMES, "eaw"])
-    assert played == [("cornell_box", ["eaw", "rae"]), ("cornell_box_moving", ["eaw", "rae"])]
+    assert played == [("cornell_box", ["eaw", "rae@tiny"]), ("cornell_box_moving", ["eaw", "rae@tiny"])]
     played.clear()
     evaluate(tiny, runs, "tiny", ["noisy"])
     rows = json.loads((runs / "eval" / "results.json").read_text())["rows"]

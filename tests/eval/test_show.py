@@ -106,7 +106,7 @@ def test_states_in_colour(tiny):
     assert np.array_equal(number[0].image, np.zeros((64, 64)))
 
 
-def test_clip_without_reference_or_some_channel(tiny, tmp_path, capsys):
+def test_clip_without_reference_or_some_channel(tiny, tmp_path, capsys, shipped):
     """What can run is shown; the rest is skipped with a word, or an error where it was asked for."""
     copy = shutil.copytree(clip_of(tiny), tmp_path / "clip")
     facts = json.loads((copy / "clip.json").read_text())

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from command_line import main
+from errors import BadInput
 from eval.spec import DenoiserSpec
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
 from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
@@ -182,8 +183,10 @@ def test_what_cannot_be_stressed(capsys, tmp_path):
         assert end.value.code == 2 and message in capsys.readouterr().err
 
 
-def test_weights_are_named(tmp_path):
-    """Fresh ones where there are no trained ones."""
+def test_weights_are_named(tmp_path, shipped):
+    """Fresh ones where there are no trained ones; those of a budget that is named must be there."""
+    with pytest.raises(BadInput, match="wskp3@tiny: it has no weights at"):
+        stressed(["wskp3@tiny"], tmp_path, "quick")
     network, classical = stressed(["wskp3", "accumulated"], tmp_path, "tiny")
     assert (weights_label(network), weights_label(classical)) == (FRESH, None)
     path = tmp_path / "train" / "wskp3-tiny" / "weights.safetensors"
@@ -191,6 +194,8 @@ def test_weights_are_named(tmp_path):
     save_weights(registry.create("wskp3"), "wskp3", {}, path)
     (network,) = stressed(["wskp3"], tmp_path, "tiny")
     assert weights_label(network) == str(path)
+    (case,) = check_all(stressed(["wskp3@tiny"], tmp_path, "quick"), [CASES["1 x 1 px"]])
+    assert (case.denoiser, case.weights) == ("wskp3@tiny", str(path))
 
 
 def test_cases_apply_to_precisions_and_logits_that_a_denoiser_has():

@@ -14,6 +14,7 @@ from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
+from eval.report.trade_plot import trade_plot
 from eval.results import REFERENCE, ClipResults, Result
 from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
@@ -127,6 +128,14 @@ def test_samples_that_are_not_worth_their_time(tmp_path):
     assert [row.metrics["psnr"] for row in rows] == [20, 30, 26, 29]
 
 
+def test_two_trainings_of_a_network_are_two_points(tmp_path):
+    bench_of(tmp_path, ["noisy", "rae"], threads=(1,))
+    plot = trade_plot(Times(tmp_path, SIZE), [clip_results(**{"noisy": 20.0, "rae": 30.0, "rae@tiny": 28.0})], "psnr")
+    points = {point.name: (point.ms, point.quality, point.by) for point in plot.points}
+    assert points == {"noisy": (1.0, 20.0, None), "rae": (2.0, 30.0, None), "rae@tiny": (2.0, 28.0, "rae")}
+    assert plot.missing == []
+
+
 # --- Samples ----------------------------------------------------------------------------------------------------------
 
 
@@ -225,9 +234,10 @@ def test_sizes_are_the_networks_of_the_ablation():
     assert [timed_as(DenoiserSpec(name)) for name in names] == ["wskp6", "wskp6-2w", "ntd", "ntd"]
     assert timed_as(DenoiserSpec("svgf", signal="indirect")) == "svgf (indirect)"
     assert timed_as(DenoiserSpec("ntd", signal="indirect")) == "ntd"
+    assert timed_as(DenoiserSpec("ntd-b@tiny")) == "ntd" and timed_as(DenoiserSpec("kp@tiny+taa")) == "kp+taa"
 
 
-def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys):
+def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys, shipped):
     with pytest.raises(BadInput, match=r"rae: it has no weights.*`onespp train rae --budget tiny --runs"):
         candidates(["rae"], tmp_path, "tiny")
     with pytest.raises(BadInput, match="`onespp ablate wskp-windows --budget tiny --runs"):
@@ -278,7 +288,7 @@ def traded(tiny, tmp_path_factory):
         save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
-    names = ("noisy", "accumulated", "svgf", "wskp6", "wskp6-2w")
+    names = ("noisy", "accumulated", "svgf", "wskp6@tiny", "wskp6-2w")
     text = trade(tiny, runs, "tiny", names, "48x32", levels=(1, 4))
     return runs, text
 
@@ -288,11 +298,15 @@ def test_trade_holds_every_precision_and_size(traded):
     content = read_json(runs / "report" / "trade.json")
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
     rows = {row["label"]: row for row in content["rows"]}
-    assert {"noisy", "wskp6", "wskp6-bfloat16", "wskp6-float16", "wskp6-2w-bfloat16"} <= rows.keys()
-    assert rows["wskp6"]["epochs"] == 7 and rows["noisy"]["epochs"] is None
-    assert rows["wskp6"]["ms"] == rows["wskp6-float16"]["ms"] == 2.0
-    assert rows["wskp6"]["metrics"]["psnr"] != rows["wskp6-bfloat16"]["metrics"]["psnr"]  # judged as it computes
-    assert rows["wskp6"]["metrics"]["psnr"] == pytest.approx(rows["wskp6-bfloat16"]["metrics"]["psnr"], abs=0.1)
+    assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16", "wskp6-2w-bfloat16"} <= rows.keys()
+    assert rows["wskp6@tiny"]["epochs"] == 7 and rows["noisy"]["epochs"] is None
+    assert rows["wskp6@tiny"]["ms"] == rows["wskp6@tiny-float16"]["ms"] == 2.0
+    assert (
+        rows["wskp6@tiny"]["metrics"]["psnr"] != rows["wskp6@tiny-bfloat16"]["metrics"]["psnr"]
+    )  # judged as it computes
+    assert rows["wskp6@tiny"]["metrics"]["psnr"] == pytest.approx(
+        rows["wskp6@tiny-bfloat16"]["metrics"]["psnr"], abs=0.1
+    )
     assert rows["noisy"]["dominated_by"]["psnr"] is None  # the fastest
     assert "beaten in PSNR by" in text and "trained on 1 spp" in text
     assert {path.name for path in (runs / "report" / "figures").iterdir()} == {

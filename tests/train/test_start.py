@@ -17,8 +17,9 @@ from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, metadata, short_task, tensors
+from tests.test_cli import fails
 from train.loop import train_network
-from train.registry import task_for
+from train.registry import start_file, task_for
 from train.task import WEIGHTS_FILE, Task
 from train.training import Training
 
@@ -87,6 +88,18 @@ def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, gen
     assert "there are no weights at missing" in said("wskp3", "--from", "missing")
     assert "holds weights of 'wskp3', not of 'rae'" in said("rae", "--from", str(general))
     assert not list(tmp_path.glob("runs/train/*/[!.]*"))
+
+
+def test_it_may_begin_with_what_is_shipped(capsys, tiny, tmp_path, shipped):
+    ours = fresh_weights("wskp3", shipped / "wskp3.safetensors")
+    assert start_file("wskp3", "weights") == ours
+    assert start_file("wskp3", "weights.safetensors") == Path("weights.safetensors") and start_file("rae", None) is None
+    there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny", "--from", "weights"]
+    assert "no weights of 'rae' are shipped; those are wskp3" in fails(capsys, "train", "rae", *there)
+    assert not (tmp_path / "runs").exists()
+    main(["train", "wskp3", *there, "--precision", "float32"])
+    weights = folder_of(tmp_path / "runs", "wskp3") / WEIGHTS_FILE
+    assert json.loads(metadata(weights)["recipe"])["from"] == file_digest(ours)
 
 
 def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):

@@ -1,0 +1,165 @@
+"""`onespp weights`: which networks have their weights shipped, and a card of each, whose facts follow from files."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tabulate import tabulate
+
+from errors import BadInput
+from eval.metrics import METRICS
+from eval.report.table_rows import mean_rows
+from eval.results import FLOOR, RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
+from eval.text_table import LEGEND, PRINTED, floor_cell, value_cell
+from files import write_file
+from models.shipped_weights import require_shipped, shipped_names
+from models.weights import read_metadata
+from provenance import file_digest
+
+LICENCE = "Apache-2.0"  # that of onespp
+COMPARED = ("noisy", "accumulated", "svgf", "oidn")  # whom cards show beside the network
+BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
+END = "<!-- end of facts -->"
+TOLD_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # by cards, from the recipe
+
+FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
+- Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
+  version {generator}, {scenes} scenes){start}.
+  Kept from step {step}, where the loss on the validation clips was least: {validation:.4g}.
+- Recipe: `{recipe}`.
+- Made by {makers}.
+
+Means over the {count} test clips of 1 spp of `{dataset}`, {signal} light, in {precision} ({device}; {versions}):
+
+{means}
+
+{metric} clip by clip:
+
+{clips}
+
+{legend}."""
+
+
+def table() -> str:
+    """A line for each of the networks."""
+    return tabulate([line(name) for name in shipped_names()], "keys", disable_numparse=True)
+
+
+def line(name: str) -> dict[str, Any]:
+    """What the table says of a network."""
+    path = require_shipped(name)
+    recipe = read_metadata(path)["recipe"]
+    data = recipe["data"]
+    return {
+        "network": name,
+        "parameters": recipe["parameters"],
+        "kB": round(path.stat().st_size / 1000),
+        "budget": recipe["profile"],
+        "trained on": f"{Path(data['profile']).name}, {len(data['scenes'])} scenes",
+        "step": recipe["step"],
+        "validation loss": f"{recipe['validation']:.4g}",
+        "SHA-256": file_digest(path)[:12],
+        "licence": LICENCE,
+    }
+
+
+def card_file(name: str) -> Path:
+    """Where the card of a network is. Raises BadInput where its weights are not shipped."""
+    return require_shipped(name).with_suffix(".md")
+
+
+def write_card(name: str, runs: Path) -> Path:
+    """Write the facts of a card anew: those of its weights, and what `onespp eval` has left in RUNS. Returns its path.
+
+    What a person wrote around them stays. Raises BadInput where there is no card yet, and where the network has not
+    been judged since its weights are there.
+    """
+    path = card_file(name)
+    text = path.read_text() if path.exists() else ""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise BadInput(
+            f"{path}: write what the network is for and where it is weak, with the lines '{BEGIN}' and '{END}' where "
+            "its facts are to stand"
+        )
+    write_file(path, f"{before}{begin}\n{facts(name, runs)}\n{end}{after}".encode())
+    return path
+
+
+def facts(name: str, runs: Path) -> str:
+    """The part of a card that follows from files, as Markdown."""
+    weights = require_shipped(name)
+    metadata = read_metadata(weights)
+    recipe = metadata["recipe"]
+    data = recipe["data"]
+    results, clips = judged(name, runs)
+    alike = of_one_spp(clips)
+    return FACTS.format(
+        name=name,
+        parameters=recipe["parameters"],
+        bytes=weights.stat().st_size,
+        digest=file_digest(weights),
+        licence=LICENCE,
+        budget=recipe["profile"],
+        seed=recipe["seed"],
+        data=Path(data["profile"]).name,
+        data_seed=data["seed"],
+        generator=data["generator"],
+        scenes=len(data["scenes"]),
+        start=f", begun with weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
+        step=recipe["step"],
+        validation=recipe["validation"],
+        recipe=json.dumps({key: value for key, value in recipe.items() if key not in TOLD_APART}),
+        makers=" and ".join(f"{in_words(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]),
+        count=len(alike),
+        dataset=Path(results["dataset"]).name,
+        signal=clips[0].signal,
+        precision=results_of(clips, name)[0].precision,
+        device=results["device"],
+        versions=in_words(results["versions"]),
+        means=means_table(alike),
+        metric=METRICS["psnr"].title,
+        clips=psnr_table(clips),
+        legend=LEGEND,
+    )
+
+
+def in_words(versions: dict[str, str]) -> str:
+    return ", ".join(f"{package} {version}" for package, version in versions.items())
+
+
+def judged(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
+    """The content of RUNS/eval/results.json, and the results of the network beside those of COMPARED.
+
+    Raises BadInput where the shipped weights, as they are, have not been judged.
+    """
+    weights = require_shipped(name)
+    path = runs / "eval" / RESULTS_FILE
+    content, clips = read_results(runs)
+    found = [clip for clip in clips if results_of([clip], name)]
+    files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
+    if not of_one_spp(found) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
+        command = f"onespp eval {' '.join((*COMPARED, name))} --runs {runs}"
+        raise BadInput(f"{path} has nothing of {weights} as it is now, on clips of 1 spp: run `{command}`")
+    wanted = (*COMPARED, name)
+    return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in found]
+
+
+def means_table(clips: Sequence[ClipResults]) -> str:
+    """Means of all denoisers over the clips, with those of their noise floors, as Markdown."""
+    lines = [[row.denoiser, *(row.text(metric) for metric in PRINTED)] for row in mean_rows(clips)]
+    head = ["denoiser", *(METRICS[metric].title for metric in PRINTED)]
+    return tabulate(lines, head, "github", disable_numparse=True)
+
+
+def psnr_table(clips: Sequence[ClipResults]) -> str:
+    """PSNR of all denoisers, a row a clip, as Markdown."""
+    lines = []
+    for clip in clips:
+        floor = clip.reference.metrics["psnr"]
+        cells = {result.denoiser: value_cell("psnr", result.metrics["psnr"], floor) for result in clip.results}
+        lines.append({"clip": f"{clip.scene}/{clip.clip}", **cells, FLOOR: floor_cell("psnr", floor)})
+    return tabulate(lines, "keys", "github", disable_numparse=True)

@@ -1,0 +1,122 @@
+"""`onespp weights`: the table, and cards whose facts are written anew around what a person wrote."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from command_line import main
+from errors import BadInput
+from eval.harness import evaluate
+from eval.results import read_results
+from eval.shipped import BEGIN, END, table, write_card
+from files import read_json, write_json
+from models.registry import create
+from models.weights import save_weights
+from provenance import file_digest
+from tests.test_cli import fails
+
+RECIPE = {
+    "profile": "tiny",
+    "seed": 3,
+    "data": {"profile": "somewhere/my.toml", "seed": 4, "generator": 5, "scenes": ["a", "b"]},
+    "loss": {"epsilon": 0.01},
+    "epochs": 6,
+    "parameters": 1234,
+    "step": 78,
+    "validation": 0.123456,
+}
+MADE_BY = [{"versions": {"torch": "1.2.3"}, "code": "c0de"}, {"versions": {"torch": "1.2.4"}, "code": "c0d3"}]
+HAND = f"# wskp3\n\nBy hand.\n\n{BEGIN}\nold\n{END}\n\n## Where it is weak\n\nBy hand, too.\n"
+
+
+@pytest.fixture
+def wskp3(shipped) -> Path:
+    """Weights that were never trained, shipped."""
+    path = shipped / "wskp3.safetensors"
+    save_weights(create("wskp3"), "wskp3", RECIPE, path, MADE_BY)
+    return path
+
+
+def test_the_table_has_a_line_for_each(wskp3, capsys):
+    save_weights(create("kp"), "kp", RECIPE | {"parameters": 77}, wskp3.with_name("kp.safetensors"))
+    main(["weights"])
+    head, _, *lines = capsys.readouterr().out.splitlines()
+    assert head.split()[:2] == ["network", "parameters"]
+    assert [line.split()[:2] for line in lines] == [["wskp3", "1234"], ["kp", "77"]]
+    assert file_digest(wskp3)[:12] in lines[0] and "my.toml, 2 scenes" in lines[0] and "0.1235" in lines[0]
+
+
+def test_no_card_of_what_is_not_shipped(shipped, capsys):
+    assert "no weights of 'rae' are shipped; those are none" in fails(capsys, "weights", "rae")
+    assert table() == ""
+
+
+def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
+    evaluate(tiny, tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
+    card = wskp3.with_suffix(".md")
+    with pytest.raises(BadInput, match=r"wskp3.md: write what the network is for.*the lines"):
+        write_card("wskp3", tmp_path)
+    card.write_text(HAND)
+    assert write_card("wskp3", tmp_path) == card
+    text = card.read_text()
+    before, _, after = HAND.partition("old\n")
+    assert text.startswith(before) and text.endswith(after) and "old" not in text
+    words = " ".join(text.split())
+    for fact in (
+        "1234 parameters",
+        file_digest(wskp3),
+        "`onespp train wskp3 --budget tiny --seed 3` on the data set `my.toml` (seed 4, ",
+        "generator version 5, 2 scenes). Kept",
+        "from step 78, where the loss on the validation clips was least: 0.1235",
+        '`{"loss": {"epsilon": 0.01}, "epochs": 6}`',
+        "torch 1.2.3, code c0de and torch 1.2.4, code c0d3",
+        "2 test clips of 1 spp of `tiny`, total light",
+    ):
+        assert fact in words, fact
+    rows = {
+        cells[1]: cells[2:-1] for line in text.splitlines() if len(cells := [c.strip() for c in line.split("|")]) > 3
+    }
+    assert "eaw" not in rows
+    results = read_json(tmp_path / "eval" / "results.json")["rows"]
+    for name in ("noisy", "accumulated", "wskp3"):
+        psnr = {row["scene"]: row["metrics"]["psnr"] for row in results if row["denoiser"] == name}
+        assert rows[name][rows["denoiser"].index("PSNR dB")] == f"{sum(psnr.values()) / 2:.2f}"
+        for scene, value in psnr.items():
+            assert rows[f"{scene}/000"][rows["clip"].index(name)] == f"{value:.2f}"
+    clips = read_results(tmp_path)[1]
+    floors = [clip.reference.metrics["rmse"] for clip in clips]
+    assert rows["(noise floor)"][0] == f"{sum(floors) / 2:.4f}"
+    assert rows["denoiser"][0] == "RMSE" and float(rows["wskp3"][0]) > float(rows["(noise floor)"][0])
+
+    capsys.readouterr()
+    main(["weights", "--card", str(tmp_path)])  # all of them
+    assert card.read_text() == text and capsys.readouterr().out == f"{card}\n"
+    main(["weights", "wskp3"])
+    assert capsys.readouterr().out == text
+
+
+def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
+    """Not those of a training, and not those that were shipped before."""
+    wskp3.with_suffix(".md").write_text(HAND)
+    evaluate(tiny, tmp_path, "tiny", ["noisy", "wskp3"])
+    results = tmp_path / "eval" / "results.json"
+    content = read_json(results)
+    os.utime(wskp3, (results.stat().st_mtime + 5,) * 2)
+    with pytest.raises(BadInput, match=r"nothing of .*wskp3.safetensors as it is now.*`onespp eval noisy"):
+        write_card("wskp3", tmp_path)
+    os.utime(wskp3, (0, 0))
+    write_card("wskp3", tmp_path)
+    for row in content["rows"]:
+        row["weights"] = row["weights"] and "runs/train/wskp3-quick/weights.safetensors"
+    write_json(results, content)
+    with pytest.raises(BadInput, match="nothing of"):
+        write_card("wskp3", tmp_path)
+    write_json(results, content | {"rows": [row for row in content["rows"] if row["denoiser"] == "noisy"]})
+    with pytest.raises(BadInput, match="nothing of"):
+        write_card("wskp3", tmp_path)
+    shutil.rmtree(tmp_path / "eval")
+    with pytest.raises(BadInput, match="there are no results"):
+        write_card("wskp3", tmp_path)
+    assert "old" not in wskp3.with_suffix(".md").read_text()

@@ -1,0 +1,85 @@
+"""The weights that are shipped: small together, each with a card, and each of a network that denoises with them."""
+
+import hashlib
+import json
+import struct
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+import torch
+
+from errors import BadInput
+from models import registry
+from models.shipped_weights import FOLDER, require_shipped, shipped_names, shipped_weights
+from provenance import ROOT
+from tests.helpers.frames import flat_frame, run
+
+FILES = sorted(FOLDER.iterdir())
+WEIGHTS = [path for path in FILES if path.suffix == ".safetensors"]
+TOGETHER = 20e6  # bytes at most
+
+
+def header(path: Path) -> dict:
+    """The header of a safetensors file, by its format: its length in 8 bytes, then JSON."""
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    return json.loads(content[8 : 8 + length])
+
+
+def test_they_are_small_and_each_has_a_card():
+    assert WEIGHTS and sum(path.stat().st_size for path in FILES) <= TOGETHER
+    assert {path.name for path in FILES} == {path.stem + end for path in WEIGHTS for end in (".safetensors", ".md")}
+    assert shipped_names() == [name for name in registry.DENOISERS if FOLDER / f"{name}.safetensors" in WEIGHTS]
+    assert len(shipped_names()) == len(WEIGHTS)
+
+
+def test_an_installed_package_has_them():
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["models"]
+    for path in FILES:
+        assert any(fnmatch(str(path.relative_to(ROOT / "models")), pattern) for pattern in patterns)
+
+
+@pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
+def test_they_denoise(path):
+    """A grey wall in even light stays finite and about as bright, and history does not spoil it."""
+    denoiser = registry.load(path.stem, path, torch.float32)
+    frames = [flat_frame(24, 40, irradiance=0.5 * torch.ones(1, 3, 24, 40)) for _ in range(3)]
+    for frame in frames:
+        frame.channels["indirect"] = frame.channels["direct"]
+    for output, frame in zip(run(denoiser, frames), frames, strict=True):
+        assert torch.isfinite(output).all() and (output >= 0).all()
+        assert output.mean() == pytest.approx(float(frame.radiance(denoiser.signal).mean()), rel=0.5)
+
+
+@pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
+def test_cards_agree_with_the_files(path):
+    found = header(path)
+    facts = found.pop("__metadata__")
+    recipe = json.loads(facts["recipe"])
+    parameters = sum(torch.Size(tensor["shape"]).numel() for tensor in found.values())
+    card = path.with_suffix(".md").read_text()
+    words = " ".join(card.split())
+    assert facts["denoiser"] == path.stem and "constants" not in facts
+    assert card.startswith(f"# {path.stem}\n") and "## Where it is weak" in card
+    assert f"{parameters} parameters, {path.stat().st_size} bytes" in words
+    assert hashlib.sha256(path.read_bytes()).hexdigest() in words
+    assert f"`onespp train {path.stem} --budget {recipe['profile']} --seed {recipe['seed']}`" in words
+    assert f"generator version {recipe['data']['generator']}, {len(recipe['data']['scenes'])} scenes" in words
+    assert f"from step {recipe['step']}," in words and f"{recipe['validation']:.4g}" in words
+    told = json.loads(card.partition("- Recipe: `")[2].partition("`.\n")[0])
+    assert told.items() <= recipe.items() and {"loss", "rate", "batch", "epochs"} <= told.keys()
+    licence = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license"]
+    assert f"Licence: {licence}." in words
+    for name in ("noisy", "accumulated", path.stem, "(noise floor)"):
+        assert f"\n| {name} " in card
+
+
+def test_names_stand_for_their_files(shipped):
+    (shipped / "kp.safetensors").write_bytes(b"")
+    assert shipped_names() == ["kp"]
+    assert shipped_weights("kp+adaptive+taa") == require_shipped("kp") == shipped / "kp.safetensors"
+    assert shipped_weights("svgf") is None and shipped_weights("wskp6-2w") is None
+    with pytest.raises(BadInput, match="no weights of 'rae' are shipped; those are kp"):
+        require_shipped("rae")
