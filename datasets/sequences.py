@@ -16,14 +16,14 @@ from errors import BadInput
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Which augmentations of RAE §4.3 are on. Each transforms all channels and cameras consistently."""
+    """Which augmentations are on, those of RAE §4.3 first. Each transforms all channels and cameras consistently."""
 
     reverse: bool = False  # half of the sequences are played backward
     stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
     rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
-    exposure: bool = False  # every sequence is brighter or darker to the network, by 2^-1.5 to 2^1.5
-    samples: bool = False  # half of the sequences are means of 2, 4, 8, ... realisations
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
+    exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5
+    samples: bool = False  # half of the sequences are means of 2, 4, 8, ... realisations
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:

@@ -21,7 +21,7 @@ from models.surfaces import Surfaces
 
 LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
-STEPS = (1, 2, 4, 8, 16, 32)  # px between the taps of the filter's levels
+STEPS = (32, 16, 8, 4, 2, 1)  # px between the taps of the filter's levels: the last ones smooth the pattern of the first
 LARGEST_LOGIT = 10.0  # of the weights of taps
 MULTIPLE = 8  # of the sides of an image that the network takes
 

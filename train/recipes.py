@@ -44,7 +44,10 @@ NTD_RECIPE = Recipe(
 )
 NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDTerms(occlusion=0.0))  # §6.3, experiments A and B
 
-# Ours: time enough to learn what to carry, and all exposures.
+# Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.
+SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
+
+# Ours: sequences long enough to learn what to carry, in all exposures and with all numbers of samples.
 ONE_RECIPE = Recipe(
     loss=OneTerms(),
     rate=2e-3,
@@ -52,14 +55,10 @@ ONE_RECIPE = Recipe(
     crop=64,
     length=8,
     epochs=40,
-    anneal=True,
-    average=0.02,
     clip=1.0,
     augmentation=Augmentation(stop=True, rotate=True, exposure=True, samples=True),
+    **SHORT,
 )
-
-# Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.
-SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 
 # What a budget changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
 RAE_BUDGETS = {
@@ -84,8 +83,9 @@ NTD_BUDGETS = {
 
 ONE_BUDGETS: dict[str, dict[str, Any]] = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
-    "quick": {},
+    "quick": {"epochs": 10},
     "release": {},
+    "paper": {},
 }
 
 PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, match_threads
+from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory, match_threads
 
 ZERO = np.float32(0)
 TWO = np.float32(2)
 LEAST_EXPONENT = np.float32(-40)
 LARGEST_EXPONENT = np.float32(40)
 LEAST_WEIGHT = np.float32(1e-30)
-BLOCK_ROWS = 8  # that share one piece of scratch memory
+BLOCK = 2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
 STRIDE = 4  # features that are compared in one pass
 
 
@@ -32,20 +32,20 @@ def add_squares(
 
 
 @jit_in_any_order
-def measure(distance: Any, features: Any, y: Any, to: Any, low: Any, high: Any, dx: Any) -> None:
-    """distance (n): |f_p - f_q|² of the pixels low to high of row y and those dx further in row `to`."""
+def measure(distance: Any, features: Any, low: Any, high: Any, offset: Any) -> None:
+    """distance (n): |f_p - f_q|² of the pixels low to high and those `offset` further."""
     distance[:] = ZERO
     for f in range(0, features.shape[0], STRIDE):
         add_squares(
             distance,
-            features[f, y, low:high],
-            features[f + 1, y, low:high],
-            features[f + 2, y, low:high],
-            features[f + 3, y, low:high],
-            features[f, to, low + dx : high + dx],
-            features[f + 1, to, low + dx : high + dx],
-            features[f + 2, to, low + dx : high + dx],
-            features[f + 3, to, low + dx : high + dx],
+            features[f, low:high],
+            features[f + 1, low:high],
+            features[f + 2, low:high],
+            features[f + 3, low:high],
+            features[f, low + offset : high + offset],
+            features[f + 1, low + offset : high + offset],
+            features[f + 2, low + offset : high + offset],
+            features[f + 3, low + offset : high + offset],
         )
 
 
@@ -84,6 +84,12 @@ def normalise(red: Any, green: Any, blue: Any, total: Any) -> None:
 
 
 @jit_in_any_order
+def leave_out(weight: Any, inside: Any) -> None:
+    for x in range(weight.size):
+        weight[x] *= inside[x]
+
+
+@jit_in_any_order
 def weigh_tap(
     weight: Any,
     distance: Any,
@@ -92,19 +98,29 @@ def weigh_tap(
     own: Any,
     importance: Any,
     surface: Any,
-    y: Any,
-    to: Any,
+    inside: Any,
     low: Any,
     high: Any,
-    dx: Any,
+    offset: Any,
 ) -> None:
-    """weight (n) of the taps dx pixels further in row `to`, for the pixels low to high of row y."""
-    if to == y and dx == 0:
-        weigh_own(weight, own[y], surface[y])
+    """weight (n) of the taps `offset` further than the pixels low to high, 0 where they are not `inside` (n)."""
+    if offset == 0:
+        weigh_own(weight, own[low:high], surface[low:high])
         return
-    measure(distance, features, y, to, low, high, dx)
-    there = slice(low + dx, high + dx)
-    weigh(weight, distance, sharpness[y, low:high], importance[to, there], surface[to, there])
+    measure(distance, features, low, high, offset)
+    there = slice(low + offset, high + offset)
+    weigh(weight, distance, sharpness[low:high], importance[there], surface[there])
+    leave_out(weight, inside)
+
+
+@jit_with_memory
+def columns_inside(pixels: int, width: int, step: int) -> Any:
+    """Whether the taps to the left, above or below, and to the right of `pixels` whole rows are in the image: (3, N)."""
+    inside = np.ones((3, pixels), np.float32)
+    for p in range(pixels):
+        inside[0, p] = np.float32(p % width >= step)
+        inside[2, p] = np.float32(p % width < width - step)
+    return inside
 
 
 @jit_parallel
@@ -117,42 +133,59 @@ def filter_image(
     own: Any,
     importance: Any,
     surface: Any,
+    width: int,
     step: int,
 ) -> None:
-    """out (3, H, W) and the sums of weights, total (H, W), from image (3, H, W), features (F, H, W), others (H, W)."""
-    height, width = total.shape
-    for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
-        distances = np.empty(width, np.float32)
-        weights = np.empty(width, np.float32)
-        start = np.int64(block) * BLOCK_ROWS
-        for y in range(start, min(start + BLOCK_ROWS, height)):
-            out[:, y] = ZERO
-            total[y] = ZERO
-            for tap in range(9):
-                to = y + (tap // 3 - 1) * step
-                dx = (tap % 3 - 1) * step
-                low = max(0, -dx)
-                high = min(width, width - dx)
-                if to < 0 or to >= height or low >= high:
-                    continue
-                weight = weights[low:high]
-                weigh_tap(
-                    weight, distances[low:high], features, sharpness, own, importance, surface, y, to, low, high, dx
-                )
-                there = slice(low + dx, high + dx)
-                add_weighted(
-                    out[0, y, low:high],
-                    out[1, y, low:high],
-                    out[2, y, low:high],
-                    total[y, low:high],
-                    weight,
-                    image[0, to, there],
-                    image[1, to, there],
-                    image[2, to, there],
-                )
-            for x in range(width):
-                total[y, x] *= surface[y, x]
-            normalise(out[0, y], out[1, y], out[2, y], total[y])
+    """out (3, N) and the sums of weights, total (N), from image (3, N), features (F, N), others (N), row after row."""
+    pixels = total.size
+    block = max(1, BLOCK // width) * width
+    inside = columns_inside(block, width, step)
+    for number in numba.prange((pixels + block - 1) // block):
+        distances = np.empty(block, np.float32)
+        weights = np.empty(block, np.float32)
+        first = np.int64(number) * block
+        last = min(first + block, pixels)
+        out[:, first:last] = ZERO
+        total[first:last] = ZERO
+        for tap in range(9):
+            offset = (tap // 3 - 1) * step * width + (tap % 3 - 1) * step
+            # Rows above and below the image are cut off here, columns beside it have no weight.
+            low = max(first, -offset)
+            high = min(last, pixels - offset)
+            if low >= high or (offset == 0) != (tap == 4):
+                continue
+            weight = weights[: high - low]
+            weigh_tap(
+                weight,
+                distances[: high - low],
+                features,
+                sharpness,
+                own,
+                importance,
+                surface,
+                inside[tap % 3, low - first : high - first],
+                low,
+                high,
+                offset,
+            )
+            there = slice(low + offset, high + offset)
+            add_weighted(
+                out[0, low:high],
+                out[1, low:high],
+                out[2, low:high],
+                total[low:high],
+                weight,
+                image[0, there],
+                image[1, there],
+                image[2, there],
+            )
+        leave_out(total[first:last], surface[first:last])
+        normalise(out[0, first:last], out[1, first:last], out[2, first:last], total[first:last])
+
+
+def flat(tensor: Tensor) -> Any:
+    """(B, C, H, W) as an array (B, C, N)."""
+    return array(tensor).reshape(*tensor.shape[:2], -1)
 
 
 def filter_level(
@@ -162,11 +195,11 @@ def filter_level(
     match_threads()
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
+    images = [flat(tensor) for tensor in (out, total, image, features)]
+    planes = [flat(tensor)[:, 0] for tensor in (sharpness, own, importance, surface)]
+    images[1] = images[1][:, 0]
     for item in range(len(image)):
-        planes = (array(plane[item, 0]) for plane in (sharpness, own, importance, surface))
-        filter_image(
-            out[item].numpy(), total[item, 0].numpy(), array(image[item]), array(features[item]), *planes, step
-        )
+        filter_image(*(each[item] for each in (*images, *planes)), image.shape[-1], step)
     return out, total
 
 
@@ -237,31 +270,41 @@ def pull_images(
     surface: Any,
     out: Any,
     total: Any,
+    width: int,
     step: int,
 ) -> None:
-    """The gradients of what affinity_level takes, added to `to_...`; all (B, ., H, W), items in parallel."""
-    batch, colours, height, width = image.shape
+    """The gradients of what affinity_level takes, added to `to_...`: (B, ., N), items in parallel."""
+    batch, colours, pixels = image.shape
+    block = max(1, BLOCK // width) * width
+    inside = columns_inside(block, width, step)
     for item in numba.prange(batch):
-        distances = np.empty(width, np.float32)
-        weights = np.empty(width, np.float32)
-        pulls = np.empty(width, np.float32)
-        dot = np.empty(width, np.float32)
-        g = np.empty((colours, width), np.float32)
-        for y in range(height):
-            dot[:] = ZERO
+        distances = np.empty(block, np.float32)
+        weights = np.empty(block, np.float32)
+        pulls = np.empty(block, np.float32)
+        dots = np.empty(block, np.float32)
+        scaled = np.empty((colours, block), np.float32)
+        for first in range(0, pixels, block):
+            last = min(first + block, pixels)
+            dots[:] = ZERO
             for c in range(colours):
-                scale_gradient(g[c], dot, gradient[item, c, y], out[item, c, y], total[item, 0, y])
+                scale_gradient(
+                    scaled[c, : last - first],
+                    dots[: last - first],
+                    gradient[item, c, first:last],
+                    out[item, c, first:last],
+                    total[item, 0, first:last],
+                )
             for tap in range(9):
-                to = y + (tap // 3 - 1) * step
-                dx = (tap % 3 - 1) * step
-                low = max(0, -dx)
-                high = min(width, width - dx)
-                if to < 0 or to >= height or low >= high:
+                offset = (tap // 3 - 1) * step * width + (tap % 3 - 1) * step
+                low = max(first, -offset)
+                high = min(last, pixels - offset)
+                if low >= high or (offset == 0) != (tap == 4):
                     continue
-                there = slice(low + dx, high + dx)
-                weight = weights[low:high]
-                distance = distances[low:high]
-                pull = pulls[low:high]
+                there = slice(low + offset, high + offset)
+                here = slice(low - first, high - first)
+                weight = weights[: high - low]
+                distance = distances[: high - low]
+                pull = pulls[: high - low]
                 weigh_tap(
                     weight,
                     distance,
@@ -270,43 +313,42 @@ def pull_images(
                     own[item, 0],
                     importance[item, 0],
                     surface[item, 0],
-                    y,
-                    to,
+                    inside[tap % 3, here],
                     low,
                     high,
-                    dx,
+                    offset,
                 )
                 pull_weights(
                     pull,
                     weight,
-                    g[0, low:high],
-                    g[1, low:high],
-                    g[2, low:high],
-                    dot[low:high],
-                    image[item, 0, to, there],
-                    image[item, 1, to, there],
-                    image[item, 2, to, there],
+                    scaled[0, here],
+                    scaled[1, here],
+                    scaled[2, here],
+                    dots[here],
+                    image[item, 0, there],
+                    image[item, 1, there],
+                    image[item, 2, there],
                 )
                 for c in range(colours):
-                    add_product(to_image[item, c, to, there], weight, g[c, low:high])
-                if to == y and dx == 0:
-                    add(to_own[item, 0, y], pull)
+                    add_product(to_image[item, c, there], weight, scaled[c, here])
+                if offset == 0:
+                    add(to_own[item, 0, low:high], pull)
                     continue
                 pull_exponent(
-                    to_sharpness[item, 0, y, low:high],
+                    to_sharpness[item, 0, low:high],
                     pull,
                     distance,
-                    sharpness[item, 0, y, low:high],
-                    importance[item, 0, to, there],
+                    sharpness[item, 0, low:high],
+                    importance[item, 0, there],
                 )
-                add(to_importance[item, 0, to, there], pull)
+                add(to_importance[item, 0, there], pull)
                 for f in range(features.shape[1]):
                     pull_feature(
-                        to_features[item, f, y, low:high],
-                        to_features[item, f, to, there],
+                        to_features[item, f, low:high],
+                        to_features[item, f, there],
                         distance,
-                        features[item, f, y, low:high],
-                        features[item, f, to, there],
+                        features[item, f, low:high],
+                        features[item, f, there],
                     )
 
 
@@ -326,6 +368,6 @@ def pull_level(
     match_threads()
     given = (image, features, sharpness, own, importance)
     pulled = tuple(torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
-    known = (array(tensor) for tensor in (gradient, *given, surface, out, total))
-    pull_images(*(tensor.numpy() for tensor in pulled), *known, step)
+    known = (*pulled, gradient, *given, surface, out, total)
+    pull_images(*(flat(tensor) for tensor in known), image.shape[-1], step)
     return pulled

@@ -23,12 +23,13 @@ from train.data import items, loader
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
 from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
+from train.losses.one import OneLoss, OneTerms, shrunk, tone
 from train.losses.relative import RelativeTerms
 from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 
-LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss}
+LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss, OneTerms: OneLoss}
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
 
@@ -221,7 +222,7 @@ def test_mean_over_surfaces_by_hand():
 
 
 @pytest.mark.parametrize("terms", [None, RelativeTerms()], ids=["its own", "relative"])
-@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
 def test_the_background_is_not_learnt_from(batch_of, name, terms):
     """Whatever the reference holds there, the loss stays what it is."""
     torch.manual_seed(0)
@@ -272,7 +273,7 @@ def test_gradients_are_finite_at_extreme_gains(batch_of, gain):
     assert torch.isfinite(value) and all(torch.isfinite(p.grad).all() for p in loss.parameters())
 
 
-@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd"])
+@pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
 def test_equal_images_have_no_loss_and_finite_gradients(batch_of, name, monkeypatch):
     batch = batch_of(name, crop=16)
     denoiser = create(name)
@@ -392,6 +393,58 @@ def test_occlusion_is_not_next_to_nothing(batch_of):
     assert parts["occlusion"] > 0.1 * value
 
 
+def test_tone_is_the_display_s_and_goes_on_as_a_logarithm():
+    radiance = torch.tensor([0.0, 0.18, 0.5, 1.0, 2.0, 1000.0])
+    expected = [1e-4 ** (1 / 2.2), *(np.array([0.1801, 0.5001, 1.0001]) ** (1 / 2.2))]
+    expected += [1.0001 ** (1 / 2.2) + np.log(x) / 2.2 for x in (2.0, 1000.0)]
+    np.testing.assert_allclose(tone(radiance).numpy(), expected, rtol=1e-5)
+
+
+def test_blocks_are_means_over_their_surfaces():
+    radiance = torch.arange(48.0).view(1, 1, 6, 8).repeat(1, 3, 1, 1)
+    surface = torch.ones(1, 1, 6, 8)
+    surface[..., :2, 1:4] = 0
+    surface[..., 4:, 4:] = 0
+    mean, share = shrunk(radiance, surface, 4)
+    assert mean.shape == (1, 3, 2, 2)
+    lit = surface[0, 0, :4, :4] > 0
+    torch.testing.assert_close(mean[0, 1, 0, 0], radiance[0, 1, :4, :4][lit].mean())
+    torch.testing.assert_close(mean[0, 1, 1, 0], radiance[0, 1, 4:, :4].mean())
+    assert share[0, 0, 1, 1] == 0 and mean[0, 0, 1, 1] == 0
+
+
+def test_one_s_loss_by_hand(batch_of, monkeypatch):
+    """Of outputs that are off by a known factor: the scales of every frame, and the change of the error."""
+    batch = batch_of("one", 2, length=2)
+    denoiser = create("one")
+    factors = iter((1.5, 0.7))
+    genuine = denoiser.predict
+    seen: list[tuple[Tensor, Tensor]] = []
+
+    def predict(frame, state):
+        _, state = genuine(frame, state)
+        truth = frame.reference_irradiance("total")
+        output = next(factors) * truth
+        seen.append(tuple(state.scale.exposure() * frame.divisor * image for image in (output, truth)))
+        return output, state
+
+    monkeypatch.setattr(denoiser, "predict", predict)
+    value, parts = OneLoss(denoiser, OneTerms(temporal=0.5, scales=(1, 8)))(batch)
+    spatial = 0.0
+    errors = []
+    for frame, (output, truth) in zip(batch.frames, seen, strict=True):
+        surface = (frame.depth > 0).float()
+        blocks = [image * surface for image in (output, truth)]
+        share = surface.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2))
+        small = [image.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2)) / share.clamp(min=1e-6) for image in blocks]
+        errors.append(tone(output) - tone(truth))
+        spatial += surface_mean(errors[-1].abs(), frame.depth) / 2
+        spatial += surface_mean((tone(small[0]) - tone(small[1])).abs(), share) / 2
+    temporal = surface_mean((errors[1] - errors[0]).abs(), batch.frames[0].depth)
+    assert parts["spatial"].item() == pytest.approx(spatial.item(), rel=1e-4)
+    assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
+
+
 def test_every_recipe_has_a_loss_for_its_terms():
     for name in TRAINABLE:
         terms = recipe_for(name, "paper").loss
@@ -414,6 +467,7 @@ SAME_NETWORK = [  # as ntd's
         ("wskp-mr", 40, {}, 0.8),
         ("kp", 40, {}, 0.8),
         ("ntd", 40, {"length": 4}, 0.8),
+        ("one", 40, {"length": 4}, 0.8),
         *SAME_NETWORK,
     ],
 )
