@@ -54,15 +54,6 @@ class Cameras:
             torch.from_numpy(view.object_to_world)[None],
         )
 
-    def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
-        """The frame with the means of its noisy channels and those of `others`, further realisations of it."""
-        frames = [self, *others]
-        noisy = {
-            name: torch.stack([frame.channels[name] for frame in frames]).mean(dim=0)
-            for name in self.channels.keys() & set(NOISY)
-        }
-        return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
-
     def map(self, function: Callable[[Tensor], Tensor]) -> "Cameras":
         """The cameras with `function` of every matrix."""
         return Cameras(function(self.K), function(self.camera_to_world), function(self.object_to_world))
@@ -249,10 +240,9 @@ class Frame:
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device)
 
-        moved = self.map(move)
         whole, spp = (None if tensor is None else move(tensor) for tensor in (self.whole, self.spp))
-        cameras = {"now": self.now.map(move), "previous": self.previous.map(move)}
-        return replace(moved, **cameras, gain=move(self.gain), whole=whole, spp=spp)
+        moved = replace(self.map(move), gain=move(self.gain), whole=whole, spp=spp)
+        return replace(moved, now=self.now.map(move), previous=self.previous.map(move))
 
     @staticmethod
     def stack(frames: Sequence["Frame"]) -> "Frame":

@@ -23,7 +23,7 @@ class Augmentation:
     rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
     exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5
-    samples: bool = False  # half of the sequences are means of 2, 4, 8, ... realisations
+    samples: bool = False  # three in ten sequences are means of 2, 4, 8, ... realisations
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
@@ -109,7 +109,9 @@ class TrainingSequences(TorchDataset[list[Frame]]):
             previous = playback[max(t - 1, 0)]
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
             if together > 1:
-                frame = frame.with_more_samples([read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]])
+                frame = frame.with_more_samples(
+                    [read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]]
+                )
             for _ in range(turns):
                 frame = frame.rot90()
             if gain is not None:
@@ -121,9 +123,9 @@ class TrainingSequences(TorchDataset[list[Frame]]):
 
     @staticmethod
     def _realisations_together(count: int, rng: np.random.Generator) -> int:
-        """1 in half of the cases, else 2, 4, 8, ... of `count`."""
+        """1 in seven of ten cases, else 2, 4, 8, ... of `count`."""
         most = int(np.log2(count))
-        return 1 if rng.random() < 0.5 else 2 ** int(rng.integers(1, max(most, 1) + 1))
+        return 1 if rng.random() < 0.7 else 2 ** int(rng.integers(1, max(most, 1) + 1))
 
     def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:
         """Frame numbers in the order in which they are played."""

@@ -1,4 +1,4 @@
-"""A filter whose weights compare learned features of pixels: one level of an à-trous transform (Işık et al. 2021)."""
+"""A filter whose weights compare learned features of pixels: one level of an à-trous transform (Isik et al. 2021)."""
 
 from typing import Any
 
@@ -29,22 +29,32 @@ class AffinityLevel(torch.autograd.Function):
     """Both directions by kernels for the processor."""
 
     @staticmethod
-    def forward(ctx: Any, *tensors: Any) -> Tensor:
-        *images, step = tensors
-        out, total = kernels.filter_level(*images, step)
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        features: Tensor,
+        sharpness: Tensor,
+        own: Tensor,
+        importance: Tensor,
+        surface: Tensor,
+        step: int,
+    ) -> Tensor:
+        given = (image, features, sharpness, own, importance)
+        out, total = kernels.filter_level(*given, surface, step)
         ctx.step = step
-        ctx.save_for_backward(*images, out, total)
+        ctx.save_for_backward(*given, surface, out, total)
         return out
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
-        return *kernels.pull_level(gradients[0], *ctx.saved_tensors, ctx.step), None, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *given, surface, out, total = ctx.saved_tensors
+        return *kernels.pull_level(gradients[0], given, surface, out, total, ctx.step), None, None
 
 
 def affinity_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> Tensor:
-    """A convex mean over 3 x 3 taps `step` pixels apart (Işık et al. 2021, Eq. 4, with two weights more).
+    """A convex mean over 3 x 3 taps `step` pixels apart (Isik et al. 2021, Eq. 4, with two weights more).
 
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p). Only
     pixels that show a surface count; the others become 0.
@@ -52,8 +62,7 @@ def affinity_level(
     image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """
-    tensors = (image, features, sharpness, own, importance, surface)
-    if image.device.type == "cpu" and image.dtype == torch.float32 and compiled.enabled:
-        out: Tensor = AffinityLevel.apply(*tensors, step)
-        return out
-    return plain_level(*tensors, step)
+    by_kernels = compiled.enabled and image.device.type == "cpu" and image.dtype == torch.float32
+    level = AffinityLevel.apply if by_kernels else plain_level
+    filtered: Tensor = level(image, features, sharpness, own, importance, surface, step)
+    return filtered

@@ -1,7 +1,7 @@
 """`one`: our own recurrent denoiser, made of convex kernels on irradiance and of history that surfaces vouch for."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -14,15 +14,13 @@ from models.compiled import one as kernels
 from models.denoiser import Denoiser, State, matching_state
 from models.neighbours import mesh_sums
 from models.operators import image_luminance, pad_to_multiple
-from models.parameters import BRIGHTEST
+from models.parameters import BRIGHTEST, COMPARED, FEWEST_SAMPLES, LARGEST_LOGIT, LATENT, STEPS
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
 
-LATENT = 6  # channels carried beside images, in [-1, 1]
-FEATURES = 8  # that pixels are compared by
-STEPS = (32, 16, 8, 4, 2, 1)  # px between the taps of the filter's levels: the last ones smooth the pattern of the first
-LARGEST_LOGIT = 10.0  # of the weights of taps
+LARGEST_TO_SQUARE = 1e15  # luminance
+DETAIL = 24  # hidden channels of what looks at every pixel alone
 MULTIPLE = 8  # of the sides of an image that the network takes
 
 
@@ -49,7 +47,7 @@ class Trunk(nn.Module):
         self.up_a = nn.ConvTranspose2d(b, a, 2, stride=2)
         self.join_a = conv(a, a)
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
-        self.detail = nn.Linear(inputs, outputs, bias=False)
+        self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
@@ -63,7 +61,7 @@ class Trunk(nn.Module):
 
 @dataclass(frozen=True)
 class OneState(State):
-    """What is carried: irradiance denoised and merely accumulated, the effective length of the latter, latent channels."""
+    """What is carried: irradiance denoised and merely accumulated, that one's effective length, latent channels."""
 
     output: Tensor  # (B, 3, H, W)
     accumulated: Tensor  # (B, 3, H, W)
@@ -97,6 +95,45 @@ class Evidence:
     found: Tensor
 
 
+class Said(NamedTuple):
+    """What the network says of every pixel, in the form that the filter takes, and the accumulation that follows."""
+
+    features: Tensor  # (B, COMPARED, H, W)
+    sharpness: Tensor  # (B, levels, H, W), as the others of affinity_level
+    own: Tensor
+    importance: Tensor
+    alpha: Tensor  # (B, 2, H, W), the weights of this frame in the accumulation and in the output
+    latent: Tensor  # (B, LATENT, H, W)
+    accumulated: Tensor  # (B, 3, H, W)
+    length: Tensor  # (B, 1, H, W)
+
+
+LEVELS = len(STEPS)
+SPLIT = (COMPARED, LEVELS, LEVELS, LEVELS, 2, LATENT)  # of the network's outputs
+
+
+@compiled.by(kernels.interpret)
+def interpret(
+    said: Tensor, noisy: Tensor, accumulated: Tensor, length: Tensor, found: Tensor, samples: Tensor
+) -> tuple[Tensor, ...]:
+    """What the outputs (B, ·, H, W) of the network mean, in the order of Said.
+
+    The others are as in Evidence, samples (B, 1, 1, 1).
+
+    The prior of the accumulation is the even mean of all samples: the network says how far to leave it. Where nothing
+    was found there is nothing to mix with.
+    """
+    features, sharpness, own, importance, alphas, latent = said.split(SPLIT, dim=1)
+    past = length.clamp(min=FEWEST_SAMPLES)
+    prior = torch.cat([torch.log(past / samples), torch.zeros_like(past)], dim=1)
+    alpha = torch.where(found > 0, torch.sigmoid(alphas - prior), 1)
+    newest, kept = alpha[:, :1], 1 - alpha[:, :1]
+    variance = newest.square() / samples + kept.square() / past
+    logits = (each.clamp(-LARGEST_LOGIT, LARGEST_LOGIT) for each in (own, importance))
+    accumulated = torch.lerp(accumulated, noisy, newest)
+    return features, F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
+
+
 @compiled.by(kernels.network_inputs)
 def network_inputs(
     frame: Frame,
@@ -120,7 +157,7 @@ def network_inputs(
 
 
 class One(Denoiser):
-    """Recurrent kernel prediction. Where no surface vouches for history, there is none: the weight of the frame is 1."""
+    """Recurrent kernel prediction. Where no surface vouches for history, the weight of the frame is 1."""
 
     reads = (
         "direct",
@@ -140,14 +177,17 @@ class One(Denoiser):
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         inputs = 5 * 3 + 4 + LATENT + 8
-        levels = len(STEPS)
-        self.split = (FEATURES, levels, levels, levels, 2, LATENT)
-        self.trunk = Trunk(inputs, sum(self.split), self.widths)
+        self.trunk = Trunk(inputs, sum(SPLIT), self.widths)
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
         surface = (frame.depth > 0).to(noisy)
         luminance = image_luminance(noisy)
-        each = torch.cat([noisy, luminance, luminance.clamp(max=1e15).square(), torch.ones_like(luminance)], dim=1) * surface
+        each = (
+            torch.cat(
+                [noisy, luminance, luminance.clamp(max=LARGEST_TO_SQUARE).square(), torch.ones_like(luminance)], dim=1
+            )
+            * surface
+        )
         close = mesh_sums(each, frame.mesh_id, 1)
         wide = mesh_sums(close, frame.mesh_id, 3)
         near = close[:, :3] / close[:, 5:].clamp(min=1)
@@ -178,25 +218,23 @@ class One(Denoiser):
         images = torch.stack([known.noisy, known.near, known.around, known.output, known.accumulated], dim=1)
         seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)
         x = pad_to_multiple(seen, MULTIPLE)
-        said = self.trunk(x.to(self.precision, memory_format=torch.channels_last))
-        said = said[..., :height, :width].to(noisy, memory_format=torch.contiguous_format)
-        features, sharpness, own, importance, alphas, latent = said.split(self.split, dim=1)
-        # The prior of accumulation is the even mean, of which the network says how far to leave it.
-        even = torch.log(known.length.clamp(min=1e-3) / frame.samples)
-        fresh = torch.cat([alphas[:, :1] - even, alphas[:, 1:]], dim=1)
-        alpha = torch.where(known.found > 0, torch.sigmoid(fresh), 1)
-        accumulated = torch.lerp(known.accumulated, noisy, alpha[:, :1])
-        variance = alpha[:, :1].square() / frame.samples + (1 - alpha[:, :1]).square() / known.length.clamp(min=1e-3)
-        length = 1 / variance.clamp(min=1e-6)
-        image = accumulated
-        logits = (LARGEST_LOGIT * torch.tanh(each / LARGEST_LOGIT) for each in (own, importance))
-        weights = (each.split(1, dim=1) for each in (F.softplus(sharpness), *logits))
-        for step, sharp, centre, count in zip(STEPS, *weights, strict=True):
-            image = affinity_level(image, features, sharp, centre, count, surface, step)
-        output = torch.lerp(known.output, image, alpha[:, 1:]) * surface
-        latent = torch.tanh(latent)
+        outputs = self.trunk(x.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
+        past = (known.accumulated, known.length, known.found)
+        said = Said(*interpret(outputs.to(noisy), noisy, *past, frame.samples.to(noisy)))
+        image = said.accumulated
+        planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
+        for step, sharpness, own, importance in zip(STEPS, *planes, strict=True):
+            image = affinity_level(image, said.features, sharpness, own, importance, surface, step)
+        output = torch.lerp(known.output, image, said.alpha[:, 1:]) * surface
         return output, OneState(
-            frame.moment, output, accumulated, length, latent, Surfaces.of(frame), scale, alpha.detach()
+            frame.moment,
+            output,
+            said.accumulated,
+            said.length,
+            said.latent,
+            Surfaces.of(frame),
+            scale,
+            said.alpha.detach(),
         )
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

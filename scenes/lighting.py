@@ -221,7 +221,7 @@ HIDDEN: tuple[Fixture, ...] = (cove, behind_opening, above_furniture, standing_l
 
 
 def brightness(layout: Layout) -> Track:
-    """A factor over time: 1 for most lamps; one in eight fades, some of these several times; one in eight is switched."""
+    """A factor over time: 1 for most lamps; one in eight fades, maybe several times; one in eight is switched."""
     rng = layout.rng
     kind = rng.random()
     if kind < 1 / 8:

@@ -1,5 +1,6 @@
 """models.affinity for the processor, with its gradients: every loop along a row is vectorised."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -20,9 +21,7 @@ STRIDE = 4  # features that are compared in one pass
 
 
 @jit_in_any_order
-def add_squares(
-    distance: Any, a: Any, b: Any, c: Any, d: Any, to_a: Any, to_b: Any, to_c: Any, to_d: Any
-) -> None:
+def add_squares(distance: Any, a: Any, b: Any, c: Any, d: Any, to_a: Any, to_b: Any, to_c: Any, to_d: Any) -> None:
     for x in range(distance.size):
         by_a = a[x] - to_a[x]
         by_b = b[x] - to_b[x]
@@ -115,7 +114,7 @@ def weigh_tap(
 
 @jit_with_memory
 def columns_inside(pixels: int, width: int, step: int) -> Any:
-    """Whether the taps to the left, above or below, and to the right of `pixels` whole rows are in the image: (3, N)."""
+    """Whether the taps to the left, above or below, and to the right of `pixels` in whole rows are inside: (3, N)."""
     inside = np.ones((3, pixels), np.float32)
     for p in range(pixels):
         inside[0, p] = np.float32(p % width >= step)
@@ -143,7 +142,7 @@ def filter_image(
     for number in numba.prange((pixels + block - 1) // block):
         distances = np.empty(block, np.float32)
         weights = np.empty(block, np.float32)
-        first = np.int64(number) * block
+        first: Any = np.int64(number) * block
         last = min(first + block, pixels)
         out[:, first:last] = ZERO
         total[first:last] = ZERO
@@ -195,17 +194,25 @@ def filter_level(
     match_threads()
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
-    images = [flat(tensor) for tensor in (out, total, image, features)]
-    planes = [flat(tensor)[:, 0] for tensor in (sharpness, own, importance, surface)]
-    images[1] = images[1][:, 0]
     for item in range(len(image)):
-        filter_image(*(each[item] for each in (*images, *planes)), image.shape[-1], step)
+        filter_image(
+            flat(out)[item],
+            flat(total)[item, 0],
+            flat(image)[item],
+            flat(features)[item],
+            flat(sharpness)[item, 0],
+            flat(own)[item, 0],
+            flat(importance)[item, 0],
+            flat(surface)[item, 0],
+            image.shape[-1],
+            step,
+        )
     return out, total
 
 
 # --- Gradients --------------------------------------------------------------------------------------------------------
 #
-# With g the gradient of the output over the sum of weights, the weight of q for p has the gradient g_p (image_q - out_p).
+# With g the gradient of the output over the sum of weights, that of the weight of q for p is g_p (image_q - out_p).
 
 
 @jit_in_any_order
@@ -231,7 +238,7 @@ def add(total: Any, a: Any) -> None:
 
 @jit_in_any_order
 def pull_exponent(to_sharpness: Any, pull: Any, distance: Any, sharpness: Any, importance: Any) -> None:
-    """pull (n) becomes the gradient of the exponent; then, for features, -2 sharpness times that is left in distance."""
+    """pull (n) becomes the gradient of the exponent; -2 sharpness times that, for features, is left in distance."""
     for x in range(pull.size):
         inside = importance[x] - sharpness[x] * distance[x] >= LEAST_EXPONENT
         pull[x] = pull[x] if inside else ZERO
@@ -353,21 +360,29 @@ def pull_images(
 
 
 def pull_level(
-    gradient: Tensor,
-    image: Tensor,
-    features: Tensor,
-    sharpness: Tensor,
-    own: Tensor,
-    importance: Tensor,
-    surface: Tensor,
-    out: Tensor,
-    total: Tensor,
-    step: int,
+    gradient: Tensor, given: Sequence[Tensor], surface: Tensor, out: Tensor, total: Tensor, step: int
 ) -> tuple[Tensor, ...]:
-    """The gradients of image, features, sharpness, own and importance."""
+    """The gradients of what was `given`: image, features, sharpness, own and importance."""
     match_threads()
-    given = (image, features, sharpness, own, importance)
-    pulled = tuple(torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
-    known = (*pulled, gradient, *given, surface, out, total)
-    pull_images(*(flat(tensor) for tensor in known), image.shape[-1], step)
-    return pulled
+    image, features, sharpness, own, importance = given
+    pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in given]
+    to_image, to_features, to_sharpness, to_own, to_importance = (flat(tensor) for tensor in pulled)
+    pull_images(
+        to_image,
+        to_features,
+        to_sharpness,
+        to_own,
+        to_importance,
+        flat(gradient),
+        flat(image),
+        flat(features),
+        flat(sharpness),
+        flat(own),
+        flat(importance),
+        flat(surface),
+        flat(out),
+        flat(total),
+        surface.shape[-1],
+        step,
+    )
+    return tuple(pulled)

@@ -22,8 +22,8 @@ from train.crops import Crops
 from train.data import items, loader
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
-from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
 from train.losses.one import OneLoss, OneTerms, shrunk, tone
+from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
 from train.losses.relative import RelativeTerms
 from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe

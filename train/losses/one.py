@@ -1,4 +1,4 @@
-"""The loss of `one`: each frame's error as displayed, at several scales, and that of its change from the frame before."""
+"""The loss of `one`: each frame's error as displayed, at several scales, and how that changes from frame to frame."""
 
 from dataclasses import dataclass
 
