@@ -131,7 +131,7 @@ def train(
 
 def evaluate(
     names: Denoisers = (),
-    data: DataOfBudget = None,
+    data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="data sets; by default data/BUDGET")] = (),
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
     processes: Annotated[int, arg(metavar="N", help="at most so many clips side by side")] = os.cpu_count() or 1,
@@ -143,7 +143,7 @@ def evaluate(
     """
     from eval.harness import evaluate as evaluate_on
 
-    evaluate_on(data_folder(data, budget), runs, budget, names, processes)
+    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes)
 
 
 def report(

@@ -4,6 +4,7 @@ import math
 import multiprocessing
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from signal import SIG_IGN, SIGINT
@@ -131,19 +132,21 @@ def save_strips(runs: Path, results: ClipResults) -> None:
 
 
 def evaluate(
-    data: Path,
+    data: Sequence[Path],
     runs: Path,
     budget: str,
     names: Sequence[str] = (),
     processes: int = 1,
     smallest_share: int = SMALLEST_SHARE,
 ) -> dict[str, Any]:
-    """Evaluate over the test clips; writes RUNS/eval: results.json, frames.csv, and a PNG strip a clip and signal.
+    """Evaluate over the test clips of data sets; writes RUNS/eval: results.json, frames.csv, and a strip of PNGs a clip.
 
     What has been evaluated before, of the same clips, weights and code, is kept. Returns the results. Strips of
-    indirect light have names that end in `-indirect`.
+    indirect light have names that end in `-indirect`. Raises BadInput where two data sets have clips of one name.
     """
-    clips = Dataset(data).clips("test")
+    clips = [clip for path in data for clip in Dataset(path).clips("test")]
+    if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
+        raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
     specs = evaluated(names, runs, budget)
     entrants = entrants_of(specs)
     (runs / "eval").mkdir(parents=True, exist_ok=True)

@@ -109,7 +109,7 @@ def is_finished(folder: Path, wanted: str) -> bool:
 
 
 def write_results(
-    runs: Path, dataset: Path, device: str, results: list[Result], weights: Mapping[str, str | None]
+    runs: Path, data: Sequence[Path], device: str, results: list[Result], weights: Mapping[str, str | None]
 ) -> dict[str, Any]:
     """Write results.json and, frame by frame, frames.csv. Returns the content of results.json."""
     rows = [
@@ -128,7 +128,7 @@ def write_results(
     ]
     content = {
         "schema": 1,
-        "dataset": str(dataset),
+        "dataset": ", ".join(map(str, data)),
         "device": device,
         "versions": versions(DENOISING),
         "rows": rows,

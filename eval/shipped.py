@@ -115,7 +115,7 @@ def facts(name: str, runs: Path) -> str:
         recipe=json.dumps({key: value for key, value in recipe.items() if key not in TOLD_APART}),
         makers=" and ".join(f"{in_words(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]),
         count=len(alike),
-        dataset=Path(results["dataset"]).name,
+        dataset="`, `".join(Path(each).name for each in results["dataset"].split(", ")),
         signal=clips[0].signal,
         precision=results_of(clips, name)[0].precision,
         device=results["device"],

@@ -25,7 +25,7 @@ def evaluated(tiny, tmp_path_factory) -> Path:
     folder = run_folder(runs, "ntd", "tiny")
     folder.mkdir(parents=True)
     save_weights(create("ntd"), "ntd", {}, folder / "weights.safetensors")
-    evaluate(tiny, runs, "tiny", list(TIMES))
+    evaluate([tiny], runs, "tiny", list(TIMES))
     rows = [
         {"denoiser": name, "height": 720, "width": 1280, "dtype": dtype, "threads": threads, "ms_median": ms / threads}
         for name, ms in (TIMES | INDIRECT).items()

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from eval import selection
 from eval.harness import entrants_of, evaluate
 from eval.results import load_picture
 from eval.spec import DenoiserSpec
+from files import read_json, write_json
 from models import registry
 from models.registry import create
 from models.weights import save_weights
@@ -44,7 +46,7 @@ def runs(tiny, tmp_path_factory):
         folder.mkdir(parents=True)
         save_weights(create(name), name, {}, folder / "weights.safetensors")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        evaluate(tiny, runs, "tiny", ["noisy", "accumulated", *TRAINED])
+        evaluate([tiny], runs, "tiny", ["noisy", "accumulated", *TRAINED])
     (runs / "table.txt").write_text(printed.getvalue())
     return runs
 
@@ -127,9 +129,25 @@ def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expec
 
 def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch, shipped):
     with pytest.raises(BadInput, match="onespp train rae"):
-        evaluate(tiny, tmp_path, "tiny", ["rae"])
+        evaluate([tiny], tmp_path, "tiny", ["rae"])
     few = {name: registry.DENOISERS[name] for name in ("noisy", "accumulated", "rae")}
     monkeypatch.setattr(selection, "DENOISERS", few)
-    results = evaluate(tiny, tmp_path, "tiny")
+    results = evaluate([tiny], tmp_path, "tiny")
     assert {row["denoiser"] for row in results["rows"]} == {"noisy", "accumulated"}
     assert re.search(r"\brae\b.*: skipped", capsys.readouterr().out)
+
+
+def test_several_data_sets_are_one_table(tiny, tmp_path):
+    """Clips of all of them; one name cannot stand for two clips."""
+    other = tmp_path / "other"
+    shutil.copytree(tiny, other)
+    with pytest.raises(BadInput, match=f"{other} both have cornell_box/000"):
+        evaluate([tiny, other], tmp_path, "tiny", ["noisy"])
+    for path in (tiny / "test").iterdir():
+        (other / "test" / path.name).rename(other / "test" / f"other_{path.name}")
+    facts = read_json(other / "dataset.json", ())
+    facts["splits"]["test"] = [f"other_{clip}" for clip in facts["splits"]["test"]]
+    write_json(other / "dataset.json", facts)
+    rows = evaluate([tiny, other], tmp_path, "tiny", ["noisy"])["rows"]
+    scenes = {path.name for path in (tiny / "test").iterdir()}
+    assert {row["scene"] for row in rows} == scenes | {f"other_{scene}" for scene in scenes}

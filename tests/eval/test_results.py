@@ -38,7 +38,7 @@ def content(runs: Path) -> dict[str, bytes]:
 def once(tiny, tmp_path_factory):
     runs = tmp_path_factory.mktemp("once")
     save_fresh(runs, 0)
-    evaluate(tiny, runs, "tiny", NAMES)
+    evaluate([tiny], runs, "tiny", NAMES)
     return runs
 
 
@@ -94,16 +94,16 @@ def test_pictures_are_what_is_shown(once, tiny):
 
 def test_what_is_there_is_kept(once, runs, tiny, played):
     before = content(once)
-    evaluate(tiny, runs, "tiny", NAMES)
+    evaluate([tiny], runs, "tiny", NAMES)
     assert played == [] and content(runs) == before
 
 
 def test_only_what_changed_is_done_again(runs, tiny, played):
     save_fresh(runs, 1)
-    evaluate(tiny, runs, "tiny", [*NAMES, "eaw"])
+    evaluate([tiny], runs, "tiny", [*NAMES, "eaw"])
     assert played == [("cornell_box", ["eaw", "rae@tiny"]), ("cornell_box_moving", ["eaw", "rae@tiny"])]
     played.clear()
-    evaluate(tiny, runs, "tiny", ["noisy"])
+    evaluate([tiny], runs, "tiny", ["noisy"])
     rows = json.loads((runs / "eval" / "results.json").read_text())["rows"]
     assert played == [] and {row["denoiser"] for row in rows} == {"noisy"}
 
@@ -112,7 +112,7 @@ def test_another_clip_under_the_same_name_is_another_result(runs, tiny, tmp_path
     other = shutil.copytree(tiny, tmp_path / "other")
     path = other / "test" / "cornell_box" / "000" / "clip.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"exposure": 1.0}))
-    evaluate(other, runs, "tiny", NAMES)
+    evaluate([other], runs, "tiny", NAMES)
     assert played == [("cornell_box", sorted([*NAMES, "reference"]))]
 
 
@@ -126,7 +126,7 @@ def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
         (folder / "result.json").unlink()
     else:
         (folder / "result.json").write_text('{"key": ')
-    evaluate(tiny, runs, "tiny", NAMES)
+    evaluate([tiny], runs, "tiny", NAMES)
     assert played == [("cornell_box", ["accumulated"])] and content(runs) == before
 
 
@@ -146,11 +146,11 @@ def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, m
     shutil.copytree(once / "train", runs / "train")
     monkeypatch.setattr(clip_run, "save_picture", killed)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(tiny, runs, "tiny", NAMES)
+        evaluate([tiny], runs, "tiny", NAMES)
     assert not (runs / "eval" / "results.json").exists()
     assert len(list(runs.glob("eval/clips/*/*/result.json"))) == (len(NAMES) + 1) * (frame // 8)
     monkeypatch.setattr(clip_run, "save_picture", save)
-    evaluate(tiny, runs, "tiny", NAMES)
+    evaluate([tiny], runs, "tiny", NAMES)
     assert content(runs) == content(once)
 
 
@@ -159,7 +159,7 @@ def test_side_by_side_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(harness, "SMALLEST_SHARE", 1)
     runs = tmp_path / "runs"
     shutil.copytree(once / "train", runs / "train")
-    evaluate(tiny, runs, "tiny", NAMES, processes=2)
+    evaluate([tiny], runs, "tiny", NAMES, processes=2)
     for a, b in zip(read_results(runs)[1], read_results(once)[1], strict=True):
         for ours, theirs in zip([*a.results, a.reference], [*b.results, b.reference], strict=True):
             assert ours.key == theirs.key and ours.frames == [

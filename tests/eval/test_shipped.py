@@ -54,7 +54,7 @@ def test_no_card_of_what_is_not_shipped(shipped, capsys):
 
 
 def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
-    evaluate(tiny, tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
+    evaluate([tiny], tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
     card = wskp3.with_suffix(".md")
     with pytest.raises(BadInput, match=r"wskp3.md: write what the network is for.*the lines"):
         write_card("wskp3", tmp_path)
@@ -100,7 +100,7 @@ def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
 def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
     """Not those of a training, and not those that were shipped before."""
     wskp3.with_suffix(".md").write_text(HAND)
-    evaluate(tiny, tmp_path, "tiny", ["noisy", "wskp3"])
+    evaluate([tiny], tmp_path, "tiny", ["noisy", "wskp3"])
     results = tmp_path / "eval" / "results.json"
     content = read_json(results)
     os.utime(wskp3, (results.stat().st_mtime + 5,) * 2)
