@@ -364,19 +364,20 @@ def stress(
 
 
 def ablate(
-    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd"], Positional],
+    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd", "one"], Positional],
     data: DataOfBudget = None,
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
     seeds: Annotated[int, arg(metavar="N", help="trainings of each network; mean and spread are shown")] = 1,
 ) -> None:
-    """Repeat an ablation of the papers, or go on with it: table beside the paper's findings, plot, results.json.
+    """Repeat an ablation of the papers, or ours, or go on with it: table beside the findings, plot, results.json.
 
     rae-inputs: what RAE gains by demodulation, normals, depth and roughness (Fig. 3).
     rae-loss: what the gradient and temporal terms of its loss add to the spatial one (§4.4).
     wskp-windows: windows of 3 to 13 pixels alone and together (WSKP, Fig. 9 and 10).
     wskp-repvgg: wskp6 and kp with and without RepVGG blocks (WSKP, Table 5).
     ntd: ntd-a, ntd-b and ntd where meshes move (NTD §6.3).
+    one: our network without history, latent channels, levels of its filter, terms of its loss.
     """
     from eval.ablation.run import ablate as repeat
 
@@ -435,6 +436,7 @@ def denoise(
     quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="OIDN's")] = None,
     stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as they were")] = None,
     png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
+    spp: Annotated[float, arg(metavar="N", help="samples a pixel that the frames were rendered with")] = 1.0,
     threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
 ) -> None:
     """Denoise a sequence of OpenEXR files from any renderer, or go on with it.
@@ -452,6 +454,8 @@ def denoise(
     from timing import thread_count
 
     colour = (*frames, *hdr)
+    if not spp > 0:
+        raise BadInput(f"--spp {spp:g} are no samples: frames have one a pixel, or a few")
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
     weights = weights or weights_of(denoiser, runs)
@@ -459,7 +463,7 @@ def denoise(
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)
     with thread_count(threads_or_all(threads)):
-        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png))
+        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png, spp))
 
 
 def weights(

@@ -62,8 +62,10 @@ def camera(K: ArrayLike, camera_to_world: ArrayLike) -> View:
     return View(np.asarray(K, np.float64), np.asarray(camera_to_world, np.float64), np.eye(4)[None])
 
 
-def frames(sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], denoiser: Denoiser) -> Iterator[Frame]:
-    """Frames from one's own arrays, a mapping for each frame.
+def frames(
+    sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], denoiser: Denoiser, spp: float = 1.0
+) -> Iterator[Frame]:
+    """Frames from one's own arrays, a mapping for each frame; the colour has `spp` samples a pixel.
 
     What may be in it, all (H, W, C), row 0 at the top:
 
@@ -81,7 +83,7 @@ def frames(sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], denois
     """
     from denoise.arrays import frames_of_arrays
 
-    return frames_of_arrays(sequence, denoiser.reads)
+    return frames_of_arrays(sequence, denoiser.reads, spp)
 
 
 def denoise(denoiser: Denoiser, sequence: Iterable[Frame]) -> Iterator[NDArray[np.float32]]:

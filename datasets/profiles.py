@@ -54,6 +54,8 @@ BOXES = ("cornell_box", "cornell_box_moving")
 FIRST_ROOM = {"train": 0, "val": 1000, "test": 2000}  # the number of a split's first room, for seed 0
 ROOMS_OF_A_SEED = 10_000
 
+TEST_OF_SMALL_ROOMS = SamplingQuality(realisations=1, reference_spp=64, floor=40, most_spp=256, passes_over=True)
+
 DATA_PROFILES = {
     "tiny": DataProfile(
         height=64,
@@ -76,7 +78,7 @@ DATA_PROFILES = {
         quality={
             "train": SamplingQuality(realisations=4, reference_spp=32),
             "val": SamplingQuality(realisations=1, reference_spp=64),
-            "test": SamplingQuality(realisations=1, reference_spp=64, floor=40, most_spp=256, passes_over=True),
+            "test": TEST_OF_SMALL_ROOMS,
         },
     ),
     # Rooms as those of release in minutes, small and short, to see how hard they are.
@@ -112,17 +114,17 @@ DATA_PROFILES = {
 
 
 def rooms_profile(rooms: int, spp: int) -> DataProfile:
-    """So many small rooms to train on, whose references have so many samples a pixel, and three to validate on."""
+    """So many small rooms to train on, with references of so many samples a pixel, and a few to validate and judge."""
     return DataProfile(
         height=96,
         width=96,
         frames=12,
         boxes=dict.fromkeys(SPLITS, 0),
-        rooms={"train": rooms, "val": 3, "test": 0},
+        rooms={"train": rooms, "val": 3, "test": 4},
         quality={
             "train": SamplingQuality(realisations=8, reference_spp=spp),
             "val": SamplingQuality(realisations=8, reference_spp=64),
-            "test": SamplingQuality(realisations=1, reference_spp=64),
+            "test": TEST_OF_SMALL_ROOMS,
         },
     )
 

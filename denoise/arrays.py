@@ -20,7 +20,7 @@ COMPONENTS = {"depth": 1, "distance": 1, "roughness": 1, "motion": 2}  # of othe
 
 
 def frames_of_arrays(
-    sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], reads: tuple[str, ...]
+    sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], reads: tuple[str, ...], spp: float
 ) -> Iterator[Frame]:
     """A Frame with the channels in `reads` for each mapping of arrays (H, W, C); onespp.frames says what they hold.
 
@@ -31,7 +31,7 @@ def frames_of_arrays(
     if first is None:
         return
     reading = Reading(Meaning() if "motion" in first else None, cameras="arrays" if CAMERA in first else None)
-    shot = Shot(reading, reads, "arrays")
+    shot = Shot(reading, reads, "arrays", spp)
     for index, quantities in enumerate(chain([first], remaining)):
         if quantities.keys() != first.keys():
             other = min(quantities.keys() ^ first.keys())

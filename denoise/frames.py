@@ -100,10 +100,11 @@ def camera_kind(pixels: Pixels) -> Reading:
 class Shot:
     """The frames between two cuts, one after another: what a frame needs of the one before is kept here."""
 
-    def __init__(self, reading: Reading, reads: tuple[str, ...], source: str):
+    def __init__(self, reading: Reading, reads: tuple[str, ...], source: str, spp: float = 1.0):
         self.reading = reading
         self.reads = reads
         self.source = source
+        self.spp = spp
         self.view: View | None = None  # of the frame before
         self.depth: Image | None = None  # of the frame before, (H, W)
         self.seen = False  # whether that frame's camera was known
@@ -139,6 +140,7 @@ class Shot:
             previous=Cameras.of(before if self.reading.has_history else NOWHERE),
             gain=torch.ones(1, 3, 1, 1),
             source=self.source,
+            spp=torch.full((1, 1, 1, 1), self.spp),
         )
 
     def given_motion(self, pixels: Pixels) -> Image | None:

@@ -50,6 +50,7 @@ class Job:
         reset_at: numbers of frames at which history begins anew.
         stored_as: precision of denoised channels, by default that of the input.
         previews: whether to write a PNG beside each frame.
+        spp: samples a pixel of the colour; what our own files say is known.
     """
 
     patterns: Mapping[str, Sequence[str]]
@@ -64,6 +65,7 @@ class Job:
     quality: OIDNQuality | None = None
     stored_as: Precision | None = None
     previews: bool = False
+    spp: float = 1.0
 
 
 @torch.inference_mode()
@@ -173,6 +175,7 @@ class Work:
             "layers": sorted(job.layers),
             "motion": str(job.motion if self.sources.is_ours else self.understanding.reading.meaning),
             "as": job.stored_as,
+            "spp": job.spp,
             "versions": versions(DENOISING),
         }
 
@@ -238,7 +241,7 @@ class Work:
                 return image, frame, int(torch.stack(bad).any(dim=0).sum())
 
             return ours
-        shot = Shot(self.understanding.reading, self.denoiser.reads, str(self.shots[0][0].passes[COLOUR]))
+        shot = Shot(self.understanding.reading, self.denoiser.reads, str(self.shots[0][0].passes[COLOUR]), self.job.spp)
 
         def foreign(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
             pixels, image = read_pixels(files, self.sources)

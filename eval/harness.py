@@ -139,7 +139,7 @@ def evaluate(
     processes: int = 1,
     smallest_share: int = SMALLEST_SHARE,
 ) -> dict[str, Any]:
-    """Evaluate over the test clips of data sets; writes RUNS/eval: results.json, frames.csv, and a strip of PNGs a clip.
+    """Evaluate over the test clips of data sets; writes RUNS/eval: results.json, frames.csv, a PNG a clip and signal.
 
     What has been evaluated before, of the same clips, weights and code, is kept. Returns the results. Strips of
     indirect light have names that end in `-indirect`. Raises BadInput where two data sets have clips of one name.

@@ -1,5 +1,6 @@
 """`one`: our own recurrent denoiser, made of convex kernels on irradiance and of history that surfaces vouch for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -108,8 +109,9 @@ class Said(NamedTuple):
     length: Tensor  # (B, 1, H, W)
 
 
-LEVELS = len(STEPS)
-SPLIT = (COMPARED, LEVELS, LEVELS, LEVELS, 2, LATENT)  # of the network's outputs
+def split_of(levels: int) -> tuple[int, ...]:
+    """How many of the network's outputs belong to what: features, three of each level, two weights, latent channels."""
+    return COMPARED, levels, levels, levels, 2, LATENT
 
 
 @compiled.by(kernels.interpret)
@@ -123,7 +125,8 @@ def interpret(
     The prior of the accumulation is the even mean of all samples: the network says how far to leave it. Where nothing
     was found there is nothing to mix with.
     """
-    features, sharpness, own, importance, alphas, latent = said.split(SPLIT, dim=1)
+    levels = (said.shape[1] - sum(split_of(0))) // 3
+    features, sharpness, own, importance, alphas, latent = said.split(split_of(levels), dim=1)
     past = length.clamp(min=FEWEST_SAMPLES)
     prior = torch.cat([torch.log(past / samples), torch.zeros_like(past)], dim=1)
     alpha = torch.where(found > 0, torch.sigmoid(alphas - prior), 1)
@@ -174,10 +177,12 @@ class One(Denoiser):
     is_network = True
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
-    def __init__(self, *, signal: Signal | None = None):
+    def __init__(self, *, steps: Sequence[int] = STEPS, signal: Signal | None = None):
+        """`steps` are the pixels between the taps of each level of the filter."""
         super().__init__(signal=signal)
+        self.steps = steps
         inputs = 5 * 3 + 4 + LATENT + 8
-        self.trunk = Trunk(inputs, sum(SPLIT), self.widths)
+        self.trunk = Trunk(inputs, sum(split_of(len(steps))), self.widths)
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
         surface = (frame.depth > 0).to(noisy)
@@ -223,7 +228,7 @@ class One(Denoiser):
         said = Said(*interpret(outputs.to(noisy), noisy, *past, frame.samples.to(noisy)))
         image = said.accumulated
         planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
-        for step, sharpness, own, importance in zip(STEPS, *planes, strict=True):
+        for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
             image = affinity_level(image, said.features, sharpness, own, importance, surface, step)
         output = torch.lerp(known.output, image, said.alpha[:, 1:]) * surface
         return output, OneState(

@@ -1,4 +1,4 @@
-"""The ablations that the papers publish, as data: which networks are trained, how, and what the papers found."""
+"""The ablations that the papers publish, and that of our own network, as data: what is trained, how, what was found."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,14 +7,18 @@ from itertools import pairwise
 from typing import Literal
 
 from errors import BadInput
+from eval.ablation.one_without import WithoutHistory, WithoutLatent
 from eval.ablation.textured_rae import TexturedRAE
 from eval.extra_denoisers import WINDOW_SETS, windows_label
 from eval.papers.tables import WSKP_TABLE_5
 from models.denoiser import Denoiser
-from models.parameters import WINDOWS
+from models.one import One
+from models.parameters import STEPS, WINDOWS
 from models.rae import AUXILIARY, RAE
 from models.registry import create
 from models.wskp import KP, WSKP
+from train.losses.network_loss import LossTerms
+from train.losses.one import OneTerms
 from train.losses.rae import RAETerms
 from train.recipe import Recipe
 from train.recipes import recipe_for
@@ -42,7 +46,7 @@ class AblationVariant:
     label: str
     base: str
     create: Callable[[], Denoiser]
-    loss: RAETerms | None = None
+    loss: LossTerms | None = None
     paper: str = "-"
 
     def recipe(self, budget: str) -> Recipe:
@@ -185,12 +189,36 @@ def ntd() -> Ablation:
     )
 
 
+def one() -> Ablation:
+    """Ours: what each part of the design is for."""
+    variants = (
+        AblationVariant("one", "one", One),
+        AblationVariant("without-history", "one", WithoutHistory),
+        AblationVariant("without-latent", "one", WithoutLatent),
+        AblationVariant("four-levels", "one", partial(One, steps=STEPS[2:])),
+        AblationVariant("fine-levels-first", "one", partial(One, steps=STEPS[::-1])),
+        AblationVariant("pixels-alone", "one", One, OneTerms(scales=(1,))),
+        AblationVariant("frames-alone", "one", One, OneTerms(temporal=0.0)),
+    )
+    pairs = tuple(("one", variant.label) for variant in variants[1:-1])
+    return Ablation(
+        source="ours: a part of `one` left out, or of its loss",
+        variants=variants,
+        metrics=("psnr", "ssim", "flip", "temporal_error"),
+        findings=(
+            Finding("every part is worth having", "psnr", pairs),
+            Finding("a loss of changes steadies it", "temporal_error", (("one", "frames-alone"),)),
+        ),
+    )
+
+
 ABLATIONS: dict[str, Callable[[], Ablation]] = {
     "rae-inputs": rae_inputs,
     "rae-loss": rae_loss,
     "wskp-windows": wskp_windows,
     "wskp-repvgg": wskp_repvgg,
     "ntd": ntd,
+    "one": one,
 }
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory, match_threads
+from models.compiled.lines import add_line, add_product, scale_line
 
 ZERO = np.float32(0)
 TWO = np.float32(2)
@@ -83,12 +84,6 @@ def normalise(red: Any, green: Any, blue: Any, total: Any) -> None:
 
 
 @jit_in_any_order
-def leave_out(weight: Any, inside: Any) -> None:
-    for x in range(weight.size):
-        weight[x] *= inside[x]
-
-
-@jit_in_any_order
 def weigh_tap(
     weight: Any,
     distance: Any,
@@ -109,7 +104,7 @@ def weigh_tap(
     measure(distance, features, low, high, offset)
     there = slice(low + offset, high + offset)
     weigh(weight, distance, sharpness[low:high], importance[there], surface[there])
-    leave_out(weight, inside)
+    scale_line(weight, inside)
 
 
 @jit_with_memory
@@ -178,7 +173,7 @@ def filter_image(
                 image[1, there],
                 image[2, there],
             )
-        leave_out(total[first:last], surface[first:last])
+        scale_line(total[first:last], surface[first:last])
         normalise(out[0, first:last], out[1, first:last], out[2, first:last], total[first:last])
 
 
@@ -222,18 +217,6 @@ def pull_weights(
     """pull (n): the gradients of the weights, times the weights."""
     for x in range(pull.size):
         pull[x] = weight[x] * (red[x] * to_red[x] + green[x] * to_green[x] + blue[x] * to_blue[x] - dot[x])
-
-
-@jit_in_any_order
-def add_product(total: Any, a: Any, b: Any) -> None:
-    for x in range(total.size):
-        total[x] += a[x] * b[x]
-
-
-@jit_in_any_order
-def add(total: Any, a: Any) -> None:
-    for x in range(total.size):
-        total[x] += a[x]
 
 
 @jit_in_any_order
@@ -339,7 +322,7 @@ def pull_images(
                 for c in range(colours):
                     add_product(to_image[item, c, there], weight, scaled[c, here])
                 if offset == 0:
-                    add(to_own[item, 0, low:high], pull)
+                    add_line(to_own[item, 0, low:high], pull)
                     continue
                 pull_exponent(
                     to_sharpness[item, 0, low:high],
@@ -348,7 +331,7 @@ def pull_images(
                     sharpness[item, 0, low:high],
                     importance[item, 0, there],
                 )
-                add(to_importance[item, 0, there], pull)
+                add_line(to_importance[item, 0, there], pull)
                 for f in range(features.shape[1]):
                     pull_feature(
                         to_features[item, f, low:high],

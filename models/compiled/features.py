@@ -12,6 +12,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
+from models.compiled.lines import interleave, scale_depth
 from models.parameters import FEATURES, GAMMA
 from models.running_scale import RunningScale
 
@@ -34,20 +35,6 @@ def display(line: Any, irradiance: Any, albedo: Any, exposure: Any) -> None:
 def scale_normal(line: Any, normal: Any) -> None:
     for x in range(line.size):
         line[x] = normal[x] * HALF + HALF
-
-
-@jit_with_reciprocals
-def scale_depth(line: Any, depth: Any, scale: Any) -> None:
-    for x in range(line.size):
-        line[x] = depth[x] / (depth[x] + scale) if depth[x] > 0 else ONE
-
-
-@jit_with_reciprocals
-def interleave(out: Any, lines: Any) -> None:
-    """out (n, C) = lines (C, n), transposed."""
-    for x in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[x, c] = lines[c, x]
 
 
 @jit_parallel

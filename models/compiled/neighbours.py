@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.lines import add_product
 
 ONE = np.float32(1)
 ZERO = np.float32(0)
@@ -17,12 +18,6 @@ ZERO = np.float32(0)
 def compare(same: Any, mesh: Any, other: Any) -> None:
     for x in range(same.size):
         same[x] = ONE if mesh[x] == other[x] else ZERO
-
-
-@jit_in_any_order
-def add_product(total: Any, weight: Any, line: Any) -> None:
-    for x in range(total.size):
-        total[x] += weight[x] * line[x]
 
 
 @jit_parallel

@@ -14,6 +14,7 @@ from datasets.frame import Frame
 from models import parameters
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.lines import copy_line, interleave, scale_depth
 from models.running_scale import RunningScale
 
 ONE = np.float32(1)
@@ -46,30 +47,10 @@ def one_over(line: Any, length: Any, samples: Any) -> None:
 
 
 @jit_in_any_order
-def copy(line: Any, image: Any) -> None:
-    for x in range(line.size):
-        line[x] = image[x]
-
-
-@jit_in_any_order
 def turn(line: Any, nx: Any, ny: Any, nz: Any, axis: Any) -> None:
     ax, ay, az = axis[0], axis[1], axis[2]
     for x in range(line.size):
         line[x] = ax * nx[x] + ay * ny[x] + az * nz[x]
-
-
-@jit_in_any_order
-def scale_depth(line: Any, depth: Any, scale: Any) -> None:
-    for x in range(line.size):
-        line[x] = depth[x] / (depth[x] + scale) if depth[x] > ZERO else ONE
-
-
-@jit_in_any_order
-def interleave(out: Any, lines: Any) -> None:
-    """out (n, C) = lines (C, n), transposed."""
-    for x in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[x, c] = lines[c, x]
 
 
 @jit_parallel
@@ -103,16 +84,16 @@ def write_inputs(
             log_of_one_more(lines[k], deviation[y])
             lines[k + 1] = ONE / samples
             one_over(lines[k + 2], length[y], samples)
-            copy(lines[k + 3], found[y])
+            copy_line(lines[k + 3], found[y])
             k += 4
             for channel in range(latent.shape[0]):
-                copy(lines[k], latent[channel, y])
+                copy_line(lines[k], latent[channel, y])
                 k += 1
             for c in range(3):
-                copy(lines[k + c], albedo[c, y])
+                copy_line(lines[k + c], albedo[c, y])
                 turn(lines[k + 3 + c], normal[0, y], normal[1, y], normal[2, y], to_view[c])
             scale_depth(lines[k + 6], depth[y], depth_scale)
-            copy(lines[k + 7], roughness[y])
+            copy_line(lines[k + 7], roughness[y])
             interleave(out[y], lines)
 
 
@@ -261,7 +242,7 @@ def interpret(
 ) -> tuple[Tensor, ...]:
     """See models.one.interpret."""
     batch, _, height, width = noisy.shape
-    levels = len(parameters.STEPS)
+    levels = (said.shape[1] - parameters.COMPARED - 2 - parameters.LATENT) // 3
     counts = (parameters.COMPARED, levels, 2 * levels, 2, parameters.LATENT, 3, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     features, sharpness, logits, alpha, latent, now_accumulated, now_length = out

@@ -16,6 +16,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import parameters
 from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_reciprocals
+from models.compiled.lines import add_product
 from models.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
 
 HALF = np.float32(0.5)
@@ -453,12 +454,6 @@ def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor
 
 
 # --- The gradient of the history --------------------------------------------------------------------------------------
-
-
-@jit_with_reciprocals
-def add_product(total: Any, weight: Any, line: Any) -> None:
-    for i in range(total.size):
-        total[i] += weight[i] * line[i]
 
 
 @jit_with_reciprocals

@@ -252,3 +252,39 @@ def test_demodulation_round_trip_and_unread_channels(clips):
     with pytest.raises(BadInput, match="'normal' was not loaded"):
         frame.view_normal()
     assert not hasattr(frame, "no_channel")
+
+
+def test_sequences_of_several_samples_are_means_of_realisations(tiny):
+    """Each frame names its samples, and is the mean of as many realisations of it."""
+    clips = Dataset(tiny).clips("train")
+    counts = set()
+    for index in range(24):
+        plain, several = (
+            TrainingSequences(clips, ("direct", "indirect"), 3, 32, augmentation, seed=0)[index]
+            for augmentation in (Augmentation(), Augmentation(samples=True))
+        )
+        for one, mean in zip(plain, several, strict=True):
+            count = int(mean.samples.item())
+            counts.add(count)
+            if count == 1:
+                assert torch.equal(one.direct, mean.direct)
+            torch.testing.assert_close(one.direct_reference, mean.direct_reference)
+        assert len({frame.samples.item() for frame in several}) == 1
+    assert counts == {1, 2}  # there are two realisations
+
+
+def test_means_of_frames_keep_everything_but_the_noise(clips):
+    frames = [read_frame(clips[0], 3, IMAGE_CHANNELS, realisation) for realisation in (0, 1)]
+    mean = frames[0].with_more_samples(frames[1:])
+    assert mean.samples.item() == 2 * frames[0].samples.item()
+    for name in frames[0].channels:
+        if name in ("direct", "indirect"):
+            torch.testing.assert_close(mean.channels[name], (frames[0].channels[name] + frames[1].channels[name]) / 2)
+        else:
+            assert torch.equal(mean.channels[name], frames[0].channels[name])
+
+
+def test_exposures_vary_without_changing_colours(clips):
+    gains = torch.cat([sequences(clips, Augmentation(exposure=True))[index][0].gain for index in range(20)]).flatten(1)
+    assert torch.equal(gains[:, 0], gains[:, 1]) and torch.equal(gains[:, 0], gains[:, 2])
+    assert 2**-1.5 <= gains.min() < 0.8 and 1.3 < gains.max() <= 2**1.5

@@ -48,11 +48,12 @@ def frames_of(tiny, reads, count: int = 2) -> list[Frame]:
 
 def made_up(what: str, value, seeds: int = 2) -> list[VariantRun]:
     """Runs of all variants whose metrics are value(index of the variant, seed)."""
+    metrics = ("psnr", "ssim", "rmse", "flip", "temporal_error", "disocclusion_l1")
     runs = []
     for index, variant in enumerate(ablation_for(what).variants):
         for seed in range(seeds):
             x = value(index, seed)
-            clips = {"scene/0": dict.fromkeys(("psnr", "ssim", "rmse", "temporal_error", "disocclusion_l1"), x)}
+            clips = {"scene/0": dict.fromkeys(metrics, x)}
             runs.append(VariantRun(variant.label, seed, 7, [None, x], clips, x))
     return runs
 

@@ -1,0 +1,147 @@
+"""`one`: what it accumulates, when it forgets, what it does not depend on; the kernels against PyTorch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from datasets.clip import Dataset
+from datasets.frame import Frame, read_frame
+from models import compiled
+from models.one import One
+from models.reprojection import reproject
+from models.surfaces import Surfaces
+from tests.helpers.frames import chain, flat_frame, play, run
+
+SIZE = (24, 40)
+BYTES_AT_720P = 150e6
+
+
+def silent(**changes: object) -> One:
+    """A network that says nothing: all its outputs are 0."""
+    denoiser = One(**changes)
+    for parameter in denoiser.parameters():
+        parameter.data.zero_()
+    denoiser.prepare()
+    return denoiser
+
+
+@pytest.fixture
+def fresh() -> One:
+    torch.manual_seed(0)
+    denoiser = One()
+    denoiser.prepare()
+    return denoiser
+
+
+def noise(count: int, scale: float = 1.0) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return [scale * torch.rand(1, 3, *SIZE, generator=generator) for _ in range(count)]
+
+
+def frames(images: list[Tensor], motion: tuple[float, float] = (0.0, 0.0)) -> list[Frame]:
+    return chain([flat_frame(*SIZE, motion, irradiance=image) for image in images])
+
+
+def test_the_prior_of_accumulation_is_the_even_mean():
+    images = noise(6)
+    _, state = play(silent(), frames(images))
+    torch.testing.assert_close(state.accumulated, torch.stack(images).mean(dim=0))
+    torch.testing.assert_close(state.length, torch.full((1, 1, *SIZE), 6.0))
+
+
+def test_frames_count_by_their_samples():
+    """Three samples, then one, then eight: the mean of all twelve."""
+    images = noise(3)
+    spp = (3.0, 1.0, 8.0)
+    sequence = [replace(frame, spp=torch.full((1, 1, 1, 1), n)) for frame, n in zip(frames(images), spp, strict=True)]
+    _, state = play(silent(), sequence)
+    mean = sum(n * image for n, image in zip(spp, images, strict=True)) / 12
+    torch.testing.assert_close(state.accumulated, mean)
+    torch.testing.assert_close(state.length, torch.full((1, 1, *SIZE), 12.0))
+
+
+def test_the_length_is_that_of_a_mean_with_as_little_noise(fresh):
+    """Unequal weights: 1 / sum of their squares, whatever the network says."""
+    images = noise(5)
+    before = None
+    weights: list[Tensor] = []
+    for frame in frames(images):
+        with torch.no_grad():
+            _, before = fresh(frame, before)
+        alpha = before.alpha[:, :1]
+        weights = [weight * (1 - alpha) for weight in weights] + [alpha]
+    assert ((before.alpha > 0.01) & (before.alpha < 0.99)).any()
+    torch.testing.assert_close(sum(weights), torch.ones(1, 1, *SIZE))
+    torch.testing.assert_close(before.length, 1 / sum(weight.square() for weight in weights), rtol=1e-4, atol=1e-4)
+
+
+def test_where_nothing_was_found_history_has_no_weight(tiny, fresh):
+    """Exactly the first frame's result where a cut or a disocclusion leaves nothing to go by."""
+    clip = Dataset(tiny).clips("test")[1]
+    first, later = read_frame(clip, 0, fresh.reads), read_frame(clip, 7, fresh.reads, previous=0)
+    _, before = play(fresh, [first])
+    _, found = reproject(later, before.output, Surfaces.of(first))
+    _, after = play(fresh, [first, later])
+    lost = ~found & (later.depth > 0)
+    assert lost.any() and found.any()
+    assert (after.alpha[lost.expand_as(after.alpha)] == 1).all()
+    noisy = later.irradiance("total")
+    torch.testing.assert_close(after.accumulated[lost.expand_as(noisy)], noisy[lost.expand_as(noisy)])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_brightness_is_but_a_factor(fresh, scale):
+    dim, lit = (run(fresh, frames(noise(4, each), (0.5, 0.25))) for each in (1.0, scale))
+    for a, b in zip(dim, lit, strict=True):
+        torch.testing.assert_close(scale * a, b, rtol=1e-3, atol=1e-3 * scale)
+
+
+@pytest.mark.parametrize("unit", [1e-2, 1e2])
+def test_units_of_length_do_not_matter(fresh, unit):
+    sequences = [
+        chain([flat_frame(*SIZE, (0.5, 0.25), depth=2.0 * each, irradiance=image) for image in noise(4)])
+        for each in (1.0, unit)
+    ]
+    for a, b in zip(*(run(fresh, sequence) for sequence in sequences), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_kernels_are_pytorch_but_faster(tiny, fresh):
+    for clip in Dataset(tiny).clips("test"):
+        sequence = [read_frame(clip, index, fresh.reads) for index in range(4)]
+        fast, state = play(fresh, sequence)
+        with compiled.disabled():
+            slow, other = play(fresh, sequence)
+        for a, b in zip(fast, slow, strict=True):
+            assert torch.isclose(a, b, rtol=1e-3, atol=1e-3).float().mean() > 0.999
+        for name in ("latent", "alpha", "length", "accumulated"):
+            close = torch.isclose(getattr(state, name), getattr(other, name), rtol=1e-3, atol=1e-3)
+            assert close.float().mean() > 0.999, name
+
+
+def test_a_still_wall_stays_what_it_is(fresh):
+    """300 frames of even light, seen by a camera that does not move: no drift."""
+    image = 0.5 * torch.ones(1, 3, *SIZE)
+    outputs = run(fresh, frames([image] * 300))
+    for output in (outputs[0], outputs[10], outputs[-1]):
+        torch.testing.assert_close(output, image, rtol=1e-4, atol=1e-4)
+
+
+def test_the_state_is_small(fresh):
+    _, state = play(fresh, frames(noise(1)))
+    images = [state.output, state.accumulated, state.length, state.latent, state.alpha]
+    tensors = [*images, state.surfaces.depth, state.surfaces.normal, state.surfaces.mesh_id]
+    bytes_a_pixel = sum(tensor.nbytes for tensor in tensors) / (SIZE[0] * SIZE[1])
+    assert bytes_a_pixel * 1280 * 720 <= BYTES_AT_720P
+
+
+def test_levels_of_the_filter_can_be_chosen():
+    """Without a word from the network each level is an even mean of nine, and levels follow one another."""
+    image = torch.zeros(1, 3, *SIZE)
+    image[..., 12, 20] = 81.0
+    outputs = run(silent(steps=(3, 1)), frames([image]))
+    square = torch.zeros_like(image)
+    square[..., 8:17, 16:25] = 1.0
+    torch.testing.assert_close(outputs[0], square)
