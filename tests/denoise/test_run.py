@@ -296,13 +296,8 @@ def test_a_frame_rendered_anew_is_denoised_anew_with_all_that_follow_from_it(sph
 def test_settings_are_never_mixed(spheres, tmp_path):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
     denoise(job(tmp_path / "in", tmp_path / "out"))
-    for other in (
-        {"denoiser": "eaw"},
-        {"reset_at": [2]},
-        {"stored_as": "half"},
-        {"motion": "XY,-x,+y,pixels"},
-        {"spp": 4.0},
-    ):
+    others = {"denoiser": "eaw", "reset_at": [2], "stored_as": "half", "motion": "XY,-x,+y,pixels", "spp": 4.0}
+    for name, value in others.items():
         with pytest.raises(BadInput, match="denoised with other settings"):
             denoise(job(tmp_path / "in", tmp_path / "out", **{name: value}))
 
