@@ -1,4 +1,4 @@
-"""The pixels around each pixel, some steps apart."""
+"""The pixels around each pixel, some steps apart, and what those of its own mesh look like."""
 
 import torch
 from torch import Tensor
@@ -6,6 +6,8 @@ from torch.nn import functional as F
 
 from models import compiled
 from models.compiled import neighbours as kernels
+from models.operators import image_luminance
+from models.parameters import LARGEST_LUMINANCE
 
 
 def shifted(x: Tensor, step: int) -> Tensor:
@@ -15,8 +17,23 @@ def shifted(x: Tensor, step: int) -> Tensor:
     return taps.view(batch, channels, 9, height, width)
 
 
-@compiled.by(kernels.mesh_sums)
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
     """Sums (B, C, H, W) over those of the 3 x 3 taps that lie on the pixel's own mesh."""
     same = shifted(mesh_id + 1, step) == mesh_id[:, :, None] + 1
     return torch.where(same, shifted(image, step), 0).sum(dim=2)
+
+
+@compiled.by(kernels.mesh_means)
+def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means of the image (B, 3, H, W) over the pixel's own mesh, and how far luminance spreads there.
+
+    The means (B, 3, H, W) are over 3 x 3 pixels, and over 9 x 9: over 3 x 3 sums like that, 3 pixels apart. The last is
+    the relative standard deviation of luminance in the latter, (B, 1, H, W).
+    """
+    luminance = image_luminance(image).clamp(max=LARGEST_LUMINANCE)
+    one = torch.ones_like(luminance)
+    close = mesh_sums(torch.cat([image, luminance, luminance.square(), one], dim=1), mesh_id, 1)
+    wide = mesh_sums(close, mesh_id, 3)
+    around, mean, square = (wide[:, :5] / wide[:, 5:]).split([3, 1, 1], dim=1)
+    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-20)
+    return close[:, :3] / close[:, 5:], around, deviation

@@ -13,14 +13,13 @@ from models import compiled
 from models.affinity import affinity_level
 from models.compiled import one as kernels
 from models.denoiser import Denoiser, State, matching_state
-from models.neighbours import mesh_sums
-from models.operators import image_luminance, pad_to_multiple
+from models.neighbours import mesh_means
+from models.operators import pad_to_multiple
 from models.parameters import BRIGHTEST, COMPARED, FEWEST_SAMPLES, LARGEST_LOGIT, LATENT, STEPS
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
 
-LARGEST_TO_SQUARE = 1e15  # luminance
 DETAIL = 24  # hidden channels of what looks at every pixel alone
 MULTIPLE = 8  # of the sides of an image that the network takes
 
@@ -185,21 +184,8 @@ class One(Denoiser):
         self.trunk = Trunk(inputs, sum(split_of(len(steps))), self.widths)
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
-        surface = (frame.depth > 0).to(noisy)
-        luminance = image_luminance(noisy)
-        each = (
-            torch.cat(
-                [noisy, luminance, luminance.clamp(max=LARGEST_TO_SQUARE).square(), torch.ones_like(luminance)], dim=1
-            )
-            * surface
-        )
-        close = mesh_sums(each, frame.mesh_id, 1)
-        wide = mesh_sums(close, frame.mesh_id, 3)
-        near = close[:, :3] / close[:, 5:].clamp(min=1)
-        mean = wide[:, :5] / wide[:, 5:].clamp(min=1)
-        around, first, second = mean[:, :3], mean[:, 3:4], mean[:, 4:]
-        deviation = (second - first.square()).clamp(min=0).sqrt() / first.clamp(min=1e-20)
-        nothing = torch.zeros_like(luminance)
+        near, around, deviation = mesh_means(noisy, frame.mesh_id)
+        nothing = torch.zeros_like(deviation)
         output, accumulated, length, latent, found = around, noisy, nothing, nothing.expand(-1, LATENT, -1, -1), nothing
         if before is not None:
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
