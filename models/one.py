@@ -140,7 +140,7 @@ def interpret(
 def network_inputs(
     frame: Frame,
     scale: RunningScale,
-    images: Tensor,
+    images: Sequence[Tensor],
     deviation: Tensor,
     length: Tensor,
     found: Tensor,
@@ -148,9 +148,9 @@ def network_inputs(
 ) -> Tensor:
     """What the network sees, (B, ·, H, W): logarithms of exposed irradiance, numbers of the history, surfaces.
 
-    `images` (B, I, 3, H, W) of irradiance; the others as in Evidence.
+    `images`, each (B, 3, H, W), are irradiance; the others as in Evidence.
     """
-    exposed = images.clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
+    exposed = torch.stack(list(images), dim=1).clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
     colours = torch.log1p(exposed.clamp(max=BRIGHTEST)).flatten(1, 2)
     newest = (1 / frame.samples).expand_as(length)
     numbers = (torch.log1p(deviation), newest, 1 / (length + frame.samples), found)
@@ -206,7 +206,7 @@ class One(Denoiser):
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         known = self.evidence(frame, noisy, before)
         height, width = frame.size
-        images = torch.stack([known.noisy, known.near, known.around, known.output, known.accumulated], dim=1)
+        images = (known.noisy, known.near, known.around, known.output, known.accumulated)
         seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)
         x = pad_to_multiple(seen, MULTIPLE)
         outputs = self.trunk(x.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]

@@ -3,6 +3,7 @@
 Networks take and give pixels with their channels side by side; all other loops here run along lines of one channel.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -70,16 +71,16 @@ def write_inputs(
     depth_scale: Any,
     roughness: Any,
 ) -> None:
-    """out (H, W, C) from images (I, 3, H, W) and others (c, H, W) or (H, W)."""
+    """out (H, W, C) from images, each (3, H, W), and others (c, H, W) or (H, W)."""
     height, width = depth.shape
     for block in numba.prange((height + BLOCK_ROWS - 1) // BLOCK_ROWS):
         lines = np.empty((out.shape[2], width), np.float32)
         start = np.int64(block) * BLOCK_ROWS
         for y in range(start, min(start + BLOCK_ROWS, height)):
             k = 0
-            for image in range(images.shape[0]):
+            for image in images:
                 for c in range(3):
-                    compress(lines[k], images[image, c, y], gain[c])
+                    compress(lines[k], image[c, y], gain[c])
                     k += 1
             log_of_one_more(lines[k], deviation[y])
             lines[k + 1] = ONE / samples
@@ -100,15 +101,15 @@ def write_inputs(
 def network_inputs(
     frame: Frame,
     scale: RunningScale,
-    images: Tensor,
+    images: Sequence[Tensor],
     deviation: Tensor,
     length: Tensor,
     found: Tensor,
     latent: Tensor,
 ) -> Tensor:
     """See models.one.network_inputs; channels come last in memory."""
-    batch = len(images)
-    channels = 3 * images.shape[1] + LONE_INPUTS + latent.shape[1]
+    batch = len(deviation)
+    channels = 3 * len(images) + LONE_INPUTS + latent.shape[1]
     out = torch.empty(batch, *frame.size, channels)
     gains = array((scale.exposure() * frame.gain).flatten(1))
     depth_scales = array(scale.log_depth.value.exp())
@@ -116,7 +117,7 @@ def network_inputs(
     for item in range(batch):
         write_inputs(
             out[item].numpy(),
-            array(images[item]),
+            tuple(array(image[item]) for image in images),
             gains[item],
             array(deviation[item, 0]),
             array(length[item, 0]),
