@@ -417,7 +417,7 @@ def denoise(
     frames: Annotated[
         Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, often with all layers")
     ] = (),
-    denoiser: Annotated[str, arg(metavar="DENOISER", help="of networks trained here NETWORK@BUDGET")] = "wskp6",
+    denoiser: Annotated[str, arg(metavar="DENOISER", help="of networks trained here NETWORK@BUDGET")] = "one",
     out: Annotated[Path, arg(metavar="DIR", help="where denoised frames go, under their own names")] = Path("denoised"),
     weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default those shipped")] = None,
     runs: Runs = Path("runs"),
