@@ -50,14 +50,19 @@ class Trunk(nn.Module):
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
+    def of_patches(self, x: Tensor) -> Tensor:
+        """What the U-Net adds to `detail`."""
         a = self.enter(x)
         b = self.down_b(a)
         c = self.down_c(b)
         b = self.join_b(b + self.up_b(c))
         a = self.join_a(a + self.up_a(b))
-        return self.leave(a) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
+        leaving: Tensor = self.leave(a)
+        return leaving
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
+        return self.of_patches(x) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,29 @@ class Evidence:
     length: Tensor  # 0 where not found
     latent: Tensor
     found: Tensor
+
+
+def averaged(noisy: Tensor, surface: Tensor) -> Tensor:
+    """What sums over neighbours are taken of, (B, 6, H, W): irradiance, luminance, its square, 1; 0 for background."""
+    luminance = image_luminance(noisy)
+    square = luminance.clamp(max=LARGEST_TO_SQUARE).square()
+    return torch.cat([noisy, luminance, square, torch.ones_like(luminance)], dim=1) * surface
+
+
+def evidence_of(noisy: Tensor, close: Tensor, wide: Tensor, past: Tensor, found: Tensor) -> Evidence:
+    """What follows from a frame's `noisy` irradiance, its sums, and the history.
+
+    `close` and `wide` are sums of `averaged` over 3 x 3 and 9 x 9 pixels; `past` (B, 7 + LATENT, H, W) holds output,
+    accumulation, its length and latent channels where they were `found` (B, 1, H, W), 1 or 0.
+    """
+    near = close[:, :3] / close[:, 5:].clamp(min=1)
+    mean = wide[:, :5] / wide[:, 5:].clamp(min=1)
+    around, first, second = mean[:, :3], mean[:, 3:4], mean[:, 4:]
+    deviation = (second - first.square()).clamp(min=0).sqrt() / first.clamp(min=1e-20)
+    output = torch.where(found > 0, past[:, :3], around)
+    accumulated = torch.where(found > 0, past[:, 3:6], noisy)
+    length, latent = (past[:, 6:] * found).split([1, LATENT], dim=1)
+    return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
 
 
 class Said(NamedTuple):
@@ -186,31 +214,15 @@ class One(Denoiser):
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
         surface = (frame.depth > 0).to(noisy)
-        luminance = image_luminance(noisy)
-        each = (
-            torch.cat(
-                [noisy, luminance, luminance.clamp(max=LARGEST_TO_SQUARE).square(), torch.ones_like(luminance)], dim=1
-            )
-            * surface
-        )
-        close = mesh_sums(each, frame.mesh_id, 1)
+        close = mesh_sums(averaged(noisy, surface), frame.mesh_id, 1)
         wide = mesh_sums(close, frame.mesh_id, 3)
-        near = close[:, :3] / close[:, 5:].clamp(min=1)
-        mean = wide[:, :5] / wide[:, 5:].clamp(min=1)
-        around, first, second = mean[:, :3], mean[:, 3:4], mean[:, 4:]
-        deviation = (second - first.square()).clamp(min=0).sqrt() / first.clamp(min=1e-20)
-        nothing = torch.zeros_like(luminance)
-        output, accumulated, length, latent, found = around, noisy, nothing, nothing.expand(-1, LATENT, -1, -1), nothing
+        found = torch.zeros_like(surface)
+        past = found.expand(-1, 7 + LATENT, -1, -1)
         if before is not None:
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
             past, where = reproject(frame, carried, before.surfaces)
-            where = where & (frame.depth > 0)
-            found = where.to(noisy)
-            output = torch.where(where, past[:, :3], around)
-            accumulated = torch.where(where, past[:, 3:6], noisy)
-            length = past[:, 6:7] * found
-            latent = past[:, 7:] * found
-        return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
+            found = where.to(noisy) * surface
+        return evidence_of(noisy, close, wide, past, found)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""

@@ -6,11 +6,12 @@ import torch
 
 from errors import BadInput
 from models.denoiser import Denoiser
+from models.export.one import OneStep
 from models.export.step import Step, Warp
 from models.export.wskp import WSKPStep
 from models.registry import load
 
-STEPS = {"wskp3": WSKPStep, "wskp6": WSKPStep}
+STEPS = {"wskp3": WSKPStep, "wskp6": WSKPStep, "one": OneStep}
 
 
 def check_exportable(name: str) -> None:
