@@ -1,7 +1,6 @@
 """A step whose history moves along with the surfaces: what it takes of a frame and of the one before, and that move."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,74 +11,46 @@ from models.export.reprojection import View, expectation, fetch, places, table_o
 from models.export.step import MESHES, Carried, Port, Step, Warp, image
 from models.surfaces import to_previous_camera
 
-
-@dataclass(frozen=True)
-class Brought:
-    """An input that each frame brings, and how it follows from the frame (B = 1)."""
-
-    port: Port
-    of: Callable[[Frame], Tensor]
-
-
-BROUGHT = {
-    each.port.name: each
-    for each in (
-        Brought(
-            image("noisy", 3, "noisy radiance of direct and indirect light, linear RGB; what is not finite counts as 0"),
-            lambda frame: frame.direct + frame.indirect,
+PORTS = {
+    port.name: port
+    for port in (
+        image("noisy", 3, "noisy radiance of direct and indirect light, linear RGB; what is not finite counts as 0"),
+        image("emission", 3, "radiance of light seen directly, linear RGB; added to the output as it is"),
+        image("albedo", 3, "reflectance in [0, 1]; 1 for background"),
+        image("normal", 3, "shading normal in world space, of unit length; 0 for background"),
+        image("depth", 1, "distance along the viewing axis, in any unit; 0 for background"),
+        image("roughness", 1, "GGX alpha; 1 for diffuse surfaces and background"),
+        image("mesh_id", 1, "number of the mesh; 0 for background", torch.int32),
+        image("motion", 2, "x and y from the pixel to where its surface was in the frame before, pixels"),
+        Port("K", (3, 3), "projection of this camera: pixel = (K p) / p_z of a point p in the camera's frame"),
+        Port(
+            "camera_to_world",
+            (4, 4),
+            "rigid pose of this camera, whose z axis looks forward; only its rotation is read",
         ),
-        Brought(
-            image("emission", 3, "radiance of light seen directly, linear RGB; added to the output as it is"),
-            lambda frame: frame.emission,
+        Port(
+            "to_previous_camera",
+            (MESHES, 4, 4),
+            "rigid, by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply in "
+            "float64: inverse(previous camera_to_world) · previous object_to_world · inverse(object_to_world) · "
+            "camera_to_world, and without the objects in row 0",
         ),
-        Brought(image("albedo", 3, "reflectance in [0, 1]; 1 for background"), lambda frame: frame.albedo),
-        Brought(
-            image("normal", 3, "shading normal in world space, of unit length; 0 for background"),
-            lambda frame: frame.normal,
-        ),
-        Brought(
-            image("depth", 1, "distance along the viewing axis, in any unit; 0 for background"),
-            lambda frame: frame.depth,
-        ),
-        Brought(
-            image("roughness", 1, "GGX alpha in [0, 1]; 1 for diffuse surfaces"),
-            lambda frame: frame.roughness,
-        ),
-        Brought(
-            image("mesh_id", 1, "number of the mesh; 0 for background", torch.int32),
-            lambda frame: frame.mesh_id.int(),
-        ),
-        Brought(
-            image("motion", 2, "x and y from the pixel to where its surface was in the frame before, pixels"),
-            lambda frame: frame.motion,
-        ),
-        Brought(
-            Port("K", (3, 3), "projection of this camera: pixel = (K p) / p_z of a point p in the camera's frame"),
-            lambda frame: frame.now.K[0].float(),
-        ),
-        Brought(
-            Port(
-                "camera_to_world",
-                (4, 4),
-                "rigid pose of this camera, whose z axis looks forward; only its rotation is read",
-            ),
-            lambda frame: frame.now.camera_to_world[0].float(),
-        ),
-        Brought(
-            Port(
-                "to_previous_camera",
-                (MESHES, 4, 4),
-                "rigid, by mesh_id: from this camera's frame to that of the frame before, along with the mesh; multiply "
-                "in float64: inverse(previous camera_to_world) · previous object_to_world · inverse(object_to_world) · "
-                "camera_to_world, and without the objects in row 0",
-            ),
-            lambda frame: to_previous_camera(frame.now, frame.previous, 0).float(),
-        ),
-        Brought(
-            Port("samples", (1,), "samples a pixel of the noisy radiance; 1 where that is not known"),
-            lambda frame: frame.samples.view(1),
-        ),
+        Port("samples", (1,), "samples a pixel of the noisy radiance; 1 where that is not known"),
     )
+}
+BROUGHT: dict[str, Callable[[Frame], Tensor]] = {
+    "noisy": lambda frame: frame.direct + frame.indirect,
+    "emission": lambda frame: frame.emission,
+    "albedo": lambda frame: frame.albedo,
+    "normal": lambda frame: frame.normal,
+    "depth": lambda frame: frame.depth,
+    "roughness": lambda frame: frame.roughness,
+    "mesh_id": lambda frame: frame.mesh_id.int(),
+    "motion": lambda frame: frame.motion,
+    "K": lambda frame: frame.now.K[0].float(),
+    "camera_to_world": lambda frame: frame.now.camera_to_world[0].float(),
+    "to_previous_camera": lambda frame: to_previous_camera(frame.now, frame.previous, 0).float(),
+    "samples": lambda frame: frame.samples.view(1),
 }
 FOR_WARP = ("mesh_id", "motion", "K", "camera_to_world", "to_previous_camera")
 TESTED = ("depth", "normal", "mesh_id", "K", "camera_to_world")  # of both frames, in the order of View
@@ -90,11 +61,11 @@ class RecurrentStep(Step):
     """A step with one image of history and the running scale as state."""
 
     def __init__(self, reads: Sequence[str], history: Port, warp: Warp):
-        """It takes what it `reads`, names of BROUGHT, and with the warp inside what that needs."""
+        """It takes what it `reads`, names of PORTS, and with the warp inside what that needs."""
         super().__init__()
         inside = warp == "inside"
         self.warp = warp
-        self.images = tuple(BROUGHT[name].port for name in dict.fromkeys([*reads, *(FOR_WARP if inside else ())]))
+        self.images = tuple(PORTS[name] for name in dict.fromkeys([*reads, *(FOR_WARP if inside else ())]))
         before = (
             Carried(Port(f"previous_{port.name}", port.shape, "that of the frame before", port.dtype), port.name)
             for port in self.images
@@ -112,7 +83,7 @@ class RecurrentStep(Step):
         )
 
     def feeds(self, frame: Frame) -> dict[str, Tensor]:
-        return {port.name: BROUGHT[port.name].of(frame) for port in self.images}
+        return {port.name: BROUGHT[port.name](frame) for port in self.images}
 
     def past(self, x: dict[str, Tensor]) -> Tensor:
         """The history (1, C, H, W) where this frame's surfaces were, 0 where they were not."""
