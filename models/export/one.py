@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from models import compiled
 from models.export.neighbours import affinity_level, mesh_sums
@@ -28,6 +29,7 @@ HISTORY = image(
     "irradiance denoised and accumulated, linear RGB each; the accumulation's length in samples; latent channels",
 )
 TO_VIEW = (-1.0, 1.0, -1.0)  # see Frame.to_view
+MARGIN = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
 
 
 def pointwise(layers: nn.Sequential) -> nn.Sequential:
@@ -52,6 +54,24 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
     return x
 
 
+class Coarsest(nn.Sequential):
+    """The trunk's layers at 1/8 of the resolution, with zeros beside: tracers must know that there are two pixels."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        inside = F.pad(torch.ones_like(x[:, :1]), MARGIN)[..., ::2, ::2]
+        x = F.pad(x, MARGIN)
+        for layer in self:
+            x = layer(x) * inside
+        return x
+
+
+class WithoutMargin(nn.Module):
+    """What `Coarsest` has added, cut off at twice its resolution."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x[..., :-2, :-2]
+
+
 class OneStep(RecurrentStep):
     """`one`, prepared for inference, which must not be used any more."""
 
@@ -60,6 +80,8 @@ class OneStep(RecurrentStep):
         self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.trunk
         self.trunk.detail = pointwise(self.trunk.detail)
+        self.trunk.down_c = Coarsest(*self.trunk.down_c)
+        self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
         self.requires_grad_(False)
 
     def evidence(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> Evidence:
@@ -98,11 +120,9 @@ class OneStep(RecurrentStep):
             said = Said(*interpret(outputs, noisy, known.accumulated, known.length, known.found, x["samples"]))
         filtered = said.accumulated
         planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
-        for step, *plane in zip(self.steps, *planes, strict=True):
-            filtered = affinity_level(filtered, said.features, *plane, surface, step)
-        newest = said.alpha[:, 1:]
-        # Where nothing was found the weight is 1 and what it is mixed with must leave no trace, however bright.
-        output = (newest * filtered + (1 - newest) * known.output) * surface
+        for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
+            filtered = affinity_level(filtered, said.features, sharpness, own, importance, surface, step)
+        output = torch.lerp(known.output, filtered, said.alpha[:, 1:]) * surface
         return {
             "radiance": output * divisor + x["emission"],
             "new_history": torch.cat([output, said.accumulated, said.length, said.latent], dim=1),
