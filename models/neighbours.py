@@ -23,6 +23,19 @@ def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
     return torch.where(same, shifted(image, step), 0).sum(dim=2)
 
 
+def summands(image: Tensor) -> Tensor:
+    """What mesh_means sums: the image (B, 3, H, W), its luminance, the square of that, and 1; (B, 6, H, W)."""
+    luminance = image_luminance(image).clamp(max=LARGEST_LUMINANCE)
+    return torch.cat([image, luminance, luminance.square(), torch.ones_like(luminance)], dim=1)
+
+
+def means_of(close: Tensor, wide: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What mesh_means returns, of sums of summands over 3 x 3 pixels and over 9 x 9."""
+    around, mean, square = (wide[:, :5] / wide[:, 5:]).split([3, 1, 1], dim=1)
+    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-20)
+    return close[:, :3] / close[:, 5:], around, deviation
+
+
 @compiled.by(kernels.mesh_means)
 def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Means of the image (B, 3, H, W) over the pixel's own mesh, and how far luminance spreads there.
@@ -30,10 +43,5 @@ def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     The means (B, 3, H, W) are over 3 x 3 pixels, and over 9 x 9: over 3 x 3 sums like that, 3 pixels apart. The last is
     the relative standard deviation of luminance in the latter, (B, 1, H, W).
     """
-    luminance = image_luminance(image).clamp(max=LARGEST_LUMINANCE)
-    one = torch.ones_like(luminance)
-    close = mesh_sums(torch.cat([image, luminance, luminance.square(), one], dim=1), mesh_id, 1)
-    wide = mesh_sums(close, mesh_id, 3)
-    around, mean, square = (wide[:, :5] / wide[:, 5:]).split([3, 1, 1], dim=1)
-    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-20)
-    return close[:, :3] / close[:, 5:], around, deviation
+    close = mesh_sums(summands(image), mesh_id, 1)
+    return means_of(close, mesh_sums(close, mesh_id, 3))

@@ -49,14 +49,19 @@ class Trunk(nn.Module):
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
+    def of_patches(self, x: Tensor) -> Tensor:
+        """What the U-Net adds to `detail`."""
         a = self.enter(x)
         b = self.down_b(a)
         c = self.down_c(b)
         b = self.join_b(b + self.up_b(c))
         a = self.join_a(a + self.up_a(b))
-        return self.leave(a) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
+        leaving: Tensor = self.leave(a)
+        return leaving
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
+        return self.of_patches(x) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,19 @@ class Evidence:
     length: Tensor  # 0 where not found
     latent: Tensor
     found: Tensor
+
+
+def evidence_of(noisy: Tensor, means: tuple[Tensor, Tensor, Tensor], past: Tensor, found: Tensor) -> Evidence:
+    """What follows from a frame's `noisy` irradiance, what mesh_means says of it, and the history.
+
+    `past` (B, 7 + LATENT, H, W) holds output, accumulation, its length and latent channels where they were `found`
+    (B, 1, H, W), 1 or 0.
+    """
+    near, around, deviation = means
+    output = torch.where(found > 0, past[:, :3], around)
+    accumulated = torch.where(found > 0, past[:, 3:6], noisy)
+    length, latent = (past[:, 6:] * found).split([1, LATENT], dim=1)
+    return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
 
 
 class Said(NamedTuple):
@@ -184,19 +202,14 @@ class One(Denoiser):
         self.trunk = Trunk(inputs, sum(split_of(len(steps))), self.widths)
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
-        near, around, deviation = mesh_means(noisy, frame.mesh_id)
-        nothing = torch.zeros_like(deviation)
-        output, accumulated, length, latent, found = around, noisy, nothing, nothing.expand(-1, LATENT, -1, -1), nothing
+        surface = (frame.depth > 0).to(noisy)
+        found = torch.zeros_like(surface)
+        past = found.expand(-1, 7 + LATENT, -1, -1)
         if before is not None:
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
             past, where = reproject(frame, carried, before.surfaces)
-            where = where & (frame.depth > 0)
-            found = where.to(noisy)
-            output = torch.where(where, past[:, :3], around)
-            accumulated = torch.where(where, past[:, 3:6], noisy)
-            length = past[:, 6:7] * found
-            latent = past[:, 7:] * found
-        return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
+            found = where.to(noisy) * surface
+        return evidence_of(noisy, mesh_means(noisy, frame.mesh_id), past, found)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""

@@ -72,8 +72,8 @@ INSIDE = """What is named `previous_…` is the input of the frame before: keep 
 transforms of `to_previous_camera` are products of matrices of large numbers: multiply in float64, then round."""
 
 OUTSIDE = """Before each frame but the first, move `history` along with the surfaces: at each pixel, what `new_history`
-held where its surface was in the frame before, and 0 in all channels where that surface was not seen. Its last channel
-is the number of frames in the mean, so 0 starts anew."""
+held where its surface was in the frame before, and 0 in all channels where that surface was not seen: one of them is a
+length, and where it is 0 the denoiser starts anew."""
 
 
 def table(ports: Sequence[Mapping[str, Any]]) -> str:

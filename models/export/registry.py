@@ -6,11 +6,12 @@ import torch
 
 from errors import BadInput
 from models.denoiser import Denoiser
+from models.export.one import OneStep
 from models.export.step import Step, Warp
 from models.export.wskp import WSKPStep
 from models.registry import load
 
-STEPS = {"wskp3": WSKPStep, "wskp6": WSKPStep}
+STEPS = {"wskp3": WSKPStep, "wskp6": WSKPStep, "one": OneStep}
 
 
 def check_exportable(name: str) -> None:
@@ -22,7 +23,7 @@ def check_exportable(name: str) -> None:
 def step_of(name: str, denoiser: Denoiser, warp: Warp) -> Step:
     """The step of a named denoiser, which is prepared for inference and must not be used any more."""
     check_exportable(name)
-    return STEPS[name](denoiser, warp)  # type: ignore[arg-type]  # each step has its own denoiser
+    return STEPS[name](denoiser, warp)
 
 
 def load_step(name: str, weights: Path, precision: torch.dtype, warp: Warp) -> Step:

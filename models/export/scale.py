@@ -21,6 +21,10 @@ class Scale(NamedTuple):
     exposure: Tensor
     depth: Tensor  # the running median
 
+    def normalised_depth(self, depth: Tensor) -> Tensor:
+        """See models.running_scale.RunningScale.normalised_depth."""
+        return torch.where(depth > 0, depth / (depth + self.depth), 1)
+
 
 def measured_luminance(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     """ln(luminance / middle grey) of the surfaces, averaged over blocks, and 1, or 0 where all is black: (1,) each."""

@@ -25,7 +25,7 @@ def test_untrained_and_unknown(capsys, tmp_path, shipped):
     runs = ["--runs", str(tmp_path), "--to", "pt2"]
     assert "wskp3: it has no weights at" in fails(capsys, "export", "wskp3", *runs)
     assert "`onespp train wskp3 --budget tiny" in fails(capsys, "export", "wskp3@tiny", *runs)
-    assert "'svgf' cannot be exported; wskp3, wskp6 can" in fails(capsys, "export", "svgf", *runs)
+    assert "'svgf' cannot be exported; wskp3, wskp6, one can" in fails(capsys, "export", "svgf", *runs)
     assert "there are no weights at" in fails(capsys, "export", "wskp3", *runs, "--weights", str(tmp_path / "w"))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 

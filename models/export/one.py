@@ -1,0 +1,132 @@
+"""`one` (models/one.py) as a step: evidence, network and affinity filter in one graph."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models import compiled
+from models.export.neighbours import affinity_level, mesh_sums
+from models.export.recurrent import RecurrentStep, demodulation
+from models.export.scale import Scale, updated_scale
+from models.export.step import Warp, image
+from models.neighbours import means_of, summands
+from models.one import MULTIPLE, Evidence, One, Said, evidence_of, interpret
+from models.parameters import BRIGHTEST, LATENT
+
+READS = (
+    "noisy",
+    "emission",
+    "albedo",
+    "normal",
+    "depth",
+    "roughness",
+    "mesh_id",
+    "camera_to_world",
+    "samples",
+)
+HISTORY = image(
+    "history",
+    7 + LATENT,
+    "irradiance denoised and accumulated, linear RGB each; the accumulation's length in samples; latent channels",
+)
+TO_VIEW = (-1.0, 1.0, -1.0)  # see Frame.to_view
+MARGIN = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
+
+
+def pointwise(layers: nn.Sequential) -> nn.Sequential:
+    """The same layers on images: linear ones as convolutions of 1 x 1."""
+    plain: list[nn.Module] = []
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            convolution = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=layer.bias is not None)
+            convolution.load_state_dict(layer.state_dict() | {"weight": layer.weight[:, :, None, None]})
+            layer = convolution
+        plain.append(layer)
+    return nn.Sequential(*plain)
+
+
+def resized(x: Tensor, height: int, width: int) -> Tensor:
+    """x (1, C, h, w) with borders repeated, or cut off, at the right and the bottom: (1, C, height, width).
+
+    By indices: tracers cannot tell how far an image is from a multiple of 8.
+    """
+    for dim, size in ((-2, height), (-1, width)):
+        x = x.index_select(dim, torch.arange(size).clamp(max=x.shape[dim] - 1))
+    return x
+
+
+class Coarsest(nn.Sequential):
+    """The trunk's layers at 1/8 of the resolution, with zeros beside: tracers must know that there are two pixels."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        inside = F.pad(torch.ones_like(x[:, :1]), MARGIN)[..., ::2, ::2]
+        x = F.pad(x, MARGIN)
+        for layer in self:
+            x = layer(x) * inside
+        return x
+
+
+class WithoutMargin(nn.Module):
+    """What `Coarsest` has added, cut off at twice its resolution."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x[..., :-2, :-2]
+
+
+class OneStep(RecurrentStep):
+    """`one`, prepared for inference, which must not be used any more."""
+
+    def __init__(self, denoiser: One, warp: Warp):
+        super().__init__(READS, HISTORY, warp)
+        self.steps = tuple(denoiser.steps)
+        self.trunk = denoiser.trunk
+        self.trunk.detail = pointwise(self.trunk.detail)
+        self.trunk.down_c = Coarsest(*self.trunk.down_c)
+        self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
+        self.requires_grad_(False)
+
+    def evidence(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> Evidence:
+        """What is known before the network speaks."""
+        mesh = x["mesh_id"].to(noisy) + 1
+        close = mesh_sums(summands(noisy), mesh, 1)
+        means = means_of(close, mesh_sums(close, mesh, 3))
+        past = self.past(x)
+        found = (past[:, 6:7] > 0).to(noisy) * surface  # no length is 0 once a frame has been seen
+        return evidence_of(noisy, means, past, found)
+
+    def features(self, x: dict[str, Tensor], known: Evidence, scale: Scale) -> Tensor:
+        """models.one.network_inputs."""
+        images = torch.cat([known.noisy, known.near, known.around, known.output, known.accumulated], dim=1)
+        colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=BRIGHTEST))
+        newest = (1 / x["samples"]).expand_as(known.length)
+        numbers = (torch.log1p(known.deviation), newest, 1 / (known.length + x["samples"]), known.found)
+        to_view = torch.tensor(TO_VIEW)[:, None] * x["camera_to_world"][:3, :3].T
+        normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])
+        surfaces = (x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
+        return torch.cat([colours, *numbers, known.latent, *surfaces], dim=1)
+
+    def network(self, seen: Tensor) -> Tensor:
+        """The trunk's outputs (1, ·, H, W)."""
+        height, width = seen.shape[-2:]
+        whole = (MULTIPLE * ((size + MULTIPLE - 1) // MULTIPLE) for size in (height, width))
+        return resized(self.trunk.of_patches(resized(seen, *whole)), height, width) + self.trunk.detail(seen)
+
+    def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        x = tensors
+        noisy, divisor, surface = demodulation(x)
+        noisy = noisy.clamp(min=0) * surface
+        state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
+        known = self.evidence(x, noisy, surface)
+        outputs = self.network(self.features(x, known, scale))
+        with compiled.disabled():
+            said = Said(*interpret(outputs, noisy, known.accumulated, known.length, known.found, x["samples"]))
+        filtered = said.accumulated
+        planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
+        for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
+            filtered = affinity_level(filtered, said.features, sharpness, own, importance, surface, step)
+        output = torch.lerp(known.output, filtered, said.alpha[:, 1:]) * surface
+        return {
+            "radiance": output * divisor + x["emission"],
+            "new_history": torch.cat([output, said.accumulated, said.length, said.latent], dim=1),
+            "new_scale": state,
+        }
