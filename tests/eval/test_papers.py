@@ -130,7 +130,7 @@ def write_evaluation(runs: Path, floors: Values | None = None, clips=("000", "00
     for result in results:
         folder_of(runs, result.scene, result.clip, result.denoiser, result.signal).mkdir(parents=True, exist_ok=True)
         result.save(runs)
-    write_results(runs, Path("data"), "cpu", results, dict.fromkeys(metrics))
+    write_results(runs, [Path("data")], "cpu", results, dict.fromkeys(metrics))
 
 
 def test_verdicts(tmp_path):
