@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from datasets.frame import Cameras
+from datasets.clip import Dataset
+from datasets.frame import Cameras, read_frame
 from errors import BadInput
 from eval.bench.fusion import unfold_kernel
 from eval.bench.synthetic_frames import synthetic_frame
@@ -88,6 +89,16 @@ def test_a_step_is_our_denoiser(weights, name, warp):
     ours = load(name, weights[name], torch.float32)
     for size in (*SIZES, (13, 17), (2, 2), (1, 5), (1, 1), (130, 17)):
         assert max(differences(step, sequence(size, frames=5), step, ours)) < TOLERANCE
+
+
+@each_kind
+@pytest.mark.parametrize("warp", ["inside", "outside"])
+def test_rendered_frames(tiny, weights, name, warp):
+    step = load_step(name, weights[name], torch.float32, warp)
+    ours = load(name, weights[name], torch.float32)
+    for clip in Dataset(tiny).clips("test"):
+        frames = [read_frame(clip, index, ours.reads) for index in range(4)]
+        assert max(differences(step, frames, step, ours)) < TOLERANCE
 
 
 @each_kind
