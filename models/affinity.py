@@ -8,8 +8,7 @@ from torch import Tensor
 from models import compiled
 from models.compiled import affinity as kernels
 from models.neighbours import shifted
-
-LEAST_EXPONENT = -40.0  # of a weight; what is below counts as that much
+from models.parameters import LEAST_LOGIT, LEAST_WEIGHT
 
 
 def plain_level(
@@ -19,10 +18,10 @@ def plain_level(
     count = features.shape[1]
     taps = shifted(torch.cat([features, importance, surface, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
-    exponent = (taps[:, count] - sharpness * distance).clamp(min=LEAST_EXPONENT)
+    exponent = (taps[:, count] - sharpness * distance).clamp(min=LEAST_LOGIT)
     weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
     total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
-    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=1e-30), 0)
+    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=LEAST_WEIGHT), 0)
 
 
 class AffinityLevel(torch.autograd.Function):
@@ -62,7 +61,6 @@ def affinity_level(
     image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """
-    by_kernels = compiled.enabled and image.device.type == "cpu" and image.dtype == torch.float32
-    level = AffinityLevel.apply if by_kernels else plain_level
+    level = AffinityLevel.apply if compiled.with_gradients(image) else plain_level
     filtered: Tensor = level(image, features, sharpness, own, importance, surface, step)
     return filtered

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from models import compiled
 from models.compiled import neighbours as kernels
 from models.operators import image_luminance
-from models.parameters import LARGEST_LUMINANCE
+from models.parameters import LARGEST_LUMINANCE, LEAST_MEAN
 
 
 def shifted(x: Tensor, step: int) -> Tensor:
@@ -32,7 +32,7 @@ def summands(image: Tensor) -> Tensor:
 def means_of(close: Tensor, wide: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """What mesh_means returns, of sums of summands over 3 x 3 pixels and over 9 x 9."""
     around, mean, square = (wide[:, :5] / wide[:, 5:]).split([3, 1, 1], dim=1)
-    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-20)
+    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=LEAST_MEAN)
     return close[:, :3] / close[:, 5:], around, deviation
 
 

@@ -38,4 +38,6 @@ COMPARED = 8  # features that pixels are compared by
 LATENT = 6  # channels carried beside images, in [-1, 1]
 BRIGHTEST = 1e13  # exposed irradiance that `one` tells apart; what is brighter looks alike to the network
 LARGEST_LOGIT = 10.0  # of the weights of taps
+LEAST_LOGIT = -40.0  # what is below counts as that much
 FEWEST_SAMPLES = 1e-3  # of a history, to divide by
+LEAST_MEAN = 1e-20  # luminance that deviations are relative to

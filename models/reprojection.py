@@ -8,7 +8,6 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import reprojection as kernels
-from models.compiled.jit import match_threads
 from models.parameters import NORMAL_TOLERANCE, PLANE_TOLERANCE
 from models.surfaces import BACKGROUND_ID, Surfaces, rays, to_previous_camera
 
@@ -121,8 +120,7 @@ def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor
     `surfaces` is the previous frame's G-buffer. The frame must have depth, normal, mesh_id and motion. The history is 0
     where none is found.
     """
-    if history.device.type == "cpu" and history.dtype == torch.float32 and compiled.enabled:
-        match_threads()
+    if compiled.with_gradients(history):
         result: tuple[Tensor, Tensor] = CompiledReprojection.apply(history, frame, surfaces)
         return result
     fetched = [Reprojection(frame, history, surfaces, item).fetch() for item in range(len(history))]

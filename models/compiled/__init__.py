@@ -1,8 +1,9 @@
 """Kernels compiled at first use: the fast way of what models/ also says in PyTorch.
 
 `by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba makes the
-kernels for the processor without a compiler and keeps them on disk from run to run. Whatever has no kernel (gradients,
-half precision, most of all on GPUs) takes the PyTorch way, which the tests hold the kernels to.
+kernels for the processor without a compiler and keeps them on disk from run to run. `with_gradients` is for kernels
+that have gradients of their own. Whatever has no kernel (other gradients, half precision, most of all on GPUs) takes
+the PyTorch way, which the tests hold the kernels to.
 """
 
 import contextlib
@@ -43,6 +44,14 @@ def kernel_device(tensors: Sequence[Tensor]) -> str | None:
         return None
     types = {tensor.device.type for tensor in tensors}
     return types.pop() if len(types) == 1 else None
+
+
+def with_gradients(image: Tensor) -> bool:
+    """Whether kernels that bring their own gradients can work on an image; then on as many threads as PyTorch."""
+    possible = enabled and image.device.type == "cpu" and image.dtype == torch.float32
+    if possible:
+        match_threads()
+    return possible
 
 
 def by(processor: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -8,15 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from models import parameters
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory, match_threads
 from models.compiled.lines import add_line, add_product, scale_line
 
 ZERO = np.float32(0)
 TWO = np.float32(2)
-LEAST_EXPONENT = np.float32(-40)
-LARGEST_EXPONENT = np.float32(40)
-LEAST_WEIGHT = np.float32(1e-30)
+LEAST_LOGIT = np.float32(parameters.LEAST_LOGIT)
 BLOCK = 2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
 STRIDE = 4  # features that are compared in one pass
 
@@ -53,7 +52,7 @@ def measure(distance: Any, features: Any, low: Any, high: Any, offset: Any) -> N
 def weigh(weight: Any, distance: Any, sharpness: Any, importance: Any, surface: Any) -> None:
     for x in range(weight.size):
         exponent = importance[x] - sharpness[x] * distance[x]
-        weight[x] = exp(min(max(exponent, LEAST_EXPONENT), LARGEST_EXPONENT)) * surface[x]
+        weight[x] = exp(min(max(exponent, LEAST_LOGIT), -LEAST_LOGIT)) * surface[x]
 
 
 @jit_in_any_order
@@ -186,7 +185,6 @@ def filter_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> tuple[Tensor, Tensor]:
     """See models.affinity.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
-    match_threads()
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
     for item in range(len(image)):
@@ -223,7 +221,7 @@ def pull_weights(
 def pull_exponent(to_sharpness: Any, pull: Any, distance: Any, sharpness: Any, importance: Any) -> None:
     """pull (n) becomes the gradient of the exponent; -2 sharpness times that, for features, is left in distance."""
     for x in range(pull.size):
-        inside = importance[x] - sharpness[x] * distance[x] >= LEAST_EXPONENT
+        inside = importance[x] - sharpness[x] * distance[x] >= LEAST_LOGIT
         pull[x] = pull[x] if inside else ZERO
         to_sharpness[x] -= pull[x] * distance[x]
         distance[x] = -TWO * sharpness[x] * pull[x]

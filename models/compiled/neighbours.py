@@ -14,7 +14,7 @@ from models.compiled.lines import add_line, add_product
 
 ONE = np.float32(1)
 ZERO = np.float32(0)
-LEAST_MEAN = np.float32(1e-20)
+LEAST_MEAN = np.float32(parameters.LEAST_MEAN)
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
 LARGEST_LUMINANCE = np.float32(parameters.LARGEST_LUMINANCE)
 SUMS = 6  # red, green, blue, luminance, its square, pixels

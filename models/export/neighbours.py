@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.affinity import LEAST_EXPONENT
-from models.parameters import LEAST_WEIGHT
+from models.parameters import LEAST_LOGIT, LEAST_WEIGHT
 
 
 def around(x: Tensor, step: int) -> Tensor:
@@ -34,7 +33,7 @@ def affinity_level(
     difference = around(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
     importances, near = around(torch.cat([importance, values], dim=1), step).split([1, 4], dim=1)
-    weight = torch.exp((importances - sharpness * distance).clamp(min=LEAST_EXPONENT))
+    weight = torch.exp((importances - sharpness * distance).clamp(min=LEAST_LOGIT))
     total = (weight * near).sum(dim=0, keepdim=True) + torch.exp(own) * values
     weighted, weights = total.split([3, 1], dim=1)
     return torch.where(surface > 0, weighted / weights.clamp(min=LEAST_WEIGHT), 0)

@@ -9,9 +9,9 @@ from torch.nn import functional as F
 from datasets.sequences import Batch
 from models.denoiser import Denoiser, State
 from models.one import One
+from models.parameters import GAMMA
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 
-GAMMA = 2.2  # of displays
 DARKEST = 1e-4  # exposed radiance, below which the curve is no steeper
 
 
