@@ -5,8 +5,8 @@ from typing import Any
 
 from datasets.sequences import Augmentation
 from errors import BadInput
+from train.losses.displayed import DisplayedTerms
 from train.losses.ntd import NTDTerms
-from train.losses.one import OneTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipe import Recipe
@@ -49,7 +49,7 @@ SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 
 # Ours: sequences long enough to learn what to carry, in all exposures and with all numbers of samples.
 ONE_RECIPE = Recipe(
-    loss=OneTerms(),
+    loss=DisplayedTerms(),
     rate=2e-3,
     batch=4,
     crop=64,

@@ -17,8 +17,8 @@ from models.parameters import STEPS, WINDOWS
 from models.rae import AUXILIARY, RAE
 from models.registry import create
 from models.wskp import KP, WSKP
+from train.losses.displayed import DisplayedTerms
 from train.losses.network_loss import LossTerms
-from train.losses.one import OneTerms
 from train.losses.rae import RAETerms
 from train.recipe import Recipe
 from train.recipes import recipe_for
@@ -197,8 +197,8 @@ def one() -> Ablation:
         AblationVariant("without-latent", "one", WithoutLatent),
         AblationVariant("four-levels", "one", partial(One, steps=STEPS[2:])),
         AblationVariant("fine-levels-first", "one", partial(One, steps=STEPS[::-1])),
-        AblationVariant("pixels-alone", "one", One, OneTerms(scales=(1,))),
-        AblationVariant("frames-alone", "one", One, OneTerms(temporal=0.0)),
+        AblationVariant("pixels-alone", "one", One, DisplayedTerms(scales=(1,))),
+        AblationVariant("frames-alone", "one", One, DisplayedTerms(temporal=0.0)),
     )
     pairs = tuple(("one", variant.label) for variant in variants[1:-1])
     return Ablation(

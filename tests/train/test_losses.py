@@ -20,16 +20,16 @@ from models.registry import create
 from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
+from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
-from train.losses.one import OneLoss, OneTerms, shrunk, tone
 from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
 from train.losses.relative import RelativeTerms
 from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 
-LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss, OneTerms: OneLoss}
+LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss, DisplayedTerms: DisplayedLoss}
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
 
@@ -429,7 +429,7 @@ def test_one_s_loss_by_hand(batch_of, monkeypatch):
         return output, state
 
     monkeypatch.setattr(denoiser, "predict", predict)
-    value, parts = OneLoss(denoiser, OneTerms(temporal=0.5, scales=(1, 8)))(batch)
+    value, parts = DisplayedLoss(denoiser, DisplayedTerms(temporal=0.5, scales=(1, 8)))(batch)
     spatial = 0.0
     errors = []
     for frame, (output, truth) in zip(batch.frames, seen, strict=True):

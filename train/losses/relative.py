@@ -1,19 +1,16 @@
 """The relative squared error, whose best network is right on the mean of noisy targets."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame
 from datasets.sequences import Batch
 from models.denoiser import Denoiser
-from models.rae import POWER, RAE
-from models.running_scale import RunningScale
 from train.crops import Crops
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from train.losses.outputs import exposed_outputs
 
 
 @dataclass(frozen=True)
@@ -26,17 +23,6 @@ class RelativeTerms(LossTerms):
 
     def around(self, denoiser: Denoiser) -> "RelativeLoss":
         return RelativeLoss(denoiser, self)
-
-
-def raised(p: Tensor, epsilon: float) -> Tensor:
-    """max(p, 0)^5, what RAE's raw output means, with a gradient that does not die at p <= 0.
-
-    Its slope is that of p^5, but never less than where p^5 = `epsilon`: darker than that, errors are not relative any
-    more. A slope of another size, whatever the target, leaves what is best in place: a zero of the loss's gradient.
-    """
-    value = p.detach().clamp(min=0) ** (1 / POWER)
-    slope = p.detach().clamp(min=epsilon**POWER) ** (1 / POWER - 1) / POWER
-    return value + slope * (p - p.detach())
 
 
 def weighted_mean(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
@@ -64,38 +50,16 @@ class RelativeLoss(NetworkLoss):
         self.denoiser = denoiser
         self.terms = terms or RelativeTerms()
 
-    def outputs(self, batch: Any) -> Iterator[tuple[Frame, Tensor, RunningScale]]:
-        """Each frame with what the network returns and the running scale there."""
-        denoiser: Any = self.denoiser
-        if isinstance(batch, Crops):
-            irradiance, _ = denoiser.filter(batch.frame, batch.irradiance, batch.scale)
-            yield batch.frame, irradiance, batch.scale
-            return
-        state: Any = None
-        for frame in batch.frames:
-            output, state = denoiser.predict(frame, state)
-            yield frame, output, state.scale
-
-    def exposed(self, frame: Frame, output: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor]:
-        """Exposed radiance f (B, 3, H, W), at least 0 and without gradient, and the errors f - A, f - B (B, 2, ...).
-
-        The errors are those of what the network returns, which may be below 0.
-        """
-        signal = self.denoiser.signal
-        exposure = scale.exposure() * frame.gain
-        is_rae = isinstance(self.denoiser, RAE)
-        irradiance = raised(output, self.terms.epsilon) if is_rae else exposure * output
-        reflected = irradiance * frame.divisor
-        errors = reflected[:, None] - exposure[:, None] * frame.reference_halves(signal)
-        shown = reflected.detach().clamp(min=0)
-        return (shown + exposure * frame.emission if signal == "total" else shown), errors
-
     def forward(self, batch: Batch | Crops) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Tensor | None = None  # the errors of the frame before
-        for frame, output, scale in self.outputs(batch):
-            shown, errors = self.exposed(frame, output, scale)
+        signal = self.denoiser.signal
+        for frame, reflected, exposure in exposed_outputs(self.denoiser, batch):
+            errors = reflected[:, None] - exposure[:, None] * frame.reference_halves(signal)
+            shown = reflected.detach().clamp(min=0)
+            if signal == "total":
+                shown = shown + exposure * frame.emission
             weight = (shown + self.terms.epsilon) ** -2
             spatial.append(surface_mean(weight * errors.prod(dim=1), frame.depth))
             if before is not None:  # (f_t - f_{t-1}) - (y_t - y_{t-1}) is the change of the error
