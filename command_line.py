@@ -454,8 +454,6 @@ def denoise(
     from timing import thread_count
 
     colour = (*frames, *hdr)
-    if not spp > 0:
-        raise BadInput(f"--spp {spp:g} are no samples: frames have one a pixel, or a few")
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
     weights = weights or weights_of(denoiser, runs)

@@ -1,6 +1,7 @@
 """From the pixels of foreign frames to the Frames that denoisers take, with what is missing derived or left out."""
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from denoise.cameras import (
 from denoise.exr_image import ExrImage
 from denoise.motion_meaning import Meaning
 from denoise.pixels import Pixels
+from errors import BadInput
 from scenes.camera import Array, View, motion_vectors, pixel_centres, unproject
 
 Image = NDArray[np.float32]
@@ -98,9 +100,14 @@ def camera_kind(pixels: Pixels) -> Reading:
 
 
 class Shot:
-    """The frames between two cuts, one after another: what a frame needs of the one before is kept here."""
+    """The frames between two cuts, one after another: what a frame needs of the one before is kept here.
+
+    Raises BadInput where `spp` are no samples a pixel.
+    """
 
     def __init__(self, reading: Reading, reads: tuple[str, ...], source: str, spp: float = 1.0):
+        if not 0 < spp < math.inf:
+            raise BadInput(f"{spp:g} spp are no samples: frames have one a pixel, or a few")
         self.reading = reading
         self.reads = reads
         self.source = source

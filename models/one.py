@@ -15,7 +15,7 @@ from models.compiled import one as kernels
 from models.denoiser import Denoiser, State, matching_state
 from models.neighbours import mesh_means
 from models.operators import pad_to_multiple
-from models.parameters import BRIGHTEST, COMPARED, FEWEST_SAMPLES, LARGEST_LOGIT, LATENT, STEPS
+from models.parameters import BRIGHTEST, COMPARED, FEWEST_SAMPLES, LARGEST_LOGIT, LATENT, ONE_INPUTS, STEPS
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
@@ -198,8 +198,7 @@ class One(Denoiser):
         """`steps` are the pixels between the taps of each level of the filter."""
         super().__init__(signal=signal)
         self.steps = steps
-        inputs = 5 * 3 + 4 + LATENT + 8
-        self.trunk = Trunk(inputs, sum(split_of(len(steps))), self.widths)
+        self.network = Trunk(sum(ONE_INPUTS.values()), sum(split_of(len(steps))), self.widths)
 
     def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
         surface = (frame.depth > 0).to(noisy)
@@ -222,7 +221,7 @@ class One(Denoiser):
         images = (known.noisy, known.near, known.around, known.output, known.accumulated)
         seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)
         x = pad_to_multiple(seen, MULTIPLE)
-        outputs = self.trunk(x.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
+        outputs = self.network(x.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
         past = (known.accumulated, known.length, known.found)
         said = Said(*interpret(outputs.to(noisy), noisy, *past, frame.samples.to(noisy)))
         image = said.accumulated

@@ -33,9 +33,10 @@ LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0
 
 # --- one --------------------------------------------------------------------------------------------------------------
 
+LATENT = 6  # channels carried beside images, in [-1, 1]
+ONE_INPUTS = {"images": 15, "history": 4, "latent": LATENT, "surfaces": 8}  # what the network sees, and how many inputs
 STEPS = (32, 16, 8, 4, 2, 1)  # px between taps of the filter: the last levels smooth the pattern that the first leave
 COMPARED = 8  # features that pixels are compared by
-LATENT = 6  # channels carried beside images, in [-1, 1]
 BRIGHTEST = 1e13  # exposed irradiance that `one` tells apart; what is brighter looks alike to the network
 LARGEST_LOGIT = 10.0  # of the weights of taps
 LEAST_LOGIT = -40.0  # what is below counts as that much

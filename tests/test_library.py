@@ -108,6 +108,12 @@ def test_unusable_arrays_are_named(changes, message):
         [*onespp.frames([arrays(0), {"colour": np.zeros((24, 32, 3))}], onespp.load("noisy"))]
 
 
+@pytest.mark.parametrize("spp", [0.0, -1.0, float("nan"), float("inf")])
+def test_frames_of_no_samples_are_refused(spp):
+    with pytest.raises(BadInput, match="are no samples"):
+        next(onespp.frames([arrays(0)], onespp.load("noisy"), spp))
+
+
 def test_public_names_are_documented():
     for name in onespp.__all__:
         assert getattr(onespp, name).__doc__ and f"onespp.{name}" in PAGE, name

@@ -25,7 +25,6 @@ LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
 LARGEST_LOGIT = np.float32(parameters.LARGEST_LOGIT)
 FEWEST_SAMPLES = np.float32(parameters.FEWEST_SAMPLES)
 BRIGHTEST = np.float32(parameters.BRIGHTEST)
-LONE_INPUTS = 12  # besides images and latent channels
 BLOCK_ROWS = 8  # that share one piece of scratch memory
 
 
@@ -109,8 +108,7 @@ def network_inputs(
 ) -> Tensor:
     """See models.one.network_inputs; channels come last in memory."""
     batch = len(deviation)
-    channels = 3 * len(images) + LONE_INPUTS + latent.shape[1]
-    out = torch.empty(batch, *frame.size, channels)
+    out = torch.empty(batch, *frame.size, sum(parameters.ONE_INPUTS.values()))
     gains = array((scale.exposure() * frame.gain).flatten(1))
     depth_scales = array(scale.log_depth.value.exp())
     to_view = array(frame.to_view)

@@ -56,7 +56,7 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
 
 
 class Coarsest(nn.Sequential):
-    """The trunk's layers at 1/8 of the resolution, with zeros beside: tracers must know that there are two pixels."""
+    """The network's layers at 1/8 of the resolution, with zeros beside: tracers must know that there are two pixels."""
 
     def forward(self, x: Tensor) -> Tensor:
         inside = F.pad(torch.ones_like(x[:, :1]), MARGIN)[..., ::2, ::2]
@@ -79,7 +79,7 @@ class OneStep(RecurrentStep):
     def __init__(self, denoiser: One, warp: Warp):
         super().__init__(READS, HISTORY, warp)
         self.steps = tuple(denoiser.steps)
-        self.trunk = denoiser.trunk
+        self.trunk = denoiser.network
         self.trunk.detail = pointwise(self.trunk.detail)
         self.trunk.down_c = Coarsest(*self.trunk.down_c)
         self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
@@ -106,7 +106,7 @@ class OneStep(RecurrentStep):
         return torch.cat([colours, *numbers, known.latent, *surfaces], dim=1)
 
     def network(self, seen: Tensor) -> Tensor:
-        """The trunk's outputs (1, ·, H, W)."""
+        """The network's outputs (1, ·, H, W)."""
         height, width = seen.shape[-2:]
         whole = (MULTIPLE * ((size + MULTIPLE - 1) // MULTIPLE) for size in (height, width))
         return resized(self.trunk.of_patches(resized(seen, *whole)), height, width) + self.trunk.detail(seen)

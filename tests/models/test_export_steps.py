@@ -60,7 +60,7 @@ def weights(tmp_path_factory):
         torch.manual_seed(0)
         denoiser = create(name)
         with torch.no_grad():
-            for layer in [denoiser.trunk.leave] if name == "one" else denoiser.network[-1].branches:
+            for layer in [denoiser.network.leave] if name == "one" else denoiser.network[-1].branches:
                 layer.weight *= 10
         files[name] = folder / f"{name}.safetensors"
         save_weights(denoiser, name, {}, files[name])
