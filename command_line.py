@@ -329,6 +329,16 @@ def bench_references(
     print(bench(data_folder(data, budget), runs, seeds))
 
 
+def bench_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
+    """How soon a change of light shows: quality frame by frame after a lamp is switched or moved, next to still light.
+
+    Renders four clips of the Cornell box, a minute or a few; table, plot, results.json.
+    """
+    from eval.bench.light import bench_light as bench
+
+    print(bench(runs, names, budget))
+
+
 def bench_loading(data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     """How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
     from eval.bench.loading import bench_loading as bench
@@ -524,6 +534,7 @@ GROUPS: dict[str, Commands] = {
             "export": bench_export,
             "rendering": bench_rendering,
             "references": bench_references,
+            "light": bench_light,
             "loading": bench_loading,
             "training": bench_training,
         },
@@ -535,7 +546,7 @@ TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can tr
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
     "figure": "Draw a figure of the papers or of the docs: variance, unbiased.",
-    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, loading, training.",
+    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, light, loading, training.",
 }
 
 

@@ -14,6 +14,7 @@ from datasets.profiles import DataProfile, profile_of
 from datasets.writer import ClipWriter
 from files import locked
 from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
+from scenes.animation import Scene
 
 
 class RenderJob(NamedTuple):
@@ -67,7 +68,7 @@ def render_to_folder(
 
     The clip is a function of the arguments alone. Raises BadInput for an unknown scene or clip name.
     """
-    split, scene_name, clip_name = folder.parts[-3:]
+    split, _, clip_name = folder.parts[-3:]
     noisy_spp = ClipKind.of(clip_name).noisy_spp
     quality = profile.quality[split]
     scene, seed = scene_of_clip(folder, profile, dataset_seed)
@@ -76,18 +77,32 @@ def render_to_folder(
         needed_spp = samples_needed(scene, profile.frames, profile.height, profile.width, quality, seed, options)
         clock.lap("pilot")
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
-    sampling = Sampling(quality.realisations, noisy_spp, spp, options)
-    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed, channels)
+    size = (profile.frames, profile.height, profile.width)
+    write_clip(folder, scene, size, Sampling(quality.realisations, noisy_spp, spp, options), seed, channels, clock)
+
+
+def write_clip(
+    folder: Path,
+    scene: Scene,
+    size: tuple[int, int, int],
+    sampling: Sampling,
+    seed: int,
+    channels: Sequence[str],
+    clock: StepTimer,
+) -> None:
+    """Render the named channels of a scene into a clip of `size` (frames, height, width), whole or not at all."""
+    split, scene_name, clip_name = folder.parts[-3:]
+    frames = render_clip(scene, *size, sampling, seed, channels)
     # While only the camera moves, motion follows from depth.
     derived = {} if scene.moves() or "motion" not in channels else {"motion": "camera"}
     with ClipWriter(folder) as writer:
         writer.timing = clock.read()
-        progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", profile.frames, leave=False, unit="frame")
+        progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame")
         for arrays, seconds in progress:
             writer.add(arrays, seconds)
         facts = {
-            "noisy_spp": noisy_spp,
-            "reference_spp": spp // 2 * 2,
+            "noisy_spp": sampling.noisy_spp,
+            "reference_spp": sampling.reference_spp // 2 * 2,
             "meshes": [shape.name for shape in scene.meshes],
         }
         writer.finish(facts, derived)

@@ -183,6 +183,11 @@ class Frame:
         }
         return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
 
+    def lit(self, light: Tensor) -> "Frame":
+        """The frame with all light but emission, noisy and in references, times `light` (H, W)."""
+        lit = {name: self.channels[name] * light for name in self.channels.keys() & {*NOISY, *REFERENCES}}
+        return replace(self, channels=self.channels | lit)
+
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
         """The frame with `function` of every channel; cameras and gain stay."""
         return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})

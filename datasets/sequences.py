@@ -11,6 +11,7 @@ from torch.utils.data import Dataset as TorchDataset
 from datasets.channels import NOISY, REFERENCES
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
+from datasets.shading import WanderingEdge
 from errors import BadInput
 
 
@@ -24,6 +25,7 @@ class Augmentation:
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
     exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5
     samples: bool = False  # three in ten sequences are means of 2, 4, 8, ... realisations
+    light: bool = False  # over three in ten sequences the edge of a shadow or of more light wanders
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
@@ -102,6 +104,8 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         stopped = len(set(playback)) < self.length
         together = self._realisations_together(len(deal), rng) if self.augmentation.samples and not stopped else 1
 
+        edge = WanderingEdge.random(rng, self.length) if self.augmentation.light and rng.random() < 0.3 else None
+
         frames = []
         for t, position in enumerate(playback):
             chosen = [int(deal[(together * t + i) % len(deal)]) for i in range(together)]
@@ -112,6 +116,8 @@ class TrainingSequences(TorchDataset[list[Frame]]):
                 frame = frame.with_more_samples(
                     [read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]]
                 )
+            if edge is not None:
+                frame = frame.lit(edge.light(t, *frame.size))
             for _ in range(turns):
                 frame = frame.rot90()
             if gain is not None:

@@ -56,7 +56,7 @@ ONE_RECIPE = Recipe(
     length=8,
     epochs=40,
     clip=1.0,
-    augmentation=Augmentation(stop=True, rotate=True, exposure=True, samples=True),
+    augmentation=Augmentation(stop=True, rotate=True, exposure=True, samples=True, light=True),
     **SHORT,
 )
 
