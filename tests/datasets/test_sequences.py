@@ -288,3 +288,22 @@ def test_exposures_vary_without_changing_colours(clips):
     gains = torch.cat([sequences(clips, Augmentation(exposure=True))[index][0].gain for index in range(20)]).flatten(1)
     assert torch.equal(gains[:, 0], gains[:, 1]) and torch.equal(gains[:, 0], gains[:, 2])
     assert 2**-1.5 <= gains.min() < 0.8 and 1.3 < gains.max() <= 2**1.5
+
+
+def test_a_change_of_light_changes_noise_and_references_alike(clips):
+    """All else stays, and what light is multiplied by is the same number for all of it."""
+    changed = 0
+    for index in range(20):
+        for plain, lit in zip(
+            *(sequences(clips, each)[index] for each in (Augmentation(), Augmentation(light=True))), strict=True
+        ):
+            light = (lit.direct_reference.sum(dim=(1, 2)) / plain.direct_reference.sum(dim=(1, 2)).clamp(min=1e-9))[0]
+            changed += bool((light[plain.direct_reference.sum(dim=(1, 2))[0] > 0] - 1).abs().max() > 0.01)
+            for name in plain.channels:
+                if name in ("direct", "indirect", "direct_reference", "indirect_reference"):
+                    where = plain.direct_reference.sum(dim=(1, 2))[0] > 1e-3
+                    expected = plain.channels[name] * light
+                    torch.testing.assert_close(lit.channels[name][..., where], expected[..., where])
+                else:
+                    assert torch.equal(lit.channels[name], plain.channels[name])
+    assert 10 < changed < 60
