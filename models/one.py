@@ -22,6 +22,7 @@ from models.surfaces import Surfaces
 
 DETAIL = 24  # hidden channels of what looks at every pixel alone
 MULTIPLE = 8  # of the sides of an image that the network takes
+CACHED = 8192  # pixels that are taken together, so that what is known of them stays in the cache
 
 
 def conv(inputs: int, outputs: int) -> nn.Sequential:
@@ -59,9 +60,22 @@ class Trunk(nn.Module):
         leaving: Tensor = self.leave(a)
         return leaving
 
+    def add_detail(self, outputs: Tensor, x: Tensor) -> None:
+        """Add what `detail` says of x to `outputs`, whose channels come last in memory, in their place."""
+        first, _, last = self.detail
+        assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        pixels, sums = (each.movedim(1, -1).view(-1, each.shape[1]) for each in (x, outputs))
+        for some, total in zip(pixels.split(CACHED), sums.split(CACHED), strict=True):
+            total.addmm_(torch.addmm(first.bias, some, first.weight.t()).relu_(), last.weight.t())
+
     def forward(self, x: Tensor) -> Tensor:
-        """(B, outputs, H, W) of x (B, inputs, H, W), whose sides are multiples of 8."""
-        return self.of_patches(x) + self.detail(x.movedim(1, -1)).movedim(-1, 1)
+        """(B, outputs, H, W) of x (B, inputs, H, W), channels last in memory, whose sides are multiples of 8."""
+        outputs = self.of_patches(x)
+        if outputs.requires_grad:
+            return outputs + self.detail(x.movedim(1, -1)).movedim(-1, 1)
+        outputs = outputs.contiguous(memory_format=torch.channels_last)
+        self.add_detail(outputs, x)
+        return outputs
 
 
 @dataclass(frozen=True)
