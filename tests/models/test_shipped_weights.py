@@ -53,6 +53,28 @@ def test_they_denoise(path):
         assert output.mean() == pytest.approx(float(frame.radiance(denoiser.signal).mean()), rel=0.5)
 
 
+@pytest.mark.slow
+def test_one_neither_drifts_nor_burns_in():
+    """1 000 frames of a still wall in a light that fades to one side, as noisy as path tracing: error does not grow."""
+    height, width = 48, 64
+    light = torch.linspace(0.1, 2.0, width).expand(1, 3, height, width)
+    generator = torch.Generator().manual_seed(0)
+    denoiser = registry.load("one", shipped_weights("one"), torch.float32)
+    state = None
+    errors = []
+    biases = []
+    for _ in range(1000):
+        noise = torch.exp(1.5 * torch.randn(1, 3, height, width, generator=generator) - 1.125)
+        frame = flat_frame(height, width, irradiance=light * noise)
+        with torch.inference_mode():
+            output, state = denoiser(frame, state)
+        difference = output - light * frame.divisor
+        errors.append(float(difference.square().mean()))
+        biases.append(float(difference.mean()))
+    assert sum(errors[-200:]) <= sum(errors[50:250])
+    assert abs(sum(biases[-200:])) <= 200 * 0.1 * float((light * frame.divisor).mean())
+
+
 @pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
 def test_cards_agree_with_the_files(path):
     found = header(path)
