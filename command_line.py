@@ -242,6 +242,22 @@ def figure_unbiased(out: Png = Path("runs/unbiased.png")) -> None:
     print(out)
 
 
+def figure_triptych(
+    scene: Annotated[str, Positional, arg(metavar="SCENE", help="a built-in one")] = "room-2014",
+    denoiser: Annotated[str, arg(metavar="NAME")] = "one",
+    out: Png = Path("runs/triptych.png"),
+    runs: Runs = Path("runs"),
+    frame: Annotated[int, arg(metavar="N", help="of the flight, which history leads to")] = 12,
+    spp: Annotated[int, arg(metavar="N", help="samples a pixel of the reference")] = 512,
+) -> None:
+    """Draw a frame of 1280 x 720 in three strips: one sample a pixel, denoised, and the reference. Minutes."""
+    from eval.figures.triptych import triptych
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    triptych(out, scene, denoiser, runs, frame, spp)
+    print(out)
+
+
 def export(
     name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6; trained here: wskp6@BUDGET")],
     to: Literal["onnx", "pt2"] = "onnx",
@@ -519,6 +535,7 @@ GROUPS: dict[str, Commands] = {
         "figure": {
             "variance": figure_variance,
             "unbiased": figure_unbiased,
+            "triptych": figure_triptych,
         },
         "papers": papers,
         "ablate": ablate,
@@ -545,7 +562,7 @@ GROUPS: dict[str, Commands] = {
 TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
-    "figure": "Draw a figure of the papers or of the docs: variance, unbiased.",
+    "figure": "Draw a figure of the papers or of the docs: variance, unbiased, triptych.",
     "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, light, loading, training.",
 }
 
