@@ -106,6 +106,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
 
         edge = WanderingEdge.random(rng, self.length) if self.augmentation.light and rng.random() < 0.3 else None
 
+        brighter = 0.0  # the logarithm of how much light a change adds
         frames = []
         for t, position in enumerate(playback):
             chosen = [int(deal[(together * t + i) % len(deal)]) for i in range(together)]
@@ -117,13 +118,15 @@ class TrainingSequences(TorchDataset[list[Frame]]):
                     [read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]]
                 )
             if edge is not None:
-                frame = frame.lit(edge.light(t, *frame.size))
+                light = edge.light(t, *frame.size)
+                brighter = float(torch.log(light).mean())
+                frame = frame.lit(light)
             for _ in range(turns):
                 frame = frame.rot90()
             if gain is not None:
                 frame = replace(frame, gain=gain)
             if self.measure is not None:
-                frame = replace(frame, whole=self.measure(clip, position, realisation))
+                frame = replace(frame, whole=self.measure(clip, position, realisation) + torch.tensor([brighter, 0.0]))
             frames.append(frame)
         return frames
 
@@ -131,7 +134,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
     def _realisations_together(count: int, rng: np.random.Generator) -> int:
         """1 in seven of ten cases, else 2, 4, 8, ... of `count`."""
         most = int(np.log2(count))
-        return 1 if rng.random() < 0.7 else 2 ** int(rng.integers(1, max(most, 1) + 1))
+        return 2 ** int(rng.integers(1, most + 1)) if most and rng.random() >= 0.7 else 1
 
     def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:
         """Frame numbers in the order in which they are played."""

@@ -15,7 +15,16 @@ from models.compiled import one as kernels
 from models.denoiser import Denoiser, State, matching_state
 from models.neighbours import mesh_means
 from models.operators import pad_to_multiple
-from models.parameters import BRIGHTEST, COMPARED, FEWEST_SAMPLES, LARGEST_LOGIT, LATENT, ONE_INPUTS, STEPS
+from models.parameters import (
+    BRIGHTEST,
+    FEWEST_SAMPLES,
+    LARGEST_IRRADIANCE,
+    LARGEST_LOGIT,
+    LATENT,
+    ONE_INPUTS,
+    STEPS,
+    outputs_of_one,
+)
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
@@ -66,12 +75,13 @@ class Trunk(nn.Module):
         assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
         pixels, sums = (each.movedim(1, -1).view(-1, each.shape[1]) for each in (x, outputs))
         for some, total in zip(pixels.split(CACHED), sums.split(CACHED), strict=True):
-            total.addmm_(torch.addmm(first.bias, some, first.weight.t()).relu_(), last.weight.t())
+            hidden = torch.addmm(first.bias, some, first.weight.t()).relu_()
+            torch.addmm(total, hidden, last.weight.t(), out=total)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, outputs, H, W) of x (B, inputs, H, W), channels last in memory, whose sides are multiples of 8."""
         outputs = self.of_patches(x)
-        if outputs.requires_grad:
+        if outputs.requires_grad or outputs.dtype != x.dtype:  # in training and, by autocast, in validation
             return outputs + self.detail(x.movedim(1, -1)).movedim(-1, 1)
         outputs = outputs.contiguous(memory_format=torch.channels_last)
         self.add_detail(outputs, x)
@@ -140,11 +150,6 @@ class Said(NamedTuple):
     length: Tensor  # (B, 1, H, W)
 
 
-def split_of(levels: int) -> tuple[int, ...]:
-    """How many of the network's outputs belong to what: features, three of each level, two weights, latent channels."""
-    return COMPARED, levels, levels, levels, 2, LATENT
-
-
 @compiled.by(kernels.interpret)
 def interpret(
     said: Tensor, noisy: Tensor, accumulated: Tensor, length: Tensor, found: Tensor, samples: Tensor
@@ -156,8 +161,8 @@ def interpret(
     The prior of the accumulation is the even mean of all samples: the network says how far to leave it. Where nothing
     was found there is nothing to mix with.
     """
-    levels = (said.shape[1] - sum(split_of(0))) // 3
-    features, sharpness, own, importance, alphas, latent = said.split(split_of(levels), dim=1)
+    levels = (said.shape[1] - sum(outputs_of_one(0))) // 3
+    features, sharpness, own, importance, alphas, latent = said.split(outputs_of_one(levels), dim=1)
     past = length.clamp(min=FEWEST_SAMPLES)
     prior = torch.cat([torch.log(past / samples), torch.zeros_like(past)], dim=1)
     alpha = torch.where(found > 0, torch.sigmoid(alphas - prior), 1)
@@ -212,10 +217,10 @@ class One(Denoiser):
         """`steps` are the pixels between the taps of each level of the filter."""
         super().__init__(signal=signal)
         self.steps = steps
-        self.network = Trunk(sum(ONE_INPUTS.values()), sum(split_of(len(steps))), self.widths)
+        self.inputs = dict(ONE_INPUTS)
+        self.network = Trunk(sum(ONE_INPUTS.values()), sum(outputs_of_one(len(steps))), self.widths)
 
-    def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
-        surface = (frame.depth > 0).to(noisy)
+    def evidence(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> Evidence:
         found = torch.zeros_like(surface)
         past = found.expand(-1, 7 + LATENT, -1, -1)
         if before is not None:
@@ -228,9 +233,9 @@ class One(Denoiser):
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
         surface = (frame.depth > 0).to(frame.depth)
-        noisy = frame.irradiance(self.signal).clamp(min=0) * surface
+        noisy = frame.irradiance(self.signal).clamp(0, LARGEST_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        known = self.evidence(frame, noisy, before)
+        known = self.evidence(frame, noisy, surface, before)
         height, width = frame.size
         images = (known.noisy, known.near, known.around, known.output, known.accumulated)
         seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)

@@ -38,7 +38,13 @@ ONE_INPUTS = {"images": 15, "history": 4, "latent": LATENT, "surfaces": 8}  # wh
 STEPS = (32, 16, 8, 4, 2, 1)  # px between taps of the filter: the last levels smooth the pattern that the first leave
 COMPARED = 8  # features that pixels are compared by
 BRIGHTEST = 1e13  # exposed irradiance that `one` tells apart; what is brighter looks alike to the network
+LARGEST_IRRADIANCE = 1e30  # what is brighter is cut: sums of it with weights of exp(10) must stay finite
 LARGEST_LOGIT = 10.0  # of the weights of taps
 LEAST_LOGIT = -40.0  # what is below counts as that much
 FEWEST_SAMPLES = 1e-3  # of a history, to divide by
 LEAST_MEAN = 1e-20  # luminance that deviations are relative to
+
+
+def outputs_of_one(levels: int) -> tuple[int, ...]:
+    """How many outputs of the network belong to what: features, three of each level, two weights, latent channels."""
+    return COMPARED, levels, levels, levels, 2, LATENT

@@ -50,9 +50,13 @@ class AblationVariant:
     paper: str = "-"
 
     def recipe(self, budget: str) -> Recipe:
-        """The base's recipe in a budget, for SHARE_OF_EPOCHS of its epochs. Raises BadInput for an unknown budget."""
+        """The base's recipe in a budget, for SHARE_OF_EPOCHS of its epochs, and with its paper's loss in any.
+
+        Raises BadInput for an unknown budget.
+        """
         recipe = recipe_for(self.base, budget)
-        return replace(recipe, epochs=max(1, round(SHARE_OF_EPOCHS * recipe.epochs)), loss=self.loss or recipe.loss)
+        loss = self.loss or recipe_for(self.base, "paper").loss
+        return replace(recipe, epochs=max(1, round(SHARE_OF_EPOCHS * recipe.epochs)), loss=loss)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,6 @@ class WithoutHistory(One):
 class WithoutLatent(One):
     """Nothing is carried but images and their length."""
 
-    def evidence(self, frame: Frame, noisy: Tensor, before: OneState | None) -> Evidence:
-        known = super().evidence(frame, noisy, before)
+    def evidence(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> Evidence:
+        known = super().evidence(frame, noisy, surface, before)
         return replace(known, latent=torch.zeros_like(known.latent))

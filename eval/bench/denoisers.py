@@ -83,13 +83,16 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
         return None
     macs = 0
 
-    def count(layer: nn.Module, inputs: Any, output: Tensor) -> None:
+    def count(layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         nonlocal macs
-        assert isinstance(layer, nn.Conv2d)
-        macs += output.numel() * layer.weight[0].numel()
+        assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
+        gathers = isinstance(
+            layer, nn.Conv2d
+        )  # a transposed one scatters: each input, not each output, has the weights
+        macs += (output if gathers else inputs[0]).numel() * layer.weight[0].numel()
 
     for layer in network.modules():
-        if isinstance(layer, nn.Conv2d):
+        if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
             layer.register_forward_hook(count)
     denoiser(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE), None)
     return macs / COUNTING_SIZE**2

@@ -13,14 +13,15 @@ from tqdm import tqdm
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.clip_job import write_clip
-from datasets.frame import read_frame
+from datasets.frame import read_frame, to_tensor
 from datasets.profiles import GENERATOR
-from datasets.tonemap import display
+from datasets.tonemap import display, psnr
 from eval.bench.output import bench_folder
 from eval.selection import evaluated
 from eval.spec import DenoiserSpec
 from files import write_file, write_json
 from models.denoiser import Denoiser, State
+from models.operators import finite
 from plotting import DPI, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling, StepTimer
@@ -90,22 +91,18 @@ def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[floa
     """PSNR in dB of each frame of the light that the denoiser returns, displayed."""
     found = []
     state: State | None = None
-    channels = (*denoiser.reads, "albedo", "emission", "depth", "direct_reference", "indirect_reference")
     for index in range(clip.frames):
-        frame = read_frame(clip, index, tuple(dict.fromkeys(channels)))
-        output, state = denoiser(frame, state)
-        reference = frame.reference_halves(denoiser.signal).mean(dim=1)
-        if denoiser.signal == "total":
-            reference = reference + frame.emission
-        error = display(output, exposure) - display(reference, exposure)
-        found.append(float(-10 * torch.log10(error.square().mean())))
+        output, state = denoiser(read_frame(clip, index, denoiser.reads), state)
+        reference = to_tensor(clip.reference(index, denoiser.signal).mean(axis=0))
+        error = display(finite(output), exposure) - display(reference, exposure)
+        found.append(psnr(error.square().mean().item()))
     return found
 
 
 def lag_of(spec: DenoiserSpec, clips: dict[str, Clip]) -> Lag:
     """All clips are displayed as the one whose light never changes."""
     denoiser = spec.build()
-    exposure = clips[STILL].facts["exposure"]
+    exposure = clips[STILL].exposure
     return Lag(spec.name, {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()})
 
 

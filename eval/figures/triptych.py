@@ -13,10 +13,10 @@ from datasets.clip import Clip
 from datasets.clip_job import write_clip
 from datasets.frame import read_frame
 from datasets.tonemap import clip_exposure, display, luminance
-from eval.selection import weights_of
+from errors import BadInput
+from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
-from models import registry
-from models.denoiser import State
+from models.denoiser import Denoiser, State
 from render.clip import Sampling, StepTimer
 from render.shot import Shot
 from render.stage import Stage
@@ -31,9 +31,8 @@ Picture = NDArray[np.float64]
 
 
 @torch.inference_mode()
-def last_frame(clip: Clip, denoiser: str, runs: Path) -> tuple[Picture, Picture]:
+def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
     """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all others."""
-    network = registry.load(denoiser, weights_of(denoiser, runs))
     state: State | None = None
     for index in range(clip.frames):
         frame = read_frame(clip, index, (*network.reads, "direct", "indirect", "emission"))
@@ -67,12 +66,15 @@ def triptych(
 
     Raises BadInput for an unknown scene or denoiser.
     """
+    (spec,) = evaluated([denoiser], runs, USUAL_BUDGET)
+    if spec.returns != "total":
+        raise BadInput(f"{denoiser} returns indirect light alone, which is not the picture: name another")
     scene = build_scene(scene_name, seed, 2 * frame)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "test" / scene_name / "000"
         path.parent.mkdir(parents=True)
         write_clip(path, scene, (frame + 1, *size), NOISY_ONLY, seed, tuple(CHANNELS), StepTimer())
-        noisy, denoised = last_frame(Clip(path), denoiser, runs)
+        noisy, denoised = last_frame(Clip(path), spec.build())
     shot = Shot(Stage(scene, *size), frame)
     reflected = shot.reflected(seed, spp)
     exposure = clip_exposure(luminance(reflected))

@@ -8,7 +8,7 @@ the PyTorch way, which the tests hold the kernels to.
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -32,6 +32,15 @@ def disabled() -> Iterator[None]:
         yield
     finally:
         enabled = before
+
+
+def tensors_among(values: Iterable[object]) -> Iterator[Tensor]:
+    """Those that are tensors, and those in lists and tuples."""
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from tensors_among(value)
 
 
 def kernel_device(tensors: Sequence[Tensor]) -> str | None:
@@ -63,7 +72,7 @@ def by(processor: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)
         def choose(*args: P.args, **kwargs: P.kwargs) -> R:
-            device = kernel_device([value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)])
+            device = kernel_device([*tensors_among((*args, *kwargs.values()))])
             if device == "cpu":
                 match_threads()
                 return processor(*args, **kwargs)

@@ -241,7 +241,7 @@ def interpret(
 ) -> tuple[Tensor, ...]:
     """See models.one.interpret."""
     batch, _, height, width = noisy.shape
-    levels = (said.shape[1] - parameters.COMPARED - 2 - parameters.LATENT) // 3
+    levels = (said.shape[1] - sum(parameters.outputs_of_one(0))) // 3
     counts = (parameters.COMPARED, levels, 2 * levels, 2, parameters.LATENT, 3, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     features, sharpness, logits, alpha, latent, now_accumulated, now_length = out

@@ -11,7 +11,7 @@ from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
 from models.neighbours import means_of, summands
 from models.one import MULTIPLE, Evidence, One, Said, evidence_of, interpret
-from models.parameters import BRIGHTEST, LATENT
+from models.parameters import BRIGHTEST, LARGEST_IRRADIANCE, LATENT
 
 READS = (
     "noisy",
@@ -114,7 +114,7 @@ class OneStep(RecurrentStep):
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors
         noisy, divisor, surface = demodulation(x)
-        noisy = noisy.clamp(min=0) * surface
+        noisy = noisy.clamp(0, LARGEST_IRRADIANCE) * surface
         state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
         known = self.evidence(x, noisy, surface)
         outputs = self.network(self.features(x, known, scale))

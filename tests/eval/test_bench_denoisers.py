@@ -19,6 +19,8 @@ from eval.bench.synthetic_frames import synthetic_frame
 from eval.extra_denoisers import WINDOW_SETS
 from eval.selection import cannot_run
 from eval.spec import DenoiserSpec, create_any, precision_in_use
+from models.one import One
+from models.parameters import ONE_INPUTS, STEPS, outputs_of_one
 from provenance import device_in_words
 
 FIELDS = [
@@ -233,3 +235,14 @@ def test_synthetic_frames_look_like_rendered_ones():
     assert traditional[~hidden].mean() > 0.98 and traditional[hidden].mean() < 0.2
     assert dual[hidden].mean() > 0.8  # they lead beside what covered the surface
     assert (synthetic_frame(0, 9, 16).motion == 0).all()
+
+
+def test_transposed_convolutions_count_their_inputs():
+    """By hand for `one`: each layer's weights, at the resolution at which they are applied."""
+    a, b, c = One.widths
+    inputs = sum(ONE_INPUTS.values())
+    outputs = sum(outputs_of_one(len(STEPS)))
+    half = 4 * inputs * a + 2 * 9 * a * a + 4 * a * outputs
+    quarter = 4 * a * b + 2 * 9 * b * b + 4 * b * a
+    eighth = 4 * b * c + 2 * 9 * c * c + 4 * c * b
+    assert macs_per_pixel(DenoiserSpec("one")) == half / 4 + quarter / 16 + eighth / 64

@@ -25,6 +25,7 @@ SHORT: dict[str, dict[str, Any]] = {
     "rae": {"epochs": 1},
     "wskp6": {"epochs": 2, "crops": (2, 1)},
     "ntd": {"epochs": 1},
+    "one": {"epochs": 1},
 }
 
 

@@ -1,5 +1,6 @@
 """`one`: what it accumulates, when it forgets, what it does not depend on; the kernels against PyTorch."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
 from models.one import One
+from models.parameters import COMPARED
 from models.reprojection import reproject
 from models.surfaces import Surfaces
 from tests.helpers.frames import chain, flat_frame, play, run
@@ -145,3 +147,14 @@ def test_levels_of_the_filter_can_be_chosen():
     square = torch.zeros_like(image)
     square[..., 8:17, 16:25] = 1.0
     torch.testing.assert_close(outputs[0], square)
+
+
+@pytest.mark.parametrize("compiled_kernels", [True, False])
+def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh, compiled_kernels):
+    """Logits at their bounds, and light whose sum float32 could not hold."""
+    fresh.network.leave.bias.data[COMPARED:] = 50.0
+    images = [torch.full((1, 3, *SIZE), 3e38) for _ in range(3)]
+    with nullcontext() if compiled_kernels else compiled.disabled():
+        outputs, state = play(fresh, frames(images))
+    assert all(torch.isfinite(output).all() for output in outputs)
+    assert torch.isfinite(state.output).all() and torch.isfinite(state.accumulated).all()

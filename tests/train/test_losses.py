@@ -224,19 +224,19 @@ def test_mean_over_surfaces_by_hand():
 @pytest.mark.parametrize("terms", [None, RelativeTerms()], ids=["its own", "relative"])
 @pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
 def test_the_background_is_not_learnt_from(batch_of, name, terms):
-    """Whatever the reference holds there, the loss stays what it is."""
+    """Whatever the reference holds there, the loss stays what it is, also where a surface comes into view."""
     torch.manual_seed(0)
     batch = batch_of(name, 2)
-    for frame in frames_of(batch):
+    for index, frame in enumerate(frames_of(batch)):
         frame.channels["depth"] = frame.depth.clone()
-        frame.channels["depth"][..., 20:, :] = 0
+        frame.channels["depth"][..., 20 + 4 * index :, :] = 0
     loss = (terms or recipe_for(name, "tiny").loss).around(create(name))
     values = []
     for sky in (0.0, 3.0, 1e4):
-        for frame in frames_of(batch):
+        for index, frame in enumerate(frames_of(batch)):
             for half in {"direct_reference", "indirect_reference"} & frame.channels.keys():
                 frame.channels[half] = frame.channels[half].clone()
-                frame.channels[half][..., 20:, :] = sky
+                frame.channels[half][..., 20 + 4 * index :, :] = sky
         values.append(loss(batch)[0].item())
     assert values[0] == values[1] == values[2] and values[0] > 0
 
@@ -260,6 +260,17 @@ def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level, 
     assert torch.isfinite(value)
     gradients = [p.grad for p in loss.parameters()]
     assert all(g is not None and torch.isfinite(g).all() for g in gradients)
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+def test_validation_knows_bfloat16(batch_of, name):
+    """Where there are no gradients networks may take other ways, which autocast must not trip."""
+    torch.manual_seed(0)
+    batch = batch_of(name)
+    loss = recipe_for(name, "release").loss.around(create(name))
+    exact = loss(batch)[0].item()
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        assert loss(batch)[0].item() == pytest.approx(exact, rel=0.05)
 
 
 @pytest.mark.parametrize("gain", [0.0, 2.0])

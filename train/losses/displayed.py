@@ -67,14 +67,16 @@ class DisplayedLoss(NetworkLoss):
         temporal: list[Tensor] = []
         before: Tensor | None = None  # the last frame's error of single pixels
         for frame, output, exposure in exposed_outputs(self.denoiser, batch):
-            target = exposure * frame.divisor * frame.reference_irradiance(self.denoiser.signal)
+            target = exposure * frame.reference_halves(self.denoiser.signal).mean(dim=1)
             errors = self.errors(output, target, (frame.depth > 0).to(output))
             spatial.append(torch.stack([surface_mean(error.abs(), share) for error, share in errors]).sum())
-            error = errors[0][0]
+            error = torch.where(frame.depth > 0, errors[0][0], 0)
             if before is not None:
                 temporal.append(surface_mean((error - before).abs(), frame.depth))
             before = error
         parts = {"spatial": torch.stack(spatial).mean()}
-        parts["temporal"] = torch.stack(temporal).mean() if temporal else torch.zeros(())
-        loss = parts["spatial"] + self.terms.temporal * parts["temporal"]
+        loss = parts["spatial"]
+        if temporal:
+            parts["temporal"] = torch.stack(temporal).mean()
+            loss = loss + self.terms.temporal * parts["temporal"]
         return loss, {name: part.detach() for name, part in parts.items()}

@@ -57,6 +57,7 @@ class RelativeLoss(NetworkLoss):
         signal = self.denoiser.signal
         for frame, reflected, exposure in exposed_outputs(self.denoiser, batch):
             errors = reflected[:, None] - exposure[:, None] * frame.reference_halves(signal)
+            errors = torch.where(frame.depth[:, None] > 0, errors, 0)
             shown = reflected.detach().clamp(min=0)
             if signal == "total":
                 shown = shown + exposure * frame.emission
