@@ -11,7 +11,8 @@ from train.task import Task
 def starting_network(task: Task, clips: list[Clip]) -> Denoiser:
     """The task's network, with fresh weights or those it starts from, specialised to `clips` if the task says so.
 
-    Raises BadInput where those weights cannot be used, or are specialised to other scenes than these.
+    Raises BadInput where those weights cannot be used, or are specialised to other scenes than these, and where a
+    network that needs all of its inputs is to be specialised.
     """
     denoiser = task.create()
     if task.start:
@@ -24,5 +25,7 @@ def starting_network(task: Task, clips: list[Clip]) -> Denoiser:
                 f"{task.data.path}: start from general weights"
             )
     if task.specialised:
+        if not denoiser.dispensable:
+            raise BadInput(f"'{task.name}' cannot do without any of its inputs: train it without --specialise")
         specialise(denoiser, constants)
     return denoiser

@@ -86,9 +86,7 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
     def count(layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         nonlocal macs
         assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-        gathers = isinstance(
-            layer, nn.Conv2d
-        )  # a transposed one scatters: each input, not each output, has the weights
+        gathers = isinstance(layer, nn.Conv2d)  # a transposed one scatters: its inputs meet the weights
         macs += (output if gathers else inputs[0]).numel() * layer.weight[0].numel()
 
     for layer in network.modules():

@@ -149,3 +149,8 @@ def test_where_all_varies_nothing_is_left_out(capsys, tiny, tmp_path):
     assert special.facts == general.facts and special.judged.denoiser.constants == {}
     train_network(short("wskp6", tiny, tmp_path / "special", specialised=True))
     assert "left out nothing: all that it sees varies" in capsys.readouterr().out
+
+
+def test_what_needs_all_of_its_inputs_is_not_specialised(tiny, tmp_path):
+    with pytest.raises(BadInput, match="without --specialise"):
+        train_network(replace(short_task("one", tiny, tmp_path), specialised=True))
