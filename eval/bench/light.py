@@ -128,7 +128,7 @@ def lag_figure(lags: Sequence[Lag]) -> Figure:
         axis.set(title=change, xlabel="frame")
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("PSNR dB")
-    axes[-1].legend(fontsize=8)
+    axes[0].legend(fontsize=8, loc="lower right")
     return figure
 
 
