@@ -233,7 +233,7 @@ class One(Denoiser):
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
         surface = (frame.depth > 0).to(frame.depth)
-        noisy = frame.irradiance(self.signal).clamp(0, LARGEST_IRRADIANCE) * surface
+        noisy = frame.irradiance(self.signal).clamp(0.0, LARGEST_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         known = self.evidence(frame, noisy, surface, before)
         height, width = frame.size

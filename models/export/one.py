@@ -114,7 +114,7 @@ class OneStep(RecurrentStep):
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors
         noisy, divisor, surface = demodulation(x)
-        noisy = noisy.clamp(0, LARGEST_IRRADIANCE) * surface
+        noisy = noisy.clamp(0.0, LARGEST_IRRADIANCE) * surface
         state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
         known = self.evidence(x, noisy, surface)
         outputs = self.network(self.features(x, known, scale))
