@@ -78,7 +78,9 @@ def render_to_folder(
         clock.lap("pilot")
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     size = (profile.frames, profile.height, profile.width)
-    write_clip(folder, scene, size, Sampling(quality.realisations, noisy_spp, spp, options), seed, channels, clock)
+    write_clip(
+        folder, scene, size, Sampling(quality.realisations, noisy_spp, spp, options), seed, channels, clock.read()
+    )
 
 
 def write_clip(
@@ -88,15 +90,18 @@ def write_clip(
     sampling: Sampling,
     seed: int,
     channels: Sequence[str],
-    clock: StepTimer,
+    seconds_before: dict[str, float] | None = None,
 ) -> None:
-    """Render the named channels of a scene into a clip of `size` (frames, height, width), whole or not at all."""
+    """Render the named channels of a scene into a clip of `size` (frames, height, width), whole or not at all.
+
+    `seconds_before` rendering, by step, are written down beside those of rendering.
+    """
     split, scene_name, clip_name = folder.parts[-3:]
     frames = render_clip(scene, *size, sampling, seed, channels)
     # While only the camera moves, motion follows from depth.
     derived = {} if scene.moves() or "motion" not in channels else {"motion": "camera"}
     with ClipWriter(folder) as writer:
-        writer.timing = clock.read()
+        writer.timing = dict(seconds_before or {})
         progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame")
         for arrays, seconds in progress:
             writer.add(arrays, seconds)

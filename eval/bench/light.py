@@ -1,5 +1,6 @@
 """`onespp bench light`: how soon a denoiser shows a change of light, by its quality in light that never changed."""
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from models.denoiser import Denoiser, State
 from models.operators import finite
 from plotting import DPI, plt, save_figure
 from provenance import device_in_words
-from render.clip import Sampling, StepTimer
+from render.clip import Sampling
 from scenes.animation import KeyframedTrack, RigidMotion, Scene, Track
 from scenes.camera import Array
 from scenes.registry import build_scene
@@ -78,11 +79,12 @@ def changed(change: str) -> Scene:
 
 
 def clip_of(change: str, folder: Path) -> Clip:
-    """The clip of a change, rendered unless it is there."""
-    path = folder / f"generator-{GENERATOR}" / f"{SCENE}-{change}" / "000"
+    """The clip of a change, rendered unless it is there: its folder names all that it follows from."""
+    made_of = repr((GENERATOR, SCENE, SEED, SIZE, SAMPLING, CHANGE, BEFORE[change]))
+    path = folder / f"{zlib.crc32(made_of.encode()):08x}" / f"{SCENE}-{change}" / "000"
     if not is_clip(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_clip(path, changed(change), SIZE, SAMPLING, SEED, tuple(CHANNELS), StepTimer())
+        write_clip(path, changed(change), SIZE, SAMPLING, SEED, tuple(CHANNELS))
     return Clip(path)
 
 

@@ -17,7 +17,7 @@ from errors import BadInput
 from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
 from models.denoiser import Denoiser, State
-from render.clip import Sampling, StepTimer
+from render.clip import Sampling
 from render.shot import Shot
 from render.stage import Stage
 from scenes.registry import build_scene
@@ -64,8 +64,10 @@ def triptych(
 ) -> None:
     """Write a PNG of a built-in scene's frame, whose reference has `spp` samples a pixel, in `size` (height, width).
 
-    Raises BadInput for an unknown scene or denoiser.
+    Raises BadInput for an unknown scene or denoiser, a frame before the first, and no samples.
     """
+    if frame < 0 or spp < 1:
+        raise BadInput(f"frame {frame} of {spp} spp: name a frame from 0 on, and 1 sample a pixel or more")
     (spec,) = evaluated([denoiser], runs, USUAL_BUDGET)
     if spec.returns != "total":
         raise BadInput(f"{denoiser} returns indirect light alone, which is not the picture: name another")
@@ -73,7 +75,7 @@ def triptych(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "test" / scene_name / "000"
         path.parent.mkdir(parents=True)
-        write_clip(path, scene, (frame + 1, *size), NOISY_ONLY, seed, tuple(CHANNELS), StepTimer())
+        write_clip(path, scene, (frame + 1, *size), NOISY_ONLY, seed, tuple(CHANNELS))
         noisy, denoised = last_frame(Clip(path), spec.build())
     shot = Shot(Stage(scene, *size), frame)
     reflected = shot.reflected(seed, spp)

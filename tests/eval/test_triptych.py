@@ -27,3 +27,8 @@ def test_a_small_one(tmp_path):
     assert pixels.std() > 10
     with pytest.raises(BadInput, match="unknown scene"):
         triptych(out, "no_scene", "svgf", tmp_path, frame=1, spp=2)
+    for frame, spp in ((-1, 4), (2, 0)):
+        with pytest.raises(BadInput, match="name a frame from 0 on"):
+            triptych(out, "cornell_box", "svgf", tmp_path, frame, spp)
+    with pytest.raises(BadInput, match="indirect light alone"):
+        triptych(out, "cornell_box", "ntd", tmp_path, frame=2, spp=4)
