@@ -8,13 +8,15 @@ FUSED = "_convolution_pointwise"  # what PyTorch's compiler uses; it is not docu
 
 
 class ConvReLU(nn.Conv2d):
-    """relu(convolution(x) + other) with kernels of `size` x `size`; zeros around the image keep its size.
+    """relu(convolution(x) + other) with kernels of `size` x `size`, an odd one or the stride.
+
+    Zeros around the image keep its size, which a stride divides.
 
     Inference on CPUs takes oneDNN's fused operator: PyTorch's own walk over the image up to three times.
     """
 
-    def __init__(self, inputs: int, outputs: int, size: int = 3):
-        super().__init__(inputs, outputs, size, padding=size // 2)
+    def __init__(self, inputs: int, outputs: int, size: int = 3, stride: int = 1):
+        super().__init__(inputs, outputs, size, stride, padding=(size - stride) // 2)
 
     def forward(self, x: Tensor, other: Tensor | None = None) -> Tensor:
         """`other` has the shape of the output; it may be overwritten."""
@@ -30,7 +32,9 @@ class ConvReLU(nn.Conv2d):
 
 
 def fusable(x: Tensor) -> bool:
-    """Whether oneDNN's fused operators, which know neither gradients nor autocast, can take `x`."""
+    """Whether oneDNN's fused operators, which know neither gradients nor autocast nor exports, can take `x`."""
+    if torch.compiler.is_compiling():
+        return False
     plain = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
     if not plain or not torch.backends.mkldnn.is_available() or not hasattr(torch.ops.mkldnn, FUSED):
         return False

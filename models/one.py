@@ -12,6 +12,7 @@ from datasets.frame import Frame, Signal
 from models import compiled
 from models.affinity import affinity_level
 from models.compiled import one as kernels
+from models.convolution import ConvReLU
 from models.denoiser import Denoiser, State, matching_state
 from models.neighbours import mesh_means
 from models.operators import pad_to_multiple
@@ -21,6 +22,7 @@ from models.parameters import (
     LARGEST_IRRADIANCE,
     LARGEST_LOGIT,
     LATENT,
+    MULTIPLE,
     ONE_INPUTS,
     STEPS,
     outputs_of_one,
@@ -30,62 +32,49 @@ from models.running_scale import RunningScale, running_scale
 from models.surfaces import Surfaces
 
 DETAIL = 24  # hidden channels of what looks at every pixel alone
-MULTIPLE = 8  # of the sides of an image that the network takes
-CACHED = 8192  # pixels that are taken together, so that what is known of them stays in the cache
-
-
-def conv(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU(inplace=True))
-
-
-def half(inputs: int, outputs: int) -> nn.Sequential:
-    """At half the resolution."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 2, stride=2), nn.ReLU(inplace=True))
+PATCH = 4  # pixels, 2 x 2
 
 
 class Trunk(nn.Module):
-    """A small U-Net at 1/2, 1/4 and 1/8 of the resolution, and what it says of every pixel."""
+    """A small U-Net at 1/2, 1/4 and 1/8 of the resolution, and what is added to it of every pixel by itself."""
 
     def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int]):
         super().__init__()
         a, b, c = widths
-        self.enter = nn.Sequential(half(inputs, a), conv(a, a))
-        self.down_b = nn.Sequential(half(a, b), conv(b, b))
-        self.down_c = nn.Sequential(half(b, c), conv(c, c), conv(c, c))
+        self.enter = nn.Sequential(ConvReLU(PATCH * inputs, a, 1), ConvReLU(a, a))
+        self.down_b = nn.Sequential(ConvReLU(a, b, 2, stride=2), ConvReLU(b, b))
+        self.down_c = nn.Sequential(ConvReLU(b, c, 2, stride=2), ConvReLU(c, c), ConvReLU(c, c))
         self.up_b = nn.ConvTranspose2d(c, b, 2, stride=2)
-        self.join_b = conv(b, b)
+        self.join_b = ConvReLU(b, b)
         self.up_a = nn.ConvTranspose2d(b, a, 2, stride=2)
-        self.join_a = conv(a, a)
+        self.join_a = ConvReLU(a, a)
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
+        # Applied where the inputs are made and the outputs read: see network_inputs and interpret.
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
-    def of_patches(self, x: Tensor) -> Tensor:
-        """What the U-Net adds to `detail`."""
-        a = self.enter(x)
+    @property
+    def hidden(self) -> nn.Linear:
+        """The first layer of `detail`."""
+        layer = self.detail[0]
+        assert isinstance(layer, nn.Linear)
+        return layer
+
+    @property
+    def last(self) -> nn.Linear:
+        """The second layer of `detail`."""
+        layer = self.detail[2]
+        assert isinstance(layer, nn.Linear)
+        return layer
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """What the U-Net says, (B, outputs, H, W), of patches_of (B, inputs, H, W)."""
+        a = self.enter(patches)
         b = self.down_b(a)
         c = self.down_c(b)
-        b = self.join_b(b + self.up_b(c))
-        a = self.join_a(a + self.up_a(b))
-        leaving: Tensor = self.leave(a)
-        return leaving
-
-    def add_detail(self, outputs: Tensor, x: Tensor) -> None:
-        """Add what `detail` says of x to `outputs`, whose channels come last in memory, in their place."""
-        first, _, last = self.detail
-        assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
-        pixels, sums = (each.movedim(1, -1).view(-1, each.shape[1]) for each in (x, outputs))
-        for some, total in zip(pixels.split(CACHED), sums.split(CACHED), strict=True):
-            hidden = torch.addmm(first.bias, some, first.weight.t()).relu_()
-            torch.addmm(total, hidden, last.weight.t(), out=total)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, outputs, H, W) of x (B, inputs, H, W), channels last in memory, whose sides are multiples of 8."""
-        outputs = self.of_patches(x)
-        if outputs.requires_grad or outputs.dtype != x.dtype:  # in training and, by autocast, in validation
-            return outputs + self.detail(x.movedim(1, -1)).movedim(-1, 1)
-        outputs = outputs.contiguous(memory_format=torch.channels_last)
-        self.add_detail(outputs, x)
-        return outputs
+        b = self.join_b(self.up_b(c).add_(b))
+        a = self.join_a(self.up_a(b).add_(a))
+        said: Tensor = self.leave(a)
+        return said
 
 
 @dataclass(frozen=True)
@@ -109,32 +98,15 @@ class OneState(State):
         }
 
 
-@dataclass(frozen=True)
-class Evidence:
+class Evidence(NamedTuple):
     """What is known of each pixel before the network speaks; irradiance, all (B, ·, H, W)."""
 
     noisy: Tensor
     near: Tensor  # mean over 3 x 3 pixels of the same mesh
     around: Tensor  # over 9 x 9
     deviation: Tensor  # relative one of luminance over 9 x 9
-    output: Tensor  # of the frame before, or `around` where it was not found
-    accumulated: Tensor
-    length: Tensor  # 0 where not found
-    latent: Tensor
-    found: Tensor
-
-
-def evidence_of(noisy: Tensor, means: tuple[Tensor, Tensor, Tensor], past: Tensor, found: Tensor) -> Evidence:
-    """What follows from a frame's `noisy` irradiance, what mesh_means says of it, and the history.
-
-    `past` (B, 7 + LATENT, H, W) holds output, accumulation, its length and latent channels where they were `found`
-    (B, 1, H, W), 1 or 0.
-    """
-    near, around, deviation = means
-    output = torch.where(found > 0, past[:, :3], around)
-    accumulated = torch.where(found > 0, past[:, 3:6], noisy)
-    length, latent = (past[:, 6:] * found).split([1, LATENT], dim=1)
-    return Evidence(noisy, near, around, deviation, output, accumulated, length, latent, found)
+    past: Tensor  # output of the frame before, accumulation, its length, latent channels; 7 + LATENT channels
+    found: Tensor  # whether the past was found, 1 or 0; else it means nothing
 
 
 class Said(NamedTuple):
@@ -150,49 +122,62 @@ class Said(NamedTuple):
     length: Tensor  # (B, 1, H, W)
 
 
-@compiled.by(kernels.interpret)
-def interpret(
-    said: Tensor, noisy: Tensor, accumulated: Tensor, length: Tensor, found: Tensor, samples: Tensor
-) -> tuple[Tensor, ...]:
-    """What the outputs (B, ·, H, W) of the network mean, in the order of Said.
-
-    The others are as in Evidence, samples (B, 1, 1, 1).
+def meaning(said: Tensor, known: Evidence, samples: Tensor) -> tuple[Tensor, ...]:
+    """What the outputs (B, ·, H, W) of the network mean, in the order of Said; samples are (B, 1, 1, 1).
 
     The prior of the accumulation is the even mean of all samples: the network says how far to leave it. Where nothing
     was found there is nothing to mix with.
     """
     levels = (said.shape[1] - sum(outputs_of_one(0))) // 3
     features, sharpness, own, importance, alphas, latent = said.split(outputs_of_one(levels), dim=1)
-    past = length.clamp(min=FEWEST_SAMPLES)
+    past = known.past[:, 6:7].clamp(min=FEWEST_SAMPLES)
     prior = torch.cat([torch.log(past / samples), torch.zeros_like(past)], dim=1)
-    alpha = torch.where(found > 0, torch.sigmoid(alphas - prior), 1)
+    alpha = torch.where(known.found > 0, torch.sigmoid(alphas - prior), 1)
     newest, kept = alpha[:, :1], 1 - alpha[:, :1]
     variance = newest.square() / samples + kept.square() / past
     logits = (each.clamp(-LARGEST_LOGIT, LARGEST_LOGIT) for each in (own, importance))
-    accumulated = torch.lerp(accumulated, noisy, newest)
+    accumulated = torch.lerp(known.past[:, 3:6], known.noisy, newest)
     return features, F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
 
 
-@compiled.by(kernels.network_inputs)
-def network_inputs(
-    frame: Frame,
-    scale: RunningScale,
-    images: Sequence[Tensor],
-    deviation: Tensor,
-    length: Tensor,
-    found: Tensor,
-    latent: Tensor,
-) -> Tensor:
-    """What the network sees, (B, ·, H, W): logarithms of exposed irradiance, numbers of the history, surfaces.
+@compiled.by(kernels.interpret)
+def interpret(said: Tensor, hidden: Tensor, last: nn.Linear, known: Evidence, samples: Tensor) -> tuple[Tensor, ...]:
+    """The meaning of what the U-Net said and what `last` makes of `hidden` (B, ·, H, W)."""
+    return meaning(said + last(hidden.movedim(1, -1)).movedim(-1, 1), known, samples)
 
-    `images`, each (B, 3, H, W), are irradiance; the others as in Evidence.
+
+def patches_of(x: Tensor) -> Tensor:
+    """Patches of 2 x 2 pixels, (B, 4 C, ⌈H / 8⌉ 4, ⌈W / 8⌉ 4), of x (B, C, H, W), whose borders are repeated.
+
+    The channels of a pixel lie side by side: in the order of rows, columns, channels.
     """
-    exposed = torch.stack(list(images), dim=1).clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
+    x = pad_to_multiple(x, MULTIPLE)
+    batch, channels, height, width = x.shape
+    pixels = x.view(batch, channels, height // 2, 2, width // 2, 2).permute(0, 3, 5, 1, 2, 4)
+    return pixels.reshape(batch, PATCH * channels, height // 2, width // 2)
+
+
+@compiled.by(kernels.network_inputs)
+def network_inputs(frame: Frame, scale: RunningScale, known: Evidence, hidden: nn.Linear) -> tuple[Tensor, Tensor]:
+    """What the network sees of pixels: logarithms of exposed irradiance, numbers of the history, surfaces.
+
+    As patches_of images (B, ·, H, W); and what looks at every pixel alone makes of those, the outputs of the layer
+    `hidden`, (B, ·, H, W).
+    """
+    output, accumulated, length, latent = known.past.split([3, 3, 1, LATENT], dim=1)
+    found = known.found > 0
+    output = torch.where(found, output, known.around)
+    accumulated = torch.where(found, accumulated, known.noisy)
+    exposed = torch.stack([known.noisy, known.near, known.around, output, accumulated], dim=1).clamp(min=0)
+    exposed = exposed * (scale.exposure() * frame.gain)[:, None]
     colours = torch.log1p(exposed.clamp(max=BRIGHTEST)).flatten(1, 2)
     newest = (1 / frame.samples).expand_as(length)
-    numbers = (torch.log1p(deviation), newest, 1 / (length + frame.samples), found)
+    oldest = 1 / (length * known.found + frame.samples)
+    numbers = (torch.log1p(known.deviation), newest, oldest, known.found, latent * known.found)
     surfaces = (frame.albedo, frame.view_normal(), scale.normalised_depth(frame.depth), frame.roughness)
-    return torch.cat([colours, *numbers, latent, *surfaces], dim=1)
+    seen = torch.cat([colours, *numbers, *surfaces], dim=1)
+    alone = torch.relu(hidden(seen.movedim(1, -1).to(hidden.weight.dtype))).movedim(-1, 1)
+    return patches_of(seen), alone
 
 
 class One(Denoiser):
@@ -227,7 +212,15 @@ class One(Denoiser):
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
             past, where = reproject(frame, carried, before.surfaces)
             found = where.to(noisy) * surface
-        return evidence_of(noisy, mesh_means(noisy, frame.mesh_id), past, found)
+        return Evidence(noisy, *mesh_means(noisy, frame.mesh_id), past, found)
+
+    def speak(self, frame: Frame, scale: RunningScale, known: Evidence) -> Said:
+        """What the network says of all that is known."""
+        patches, hidden = network_inputs(frame, scale, known, self.network.hidden)
+        height, width = frame.size
+        said = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
+        said = said.to(known.noisy)
+        return Said(*interpret(said, hidden, self.network.last, known, frame.samples.to(known.noisy)))
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
@@ -236,18 +229,12 @@ class One(Denoiser):
         noisy = frame.irradiance(self.signal).clamp(0.0, LARGEST_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         known = self.evidence(frame, noisy, surface, before)
-        height, width = frame.size
-        images = (known.noisy, known.near, known.around, known.output, known.accumulated)
-        seen = network_inputs(frame, scale, images, known.deviation, known.length, known.found, known.latent)
-        x = pad_to_multiple(seen, MULTIPLE)
-        outputs = self.network(x.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
-        past = (known.accumulated, known.length, known.found)
-        said = Said(*interpret(outputs.to(noisy), noisy, *past, frame.samples.to(noisy)))
+        said = self.speak(frame, scale, known)
         image = said.accumulated
         planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
         for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
             image = affinity_level(image, said.features, sharpness, own, importance, surface, step)
-        output = torch.lerp(known.output, image, said.alpha[:, 1:]) * surface
+        output = torch.lerp(known.past[:, :3], image, said.alpha[:, 1:]) * surface
         return output, OneState(
             frame.moment,
             output,

@@ -41,6 +41,7 @@ BRIGHTEST = 1e13  # exposed irradiance that `one` tells apart; what is brighter 
 LARGEST_IRRADIANCE = 1e30  # what is brighter is cut: sums of it with weights of exp(10) must stay finite
 LARGEST_LOGIT = 10.0  # of the weights of taps
 LEAST_LOGIT = -40.0  # what is below counts as that much
+MULTIPLE = 8  # of the sides of an image that the network takes
 FEWEST_SAMPLES = 1e-3  # of a history, to divide by
 LEAST_MEAN = 1e-20  # luminance that deviations are relative to
 

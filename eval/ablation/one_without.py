@@ -1,13 +1,12 @@
 """`one` without some of its parts, for its ablation."""
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from datasets.frame import Frame
 from models.denoiser import State
 from models.one import Evidence, One, OneState
+from models.parameters import LATENT
 
 
 class WithoutHistory(One):
@@ -22,4 +21,5 @@ class WithoutLatent(One):
 
     def evidence(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> Evidence:
         known = super().evidence(frame, noisy, surface, before)
-        return replace(known, latent=torch.zeros_like(known.latent))
+        images, latent = known.past.split([7, LATENT], dim=1)
+        return known._replace(past=torch.cat([images, torch.zeros_like(latent)], dim=1))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import ParamSpec, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.compiled.jit import match_threads
 
@@ -35,10 +35,12 @@ def disabled() -> Iterator[None]:
 
 
 def tensors_among(values: Iterable[object]) -> Iterator[Tensor]:
-    """Those that are tensors, and those in lists and tuples."""
+    """Those that are tensors, those in lists and tuples, and the parameters of modules."""
     for value in values:
         if isinstance(value, Tensor):
             yield value
+        elif isinstance(value, nn.Module):
+            yield from value.parameters()
         elif isinstance(value, list | tuple):
             yield from tensors_among(value)
 

@@ -4,14 +4,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models import compiled
 from models.export.neighbours import affinity_level, mesh_sums
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
 from models.neighbours import means_of, summands
-from models.one import MULTIPLE, Evidence, One, Said, evidence_of, interpret
-from models.parameters import BRIGHTEST, LARGEST_IRRADIANCE, LATENT
+from models.one import PATCH, Evidence, One, Said, meaning
+from models.parameters import BRIGHTEST, LARGEST_IRRADIANCE, LATENT, MULTIPLE
 
 READS = (
     "noisy",
@@ -43,6 +42,16 @@ def pointwise(layers: nn.Sequential) -> nn.Sequential:
             layer = convolution
         plain.append(layer)
     return nn.Sequential(*plain)
+
+
+def of_pixels(layer: nn.Module) -> nn.Sequential:
+    """A layer on patches of 2 x 2 pixels as one on pixels."""
+    assert isinstance(layer, nn.Conv2d)
+    outputs, inputs = layer.weight.shape[:2]
+    convolution = nn.Conv2d(inputs // PATCH, outputs, 2, stride=2)
+    weight = layer.weight.view(outputs, 2, 2, inputs // PATCH).permute(0, 3, 1, 2)
+    convolution.load_state_dict({"weight": weight, "bias": layer.bias})
+    return nn.Sequential(convolution, nn.ReLU())
 
 
 def resized(x: Tensor, height: int, width: int) -> Tensor:
@@ -80,6 +89,7 @@ class OneStep(RecurrentStep):
         super().__init__(READS, HISTORY, warp)
         self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.network
+        self.trunk.enter = nn.Sequential(of_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = pointwise(self.trunk.detail)
         self.trunk.down_c = Coarsest(*self.trunk.down_c)
         self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
@@ -92,24 +102,28 @@ class OneStep(RecurrentStep):
         means = means_of(close, mesh_sums(close, mesh, 3))
         past = self.past(x)
         found = (past[:, 6:7] > 0).to(noisy) * surface  # no length is 0 once a frame has been seen
-        return evidence_of(noisy, means, past, found)
+        return Evidence(noisy, *means, past, found)
 
     def features(self, x: dict[str, Tensor], known: Evidence, scale: Scale) -> Tensor:
         """models.one.network_inputs."""
-        images = torch.cat([known.noisy, known.near, known.around, known.output, known.accumulated], dim=1)
+        past, accumulated, length, latent = known.past.split([3, 3, 1, LATENT], dim=1)
+        past = torch.where(known.found > 0, past, known.around)
+        accumulated = torch.where(known.found > 0, accumulated, known.noisy)
+        images = torch.cat([known.noisy, known.near, known.around, past, accumulated], dim=1)
         colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=BRIGHTEST))
-        newest = (1 / x["samples"]).expand_as(known.length)
-        numbers = (torch.log1p(known.deviation), newest, 1 / (known.length + x["samples"]), known.found)
+        newest = (1 / x["samples"]).expand_as(length)
+        oldest = 1 / (length * known.found + x["samples"])
+        numbers = (torch.log1p(known.deviation), newest, oldest, known.found, latent * known.found)
         to_view = torch.tensor(TO_VIEW)[:, None] * x["camera_to_world"][:3, :3].T
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])
         surfaces = (x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
-        return torch.cat([colours, *numbers, known.latent, *surfaces], dim=1)
+        return torch.cat([colours, *numbers, *surfaces], dim=1)
 
     def network(self, seen: Tensor) -> Tensor:
         """The network's outputs (1, ·, H, W)."""
         height, width = seen.shape[-2:]
         whole = (MULTIPLE * ((size + MULTIPLE - 1) // MULTIPLE) for size in (height, width))
-        return resized(self.trunk.of_patches(resized(seen, *whole)), height, width) + self.trunk.detail(seen)
+        return resized(self.trunk(resized(seen, *whole)), height, width) + self.trunk.detail(seen)
 
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors
@@ -118,13 +132,12 @@ class OneStep(RecurrentStep):
         state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
         known = self.evidence(x, noisy, surface)
         outputs = self.network(self.features(x, known, scale))
-        with compiled.disabled():
-            said = Said(*interpret(outputs, noisy, known.accumulated, known.length, known.found, x["samples"]))
+        said = Said(*meaning(outputs, known, x["samples"]))
         filtered = said.accumulated
         planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
         for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
             filtered = affinity_level(filtered, said.features, sharpness, own, importance, surface, step)
-        output = torch.lerp(known.output, filtered, said.alpha[:, 1:]) * surface
+        output = torch.lerp(known.past[:, :3], filtered, said.alpha[:, 1:]) * surface
         return {
             "radiance": output * divisor + x["emission"],
             "new_history": torch.cat([output, said.accumulated, said.length, said.latent], dim=1),
