@@ -11,7 +11,6 @@ from torch.utils.data import Dataset as TorchDataset
 from datasets.channels import NOISY, REFERENCES
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
-from datasets.roulette import Roulette
 from datasets.shading import WanderingEdge
 from errors import BadInput
 
@@ -27,7 +26,6 @@ class Augmentation:
     exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5
     samples: bool = False  # three in ten sequences are means of 2, 4, 8, ... realisations
     light: bool = False  # over three in ten sequences the edge of a shadow or of more light wanders
-    roulette: bool = False  # in four of ten sequences light is harder to find: few samples survive, and count for more
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
@@ -108,21 +106,17 @@ class TrainingSequences(TorchDataset[list[Frame]]):
 
         edge = WanderingEdge.random(rng, self.length) if self.augmentation.light and rng.random() < 0.3 else None
 
-        roulette = Roulette.random(rng) if self.augmentation.roulette and rng.random() < 0.4 else None
-
-        def realisation_of(position: int, channels: Sequence[str], realisation: int, previous: int) -> Frame:
-            frame = read_frame(clip, position, channels, realisation, previous, window)
-            return frame if roulette is None else roulette.play(frame, rng)
-
         brighter = 0.0  # the logarithm of how much light a change adds
         frames = []
         for t, position in enumerate(playback):
             chosen = [int(deal[(together * t + i) % len(deal)]) for i in range(together)]
             realisation = chosen[0]
             previous = playback[max(t - 1, 0)]
-            frame = realisation_of(position, self.channels, realisation, previous)
+            frame = read_frame(clip, position, self.channels, realisation, previous, window)
             if together > 1:
-                frame = frame.with_more_samples([realisation_of(position, NOISY, i, previous) for i in chosen[1:]])
+                frame = frame.with_more_samples(
+                    [read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]]
+                )
             if edge is not None:
                 light = edge.light(t, *frame.size)
                 brighter = float(torch.log(light).mean())

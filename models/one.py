@@ -137,7 +137,8 @@ def meaning(said: Tensor, known: Evidence, samples: Tensor) -> tuple[Tensor, ...
     variance = newest.square() / samples + kept.square() / past
     logits = (each.clamp(-LARGEST_LOGIT, LARGEST_LOGIT) for each in (own, importance))
     accumulated = torch.lerp(known.past[:, 3:6], known.noisy, newest)
-    return features, F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
+    # Every level of the filter reads the features: let none have to bring them together.
+    return features.contiguous(), F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
 
 
 @compiled.by(kernels.interpret)

@@ -16,6 +16,12 @@ def copy_line(line: Any, source: Any) -> None:
 
 
 @jit_in_any_order
+def fill_line(line: Any, value: Any) -> None:
+    for x in range(line.size):
+        line[x] = value
+
+
+@jit_in_any_order
 def add_line(line: Any, other: Any) -> None:
     for x in range(line.size):
         line[x] += other[x]

@@ -14,7 +14,7 @@ from datasets.frame import Frame
 from models import parameters
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
-from models.compiled.lines import copy_line, scale_depth, scale_line
+from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line
 from models.running_scale import RunningScale
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def write_inputs(patches: Any, hidden: Any, seen: Seen, layer: Layer) -> None:
             if bottom > y:
                 continue
             for c in range(sums.shape[0]):
-                sums[c, :n] = layer.bias[c]
+                fill_line(sums[c, :n], layer.bias[c])
             add_layer(sums, lines, layer.weight, n)
             for c in range(hidden.shape[0]):
                 activate(hidden[c, y, x : x + n], sums[c, :n])
