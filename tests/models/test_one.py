@@ -123,6 +123,19 @@ def test_kernels_are_pytorch_but_faster(tiny, fresh):
             assert close.float().mean() > 0.999, name
 
 
+@pytest.mark.parametrize("size", [(2, 2), (13, 7), (3, 1100)])
+def test_kernels_are_pytorch_at_any_size(fresh, size):
+    """Also where a row takes several chunks, and where the borders are repeated up to a multiple of 8."""
+    generator = torch.Generator().manual_seed(2)
+    images = [torch.rand(1, 3, *size, generator=generator) for _ in range(3)]
+    sequence = chain([flat_frame(*size, (0.5, 0.25), irradiance=image) for image in images])
+    fast = run(fresh, sequence)
+    with compiled.disabled():
+        slow = run(fresh, sequence)
+    for a, b in zip(fast, slow, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
 def test_a_still_wall_stays_what_it_is(fresh):
     """300 frames of even light, seen by a camera that does not move: no drift."""
     image = 0.5 * torch.ones(1, 3, *SIZE)
