@@ -425,7 +425,7 @@ def test_blocks_are_means_over_their_surfaces():
 
 
 def test_one_s_loss_by_hand(batch_of, monkeypatch):
-    """Of outputs that are off by a known factor: the scales of every frame, and the change of the error."""
+    """Of outputs that are off by a known factor: every frame's error and how it changes, at both scales."""
     batch = batch_of("one", 2, length=2)
     denoiser = create("one")
     factors = iter((1.5, 0.7))
@@ -442,16 +442,17 @@ def test_one_s_loss_by_hand(batch_of, monkeypatch):
     monkeypatch.setattr(denoiser, "predict", predict)
     value, parts = DisplayedLoss(denoiser, DisplayedTerms(temporal=0.5, scales=(1, 8)))(batch)
     spatial = 0.0
-    errors = []
+    errors: list[list[Tensor]] = []
     for frame, (output, truth) in zip(batch.frames, seen, strict=True):
         surface = (frame.depth > 0).float()
         blocks = [image * surface for image in (output, truth)]
         share = surface.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2))
         small = [image.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2)) / share.clamp(min=1e-6) for image in blocks]
-        errors.append(tone(output) - tone(truth))
-        spatial += surface_mean(errors[-1].abs(), frame.depth) / 2
-        spatial += surface_mean((tone(small[0]) - tone(small[1])).abs(), share) / 2
-    temporal = surface_mean((errors[1] - errors[0]).abs(), batch.frames[0].depth)
+        errors.append([surface * (tone(output) - tone(truth)), tone(small[0]) - tone(small[1])])
+        shares = (frame.depth, share)
+        spatial += sum(surface_mean(error.abs(), each) / 2 for error, each in zip(errors[-1], shares, strict=True))
+    changes = [now - then for then, now in zip(*errors, strict=True)]
+    temporal = sum(surface_mean(change.abs(), each) for change, each in zip(changes, shares, strict=True))
     assert parts["spatial"].item() == pytest.approx(spatial.item(), rel=1e-4)
     assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
 

@@ -1,5 +1,6 @@
-"""A loss for noisy references: the error as displayed, at several scales, and how it changes from frame to frame."""
+"""A loss for noisy references: the error as displayed and how it changes from frame to frame, at several scales."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,6 +32,11 @@ def shrunk(radiance: Tensor, surface: Tensor, scale: int) -> tuple[Tensor, Tenso
     return mean / share.clamp(min=1e-6), share
 
 
+def sum_of_scales(errors: Sequence[Tensor], shares: Sequence[Tensor]) -> Tensor:
+    """The sum of the mean absolute values of errors where there are surfaces."""
+    return torch.stack([surface_mean(error.abs(), share) for error, share in zip(errors, shares, strict=True)]).sum()
+
+
 @dataclass(frozen=True)
 class DisplayedTerms(LossTerms):
     """The weight of what changes, and the scales in pixels, the first of them 1.
@@ -47,7 +53,7 @@ class DisplayedTerms(LossTerms):
 
 
 class DisplayedLoss(NetworkLoss):
-    """L1 of what is displayed: of each scale, and of changes. For any network, which sets the exposure."""
+    """L1 of what is displayed, and of its changes, at each scale. For any network, which sets the exposure."""
 
     def __init__(self, denoiser: Denoiser, terms: DisplayedTerms | None = None):
         super().__init__()
@@ -55,25 +61,25 @@ class DisplayedLoss(NetworkLoss):
         self.terms = terms or DisplayedTerms()
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Output minus target (B, 3, H, W) as displayed, and where there are surfaces, in blocks of each scale."""
+        """Output minus target (B, 3, H, W) as displayed, 0 off surfaces; where these are: in blocks of each scale."""
         found = []
         for scale in self.terms.scales:
             shown, share = shrunk(output, surface, scale)
-            found.append((tone(shown) - tone(shrunk(target, surface, scale)[0]), share))
+            error = tone(shown) - tone(shrunk(target, surface, scale)[0])
+            found.append((torch.where(share > 0, error, 0), share))
         return found
 
     def forward(self, batch: Batch | Crops) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
-        before: Tensor | None = None  # the last frame's error of single pixels
+        before: Sequence[Tensor] = ()  # the last frame's errors
         for frame, output, exposure in exposed_outputs(self.denoiser, batch):
             target = exposure * frame.reference_halves(self.denoiser.signal).mean(dim=1)
-            errors = self.errors(output, target, (frame.depth > 0).to(output))
-            spatial.append(torch.stack([surface_mean(error.abs(), share) for error, share in errors]).sum())
-            error = torch.where(frame.depth > 0, errors[0][0], 0)
-            if before is not None:
-                temporal.append(surface_mean((error - before).abs(), frame.depth))
-            before = error
+            errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
+            spatial.append(sum_of_scales(errors, shares))
+            if before:
+                temporal.append(sum_of_scales([now - then for now, then in zip(errors, before, strict=True)], shares))
+            before = errors
         parts = {"spatial": torch.stack(spatial).mean()}
         loss = parts["spatial"]
         if temporal:
