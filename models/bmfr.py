@@ -1,24 +1,26 @@
 """BMFR: blockwise multi-order feature regression (Koskela et al. 2019).
 
 Accumulated irradiance is fitted, block by block, by a linear combination of noise-free features; what was fitted is
-accumulated once more. Weights, the amount of noise and the size of blocks are the paper's. Its temporal antialiasing is
-a stage of its own here as for every denoiser: `bmfr+taa` is the whole pipeline, in which models.taa blends 0.1 of the
-newest frame after Karis, the paper 0.2 (and without tone mapping).
+accumulated once more. Features, size of blocks, amount of noise and weights are those of the code that its authors
+published (github.com/maZZZu/bmfr); we do not have the paper's text. Its last stage, temporal antialiasing, comes after
+remodulation and is an option for every denoiser here: `bmfr+taa` is the whole pipeline. models.taa blends after Karis,
+0.1 of the newest frame, the authors 0.2 of gamma-corrected pictures.
 
-Where the paper is silent, or we do not have its words, we choose:
+What is ours:
 
-- History is found as for all denoisers here (models.reprojection), also for what was fitted.
+- History is found as for all denoisers here (models.reprojection), for what is accumulated first and second alike.
 - Positions are along the world's axes, around the camera, and scaled to [0, 1] in each block, then squared. Squares of
   positions as they are would span the same space together with 1 and positions, wherever the origin is; but far from
-  it, noise hides what tells them from positions.
+  it, noise hides what tells them from positions. The authors scale only what extends over more than a unit; we scale
+  always, so that the unit cancels.
 - An axis along which a block is flat, to 10^-3 of its largest extent, is scaled by that: rounding is no feature.
-- Background is no row of a regression: of its features only the noise is left, its light and even its constant are 0.
-  So blocks with few surfaces, or a single pixel, are regularised as strongly as full ones, and every block that shows
-  any surface has full rank.
+- Background takes part in no regression: its light and features, the constant too, are 0 but for the noise. So blocks
+  with few surfaces, or a single pixel, are regularised as strongly as full ones, and have full rank. Blocks without any
+  are left out.
 - The grid's offsets are the first 16 points of the R2 sequence. Noise is the same for all blocks of a frame, and drawn
   anew for each by its number since the last reset.
 - Images narrower than a block are mirrored again and again.
-- Fitted irradiance is also cut where it exceeds all that a frame can hold; QR factors are computed in float64.
+- QR factors are computed in float64, in which no irradiance overflows; fits are cut at the largest light of a frame.
 """
 
 from dataclasses import dataclass
