@@ -21,6 +21,12 @@ EPSILON_Z = 1e-3  # of the depth
 EPSILON_L = 1e-20  # luminance²
 LEAST_DIVISOR = 1e-30  # keeps quotients finite where lengths and depths are 0
 
+# --- BMFR (Koskela et al. 2019) ---------------------------------------------------------------------------------------
+
+BLOCK_SIDE = 32  # px
+REGRESSORS = 10  # 1, normal (3), position (3), its squares (3)
+FLATTEST = 1e-3  # of a block's largest extent: what is smaller along an axis is not stretched to 1
+
 # --- Weight-shared kernels (Fan et al. 2021) --------------------------------------------------------------------------
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3

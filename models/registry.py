@@ -10,6 +10,7 @@ from errors import BadInput
 from models.adaptive import adaptive
 from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
+from models.bmfr import BMFR
 from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.fastest import bfloat16_pays
@@ -30,6 +31,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "eaw": EAW,
     "svgf": SVGF,
     "asvgf": ASVGF,
+    "bmfr": BMFR,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,

@@ -1,0 +1,301 @@
+"""BMFR against numpy's padding and least squares, block by block, and against what is known of its parts."""
+
+import contextlib
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.frame import Cameras
+from eval.bench.synthetic_frames import synthetic_frame
+from models import bmfr, compiled
+from models.baselines import Accumulated
+from models.bmfr import BMFR, Blocks
+from tests.helpers.frames import chain, flat_frame, play, run
+
+WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+EXAMPLES = settings(deadline=None)
+SIZES = st.tuples(st.integers(1, 70), st.integers(1, 70))
+OFFSETS = st.tuples(st.integers(0, 31), st.integers(0, 31))
+NO_NOISE = torch.zeros(1024, 10, dtype=torch.float64)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Images are tiny: threads would only wait for each other, for long where other processes keep a core busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(params=WAYS)
+def way(request):
+    """The test runs with compiled kernels and the PyTorch way."""
+    with WAYS[request.param]():
+        yield request.param
+
+
+def to_torch(array):
+    return torch.from_numpy(np.ascontiguousarray(array))[None]
+
+
+def scene(rng, height, width, share=0.8):
+    """Irradiance and normals (3, H, W), depth (H, W), 0 for background, and axes (3, 3) of some camera."""
+    depth = np.float32((1 + rng.random((height, width))) * (rng.random((height, width)) < share))
+    normal = np.float32(rng.standard_normal((3, height, width)))
+    light = np.float32(10 * rng.random((3, height, width)) ** 4)
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return light, normal, depth, turn @ np.linalg.inv([[-50, 0, width / 2], [0, -60, height / 2], [0, 0, 1]])
+
+
+def positions(depth, axes):
+    """(3, H, W)."""
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    return np.einsum("ij,jhw->ihw", axes, np.stack([x, y, np.ones_like(x)])) * depth
+
+
+def regress(light, normal, depth, axes, noise, offset):
+    """As arrays."""
+    tensors = (to_torch(array) for array in (light, normal, depth[None], axes))
+    return bmfr.regress(*tensors, noise, offset)[0].double().numpy()
+
+
+# --- The grid ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_grid_moves_from_frame_to_frame_and_returns():
+    offsets = [bmfr.grid_offset(number) for number in range(32)]
+    assert offsets[:16] == offsets[16:] and len(set(offsets[:16])) == 16
+    assert all(0 <= place < 32 for offset in offsets for place in offset)
+    for (y, x), (to_y, to_x) in itertools.pairwise(offsets):
+        apart = [min(step % 32, -step % 32) for step in (to_y - y, to_x - x)]
+        assert max(apart) >= 4  # no pixel stays close to a border
+    for axis in range(2):
+        assert np.ptp(np.sort(np.array(offsets)[:16, axis]) - 2 * np.arange(16)) <= 4  # evenly spread
+
+
+@EXAMPLES
+@given(size=SIZES, offset=OFFSETS, seed=st.integers(0, 9999))
+def test_blocks_cover_the_image_and_mirror_it(size, offset, seed):
+    image = np.random.default_rng(seed).random((2, 3, *size))
+    blocks = Blocks(size, offset)
+    split = blocks.split(torch.from_numpy(image))
+    assert torch.equal(blocks.join(split), torch.from_numpy(image))
+    down, across = (-(-(length + before) // 32) for length, before in zip(size, offset, strict=True))
+    behind = [count * 32 - length - o for count, length, o in zip((down, across), size, offset, strict=True)]
+    padding = [(0, 0), (0, 0), *zip(offset, behind, strict=True)]
+    padded = np.pad(image, padding, mode="symmetric")
+    expected = padded.reshape(2, 3, down, 32, across, 32).transpose(0, 2, 4, 3, 5, 1).reshape(2, -1, 1024, 3)
+    assert np.array_equal(split.numpy(), expected)
+
+
+# --- The regression ---------------------------------------------------------------------------------------------------
+
+
+def fitted_by_numpy(light, normal, depth, axes, noise, offset):
+    """Blocks gathered pixel by pixel from a mirrored image, solved by numpy."""
+    height, width = depth.shape
+    out = np.zeros_like(light, dtype=float)
+    where = positions(depth.astype(float), axes)
+
+    def mirrored(place, size):
+        return np.pad(np.arange(size), 64, mode="symmetric")[place + 64]
+
+    for top in range(-offset[0], height, 32):
+        for left in range(-offset[1], width, 32):
+            places = [(top + p // 32, left + p % 32) for p in range(1024)]
+            pixels = [(mirrored(y, height), mirrored(x, width)) for y, x in places]
+            seen = [pixel for pixel in pixels if depth[pixel] > 0]
+            if not seen:
+                continue
+            spots = np.array([where[:, *pixel] for pixel in seen])
+            low = spots.min(axis=0)
+            extent = np.ptp(spots, axis=0)
+            extent = np.maximum(extent, 1e-3 * extent.max())
+            rows = np.zeros((1024, 10))
+            target = np.zeros((1024, 3))
+            for row, pixel in enumerate(pixels):
+                if depth[pixel] > 0:
+                    p = (where[:, *pixel] - low) / np.where(extent > 0, extent, 1)
+                    rows[row] = [1, *normal[:, *pixel], *p, *p**2]
+                    target[row] = light[:, *pixel]
+            fit = rows @ np.linalg.lstsq(rows + noise, target, rcond=None)[0]
+            for row, (y, x) in enumerate(places):
+                if 0 <= y < height and 0 <= x < width:
+                    out[:, y, x] = fit[row]
+    return out
+
+
+@EXAMPLES
+@given(size=SIZES, offset=OFFSETS, share=st.sampled_from([0.0, 0.003, 0.05, 0.8, 1.0]), seed=st.integers(0, 9999))
+@pytest.mark.parametrize("name", WAYS)
+def test_blocks_are_fitted_as_numpy_does(name, size, offset, share, seed):
+    image = scene(np.random.default_rng(seed), *size, share)
+    noise = bmfr.feature_noise(seed)
+    expected = fitted_by_numpy(*image, noise.numpy(), offset)
+    with WAYS[name]():
+        np.testing.assert_allclose(regress(*image, noise, offset), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_combination_of_features_comes_back(way):
+    """Without noise; squares of positions around any origin are combinations of those of each block."""
+    rng = np.random.default_rng(1)
+    _, normal, depth, axes = scene(rng, 70, 90, share=0.9)
+    p = positions(depth.astype(float), axes) + np.array([0.3, -2, 1])[:, None, None]
+    features = np.concatenate([np.ones((1, *depth.shape)), normal, p, p**2])
+    light = np.float32(np.tensordot(rng.standard_normal((3, 10)), features, 1) * (depth > 0))
+    np.testing.assert_allclose(regress(light, normal, depth, axes, NO_NOISE, (5, 30)), light, rtol=1e-4, atol=1e-5)
+
+
+def test_noise_is_small_of_mean_0_and_always_the_same():
+    noise = bmfr.feature_noise(3)
+    assert torch.equal(noise, bmfr.feature_noise(3)) and not torch.equal(noise, bmfr.feature_noise(4))
+    assert (noise[:, 0] == 0).all() and noise.abs().max() <= 0.01
+    assert noise[:, 1:].abs().mean().item() == pytest.approx(0.005, rel=0.05)
+    assert abs(noise.mean().item()) < 3e-4
+
+
+@EXAMPLES
+@given(
+    size=SIZES,
+    share=st.sampled_from([0.003, 0.5, 1.0]),
+    level=st.sampled_from([1e-30, 1.0, 65504.0, 1e30]),
+    seed=st.integers(0, 9999),
+)
+@pytest.mark.parametrize("name", WAYS)
+def test_even_light_stays_even_whatever_the_surfaces(name, size, share, level, seed):
+    """Flat walls, of which all features but the constant depend on each other, in light from faint to blinding."""
+    rng = np.random.default_rng(seed)
+    depth = np.float32(3 * (rng.random(size) < share))
+    normal = np.float32(np.array([0, 0, -1])[:, None, None] * np.ones((3, *size)))
+    light = np.float32(level * (depth > 0) * np.ones((3, *size)))
+    with WAYS[name]():
+        fitted = regress(light, normal, depth, np.eye(3), bmfr.feature_noise(seed), (seed % 32, seed % 31))
+    np.testing.assert_allclose(fitted * (depth > 0), light, rtol=1e-6)
+
+
+@EXAMPLES
+@given(size=SIZES, seed=st.integers(0, 9999))
+@pytest.mark.parametrize("name", WAYS)
+def test_background_takes_part_in_no_regression(name, size, seed):
+    rng = np.random.default_rng(seed)
+    light, normal, depth, axes = scene(rng, *size, share=0.5)
+    other, other_normal, _, _ = scene(rng, *size)
+    sky = depth == 0
+    noise = bmfr.feature_noise(0)
+    with WAYS[name]():
+        one = regress(light, normal, depth, axes, noise, (7, 9))
+        two = regress(np.where(sky, other, light), np.where(sky, other_normal, normal), depth, axes, noise, (7, 9))
+    assert np.array_equal(one, two) and (one[:, sky] == 0).all()
+
+
+def test_a_single_pixel_in_the_sky_keeps_its_light(way):
+    rng = np.random.default_rng(2)
+    light, normal, depth, axes = scene(rng, 40, 40, share=0)
+    depth[11, 13] = 4
+    fitted = regress(light, normal, depth, axes, bmfr.feature_noise(0), (0, 0))
+    np.testing.assert_allclose(fitted[:, 11, 13], light[:, 11, 13], rtol=1e-5)
+
+
+def test_a_few_pixels_of_a_block_stay_in_range(way):
+    """Fewer than there are features: noise alone does not let them be fitted one by one, nor leap out of range."""
+    rng = np.random.default_rng(3)
+    for number in range(50):
+        light, normal, depth, axes = scene(rng, 32, 32, share=0.004)
+        normal[:] = np.array([0, 0, -1])[:, None, None]
+        seen = depth > 0
+        if seen.any():
+            fitted = regress(light, normal, depth, axes, bmfr.feature_noise(number), (0, 0))[:, seen]
+            assert np.abs(fitted).max() < 2 * light[:, seen].max()
+
+
+# --- The whole --------------------------------------------------------------------------------------------------------
+
+
+def test_both_accumulations(monkeypatch):
+    """The first is an even mean of five frames, then exponential with 0.2; the second of ten, then with 0.1."""
+    seen = []
+
+    def regress(irradiance, *_):
+        seen.append(irradiance[0, 0, 0, 0].item())
+        return torch.full_like(irradiance, fits[len(seen) - 1])
+
+    monkeypatch.setattr(bmfr, "regress", regress)
+    rng = np.random.default_rng(0)
+    lights, fits = rng.random((2, 14))
+    frames = [flat_frame(4, 5, irradiance=torch.full((1, 3, 4, 5), light)) for light in np.float32(lights)]
+    outputs, state = play(BMFR(), frames)
+    accumulated, shown = 0.0, 0.0
+    for n in range(14):
+        accumulated += (lights[n] - accumulated) * max(0.2, 1 / (n + 1))
+        shown += (fits[n] - shown) * max(0.1, 1 / (n + 1))
+        assert seen[n] == pytest.approx(accumulated, rel=1e-5)
+        torch.testing.assert_close(outputs[n], torch.full((1, 3, 4, 5), shown), rtol=1e-5, atol=0)
+    assert shown != pytest.approx(fits.mean(), rel=1e-3)
+    assert seen[4] == pytest.approx(lights[:5].mean(), rel=1e-5)
+    assert outputs[9][0, 0, 0, 0].item() == pytest.approx(fits[:10].mean(), rel=1e-5)
+    assert state.frames == 14 and (state.pictures()["history length"] == 14).all()
+
+
+def test_what_was_fitted_is_clipped_and_dropped_where_disoccluded(monkeypatch):
+    fits = iter([-1.0, 3.0, float("inf")])
+    monkeypatch.setattr(bmfr, "regress", lambda irradiance, *_: torch.full_like(irradiance, next(fits)))
+    frames = chain([flat_frame(4, 8, motion) for motion in ((0.0, 0.0), (2.0, 0.0), (100.0, 0.0))])
+    outputs = run(BMFR(), frames)
+    assert (outputs[0] == 0).all()
+    assert (outputs[1][..., :7] == 1.5).all() and (outputs[1][..., 7] == 3).all()
+    assert torch.isfinite(outputs[2]).all() and (outputs[2] > 1e30).all()
+
+
+@pytest.mark.parametrize("signal", ["total", "indirect"])
+def test_compiled_and_plain_agree(signal):
+    frames = [synthetic_frame(index, 41, 70) for index in range(6)]
+    made = BMFR(signal=signal)
+    torch.set_num_threads(2)
+    fast = run(made, frames)
+    torch.set_num_threads(1)
+    with compiled.disabled():
+        slow = run(made, frames)
+    for a, b in zip(fast, slow, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_the_same_frames_give_the_same_bits_and_far_from_the_origin_the_same_picture(way):
+    """Of cameras the regression knows the rotation alone; what differs far away is how reprojection rounds."""
+    away = torch.eye(4, dtype=torch.float64)
+    away[:3, 3] = torch.tensor([1e7, -3e6, 2e7])
+
+    def moved(cameras):
+        return Cameras(cameras.K, away @ cameras.camera_to_world, away @ cameras.object_to_world)
+
+    frames = [synthetic_frame(index, 40, 50) for index in range(3)]
+    far = [replace(frame, now=moved(frame.now), previous=moved(frame.previous)) for frame in frames]
+    near, again, there = (run(BMFR(), sequence) for sequence in (frames, frames, far))
+    assert all(torch.equal(a, b) for a, b in zip(near, again, strict=True))
+    for a, b in zip(near, there, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+
+
+def test_a_thousand_times_the_light_is_a_thousand_times_the_output():
+    frames = [synthetic_frame(index, 30, 40) for index in range(4)]
+    lights = ("direct", "indirect", "emission")
+    bright = [replace(f, channels=f.channels | {name: 1000 * f.channels[name] for name in lights}) for f in frames]
+    for a, b in zip(run(BMFR(), frames), run(BMFR(), bright), strict=True):
+        torch.testing.assert_close(1000 * a, b, rtol=1e-4, atol=1e-3)
+
+
+def test_noise_on_a_wall_is_gone():
+    """A thousand pixels for each of ten coefficients: nearly all of its variance goes."""
+    generator = torch.Generator().manual_seed(0)
+    frames = []
+    for _ in range(8):
+        light = (torch.rand(1, 1, 64, 64, generator=generator) < 0.25).float().repeat(1, 3, 1, 1) * 4
+        frames.append(flat_frame(64, 64, irradiance=light))
+    fitted, accumulated = (run(denoiser, frames)[-1] for denoiser in (BMFR(), Accumulated()))
+    errors = [(image - 1).square().mean() for image in (fitted, accumulated)]
+    assert errors[0] < 0.02 * errors[1]
