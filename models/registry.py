@@ -21,7 +21,7 @@ from models.rae import RAE
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
 from models.weights import load_weights
-from models.wskp import KP, WSKP, WSKP3, WSKPMR
+from models.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
 
 TAA = "+taa"
 ADAPTIVE = "+adaptive"
@@ -39,6 +39,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "wskp6": WSKP,
     "wskp-mr": WSKPMR,
     "kp": KP,
+    "mr-kp": MRKP,
     "ntd-a": NTDTraditional,
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,

@@ -210,23 +210,31 @@ def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Te
     return fine + alpha * F.interpolate(coarse - halve(fine, surface), scale_factor=2.0)
 
 
-class WSKPMR(KernelPredictor):
-    """Windows 3 and 5 at three resolutions, combined from the coarsest on by Eq. 7 (§5.2, §5.3).
+class MultiResolution(KernelPredictor):
+    """A filter at each of three resolutions, combined from the coarsest on by Eq. 7 (§5.2).
 
     Eq. 7 is no convex combination: what it makes negative is cut off.
     """
 
-    windows = (3, 5)
+    maps: ClassVar[int]  # that the filter takes, at each resolution
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.network = MultiResolutionNet(sum(FEATURES.values()), 2 * len(self.windows) + 1)
+        self.network = MultiResolutionNet(sum(FEATURES.values()), self.maps + 1)
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
         return [self.network.down[0][0]]  # type: ignore[index, list-item]
 
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        """The image (B, 3, h, w) of one resolution, filtered as its `maps` (B, ·, h, w) say."""
+        raise NotImplementedError
+
+    def mixture(self, maps: Tensor) -> Tensor | None:
+        """The logits between windows among the `maps` of the finest resolution, if any."""
+        return None
 
     def reconstruct(  # type: ignore[override]
         self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
@@ -238,11 +246,31 @@ class WSKPMR(KernelPredictor):
             images.append(halve(images[-1], surfaces[-1]))
             surfaces.append(halve_surface(surfaces[-1]))
         output = images[-1]
-        mixture: Tensor | None = None
-        for level, (image, there, maps) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
-            maps = maps.to(image.dtype)
-            mixture = maps[:, 2:4]
-            filtered = fuse(image, maps[:, :2], mixture, self.windows, there)
-            output = combine_resolutions(filtered, output, torch.sigmoid(maps[:, 4:]), there) if level else filtered
-        assert mixture is not None
-        return output[..., :height, :width].clamp(min=0), mixture[..., :height, :width]
+        for level, (image, there, predictions) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
+            maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
+            filtered = self.filter_level(image, maps, there)
+            output = combine_resolutions(filtered, output, torch.sigmoid(alpha), there) if level else filtered
+        mixture = self.mixture(maps[..., :height, :width])
+        return output[..., :height, :width].clamp(min=0), mixture
+
+
+class WSKPMR(MultiResolution):
+    """Windows 3 and 5 at three resolutions (§5.3)."""
+
+    windows = (3, 5)
+    maps = 4
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        return fuse(image, maps[:, :2], maps[:, 2:], self.windows, surface)
+
+    def mixture(self, maps: Tensor) -> Tensor | None:
+        return maps[:, 2:]
+
+
+class MRKP(MultiResolution):
+    """The paper's other baseline (§6.1): the network of wskp-mr, and a free 5 x 5 kernel a pixel at each resolution."""
+
+    maps = 25
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        return apply_kernels(image, maps, surface)

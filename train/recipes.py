@@ -101,6 +101,7 @@ PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
     "wskp6": (WSKP_RECIPE, WSKP_BUDGETS),
     "wskp-mr": (WSKP_RECIPE, WSKP_BUDGETS),
     "kp": (WSKP_RECIPE, WSKP_BUDGETS),
+    "mr-kp": (WSKP_RECIPE, WSKP_BUDGETS),
     "ntd-a": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd": (NTD_RECIPE, NTD_BUDGETS),

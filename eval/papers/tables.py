@@ -82,7 +82,14 @@ SVGF_TABLE_1 = PaperTable(
 )
 
 BMFR_SCENES = ("Classroom", "Living room", "San Miguel", "Sponza", "Sponza (glossy)", "Sponza (mov. light)")
-WSKP_OURS = {"BMFR": "bmfr", "SVGF": "svgf", "KP": "kp", "Ours (6-layer)": "wskp6", "Ours (3-layer)": "wskp3"}
+WSKP_OURS = {
+    "BMFR": "bmfr",
+    "SVGF": "svgf",
+    "MR-KP": "mr-kp",
+    "KP": "kp",
+    "Ours (6-layer)": "wskp6",
+    "Ours (3-layer)": "wskp3",
+}
 
 WSKP_TABLE_1 = PaperTable(
     "WSKP (Fan et al. 2021), Table 1",
@@ -146,6 +153,7 @@ WSKP_TABLE_3 = PaperTable(
         "Ours 6-layer": "wskp6",
         "Ours MR": "wskp-mr",
         "KP": "kp",
+        "MR-KP": "mr-kp",
         "BMFR": "bmfr",
         "SVGF": "svgf",
     },

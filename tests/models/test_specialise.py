@@ -26,6 +26,7 @@ LEFT_OUT = {
     "wskp6": {"albedo", "normal"},
     "wskp-mr": {"albedo", "normal"},
     "kp": {"albedo", "normal"},
+    "mr-kp": {"albedo", "normal"},
     "rae": {"roughness"},
     "ntd": {"albedo", "normal"},
 }

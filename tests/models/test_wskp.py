@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.clip import Dataset
@@ -85,7 +86,35 @@ def test_combination_of_resolutions_is_equation_7():
     np.testing.assert_allclose(combine_resolutions(*tensors)[0, 0], expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])
+def test_mr_kp_is_kernels_of_5_by_5_at_three_resolutions():
+    """With one large logit at every resolution, each of them is its image shifted by that tap; Eq. 7 follows."""
+    denoiser = registry.create("mr-kp")
+    image = torch.rand(1, 3, 12, 16, generator=torch.Generator().manual_seed(0))
+    dy, dx, alpha = 1, -2, 0.3
+    predicted = []
+    for level in (2, 1, 0):
+        maps = torch.zeros(1, 26, 12 >> level, 16 >> level)
+        maps[:, (dy + 2) * 5 + dx + 2] = 200.0
+        maps[:, 25] = np.log(alpha / (1 - alpha))
+        predicted.append(maps)
+    output, mixture = denoiser.reconstruct(image, predicted)
+    assert mixture is None
+
+    def shifted(image: Tensor) -> Tensor:
+        """What lies dy, dx further; inside the image a tap outside has no weight, so only inner pixels are compared."""
+        return torch.roll(image, (-dy, -dx), dims=(-2, -1))
+
+    expected = shifted(F.avg_pool2d(image, 4))
+    for size in (2, 1):
+        fine = shifted(F.avg_pool2d(image, size))
+        up = F.interpolate(expected - F.avg_pool2d(fine, 2), scale_factor=2.0)
+        expected = fine + alpha * up
+    # At the coarsest resolution the first two columns and the last row have no such tap.
+    inner = (slice(0, 8), slice(12, 14))
+    torch.testing.assert_close(output[..., *inner], expected.clamp(min=0)[..., *inner], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"])
 def test_a_constant_image_stays_constant(name):
     frames = [flat_frame(21, 18, irradiance=torch.full((1, 3, 21, 18), 7.0)) for _ in range(2)]
     for output in run(registry.create(name), frames):

@@ -478,6 +478,7 @@ SAME_NETWORK = [  # as ntd's
         ("wskp6", 40, {}, 0.8),
         ("wskp-mr", 40, {}, 0.8),
         ("kp", 40, {}, 0.8),
+        ("mr-kp", 40, {}, 0.8),
         ("ntd", 40, {"length": 4}, 0.8),
         ("one", 40, {"length": 4}, 0.8),
         *SAME_NETWORK,

@@ -30,7 +30,7 @@ def test_rae_is_the_paper_s():
     assert recipe.loss == RAETerms(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
 
 
-@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp"])
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"])
 def test_wskp_is_the_paper_s(name):
     recipe = recipe_for(name, "paper")
     assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (64, 128, (80, 20), 500, 1e-3)
