@@ -25,11 +25,11 @@ def realisations(stage: Stage, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_one_spp_images_average_to_the_stock_integrator(stage):
     stage.pose(POSED_FRAME)
-    direct, indirect = realisations(stage, 1200)
+    direct, indirect = realisations(stage, 600)
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
     np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
-    assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(60)]))
-    assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 3, 16, s) for s in range(60)]))
+    assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(30)]))
+    assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
 
 
 def test_reference_averages_to_the_stock_integrator(stage):
