@@ -17,6 +17,7 @@ from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.one import One
 from models.rae import RAE
+from models.sbf import SBF
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
 from models.weights import load_weights
@@ -30,6 +31,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "eaw": EAW,
     "svgf": SVGF,
     "asvgf": ASVGF,
+    "sbf": SBF,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
