@@ -13,6 +13,7 @@ from models.baselines import Accumulated, Noisy
 from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.fastest import bfloat16_pays
+from models.nfor import NFOR
 from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.one import One
@@ -32,6 +33,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "svgf": SVGF,
     "asvgf": ASVGF,
     "sbf": SBF,
+    "nfor": NFOR,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
