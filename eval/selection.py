@@ -31,6 +31,8 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
     skipped: dict[str, list[str]] = {}  # names by what is in the way of all of them alike
     for name in dict.fromkeys(names or everyone):
         reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
+        if class_of(name).offline and not names:
+            reason = reason or "it takes seconds a frame: name it to run it"
         if reason and names:
             raise BadInput(f"{name}: {reason}")
         if reason:

@@ -51,6 +51,7 @@ class Denoiser(torch.nn.Module):
             default for instances.
         refuses: precisions that it does not compute in, with the reason.
         is_network: whether it needs trained weights.
+        offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
         dispensable: channels that its network can do without where they do not vary, and what it sees of a value.
         inputs: what its network sees, in order, and how many inputs each is; channels by their names.
         constants: channels that it does without, see models.specialise, and the value that each has everywhere.
@@ -61,6 +62,7 @@ class Denoiser(torch.nn.Module):
     signal: Signal = "total"
     refuses: ClassVar[dict[torch.dtype, str]] = {}
     is_network: ClassVar[bool] = False
+    offline: ClassVar[bool] = False
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     precision: torch.dtype = torch.float32
 

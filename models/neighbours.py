@@ -45,3 +45,14 @@ def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     close = mesh_sums(summands(image), mesh_id, 1)
     return means_of(close, mesh_sums(close, mesh_id, 3))
+
+
+def mesh_variance(image: Tensor, mesh_id: Tensor) -> Tensor:
+    """Variance (B, C, H, W) of each channel of the image over the pixel's own mesh, over 9 x 9 pixels as in mesh_means.
+
+    Zero for the only pixel of a mesh there.
+    """
+    moments = torch.cat([image, image.square(), torch.ones_like(image[:, :1])], dim=1)
+    sums = mesh_sums(mesh_sums(moments, mesh_id, 1), mesh_id, 3)
+    mean, square = (sums[:, :-1] / sums[:, -1:]).chunk(2, dim=1)
+    return (square - mean.square()).clamp(min=0)

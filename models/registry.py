@@ -14,10 +14,12 @@ from models.bmfr import BMFR
 from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.fastest import bfloat16_pays
+from models.nfor import NFOR
 from models.ntd import NTD, NTDMean, NTDTraditional
 from models.oidn import OIDN, OIDNAccumulated
 from models.one import One
 from models.rae import RAE
+from models.sbf import SBF
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
 from models.weights import load_weights
@@ -32,6 +34,8 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "svgf": SVGF,
     "asvgf": ASVGF,
     "bmfr": BMFR,
+    "sbf": SBF,
+    "nfor": NFOR,
     "oidn": OIDN,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,

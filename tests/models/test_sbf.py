@@ -1,0 +1,165 @@
+"""SBF against a slow version in float64, and its estimate of the error against the error."""
+
+import contextlib
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models import compiled
+from models.neighbours import mesh_variance
+from models.sbf import BANK, SBF, best_filtered, filter_with_risk, guides
+from tests.helpers.frames import flat_frame, run
+
+WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+
+
+@pytest.fixture(params=WAYS, autouse=True)
+def way(request):
+    """Every test runs with compiled kernels and the PyTorch way."""
+    with WAYS[request.param]():
+        yield
+
+
+def naive_weight(features, sigma, p, q):
+    """Of the paper, σ_r = ∞; features (F, H, W) in units of √2 σ_f."""
+    if max(abs(p[0] - q[0]), abs(p[1] - q[1])) > round(2 * sigma):
+        return 0.0
+    apart = features[:, *p] - features[:, *q]
+    return math.exp(-((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2) / (2 * sigma**2) - apart @ apart)
+
+
+def naive_mean(image, features, sigma, p):
+    """The filtered image (C, H, W) at p, and the sum of weights."""
+    weights = {q: naive_weight(features, sigma, p, q) for q in np.ndindex(image.shape[1:])}
+    total = sum(weights.values())
+    return sum(w * image[:, *q] for q, w in weights.items()) / total, total
+
+
+def naive_best(colour, variance, features):
+    size = colour.shape[1:]
+    filtered = np.zeros((len(BANK), *colour.shape))
+    risk = np.zeros((len(BANK), *size))
+    for s, sigma in enumerate(BANK):
+        for p in np.ndindex(size):
+            filtered[s, :, *p], total = naive_mean(colour, features, sigma, p)
+            c, v = colour[:, *p], variance[:, *p]
+            risk[s, *p] = np.mean((filtered[s, :, *p] - c) ** 2 + 2 * v / total - v)
+    best = np.zeros_like(colour)
+    for p in np.ndindex(size):
+        smoothed, _ = naive_mean(risk, features, 8.0, p)
+        best[:, *p] = filtered[np.argmin(smoothed), :, *p]
+    return best
+
+
+def to_torch(array):
+    return torch.from_numpy(np.float32(array))[None]
+
+
+def inputs(rng, height, width):
+    """Colour and the variance of its noise (3, H, W), features (7, H, W): float64 with the values of float32."""
+    shapes = [(3, height, width), (3, height, width), (7, height, width)]
+    return [np.float32(rng.random(shape)).astype(float) for shape in shapes]
+
+
+@settings(max_examples=10, deadline=None)
+@given(size=st.tuples(st.integers(1, 9), st.integers(1, 9)), seed=st.integers(0, 999))
+def test_the_best_filter_is_chosen(size, seed):
+    colour, variance, features = inputs(np.random.default_rng(seed), *size)
+    found = best_filtered(*map(to_torch, (colour, variance, features)))
+    np.testing.assert_allclose(found[0], naive_best(colour, variance, features), rtol=1e-4)
+
+
+def test_windows_larger_than_a_strip_of_rows():
+    """Windows of a width that images of the test above do not have, and several strips."""
+    colour, variance, features = inputs(np.random.default_rng(0), 37, 21)
+    filtered, _ = filter_with_risk(*map(to_torch, (colour, variance, features)), BANK)
+    for p in ((0, 0), (15, 20), (16, 3), (18, 10), (36, 0)):
+        for s, sigma in enumerate(BANK):
+            expected, _ = naive_mean(colour, features, sigma, p)
+            np.testing.assert_allclose(filtered[0, s, :, *p], expected, rtol=1e-5)
+
+
+def test_the_derivative_is_that_of_the_filter():
+    """SURE's term 2 σ² dF/dc against finite differences, pixel by pixel."""
+    colour, variance, features = map(to_torch, inputs(np.random.default_rng(0), 5, 6))
+    filtered, risk = filter_with_risk(colour, variance, features, BANK)
+    derivative = ((risk - (filtered - colour[:, None]).square()) / variance[:, None] + 1) / 2
+    step = 0.5
+    for y, x in np.ndindex(5, 6):
+        moved = colour.clone()
+        moved[..., y, x] += step
+        after, _ = filter_with_risk(moved, variance, features, BANK)
+        slope = (after - filtered)[..., y, x] / step
+        torch.testing.assert_close(derivative[..., y, x], slope, rtol=1e-3, atol=1e-5)
+
+
+def test_the_risk_is_the_squared_error_on_average():
+    """Over many images of the same truth: an edge that features know, one that they do not, noise that grows."""
+    generator = torch.Generator().manual_seed(0)
+    count, height, width = 1000, 6, 8
+    truth = torch.linspace(0.2, 1, height)[:, None].repeat(3, 1, width).view(3, height, width)
+    truth[..., 3:] += 1
+    truth[..., 4:, :] *= 0.5
+    features = torch.zeros(7, height, width)
+    features[0, :, 3:] = 1
+    deviation = torch.linspace(0.05, 0.8, width).expand(3, height, width)
+    noise = torch.randn(count, 3, height, width, generator=generator)
+    colour = truth + deviation * noise
+    filtered, risk = filter_with_risk(
+        colour, deviation.square().expand_as(colour), features.expand(count, -1, -1, -1), BANK
+    )
+    off = (risk - (filtered - truth).square()).double()
+    standard_error = off.std(dim=0) / math.sqrt(count)
+    assert (off.mean(dim=0).abs() < 5 * standard_error).all()
+
+
+def test_noise_is_filtered_widely_and_detail_narrowly():
+    generator = torch.Generator().manual_seed(0)
+    flat = torch.zeros(1, 7, 40, 40)
+    noise = 1 + 0.5 * torch.randn(1, 3, 40, 40, generator=generator)
+    calm = best_filtered(noise, torch.full_like(noise, 0.25), flat)
+    widest, _ = filter_with_risk(noise, noise, flat, BANK[-1:])
+    torch.testing.assert_close(calm[..., 16:24, 16:24], widest[:, 0, :, 16:24, 16:24])
+    stripes = torch.ones(1, 3, 40, 40)
+    stripes[..., ::4] = 3
+    sharp = best_filtered(stripes, torch.full_like(stripes, 1e-4), flat)
+    narrowest, _ = filter_with_risk(stripes, stripes, flat, BANK[:1])
+    torch.testing.assert_close(sharp, narrowest[:, 0])
+
+
+def test_variance_is_that_of_the_own_mesh():
+    rng = np.random.default_rng(0)
+    image = rng.random((3, 14, 11))
+    mesh = np.zeros((14, 11))
+    mesh[:, 5:] = 1
+    mesh[7, 2] = 2
+    found = mesh_variance(to_torch(image), to_torch(mesh[None]))[0]
+    np.testing.assert_allclose(found[:, 6, 9], image[:, 2:11, 5:].var(axis=(1, 2)), rtol=1e-4)
+    assert (found[:, 7, 2] == 0).all()
+
+
+def test_features_are_in_units_of_the_paper_s_deviations():
+    frame = flat_frame(1, 2)
+    frame.channels.update(
+        normal=torch.tensor([[0.0, 0.8], [0, 0], [-1, -1]])[None, :, None],
+        albedo=torch.tensor([[0.5, 0.75], [0.5, 0.5], [0.5, 0.25]])[None, :, None],
+        depth=torch.tensor([[2.0, 5.0]])[None, :, None],
+    )
+    apart = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
+    torch.testing.assert_close(2 * apart, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))
+
+
+@settings(max_examples=20, deadline=None)
+@given(level=st.sampled_from([0.0, 1e-30, 1e-7, 6e4, 1e35, 3e38]), firefly=st.sampled_from([0.0, 1e-7, 6e4, 3e38]))
+def test_extremes_stay_within_what_was_there(level, firefly):
+    frame = flat_frame(7, 9, irradiance=torch.full((1, 3, 7, 9), level))
+    frame.direct[0, :, 3, 4] = firefly
+    frame.channels["albedo"] = torch.full((1, 3, 7, 9), 0.5)
+    (output,) = run(SBF(), [frame])
+    assert torch.isfinite(output).all()
+    low, high = sorted((level, firefly))
+    assert output.min() >= min(low, 1e16 / 2) * (1 - 1e-5) and output.max() <= high * (1 + 1e-5)
