@@ -28,11 +28,10 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
     Raises BadInput where a named one is unknown or cannot run.
     """
     chosen: list[str] = []
+    obstacles = obstacles if names else (*obstacles, takes_long)
     skipped: dict[str, list[str]] = {}  # names by what is in the way of all of them alike
     for name in dict.fromkeys(names or everyone):
         reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
-        if class_of(name).offline and not names:
-            reason = reason or "it takes seconds a frame: name it to run it"
         if reason and names:
             raise BadInput(f"{name}: {reason}")
         if reason:
@@ -42,6 +41,11 @@ def choose(names: Sequence[str], everyone: Iterable[str], *obstacles: Obstacle) 
     for reason, alike in skipped.items():
         print(f"{', '.join(alike)}: skipped, {reason if len(alike) > 1 else reason.replace('NAME', alike[0])}")
     return chosen
+
+
+def takes_long(name: str) -> str | None:
+    """Why a denoiser runs only where it is named. Raises BadInput for an unknown name."""
+    return "it takes seconds a frame: name it to run it" if class_of(name).offline else None
 
 
 def cannot_run(name: str) -> str | None:

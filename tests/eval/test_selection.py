@@ -30,13 +30,23 @@ NAMES = (
 )
 
 
+def not_mine(name: str) -> str | None:
+    return "it is another's" if name != "one" else None
+
+
 def left_handed(name: str) -> str | None:
     return "it is left-handed" if name.startswith("l") else None
 
 
 def test_of_all_those_who_can_and_a_word_on_the_others(capsys):
-    assert choose([], ["left", "right", "right"], left_handed) == ["right"]
-    assert capsys.readouterr().out == "left: skipped, it is left-handed\n"
+    assert choose([], ["svgf", "one", "one"], not_mine) == ["one"]
+    assert capsys.readouterr().out == "svgf: skipped, it is another's\n"
+
+
+def test_what_takes_seconds_a_frame_waits_to_be_named(capsys):
+    assert choose([], ["svgf", "nfor"]) == ["svgf"]
+    assert capsys.readouterr().out == "nfor: skipped, it takes seconds a frame: name it to run it\n"
+    assert choose(["nfor"], ["svgf"]) == ["nfor"]
 
 
 def test_those_with_the_same_in_their_way_share_a_line(capsys):
