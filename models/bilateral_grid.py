@@ -1,6 +1,6 @@
-"""Means over the cells of a bilateral grid, read out between cells: what NBGD filters with (Meng et al. 2020, §4)."""
+"""Means over the cells of a bilateral grid, read out between cells: what NBGD filters with (Meng et al. 2020)."""
 
-from collections.abc import Iterator
+import math
 from itertools import product
 
 import torch
@@ -22,22 +22,25 @@ def cells_around(place: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
     return [(cell.clamp(0, count - 1).long(), weight * (cell == cell.clamp(0, count - 1))) for cell, weight in cells]
 
 
-def taps(guide: Tensor, spacing: int) -> tuple[int, Iterator[tuple[Tensor, Tensor]]]:
-    """How many cells the grids of all items have; each pixel's eight, by their numbers (N,), with weights (N, 1)."""
+def grid_shape(guide: Tensor, spacing: int) -> tuple[int, int, int, int]:
+    """Items, and cells down, across and along the guide (B, 1, H, W)."""
     batch, _, height, width = guide.shape
-    sizes = (batch, -(-height // spacing), -(-width // spacing), GUIDES // spacing)
-    lines = (torch.arange(size).to(guide) + 0.5 for size in (height, width))
-    y, x = (line / spacing - 0.5 for line in lines)
+    return batch, -(-height // spacing), -(-width // spacing), GUIDES // spacing
+
+
+def cells_of_pixels(guide: Tensor, spacing: int) -> list[tuple[Tensor, Tensor]]:
+    """The eight cells around each pixel: their numbers (N,), row after row of all items, and weights (N, 1)."""
+    batch, down, across, along = grid_shape(guide, spacing)
+    y, x = ((torch.arange(size).to(guide) + 0.5) / spacing - 0.5 for size in guide.shape[-2:])
     z = ((GUIDES - 1) * guide[:, 0] + 0.5) / spacing - 0.5
-    axes = (cells_around(y[:, None], sizes[1]), cells_around(x, sizes[2]), cells_around(z, sizes[3]))
     item = torch.arange(batch, device=guide.device)[:, None, None]
-
-    def each() -> Iterator[tuple[Tensor, Tensor]]:
-        for (row, by_row), (column, by_column), (level, by_level) in product(*axes):
-            number = ((item * sizes[1] + row) * sizes[2] + column) * sizes[3] + level
-            yield number.flatten(), (by_row * by_column * by_level).reshape(-1, 1)
-
-    return sizes[0] * sizes[1] * sizes[2] * sizes[3], each()
+    found = []
+    for (row, by_row), (column, by_column), (level, by_level) in product(
+        cells_around(y[:, None], down), cells_around(x, across), cells_around(z, along)
+    ):
+        cell = ((item * down + row) * across + column) * along + level
+        found.append((cell.flatten(), (by_row * by_column * by_level).reshape(-1, 1)))
+    return found
 
 
 @compiled.by(kernels.grid_mean)
@@ -56,14 +59,13 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     """
     counted = torch.ones_like(guide) if surface is None else surface
     values = torch.cat([image * counted, counted], dim=1).permute(0, 2, 3, 1).reshape(-1, 4)
-    count, around = taps(guide, spacing)
-    chosen = list(around)
-    cells = values.new_zeros(count, 4)
-    for cell, weight in chosen:
+    around = cells_of_pixels(guide, spacing)
+    cells = values.new_zeros(math.prod(grid_shape(guide, spacing)), 4)
+    for cell, weight in around:
         cells.index_add_(0, cell, values * weight)
     # A pixel that counts is in all the cells that it reads: none of them is empty.
     means = cells[:, :3] / cells[:, 3:].clamp(min=LEAST_WEIGHT)
-    total = torch.stack([weight * means[cell] for cell, weight in chosen]).sum(dim=0)
-    share = torch.stack([weight for _, weight in chosen]).sum(dim=0)
+    total = torch.stack([weight * means[cell] for cell, weight in around]).sum(dim=0)
+    share = torch.stack([weight for _, weight in around]).sum(dim=0)
     filtered = (total / share).reshape(len(image), *image.shape[-2:], 3).permute(0, 3, 1, 2)
     return filtered * counted

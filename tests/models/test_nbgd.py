@@ -9,7 +9,7 @@ from torch import Tensor
 
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, registry
-from models.bilateral_grid import grid_mean, taps
+from models.bilateral_grid import grid_mean, grid_shape
 from models.nbgd import SPACINGS
 from tests.helpers.frames import flat_frame, run
 
@@ -127,7 +127,8 @@ def test_the_kernel_reads_its_own_memory_alone():
 def test_grids_have_the_sizes_of_the_paper():
     """WSKP, Fig. 6: 320 x 180 x 64 to 80 x 45 x 16."""
     guide = torch.zeros(1, 1, 720, 1280)
-    assert [taps(guide, spacing)[0] for spacing in SPACINGS] == [320 * 180 * 64, 160 * 90 * 32, 80 * 45 * 16]
+    shapes = [grid_shape(guide, spacing) for spacing in SPACINGS]
+    assert shapes == [(1, 180, 320, 64), (1, 90, 160, 32), (1, 45, 80, 16)]
 
 
 def test_the_network_has_two_layers():
