@@ -46,6 +46,10 @@ LEAST_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; wha
 OUTSIDE = -1e30  # logit of a tap outside the image, or without a surface
 LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0
 
+# --- NBGD (Meng et al. 2020) ------------------------------------------------------------------------------------------
+
+GUIDES = 256  # values of a guide, which cells of a grid divide as they divide pixels
+
 # --- one --------------------------------------------------------------------------------------------------------------
 
 LATENT = 6  # channels carried beside images, in [-1, 1]

@@ -87,6 +87,7 @@ WSKP_OURS = {
     "SVGF": "svgf",
     "MR-KP": "mr-kp",
     "KP": "kp",
+    "NBGD": "nbgd",
     "Ours (6-layer)": "wskp6",
     "Ours (3-layer)": "wskp3",
 }
@@ -152,6 +153,7 @@ WSKP_TABLE_3 = PaperTable(
         "Ours 3-layer": "wskp3",
         "Ours 6-layer": "wskp6",
         "Ours MR": "wskp-mr",
+        "NBGD 2-layer": "nbgd",
         "KP": "kp",
         "MR-KP": "mr-kp",
         "BMFR": "bmfr",

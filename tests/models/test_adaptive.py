@@ -205,7 +205,7 @@ def test_brightness_does_not_matter():
 
 
 def test_whatever_accumulates_can_accumulate_adaptively():
-    for name in ("accumulated", "eaw", "bmfr", "oidn-accumulated", "wskp6", "kp", "wskp-mr", "mr-kp"):
+    for name in ("accumulated", "eaw", "bmfr", "oidn-accumulated", "wskp6", "kp", "wskp-mr", "mr-kp", "nbgd"):
         kind = registry.denoiser_class(f"{name}+adaptive")
         assert kind.accumulation is accumulate_adaptively
         assert kind.reads == registry.denoiser_class(name).reads

@@ -27,6 +27,7 @@ LEFT_OUT = {
     "wskp-mr": {"albedo", "normal"},
     "kp": {"albedo", "normal"},
     "mr-kp": {"albedo", "normal"},
+    "nbgd": {"albedo", "normal"},
     "rae": {"roughness"},
     "ntd": {"albedo", "normal"},
 }

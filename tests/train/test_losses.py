@@ -21,6 +21,7 @@ from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
+from train.losses.nbgd import NBGDLoss, NBGDTerms
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
 from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
@@ -29,7 +30,13 @@ from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 
-LOSSES = {RAETerms: RAELoss, SMAPETerms: SMAPELoss, NTDTerms: NTDLoss, DisplayedTerms: DisplayedLoss}
+LOSSES = {
+    RAETerms: RAELoss,
+    SMAPETerms: SMAPELoss,
+    NBGDTerms: NBGDLoss,
+    NTDTerms: NTDLoss,
+    DisplayedTerms: DisplayedLoss,
+}
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
 
@@ -127,20 +134,30 @@ def test_smape_is_that_of_the_paper_and_of_torchmetrics():
     assert (smape(r, r, 0.01) == 0).all()
 
 
-def test_smape_loss_compares_radiance_as_exposed(batch_of, monkeypatch):
+def shown(x):
+    return (np.clip(x, 0, 1) + 1e-4) ** (1 / 2.2)
+
+
+@pytest.mark.parametrize(
+    "name, error",
+    [
+        ("wskp6", lambda x, r: abs(x - r) / (abs(x) + abs(r) + 0.01)),
+        ("nbgd", lambda x, r: abs(shown(x) - shown(r))),
+    ],
+)
+def test_losses_of_crops_compare_radiance_as_exposed(batch_of, monkeypatch, name, error):
     """Emission included, albedo multiplied back, at the exposure of the accumulated frames."""
-    batch = batch_of("wskp6", 3)
-    wskp = WSKP()
+    batch = batch_of(name, 3)
+    denoiser = create(name)
     guess = torch.rand_like(batch.irradiance)
-    monkeypatch.setattr(wskp, "filter", lambda frame, irradiance, scale: (guess, None))
-    value, _ = SMAPELoss(wskp)(batch)
+    monkeypatch.setattr(denoiser, "filter", lambda frame, irradiance, scale: (guess, None))
+    value, _ = recipe_for(name, "paper").loss.around(denoiser)(batch)
     frame = batch.frame
     exposure = 0.18 * np.exp(-batch.scale.log_luminance.value.numpy())[:, None, None, None]
     albedo = np.maximum(frame.albedo.numpy(), 0.01)
     output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
     reference = exposure * (frame.direct_reference + frame.indirect_reference + frame.emission[:, None]).mean(1).numpy()
-    expected = (abs(output - reference) / (abs(output) + abs(reference) + 0.01)).mean()
-    assert value.item() == pytest.approx(expected, rel=1e-4)
+    assert value.item() == pytest.approx(error(output, reference).mean(), rel=1e-4)
 
 
 def test_ntd_loss_by_hand(batch_of, monkeypatch):
@@ -479,6 +496,7 @@ SAME_NETWORK = [  # as ntd's
         ("wskp-mr", 40, {}, 0.8),
         ("kp", 40, {}, 0.8),
         ("mr-kp", 40, {}, 0.8),
+        ("nbgd", 40, {}, 0.8),
         ("ntd", 40, {"length": 4}, 0.8),
         ("one", 40, {"length": 4}, 0.8),
         *SAME_NETWORK,

@@ -9,6 +9,7 @@ from datasets.sequences import Augmentation
 from errors import BadInput
 from models.registry import DENOISERS, create
 from train.losses.displayed import DisplayedTerms
+from train.losses.nbgd import NBGDTerms
 from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
@@ -36,6 +37,12 @@ def test_wskp_is_the_paper_s(name):
     assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (64, 128, (80, 20), 500, 1e-3)
     assert recipe.loss == SMAPETerms(0.01) and recipe.augmentation == Augmentation()
     assert recipe.learning_rate(0) == recipe.learning_rate(499) == 1e-3
+
+
+def test_nbgd_is_its_authors():
+    recipe = recipe_for("nbgd", "paper")
+    assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (1, 128, (50, 50), 100, 1e-4)
+    assert recipe.loss == NBGDTerms() and recipe.augmentation == Augmentation()
 
 
 @pytest.mark.parametrize("name, occlusion", [("ntd-a", 0.0), ("ntd-b", 0.0), ("ntd", 1.0)])

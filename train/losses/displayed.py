@@ -17,10 +17,14 @@ from train.losses.outputs import exposed_outputs
 DARKEST = 1e-4  # exposed radiance, below which the curve is no steeper
 
 
+def cut_tone(radiance: Tensor) -> Tensor:
+    """Exposed radiance as a display shows it, about in [0, 1]; what is brighter than white is cut."""
+    return (radiance.clamp(0, 1) + DARKEST) ** (1 / GAMMA)
+
+
 def tone(radiance: Tensor) -> Tensor:
-    """Exposed radiance as a display shows it, about in [0, 1]; what is brighter than white goes on as its logarithm."""
-    shown = (radiance.clamp(0, 1) + DARKEST) ** (1 / GAMMA)
-    return shown + torch.log(radiance.clamp(min=1)) / GAMMA
+    """The same, but what is brighter than white goes on as its logarithm."""
+    return cut_tone(radiance) + torch.log(radiance.clamp(min=1)) / GAMMA
 
 
 def shrunk(radiance: Tensor, surface: Tensor, scale: int) -> tuple[Tensor, Tensor]:

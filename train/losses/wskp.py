@@ -15,6 +15,16 @@ def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
     return (x - reference).abs() / (x.abs() + reference.abs() + epsilon)
 
 
+def exposed_images(denoiser: KernelPredictor, crops: Crops) -> tuple[Tensor, Tensor]:
+    """What a network makes of accumulated crops and the reference, as exposed radiance, emission included."""
+    signal = denoiser.signal
+    frame = crops.frame
+    filtered, _ = denoiser.filter(frame, crops.irradiance, crops.scale)
+    exposure = crops.scale.exposure()
+    output, reference = (frame.remodulate(image, signal) for image in (filtered, frame.reference_irradiance(signal)))
+    return exposure * output, exposure * reference
+
+
 @dataclass(frozen=True)
 class SMAPETerms(LossTerms):
     """The loss of WSKP §5.2, Eq. 6."""
@@ -38,10 +48,5 @@ class SMAPELoss(NetworkLoss):
         self.terms = terms or SMAPETerms()
 
     def forward(self, batch: Crops) -> tuple[Tensor, Parts]:
-        signal = self.denoiser.signal
-        frame = batch.frame
-        filtered, _ = self.denoiser.filter(frame, batch.irradiance, batch.scale)
-        exposure = batch.scale.exposure()
-        images = (filtered, frame.reference_irradiance(signal))
-        output, reference = (exposure * frame.remodulate(image, signal) for image in images)
-        return surface_mean(smape(output, reference, self.terms.epsilon), frame.depth), {}
+        output, reference = exposed_images(self.denoiser, batch)
+        return surface_mean(smape(output, reference, self.terms.epsilon), batch.frame.depth), {}
