@@ -46,13 +46,16 @@ CHANNELS: dict[str, Channel] = {
     "mesh_id": Channel(("F", "H", "W", 1), "<u2", "index"),
     "motion": Channel(("F", "H", "W", 2), "<f4", "px"),
     "dual_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
+    "shadow_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
+    "reflection_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
     "gradient": Channel(("F", "H", "W", 2), "<f2", RADIANCE_UNIT, radiance=True),
     "K": Channel(("F", 3, 3), "<f8", "px"),
     "camera_to_world": Channel(("F", 4, 4), "<f8", "world units"),
     "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
 }
 
-MOTION_CHANNELS = ("motion", "dual_motion")
+TRACKED_CHANNELS = ("shadow_motion", "reflection_motion")  # of what causes a pixel's light
+MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
 TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
 NOISY = ("direct", "indirect")

@@ -98,8 +98,9 @@ def write_clip(
     """
     split, scene_name, clip_name = folder.parts[-3:]
     frames = render_clip(scene, *size, sampling, seed, channels)
-    # While only the camera moves, motion follows from depth.
-    derived = {} if scene.moves() or "motion" not in channels else {"motion": "camera"}
+    # While only the camera moves, motion follows from depth, and shadows stay on their surfaces.
+    alike = () if scene.moves() else ("motion", "shadow_motion")
+    derived = {name: "camera" for name in alike if name in channels}
     with ClipWriter(folder) as writer:
         writer.timing = dict(seconds_before or {})
         progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame")

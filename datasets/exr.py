@@ -24,6 +24,8 @@ COMPONENTS = {
     "mesh_id": "I",
     "motion": "XY",
     "dual_motion": "XY",
+    "shadow_motion": "XY",
+    "reflection_motion": "XY",
     "gradient": "XY",
 }
 HALVES = ("_a", "_b")  # endings of the two layers of a reference

@@ -277,7 +277,7 @@ def read_frame(
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
     another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
 
-    Raises BadInput where a channel was not rendered or is damaged, and for dual motion and gradients in reversed
+    Raises BadInput where a channel was not rendered or is damaged, and for what only the renderer knows in reversed
     playback.
     """
     stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead

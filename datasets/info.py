@@ -20,7 +20,7 @@ AUXILIARY_CHANNELS = tuple(
     for name, channel in CHANNELS.items()
     if channel.is_image and (not channel.radiance or name in ("emission", "gradient"))
 )
-OPTIONAL_STEPS = ("dual_motion", "gradient")  # of rendering: each makes the channel of its name
+OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient")  # of rendering: each makes the channel of its name
 CLIP_HEAD = (
     "clip",
     "frames",
@@ -118,7 +118,7 @@ def channel_table(clips: list[Clip]) -> str:
 
 
 def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
-    """Seconds by step, and what was saved where dual motion and gradients were not rendered.
+    """Seconds by step, and what was saved where optional channels were not rendered.
 
     The savings are estimated by the mean times per pixel in the clips that have them.
     """

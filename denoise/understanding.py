@@ -42,6 +42,8 @@ def understand(
         raise BadInput(
             "asvgf reads how samples shaded anew have changed, which only onespp's own renders have: use svgf"
         )
+    if "shadow_motion" in reads:
+        raise BadInput("trmv reads where shadows and reflections were, which only onespp's own renders have: use svgf")
     first, _ = read_pixels(shots[0][0], sources)
     reading = camera_kind(first)
     words = [(quantity, found_in_words(sources, quantity)) for quantity in KNOWN if sources.has(quantity)]

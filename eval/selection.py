@@ -13,7 +13,8 @@ from models.shipped_weights import shipped_weights
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 
-BASELINES = ("noisy", "accumulated", "svgf")  # what denoisers of indirect light are compared with, on that alone
+# What denoisers of indirect light are compared with, on that alone.
+BASELINES = ("noisy", "accumulated", "svgf", "trmv")
 
 USUAL_BUDGET = "quick"  # of commands that do not ask for one
 

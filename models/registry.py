@@ -23,6 +23,7 @@ from models.rae import RAE
 from models.sbf import SBF
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
+from models.trmv import TRMV
 from models.weights import load_weights
 from models.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
 
@@ -34,6 +35,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "eaw": EAW,
     "svgf": SVGF,
     "asvgf": ASVGF,
+    "trmv": TRMV,
     "bmfr": BMFR,
     "sbf": SBF,
     "nfor": NFOR,

@@ -12,6 +12,7 @@ from render.gradient import Samples
 from render.motion import dual_motion_vectors
 from render.path import PathTracer
 from render.stage import Stage
+from render.tracking import causes, tracked_motion
 from scenes.animation import Scene
 from scenes.camera import View, motion_vectors, pixel_centres
 
@@ -125,8 +126,10 @@ def render_clip(
     tracer = PathTracer(stage, regularise=regularise)
     noisy_tracer = PathTracer(stage, halton, regularise) if halton else tracer
     wants_dual = channels is None or "dual_motion" in channels
+    wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
     wants_gradient = channels is None or "gradient" in channels
     samples: Samples | None = None  # of the frame before
+    before: View | None = None
     timer = StepTimer()
     for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
         ray = stage.rays(view)
@@ -137,6 +140,11 @@ def render_clip(
         seeds = [stream_seed(seed, shift, NOISY_STREAM, i) for i in range(sampling.realisations)]
         noisy = [noisy_tracer.radiance(ray, noisy_seed, spp, first) for noisy_seed in seeds]
         timer.lap("noisy")
+        if wants_tracked:
+            met = causes(noisy_tracer, view, seeds[0], first)
+            arrays |= tracked_motion(met, arrays, view, before or view)
+            before = view
+            timer.lap("shadow_motion")
         if wants_gradient:
             still = np.zeros((height, width, 2))
             arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still

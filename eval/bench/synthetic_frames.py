@@ -133,6 +133,8 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "mesh_id": seen.mesh_id[..., None],
         "motion": motion,
         "dual_motion": dual,
+        "shadow_motion": motion,
+        "reflection_motion": motion,
         "gradient": np.zeros_like(motion),
     }
     gain = to_tensor(np.ones((1, 1, 3)))

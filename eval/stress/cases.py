@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from datasets.channels import MOTION_CHANNELS
 from datasets.frame import Frame
 from eval.bench.sizes import Size
 from eval.stress.changes import (
@@ -106,7 +107,7 @@ STRESS_CASES = (
     StressCase("depth around 1e-4", surfaces=lengths_times(2e-5)),
     StressCase("depth around 1e6", surfaces=lengths_times(2e5)),
     StressCase("depth 1e-4 to 1e6", surfaces=near_to_far),
-    StressCase("motion far outside", surfaces=channels_at(motion=(1e5, -1e30), dual_motion=(1e5, -1e30))),
+    StressCase("motion far outside", surfaces=channels_at(**dict.fromkeys(MOTION_CHANNELS, (1e5, -1e30)))),
     StressCase("1 x 1 px", size=(1, 1)),
     StressCase("37 x 1 px", size=(1, 37)),
     StressCase("1 x 37 px", size=(37, 1)),

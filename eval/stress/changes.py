@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from datasets.channels import MOTION_CHANNELS
 from datasets.frame import Cameras, Frame
 
 FrameChange = Callable[[Frame], Frame]
 
 LIGHT_CHANNELS = ("direct", "indirect", "emission")
-SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS)
 
 
 def unchanged(frame: Frame) -> Frame:

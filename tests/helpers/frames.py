@@ -46,6 +46,7 @@ def flat_frame(
         "motion": torch.tensor(motion)[None, :, None, None].expand(1, 2, height, width).contiguous(),
     }
     channels["dual_motion"] = channels["motion"].clone()  # nothing is hidden
+    channels["shadow_motion"] = channels["reflection_motion"] = channels["motion"]
     channels["gradient"] = torch.zeros(1, 2, height, width)  # and light does not change
     bodies = torch.eye(4, dtype=torch.float64).expand(1, MESHES, 4, 4)
     gain = torch.ones(1, 3, 1, 1)

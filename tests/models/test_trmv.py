@@ -1,0 +1,95 @@
+"""TRMV: history is where its cause was, and SVGF's where nothing but the camera moves."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from datasets.frame import Frame
+from eval.bench.synthetic_frames import synthetic_frame
+from models import registry
+from models.trmv import offset_around, reliable_vectors
+from tests.helpers.frames import chain, flat_frame, run
+
+SIZE = 36
+
+
+def stripes(frame: int) -> Tensor:
+    """Light (1, 3, H, W) and shadow of 9 px each on a flat wall, which move to the right by 2 px a frame."""
+    x = torch.arange(SIZE) - 2 * frame
+    return torch.where(x % 18 < 9, 1.0, 0.1).expand(1, 3, SIZE, SIZE).contiguous()
+
+
+def with_channels(frame: Frame, **channels: Tensor) -> Frame:
+    return replace(frame, channels=frame.channels | channels)
+
+
+def vectors(dx: float, dy: float = 0.0) -> Tensor:
+    return torch.tensor([dx, dy])[None, :, None, None].repeat(1, 1, SIZE, SIZE)
+
+
+def error(name: str, frames: list[Frame]) -> float:
+    """Of the last of all frames, away from the borders."""
+    output = run(registry.create(name), frames)[-1]
+    return (output - stripes(len(frames) - 1))[..., 4:-4, 14:-4].abs().mean().item()
+
+
+def test_moving_shadows_do_not_lag():
+    """Where a quarter of the samples say that shadows move."""
+    generator = torch.Generator().manual_seed(0)
+    frames = []
+    for index in range(6):
+        shaded = torch.rand(1, 1, SIZE, SIZE, generator=generator) < 0.25
+        frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
+        frames.append(with_channels(frame, shadow_motion=torch.where(shaded, vectors(-2), 0)))
+    assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
+
+
+def test_reflections_do_not_lag():
+    frames = []
+    for index in range(6):
+        frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
+        smooth = torch.full_like(frame.roughness, 0.1)
+        frames.append(with_channels(frame, roughness=smooth, reflection_motion=vectors(-2)))
+    assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
+
+
+def test_without_moving_causes_it_is_svgf():
+    frames = [synthetic_frame(index, 40, 60) for index in range(4)]
+    frames = [with_channels(frame, dual_motion=frame.motion) for frame in frames]
+    for ours, theirs in zip(run(registry.create("trmv"), frames), run(registry.create("svgf"), frames), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_offsets_are_means_over_the_own_mesh():
+    mesh = torch.ones(1, 1, SIZE, SIZE)
+    mesh[..., 20:] = 2
+    motion = vectors(1, 0)
+    offset = torch.zeros(1, 2, SIZE, SIZE)
+    offset[:, :, 10, 10] = torch.tensor([3.0, -1])
+    offset[:, :, 12, 12] = torch.tensor([5.0, 1])
+    offset[:, :, 10, 22] = 100
+    frame = with_channels(flat_frame(SIZE, SIZE, mesh_id=mesh), motion=motion)
+    around, share = offset_around(motion + offset, frame)
+    torch.testing.assert_close(around[0, :, 11, 11], torch.tensor([4.0, 0]))
+    torch.testing.assert_close(share[0, 0, 11, 11], torch.tensor(2 / 81))
+    torch.testing.assert_close(around[0, :, 10, 18], torch.tensor([0.0, 0]))  # beside another mesh
+    torch.testing.assert_close(share[0, 0, 10, 22], torch.tensor(1 / 54))  # 9 rows of two threes of columns
+
+
+def test_each_kind_of_light_has_its_vectors():
+    frame = with_channels(
+        flat_frame(SIZE, SIZE), dual_motion=vectors(1), shadow_motion=vectors(2), reflection_motion=vectors(3)
+    )
+
+    def found(**channels: Tensor) -> list[float]:
+        direct, indirect = reliable_vectors(with_channels(frame, **channels))
+        return [direct[0, 0, 18, 18].item(), indirect[0, 0, 18, 18].item()]
+
+    smooth = torch.full((1, 1, SIZE, SIZE), 0.1)
+    few = torch.zeros(1, 2, SIZE, SIZE)
+    few[..., ::4, ::4] = 2.0
+    assert found() == [2, 1]
+    assert found(roughness=smooth) == [3, 3]
+    assert found(roughness=smooth, reflection_motion=few) == [2, 1]  # of plastic, one sample in 16 is a reflection
+    assert found(shadow_motion=few) == [1, 1]

@@ -1,0 +1,97 @@
+"""Motion of shadows and reflections in scenes where similar triangles tell it, and that it costs no other channel."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from render.clip import Sampling, render_clip
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.registry import build_scene
+
+SIZE = 48  # px, at a field of view of 90°
+DISTANCE = 4.0  # of the eye from the wall at z = 0
+FOCAL = SIZE / 2
+STEP = 0.1
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+MIRROR = {"type": "conductor", "material": "none"}
+SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=2)
+
+
+def plate(name, side, place, bsdf=GREY, slides=0.0, radiance=None):
+    """A square parallel to the wall, of two sides, that slides to the right by so much a frame."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) * side / 2
+    mesh = trimesh.Trimesh(
+        np.concatenate([corners, corners]), [[0, 1, 2], [0, 2, 3], [6, 5, 4], [7, 6, 4]], process=False
+    )
+    start = np.array(place, float)
+    track = Track(np.stack([start, start + np.array([3 * slides, 0, 0])]), 0, 3) if slides else Track.constant(start)
+    shine = None if radiance is None else Track.constant([radiance] * 3)
+    return Shape(name, mesh, bsdf, motion=RigidMotion(track, Track.constant(0.0)), radiance=shine)
+
+
+def frames_of(*shapes, eye_slides=0.0, sky=None):
+    """Three frames: the eye looks along -z at a wall at z = 0, which is white or a mirror."""
+    eye = np.array([[0.0, 0, DISTANCE], [3 * eye_slides, 0, DISTANCE]])
+    camera = Camera(Track(eye, 0, 3), Track(eye - [0, 0, 1], 0, 3), Track.constant(90.0))
+    return [arrays for arrays, _ in render_clip(Scene(shapes, camera, sky=sky), 3, SIZE, SIZE, SAMPLING, 1)]
+
+
+def tracked(frame, name, mesh):
+    """Vectors (N, 2) of a channel that differ from motion, on the mesh of that number."""
+    differs = np.abs(frame[name] - frame["motion"]).max(axis=-1) > 1e-3
+    return frame[name][differs & (frame["mesh_id"][..., 0] == mesh)]
+
+
+@pytest.mark.parametrize("lamp_slides", [0.0, STEP])
+@pytest.mark.parametrize("eye_slides", [0.0, 0.05])
+def test_a_shadow_moves_as_similar_triangles_say(lamp_slides, eye_slides):
+    """The lamp is twice as far from the wall as the blocker; both may slide, and the eye."""
+    wall = plate("a wall", 20, (0, 0, 0))
+    blocker = plate("b blocker", 0.6, (1.5, 0, 1), slides=STEP)
+    lamp = plate("c lamp", 0.05, (3, 0, 2), radiance=100, slides=lamp_slides)
+    for frame in frames_of(wall, blocker, lamp, eye_slides=eye_slides)[1:]:
+        shadow = tracked(frame, "shadow_motion", 1)
+        assert len(shadow) > 20
+        back = -(2 * STEP - lamp_slides)  # of the shadow, to where it was
+        expected = [(back + eye_slides) * FOCAL / DISTANCE, 0]
+        np.testing.assert_allclose(shadow, np.broadcast_to(expected, shadow.shape), atol=2e-3)
+
+
+def test_a_shadow_stays_on_its_surface_while_the_camera_alone_moves():
+    wall = plate("a wall", 20, (0, 0, 0))
+    for frame in frames_of(wall, plate("b", 0.6, (1.5, 0, 1)), plate("c", 0.05, (3, 0, 2), radiance=1), eye_slides=0.1):
+        assert np.array_equal(frame["shadow_motion"], frame["motion"])
+
+
+@pytest.mark.parametrize("eye_slides", [0.0, 0.05])
+def test_a_reflection_moves_as_what_stands_behind_the_mirror(eye_slides):
+    """The image of what is 1 in front of the mirror stands 1 behind it."""
+    mirror = plate("a mirror", 20, (0, 0, 0), MIRROR)
+    thing = plate("b thing", 1.0, (1.5, 0, 1), slides=STEP)
+    lamp = plate("c lamp", 0.5, (0, 3, 6), radiance=1)
+    for frame in frames_of(mirror, thing, lamp, eye_slides=eye_slides)[1:]:
+        seen = tracked(frame, "reflection_motion", 1)
+        back = (eye_slides - STEP) * FOCAL / (DISTANCE + 1)
+        of_thing = seen[np.abs(seen[:, 0] - back) < 5e-3]
+        assert len(of_thing) > 10 and np.abs(of_thing[:, 1]).max() < 5e-3
+
+
+def test_the_sky_s_reflection_moves_with_the_view_alone():
+    mirror = plate("a mirror", 20, (0, 0, 0), MIRROR)
+    for frame in frames_of(mirror, eye_slides=0.2, sky=np.ones((2, 4, 3)))[1:]:
+        assert np.abs(frame["reflection_motion"]).max() < 1e-3 and np.abs(frame["motion"][..., 0]).min() > 1
+
+
+def test_diffuse_surfaces_reflect_nothing_in_particular():
+    for frame in frames_of(plate("a", 20, (0, 0, 0)), plate("b", 0.5, (2, 0, 2), radiance=1), eye_slides=0.1):
+        assert np.array_equal(frame["reflection_motion"], frame["motion"])
+
+
+def test_first_frames_do_not_move_and_no_other_channel_is_changed():
+    scene = build_scene("cornell_box_moving", 3, 24)
+    names = ("direct", "indirect", "direct_reference", "motion", "mesh_id")
+    plain = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1, names)]
+    whole = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1)]
+    assert not any(whole[0][name].any() for name in ("shadow_motion", "reflection_motion"))
+    for one, other in zip(plain, whole, strict=True):
+        assert set(one) == set(names) and all(np.array_equal(one[name], other[name]) for name in names)
