@@ -206,7 +206,7 @@ def one() -> Ablation:
     )
     pairs = tuple(("one", variant.label) for variant in variants[1:-1])
     return Ablation(
-        source="ours: a part of `one` left out, or of its loss",
+        source="ours: a part of the network left out, or of its loss",
         variants=variants,
         metrics=("psnr", "ssim", "flip", "temporal_error"),
         findings=(

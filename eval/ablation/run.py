@@ -164,7 +164,7 @@ def ablate(what: str, data: Path, runs: Path, budget: str, seeds: int = 1) -> st
     judged = train_and_judge(ablation, trainings, clips, folder)
 
     epochs = trainings[0][1].recipe.epochs
-    title = f"{what}, after {ablation.source}\n"
+    title = f"{what} ({ablation.source})\n"
     title += f"budget {budget}, {epochs} epochs ({SHARE_OF_EPOCHS:.0%} of its own), seeds: {seeds}, "
     title += f"judged on {', '.join(judged[0].clips)}"
     save_figure(folder / "plot.png", ablation_figure(ablation, judged, title))

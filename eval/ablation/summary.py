@@ -62,4 +62,4 @@ def ablation_table(ablation: Ablation, runs: Sequence[VariantRun], form: str = "
     head = ["variant", "parameters", *(titles[metric] for metric in ablation.metrics), "paper, its scenes"]
     table = tabulate(lines, head, form, disable_numparse=True)
     found = [f"- {f.text} (by {titles[f.metric]}): {f.here}" for f in judged_findings(ablation, runs)]
-    return "\n".join([table, "\nWhat the paper found, here:\n", *found])
+    return "\n".join([table, "\nWhat was to be found, and whether it was here:\n", *found])
