@@ -44,6 +44,7 @@ class DataProfile:
     boxes: dict[str, int]  # clips of each Cornell box
     rooms: dict[str, int]  # rooms, of one clip each
     quality: dict[str, SamplingQuality]
+    closeups: dict[str, int] = field(default_factory=dict)  # of further rooms, one clip each
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
     own: Path | None = None  # the TOML of a user's own scene, whose clips all are
 
@@ -90,15 +91,17 @@ DATA_PROFILES = {
         rooms={"train": 64, "val": 8, "test": 0},
         quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=64)),
     ),
+    # Whole rooms, and parts of others as fine as large pictures show them.
     "release": DataProfile(
-        height=256,
-        width=256,
-        frames=32,
+        height=128,
+        width=128,
+        frames=12,
         boxes={"train": 0, "val": 0, "test": 1},
         rooms={"train": 128, "val": 8, "test": 6},
+        closeups={"train": 128, "val": 4},
         quality={
-            "train": SamplingQuality(realisations=4, reference_spp=32),
-            "val": SamplingQuality(realisations=1, reference_spp=256),
+            "train": SamplingQuality(realisations=8, reference_spp=32),
+            "val": SamplingQuality(realisations=8, reference_spp=64),
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={
@@ -206,10 +209,17 @@ def rooms_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp)
     return list(islice(suitable, profile.rooms[split]))
 
 
+def closeups_of(profile: DataProfile, split: str, seed: int) -> list[str]:
+    """The close-ups of a split, each as SCENE/CLIP, none of a room that is there as a whole."""
+    first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms[split]
+    return [f"closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
+
+
 def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp = NO_PILOTS) -> list[str]:
     """All clips of a split, each as SCENE/CLIP, of the data set with that seed, by what pilots have found."""
     boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes[split])]
-    return boxes + rooms_of(profile, split, seed, needed_spp) + profile.special.get(split, [])
+    rooms = rooms_of(profile, split, seed, needed_spp) + closeups_of(profile, split, seed)
+    return boxes + rooms + profile.special.get(split, [])
 
 
 def rendered_channels(reads: Iterable[str]) -> list[str]:

@@ -34,6 +34,10 @@ def test_release_has_rooms_enough_and_tests_on_others():
     facts = plan("release", 0)
     rooms = {split: {c for c in clips if c.startswith("room")} for split, clips in facts["splits"].items()}
     assert len(rooms["train"]) >= 64 and len(rooms["val"]) >= 8 and rooms["test"]
+    parts = {
+        c.replace("closeup", "room") for clips in facts["splits"].values() for c in clips if c.startswith("closeup")
+    }
+    assert len(parts) >= 64 and not parts & (rooms["train"] | rooms["val"] | rooms["test"])
     assert not rooms["train"] & rooms["val"] and not (rooms["train"] | rooms["val"]) & rooms["test"]
     boxes = {split: [c for c in clips if c.startswith("cornell")] for split, clips in facts["splits"].items()}
     assert not boxes["train"] and {"cornell_box/000", "cornell_box_moving/still"} <= set(boxes["test"])
