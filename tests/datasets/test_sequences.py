@@ -8,16 +8,14 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, TEMPORAL_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from errors import BadInput
 
-# The others exist for forward playback only.
-IMAGE_CHANNELS = tuple(
-    name for name, channel in CHANNELS.items() if channel.is_image and name not in ("dual_motion", "gradient")
-)
+FORWARD_ALONE = tuple(name for name in TEMPORAL_CHANNELS if name != "motion")
+IMAGE_CHANNELS = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name not in FORWARD_ALONE)
 AUGMENTATIONS = {
     "none": Augmentation(),
     "reverse": Augmentation(reverse=True),
@@ -200,7 +198,7 @@ def test_reversed_playback_uses_forward_vectors(clips):
     assert (forward + backward).abs().max() > 0.005  # computed, not negated
 
 
-@pytest.mark.parametrize("name", ["dual_motion", "gradient"])
+@pytest.mark.parametrize("name", FORWARD_ALONE)
 def test_what_only_the_renderer_sees_refuses_reversed_playback(tiny, name):
     clip = Dataset(tiny).clips("test")[1]
     with pytest.raises(BadInput, match=f"'{name}' exists for forward playback only"):
