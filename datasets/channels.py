@@ -24,6 +24,11 @@ class Channel(NamedTuple):
         """Whether the channel has pixels."""
         return "H" in self.axes
 
+    @property
+    def has_halves(self) -> bool:
+        """Whether a frame has two images of it, of independent samples."""
+        return self.axes[-4:-3] == (2,)
+
     def shape(self, **sizes: int) -> list[int]:
         """The stored shape, for the lengths of the axes given by name: F, S, H, W and M."""
         return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
@@ -36,6 +41,8 @@ ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than t
 CHANNELS: dict[str, Channel] = {
     "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
     "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "direct_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "indirect_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
     "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
     "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
     "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
@@ -59,4 +66,9 @@ MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
 TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
 NOISY = ("direct", "indirect")
+HALVES = {
+    "direct": "direct_halves",
+    "indirect": "indirect_halves",
+}  # of noisy channels, where samples are in two halves
+USUAL_CHANNELS = tuple(name for name in CHANNELS if name not in HALVES.values())  # halves are stored where asked for
 REFERENCES = ("direct_reference", "indirect_reference")

@@ -96,7 +96,7 @@ class Clip:
         return self._maps[channel]
 
     def read(self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0) -> NDArray[Any]:
-        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for the halves of a reference.
+        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for channels that have halves.
 
         The array is the same whether the channel is stored in full, stored as one value or derived from others.
         Raises BadInput where the channel was not rendered, or its file is missing or damaged.
@@ -106,15 +106,14 @@ class Clip:
         spec = CHANNELS[channel]
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
-            leading = (2,) if spec.axes[1] == 2 else ()
+            leading = (2,) if spec.has_halves else ()
             value = np.array(entry["value"], "<f4" if spec.radiance else spec.dtype)
             return np.broadcast_to(value, (*leading, *area, spec.components))
         if "derived" in entry:
             return self.motion_to(frame, max(frame - 1, 0), window)
         array = self.map(channel)
-        if "S" in spec.axes:
-            return array[frame, realisation, rows, columns]
-        return array[frame, ..., rows, columns, :]
+        images = array[frame, realisation] if "S" in spec.axes else array[frame]
+        return images[..., rows, columns, :]
 
     def view(self, frame: int) -> View:
         """The camera and the poses of all meshes in one frame."""

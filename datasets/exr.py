@@ -10,7 +10,7 @@ import OpenEXR
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, REFERENCES
+from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
@@ -28,12 +28,12 @@ COMPONENTS = {
     "reflection_motion": "XY",
     "gradient": "XY",
 }
-HALVES = ("_a", "_b")  # endings of the two layers of a reference
+HALVES = ("_a", "_b")  # endings of the two layers of a channel that has halves
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 
 
 def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """EXR channels (H, W), named LAYER.COMPONENT, of a clip's channel (H, W, C), or (2, H, W, C) for references."""
+    """EXR channels (H, W), named LAYER.COMPONENT, of a clip's channel (H, W, C), or (2, H, W, C) if it has halves."""
     if array.ndim == 4:
         halves = zip(HALVES, array, strict=True)
         return {key: plane for half, image in halves for key, plane in layers_of(name + half, image).items()}
@@ -109,7 +109,7 @@ def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     for name, channel in CHANNELS.items():
         components = COMPONENTS.get(name, "RGB")
-        layers = [name + half for half in HALVES] if name in REFERENCES else [name]
+        layers = [name + half for half in HALVES] if channel.has_halves else [name]
         if channel.is_image and all(f"{layer}.{c}" in planes for layer in layers for c in components):
             images = [np.stack([planes[f"{layer}.{c}"] for c in components], axis=-1) for layer in layers]
             array = images[0] if len(images) == 1 else np.stack(images)

@@ -13,6 +13,7 @@ from datasets.channels import (
     ALBEDO_FLOOR,
     CAMERA_CHANNELS,
     CHANNELS,
+    HALVES,
     MOTION_CHANNELS,
     NOISY,
     REFERENCES,
@@ -97,7 +98,8 @@ class Moment:
 class Frame:
     """One frame of one noise realisation: tensors (B, C, H, W), float32, as attributes named like the channels.
 
-    `direct_reference` and `indirect_reference` are (B, 2, 3, H, W). Using a channel that was not read raises BadInput.
+    Channels with halves, such as `direct_reference`, are (B, 2, 3, H, W). Using a channel that was not read raises
+    BadInput.
     Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
     networks multiply their exposure by it, while radiance stays as rendered. `whole` belongs to training crops: what
     models.running_scale measures in the whole frame, (B, 2); None where this is the whole frame. `spp` are the samples
@@ -182,6 +184,17 @@ class Frame:
             for name in self.channels.keys() & set(NOISY)
         }
         return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
+
+    @property
+    def has_halves(self) -> bool:
+        """Whether the samples of the noisy channels are known in two independent halves."""
+        return self.channels.keys() & set(HALVES.values()) != set()
+
+    def half(self, which: int) -> "Frame":
+        """The frame with half of its samples alone: those of half 0 or 1. BadInput where it has no halves."""
+        noisy = {name: getattr(self, halves)[:, which] for name, halves in HALVES.items() if name in self.channels}
+        others = {name: tensor for name, tensor in self.channels.items() if name not in HALVES.values()}
+        return replace(self, channels=others | noisy, spp=self.samples / 2)
 
     def lit(self, light: Tensor) -> "Frame":
         """The frame with all light but emission, noisy and in references, times `light` (H, W)."""
@@ -277,21 +290,23 @@ def read_frame(
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
     another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
 
-    Raises BadInput where a channel was not rendered or is damaged, and for what only the renderer knows in reversed
-    playback.
+    Halves of noisy channels are left out where the clip has none.
+
+    Raises BadInput where another channel was not rendered or is damaged, and for what only the renderer knows in
+    reversed playback.
     """
     stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead
     if previous is None:
         previous = stored_previous
     tensors = {}
     for name in channels:
-        if name in CAMERA_CHANNELS:
+        if name in CAMERA_CHANNELS or (name in HALVES.values() and name not in clip.channels):
             continue
         if name in TEMPORAL_CHANNELS and previous != stored_previous:
             array = for_playback(clip, name, index, previous, window)
         else:
             array = clip.read(name, index, window, realisation)
-        tensors[name] = to_tensor(array, has_halves=name in REFERENCES)
+        tensors[name] = to_tensor(array, has_halves=CHANNELS[name].has_halves)
     return Frame(
         tensors,
         now=Cameras.of(clip.view(index), window),

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from datasets.card import write_card
-from datasets.channels import CHANNELS
+from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Dataset, is_clip
 from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
 from datasets.pilots import choose_rooms
@@ -55,7 +55,7 @@ def generate(
     profile: str,
     seed: int,
     share: Share = WHOLE_DATA_SET,
-    reads: Sequence[str] = tuple(CHANNELS),
+    reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
     render: Callable[[Sequence[RenderJob]], Iterator[ClipOutcome]] = render_here,
 ) -> int:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES
+from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
 from provenance import RENDERING, versions
@@ -237,19 +237,21 @@ def check_seed(seed: int) -> None:
 def plan(
     profile: str,
     seed: int,
-    reads: Sequence[str] = tuple(CHANNELS),
+    reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
     needed_spp: NeededSpp = NO_PILOTS,
 ) -> dict[str, Any]:
     """The content of dataset.json.
 
     Clips for training and validation get the channels that can be derived from nothing else and those in `reads`;
-    test clips get all, because metrics read them. Raises BadInput for an unknown profile or a negative seed.
+    test clips get all, because metrics read them, but halves of noisy frames only where `reads` names them.
+    Raises BadInput for an unknown profile or a negative seed.
     """
     check_seed(seed)
     described = profile_of(profile)
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     train = rendered_channels(reads)
+    test = [name for name in CHANNELS if name in USUAL_CHANNELS or name in reads]
     return {
         "schema": SCHEMA,
         "profile": profile,
@@ -258,7 +260,7 @@ def plan(
         "seed": seed,
         "scenes": list(dict.fromkeys(clip.split("/")[0] for clips in splits.values() for clip in clips)),
         "options": options._asdict(),
-        "channels": {"train": train, "val": train, "test": list(CHANNELS)},
+        "channels": {"train": train, "val": train, "test": test},
         "splits": splits,
         "needed_spp": dict(needed_spp),
         "source": source_of(described),

@@ -65,6 +65,7 @@ class StepTimer:
 NOISY_STREAM = 0
 REFERENCE_STREAM = 1
 GRADIENT_STREAM = 2
+OTHER_HALF_STREAM = 3
 
 
 def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:
@@ -117,7 +118,8 @@ def render_clip(
 ) -> Iterator[tuple[Arrays, dict[str, float]]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
-    With `channels` only those are yielded, and the time that the others alone would take is saved.
+    With `channels` only those are yielded, and the time that the others alone would take is saved. Noisy frames of an
+    even number of samples a pixel are drawn in two halves where these are named, which makes them other samples.
 
     Deterministic in its arguments on one variant and processor.
     """
@@ -128,35 +130,43 @@ def render_clip(
     wants_dual = channels is None or "dual_motion" in channels
     wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
     wants_gradient = channels is None or "gradient" in channels
+    wants_halves = channels is not None and "direct_halves" in channels and sampling.noisy_spp % 2 == 0
+    parts = 2 if wants_halves else 1  # in which the samples of a noisy frame are drawn, with a seed each
     samples: Samples | None = None  # of the frame before
     before: View | None = None
     timer = StepTimer()
     for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
         ray = stage.rays(view)
-        spp = sampling.noisy_spp
+        spp = sampling.noisy_spp // parts
         # A Halton cycle goes on from frame to frame with the shift of its realisation.
-        first = frame * spp if halton else 0
+        first = frame * sampling.noisy_spp if halton else 0
         shift = 0 if halton else frame
-        seeds = [stream_seed(seed, shift, NOISY_STREAM, i) for i in range(sampling.realisations)]
-        noisy = [noisy_tracer.radiance(ray, noisy_seed, spp, first) for noisy_seed in seeds]
+        seeds = [
+            [stream_seed(seed, shift, stream, i) for stream in (NOISY_STREAM, OTHER_HALF_STREAM)[:parts]]
+            for i in range(sampling.realisations)
+        ]
+        drawn = np.array(
+            [[noisy_tracer.radiance(ray, own, spp, first + i * spp) for i, own in enumerate(each)] for each in seeds]
+        )
+        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, parts, H, W, 3)
+        arrays |= {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
+        arrays |= {"direct_halves": direct, "indirect_halves": indirect} if wants_halves else {}
         timer.lap("noisy")
         if wants_tracked:
-            met = causes(noisy_tracer, view, seeds[0], first)
+            met = causes(noisy_tracer, view, seeds[0][0], first)
             arrays |= tracked_motion(met, arrays, view, before or view)
             before = view
             timer.lap("shadow_motion")
         if wants_gradient:
             still = np.zeros((height, width, 2))
             arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still
-            drawn_by = {"seed": seeds[0], "spp": spp, "first": first}
+            drawn_by = {"seed": seeds[0][0], "spp": spp, "first": first}
             choice = stream_seed(seed, frame, GRADIENT_STREAM, 0)
-            samples = Samples.of(arrays, *noisy[0], view, stage.poses, drawn_by, choice)
+            samples = Samples.of(arrays, direct[0, 0], indirect[0, 0], view, stage.poses, drawn_by, choice)
             timer.lap("gradient")
         spp = sampling.reference_spp // 2
         halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), spp) for i in range(2)]
         timer.lap("reference")
-        arrays["direct"] = np.stack([direct for direct, _ in noisy])
-        arrays["indirect"] = np.stack([indirect for _, indirect in noisy])
         arrays["direct_reference"] = np.stack([direct for direct, _ in halves])
         arrays["indirect_reference"] = np.stack([indirect for _, indirect in halves])
         arrays |= view._asdict()  # K, camera_to_world, object_to_world

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, HALVES, NOISY
 from datasets.clip import Clip, Dataset
 from datasets.clip_scene import scene_of_clip
 from datasets.generate import check_versions
@@ -21,10 +21,8 @@ from render.clip import Options, Sampling, render_clip
 from render.sampler import CYCLE
 from scenes.animation import Scene
 
-NOISY_CHANNELS = ("direct", "indirect")
-
 Source = Literal["averaged", "rendered"]
-NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS, (H, W, 3)
+NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY (H, W, 3), of HALVES (2, H, W, 3)
 
 
 def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
@@ -41,24 +39,28 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     return scene_of_clip(clip.path, profile, dataset.facts["seed"])
 
 
-def averaged(clip: Clip, count: int) -> Iterator[NoisyFrame]:
+def averaged(clip: Clip, count: int, halves: bool) -> Iterator[NoisyFrame]:
     """Frame by frame the mean of the clip's first `count` noise realisations, which are independent."""
     for frame in range(clip.frames):
-        yield {
-            name: np.mean([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)], axis=0)
-            for name in NOISY_CHANNELS
-        }
+        noisy = {}
+        for name in NOISY:
+            drawn = np.stack([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)])
+            noisy[name] = drawn.mean(axis=0)
+            if halves:
+                noisy[HALVES[name]] = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
+        yield noisy
 
 
-def rendered(clip: Clip, dataset: Dataset, spp: int) -> Iterator[NoisyFrame]:
+def rendered(clip: Clip, dataset: Dataset, spp: int, halves: bool) -> Iterator[NoisyFrame]:
     """Frame by frame what the renderer makes of `spp` stratified samples: the bytes of a clip such as 000-4spp.
 
     Raises BadInput as `scene_of` does.
     """
     scene, seed = scene_of(clip, dataset)
     sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # nothing is kept of the reference
-    for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, NOISY_CHANNELS):
-        yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in NOISY_CHANNELS}
+    channels = (*NOISY, *HALVES.values()) if halves else NOISY
+    for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, channels):
+        yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in channels}
 
 
 def source(clip: Clip, most: int) -> Source:
@@ -66,8 +68,10 @@ def source(clip: Clip, most: int) -> Source:
     return "averaged" if clip.realisations * clip.facts["noisy_spp"] >= most else "rendered"
 
 
-def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path) -> Clip:
+def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path, halves: bool = False) -> Clip:
     """`clip` with `spp` samples a pixel as its noisy input: a clip of one realisation below the folder `root`.
+
+    With `halves` it has those of its samples too, where these are an even number of the clip's own.
 
     It is made unless it is there already, of what `clip` is now. Its other channels are the files of `clip`.
     Raises BadInput where `spp` is no multiple of the clip's own samples, or more than its sampler has; where another
@@ -83,10 +87,12 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     if spp % own:
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"
+    halves = halves and spp // own % 2 == 0
     made_of = {
         "clip": str(clip.path.resolve()),
         "crc32": clip.fingerprint,
         "how": how,
+        "halves": halves,
     }
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)
@@ -94,7 +100,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     with locked(path.with_name(f".{path.name}.lock")) as ours:
         if not ours:
             raise BadInput(f"another process is making {path}: wait for it")
-        frames = averaged(clip, spp // own) if how == "averaged" else rendered(clip, dataset, spp)
+        frames = averaged(clip, spp // own, halves) if how == "averaged" else rendered(clip, dataset, spp, halves)
         progress = tqdm(frames, f"{clip.scene}/{path.name}", clip.frames, unit="frame", leave=False)
         write_resampled(path, clip, list(progress), {"noisy_spp": spp, "made_of": made_of})
     return Clip(path)
@@ -110,7 +116,7 @@ def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dic
         name: entry | {"file": str((clip.path / entry["file"]).resolve())} if "file" in entry else entry
         for name, entry in clip.channels.items()
     }
-    for name in NOISY_CHANNELS:
+    for name in frames[0]:
         array = to_storage(np.stack([frame[name] for frame in frames])[:, None], "<f4")[0]
         file = path / f"{name}.npy"
         np.save(file, array)
