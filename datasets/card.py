@@ -6,7 +6,7 @@ from typing import Any
 
 from tabulate import tabulate
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.tonemap import psnr
 from files import write_file
@@ -86,6 +86,7 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
                 "splits": [split for split in used if name in facts["channels"][split]],
             }
             for name, channel in CHANNELS.items()
+            if name in USUAL_CHANNELS or any(name in facts["channels"][split] for split in used)
         },
         "clips": clips,
     }

@@ -7,7 +7,7 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
@@ -104,14 +104,15 @@ def channel_table(clips: list[Clip]) -> str:
     rows: list[list[str]] = []
     stored: dict[str, int] = {}
     full: dict[str, int] = {}
-    for name in CHANNELS:
+    names = [name for name in CHANNELS if name in USUAL_CHANNELS or any(name in clip.channels for clip in clips)]
+    for name in names:
         stored[name] = sum(stored_size(clip, name) for clip in clips)
         full[name] = sum(size_in_full(clip, name) for clip in clips)
         kinds = sorted({stored_as(clip, name) for clip in clips})
         rows.append([name, ", ".join(kinds), megabytes(stored[name]), megabytes(full[name])])
-    for label, names in (("auxiliary channels", AUXILIARY_CHANNELS), ("all", tuple(CHANNELS))):
-        total_stored = sum(stored[name] for name in names)
-        total_full = sum(full[name] for name in names)
+    for label, summed in (("auxiliary channels", AUXILIARY_CHANNELS), ("all", tuple(names))):
+        total_stored = sum(stored[name] for name in summed)
+        total_full = sum(full[name] for name in summed)
         share = f"{total_stored / total_full:.0%} of full"
         rows.append([label, share, megabytes(total_stored), megabytes(total_full)])
     return tabulate(rows, ["channel", "stored as", "MB", "in full"], disable_numparse=True)

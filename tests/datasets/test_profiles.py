@@ -4,13 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from datasets import pilots
 from datasets.adaptive_spp import noise_of_reference, samples_needed
-from datasets.channels import CHANNELS, MOTION_CHANNELS
+from datasets.channels import CHANNELS, HALVES, MOTION_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
+from datasets.frame import read_frame
 from datasets.generate import Share, generate
 from datasets.info import AUXILIARY_CHANNELS, size_in_full, stored_size, summarise
 from datasets.pilots import choose_rooms
@@ -105,6 +107,28 @@ def test_more_samples_as_input_have_less_noise_and_the_same_reference(moving_box
     assert variance(many) < variance(one) / 12  # stratified samples gain at least as much as independent ones, a 16th
 
 
+def test_halves_tell_the_noise_of_their_mean(moving_boxes):
+    """(A - B)² / 4 is the variance of the mean: the same that its realisations show."""
+    assert "direct_halves" not in moving_boxes["000"].channels  # of one sample
+    many = moving_boxes["000-16spp"]
+    for name, halves in HALVES.items():
+        drawn = np.array([[many.read(halves, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
+        noisy = np.array([[many.read(name, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
+        np.testing.assert_allclose(noisy, drawn.mean(axis=2), rtol=2e-3, atol=1e-5)  # of float16
+        told = ((drawn[:, :, 0] - drawn[:, :, 1]) ** 2).mean() / 4
+        assert told == pytest.approx(np.var(noisy, axis=1, ddof=1).mean(), rel=0.3)
+
+
+def test_a_frame_gives_its_halves_as_frames(moving_boxes):
+    frame = read_frame(moving_boxes["000-16spp"], 2, ("direct", "albedo", *HALVES.values()))
+    a, b = frame.half(0), frame.half(1)
+    assert frame.has_halves and not a.has_halves
+    assert a.channels.keys() == {"direct", "albedo"} and float(a.samples) == float(b.samples) == 8
+    torch.testing.assert_close((a.direct + b.direct) / 2, frame.direct, rtol=2e-3, atol=1e-5)
+    one = read_frame(moving_boxes["000"], 2, ("direct", "albedo", *HALVES.values()))
+    assert not one.has_halves and one.channels.keys() == {"direct", "albedo"}
+
+
 @pytest.mark.parametrize("floor", [34.0, 40.0])
 def test_references_get_down_to_their_floor(floor, tmp_path):
     profile = small_profile(32, 4, SamplingQuality(realisations=1, reference_spp=16, floor=floor))
@@ -184,7 +208,7 @@ def test_what_nobody_reads_is_not_rendered(lean):
     assert set(clip.channels) == set(rendered_channels(READS)) < set(CHANNELS)
     with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
         clip.read("dual_motion", 1)
-    assert set(static_box(lean, "test").channels) == set(CHANNELS)
+    assert set(static_box(lean, "test").channels) == set(USUAL_CHANNELS)
 
 
 def test_what_one_denoiser_reads_is_rendered_for_all(tiny):

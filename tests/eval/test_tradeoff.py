@@ -147,7 +147,15 @@ def test_realisations_are_averaged(tiny, tmp_path):
     assert stored.shape[1] == 2
     np.testing.assert_allclose(np.load(two.path / "indirect.npy")[:, 0], stored.mean(axis=1), rtol=1e-6)
     assert two.facts["noisy_spp"] == 2 and two.realisations == 1
-    assert len(list(averaged(clip, 1))) == clip.frames
+    assert "indirect_halves" not in two.channels
+    assert len(list(averaged(clip, 1, False))) == clip.frames
+
+
+def test_realisations_make_halves_too(tiny, tmp_path):
+    clip = a_clip(tiny, "train")
+    halves = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path, halves=True).read("indirect_halves", 1)
+    for half, drawn in zip(halves, (clip.read("indirect", 1, realisation=i) for i in range(2)), strict=True):
+        np.testing.assert_array_equal(half, drawn)
 
 
 def test_everything_but_the_noise_is_the_clips_own(tiny, tmp_path):
@@ -165,7 +173,7 @@ def test_everything_but_the_noise_is_the_clips_own(tiny, tmp_path):
 def test_the_renderer_goes_on_where_the_clip_began(tiny):
     """With as many samples as the clip has it makes the clip's own bytes: so scene, frames and seed are right."""
     clip = a_clip(tiny)
-    frames = list(rendered(clip, Dataset(tiny), 1))
+    frames = list(rendered(clip, Dataset(tiny), 1, False))
     for frame in (0, clip.frames - 1):
         half = frames[frame]["indirect"].astype(np.float16)
         assert np.array_equal(half, clip.read("indirect", frame).astype(np.float16))
