@@ -50,6 +50,14 @@ LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0
 
 GUIDES = 256  # values of a guide, which cells of a grid divide as they divide pixels
 
+# --- LBF (Kalantari et al. 2015) --------------------------------------------------------------------------------------
+
+FILTER_RADIUS = 27  # px: windows of 55 x 55
+GROUPS = (3, 3, 3, 1, 1)  # channels of each feature: position, normal, albedo, roughness, visibility
+COLOUR_SHARPNESS = 1 / (2 * 7**2)  # 1 / 2 β²
+LEAST_VARIANCE = 1e-30  # of colours, to divide by; far below that of any noise
+LARGEST_EXPONENT = 80.0  # what would weigh less than exp(-80) counts as that much
+
 # --- one --------------------------------------------------------------------------------------------------------------
 
 LATENT = 6  # channels carried beside images, in [-1, 1]

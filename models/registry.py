@@ -14,6 +14,7 @@ from models.bmfr import BMFR
 from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.fastest import bfloat16_pays
+from models.lbf import LBF
 from models.nbgd import NBGD
 from models.nfor import NFOR
 from models.ntd import NTD, NTDMean, NTDTraditional
@@ -48,6 +49,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "kp": KP,
     "mr-kp": MRKP,
     "nbgd": NBGD,
+    "lbf": LBF,
     "ntd-a": NTDTraditional,
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,

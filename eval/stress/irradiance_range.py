@@ -9,7 +9,7 @@ from datasets.frame import Frame
 from models.operators import finite
 
 # Filters whose output is a mean of irradiance that they have seen.
-CONVEX = ("eaw", "svgf", "asvgf", "trmv", "sbf", "wskp3", "wskp6", "kp", "one")
+CONVEX = ("eaw", "svgf", "asvgf", "trmv", "sbf", "lbf", "wskp3", "wskp6", "kp", "one")
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 

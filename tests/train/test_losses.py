@@ -21,6 +21,7 @@ from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
+from train.losses.lbf import LBFLoss, LBFTerms
 from train.losses.nbgd import NBGDLoss, NBGDTerms
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
@@ -34,6 +35,7 @@ LOSSES = {
     RAETerms: RAELoss,
     SMAPETerms: SMAPELoss,
     NBGDTerms: NBGDLoss,
+    LBFTerms: LBFLoss,
     NTDTerms: NTDLoss,
     DisplayedTerms: DisplayedLoss,
 }
@@ -497,6 +499,7 @@ SAME_NETWORK = [  # as ntd's
         ("kp", 40, {}, 0.8),
         ("mr-kp", 40, {}, 0.8),
         ("nbgd", 40, {}, 0.8),
+        ("lbf", 40, {}, 0.95),
         ("ntd", 40, {"length": 4}, 0.8),
         ("one", 40, {"length": 4}, 0.8),
         *SAME_NETWORK,
@@ -505,7 +508,7 @@ SAME_NETWORK = [  # as ntd's
 def test_every_network_learns_one_batch(batch_of, name, steps, changes, left):
     """Some steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.
 
-    The other networks begin as filters already, so that less is left to learn.
+    The other networks begin as filters already, so that less is left to learn, and for the few weights of LBF little.
     """
     torch.manual_seed(0)
     loss = recipe_for(name, "tiny").loss.around(create(name)).train()
