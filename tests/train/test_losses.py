@@ -162,6 +162,27 @@ def test_losses_of_crops_compare_radiance_as_exposed(batch_of, monkeypatch, name
     assert value.item() == pytest.approx(error(output, reference).mean(), rel=1e-4)
 
 
+def test_lbf_loss_by_hand(batch_of, monkeypatch):
+    """The relative MSE of exposed radiance, emission included, times half the samples a pixel."""
+    batch = batch_of("lbf", 2)
+    denoiser = create("lbf")
+    (frame,) = batch.frames
+    frame = replace(frame, spp=torch.tensor([1.0, 4.0])[:, None, None, None])
+    _, state = denoiser.predict(frame, None)
+    guess = torch.rand_like(frame.albedo)
+    monkeypatch.setattr(denoiser, "predict", lambda frame, before: (guess, state))
+    value, _ = LBFLoss(denoiser)(Batch([frame]))
+    exposure = state.scale.exposure().numpy()
+    albedo = np.maximum(frame.albedo.numpy(), 0.01)
+    output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
+    halves = frame.direct_reference + frame.indirect_reference + frame.emission[:, None]
+    reference = exposure * halves.mean(dim=1).numpy()
+    error = (output - reference) ** 2 / (reference**2 + 0.01)
+    surface = np.broadcast_to(frame.depth.numpy() > 0, error.shape)
+    items = [samples / 2 * error[item][surface[item]].mean() for item, samples in enumerate((1, 4))]
+    assert value.item() == pytest.approx(np.mean(items), rel=1e-4)
+
+
 def test_ntd_loss_by_hand(batch_of, monkeypatch):
     """Eq. 5 and 6 with known outputs, in numpy and float64: masks of this frame and the two before it."""
     batch = batch_of("ntd", 2, length=5)
