@@ -64,11 +64,11 @@ def noise(features: Tensor, surface: Tensor) -> Tensor:
     results, the largest of 3 x 3 pixels. Details that are not all of surfaces count as 0.
     """
     height, width = surface.shape[-2:]
-    cells = (pad_to_multiple(image, 2).unflatten(3, (-1, 2)).unflatten(2, (-1, 2)) for image in (features, surface))
-    values, shown = cells
-    details = (
-        values[:, :, :, 0, :, 0] + values[:, :, :, 1, :, 1] - values[:, :, :, 0, :, 1] - values[:, :, :, 1, :, 0]
-    ) / 2
+    values, shown = (
+        pad_to_multiple(image, 2).unflatten(3, (-1, 2)).unflatten(2, (-1, 2)) for image in (features, surface)
+    )
+    signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).to(features)[:, None]
+    details = (signs * values).sum(dim=(3, 5)) / 2
     details = details.abs() * shown.amin(dim=(3, 5))
     around = F.pad(details, (2, 1, 2, 1), mode="replicate").unfold(2, 4, 1).unfold(3, 4, 1).flatten(4)
     median = torch.stack(
@@ -86,8 +86,9 @@ def group_means(features: Tensor) -> Tensor:
 def secondary_features(features: Tensor, variance: Tensor, surface: Tensor, samples: Tensor) -> Tensor:
     """The network's input, (B, SECONDARY, H, W).
 
-    `variance` (B, groups, H, W) is that of the noise in features, `samples` (B, 1, 1, 1) a pixel. Means go in as they
-    are, spreads x as ln(1 + x / SPREAD).
+    Of each group: noise, mean deviation, gradient, deviation of the pixel and of the block around, values of the pixel,
+    their mean over the block; last, 1 / `samples`, which are (B, 1, 1, 1). `variance` (B, groups, H, W) is that of the
+    noise in features. Values go in as they are, spreads x as ln(1 + x / SPREAD).
     """
     mean, deviation = block_statistics(features, surface)
     spreads = [group_means(kind(features, surface)) for kind in (noise, mean_deviation, gradients)]

@@ -75,9 +75,7 @@ RAE_TIMES = PaperTable(
     },
     {"EAW": "eaw", "Our": "rae", "SBF": "sbf", "LBF": "lbf", "NFOR": "nfor"},
     where="bench",
-    notes=(
-        "The paper's machine is a Titan X (Pascal); NFOR's a Core i7-7700HQ: the middle of 107 to 121 s.",
-    ),
+    notes=("The paper's machine is a Titan X (Pascal); NFOR's a Core i7-7700HQ: the middle of 107 to 121 s.",),
 )
 
 SVGF_TABLE_1 = PaperTable(
