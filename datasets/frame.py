@@ -181,7 +181,7 @@ class Frame:
         return replace(self, channels=self.channels | mended) if bad else self
 
     def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
-        """The frame with the means of its noisy channels and HIT_CHANNELS and those of `others`, further realisations of it."""
+        """The frame with the means over itself and `others`, further realisations of it, of noise and what it met."""
         frames = [self, *others]
 
         def stacked(name: str) -> Tensor:

@@ -16,11 +16,10 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name
-    for name, channel in CHANNELS.items()
-    if channel.is_image and name not in (*NOISY, *REFERENCES)
+    name for name, channel in CHANNELS.items() if channel.is_image and name not in (*NOISY, *REFERENCES)
 )
-OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient", "hit_distance")  # of rendering: each makes the channel of its name
+# Steps of rendering, each of which makes the channel of its name.
+OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient", "hit_distance")
 CLIP_HEAD = (
     "clip",
     "frames",

@@ -11,9 +11,11 @@ from scenes.bsdf import Bsdf
 SIZE = 48  # px, at a field of view of 90°
 DISTANCE = 4.0  # of the eye from the wall at z = 0
 FOCAL = SIZE / 2
+Triangles = tuple[tuple[int, int, int], ...]
 GREY: Bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=2)
-BOTH_SIDES = [[0, 1, 2], [0, 2, 3], [6, 5, 4], [7, 6, 4]]
+TO_THE_EYE = ((0, 1, 2), (0, 2, 3))
+TO_THE_WALL = ((6, 5, 4), (7, 6, 4))
 
 
 def plate(
@@ -23,9 +25,9 @@ def plate(
     bsdf: Bsdf = GREY,
     slides: float = 0.0,
     radiance: float | None = None,
-    faces: list[list[int]] = BOTH_SIDES,
+    faces: Triangles = (*TO_THE_EYE, *TO_THE_WALL),
 ) -> Shape:
-    """A square parallel to the wall, of two sides, that slides to the right by so much a frame."""
+    """A square parallel to the wall that slides to the right by so much a frame. `faces` are its sides, or one."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) * side / 2
     mesh = trimesh.Trimesh(np.concatenate([corners, corners]), faces, process=False)
     start = np.array(place, float)

@@ -9,12 +9,10 @@ from render.hit_distance import HIT_CHANNELS, hit_channels
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.registry import build_scene
-from tests.helpers.plates import DISTANCE, frames_of, plate
+from tests.helpers.plates import DISTANCE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
 
 HEIGHT = 2.0  # of the lamp over the wall
 SIDE = 0.8  # of the lamp
-TO_THE_WALL = [[6, 5, 4], [7, 6, 4]]
-TO_THE_EYE = [[0, 1, 2], [0, 2, 3]]
 WALL = plate("a wall", 20, (0, 0, 0), faces=TO_THE_EYE)
 LAMP = plate("c lamp", SIDE, (2.5, 0, HEIGHT), radiance=50, faces=TO_THE_WALL)
 
