@@ -63,4 +63,5 @@ TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to th
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
 NOISY = ("direct", "indirect")
 HIT_CHANNELS = ("hit_distance", "light_distance", "light_angle")  # of the samples in NOISY; 0 where none met anything
+SAMPLED = (*NOISY, *HIT_CHANNELS)  # which each noise realisation has of its own
 REFERENCES = ("direct_reference", "indirect_reference")

@@ -1,8 +1,8 @@
 """AAF: axis-aligned filtering of soft shadows (Mehta et al. 2012) and of indirect light (Mehta et al. 2013).
 
 Frequency analysis says how fast light can vary along a surface: the faster, the nearer the blocker to the surface and
-the larger the light; the faster, the nearer what indirect rays hit. So each pixel has a Gaussian of its own, as wide as
-light varies slowly, measured in the plane of the surface and applied along rows and then along columns.
+the smaller the light; the faster, the nearer what indirect rays hit. So each pixel has a Gaussian of its own, as wide
+as light varies slowly, measured in the plane of the surface and applied along rows and then along columns.
 
 "Axis-Aligned Filtering for Interactive Sampled Soft Shadows", and "... for Interactive Physically-Based Diffuse
 Indirect Lighting". Theirs are the widths
