@@ -47,6 +47,12 @@ def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return means_of(close, mesh_sums(close, mesh_id, 3))
 
 
+def mesh_least(image: Tensor, mesh_id: Tensor) -> Tensor:
+    """The least of each channel of the image (B, C, H, W) over the pixel's own mesh, of 3 x 3 pixels."""
+    same = shifted(mesh_id + 1, 1) == mesh_id[:, :, None] + 1
+    return torch.where(same, shifted(image, 1), torch.inf).amin(dim=2)
+
+
 def mesh_variance(image: Tensor, mesh_id: Tensor) -> Tensor:
     """Variance (B, C, H, W) of each channel of the image over the pixel's own mesh, over 9 x 9 pixels as in mesh_means.
 

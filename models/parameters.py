@@ -36,6 +36,13 @@ FARTHEST = 1e30  # the distance to what is no surface
 RIDGE = 1e-5  # of the sum of weights, in squared units of features
 LARGEST_FITTED = 1e13  # irradiance; fits extrapolate it, and squares of that must stay finite
 
+# --- AAF (Mehta et al. 2012, 2013) ------------------------------------------------------------------------------------
+
+DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
+AAF_REACH = 50  # px
+AAF_TRUNCATION = 8**0.5  # standard deviations at which Gaussians end
+AAF_LEAST_COSINE = 0.99619  # of 5°, between normals
+
 # --- Weight-shared kernels (Fan et al. 2021) --------------------------------------------------------------------------
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3

@@ -7,6 +7,7 @@ import torch
 
 from datasets.frame import Signal
 from errors import BadInput
+from models.aaf import AAF
 from models.adaptive import adaptive
 from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
@@ -38,6 +39,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "asvgf": ASVGF,
     "trmv": TRMV,
     "bmfr": BMFR,
+    "aaf": AAF,
     "sbf": SBF,
     "nfor": NFOR,
     "oidn": OIDN,

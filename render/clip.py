@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from render.gbuffer import render_gbuffer
 from render.gradient import Samples
+from render.hit_distance import HIT_CHANNELS, hit_channels
 from render.motion import dual_motion_vectors
 from render.path import PathTracer
 from render.stage import Stage
@@ -128,6 +129,7 @@ def render_clip(
     wants_dual = channels is None or "dual_motion" in channels
     wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
     wants_gradient = channels is None or "gradient" in channels
+    wants_hits = channels is None or not HIT_CHANNELS.isdisjoint(channels)
     samples: Samples | None = None  # of the frame before
     before: View | None = None
     timer = StepTimer()
@@ -140,6 +142,10 @@ def render_clip(
         seeds = [stream_seed(seed, shift, NOISY_STREAM, i) for i in range(sampling.realisations)]
         noisy = [noisy_tracer.radiance(ray, noisy_seed, spp, first) for noisy_seed in seeds]
         timer.lap("noisy")
+        if wants_hits:
+            hits = [hit_channels(noisy_tracer, view, noisy_seed, spp, first) for noisy_seed in seeds]
+            arrays |= {name: np.stack([each[name] for each in hits]) for name in HIT_CHANNELS}
+            timer.lap("hit_distance")
         if wants_tracked:
             met = causes(noisy_tracer, view, seeds[0], first)
             arrays |= tracked_motion(met, arrays, view, before or view)

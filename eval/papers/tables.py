@@ -58,7 +58,7 @@ RAE_FIG_8 = PaperTable(
         "SBF": {"rmse": (0.044, 0.060, 0.057, 0.087, 0.072), "ssim": (0.818, 0.502, 0.649, 0.575, 0.610)},
         "Our": {"rmse": (0.014, 0.016, 0.034, 0.055, 0.040), "ssim": (0.984, 0.953, 0.843, 0.844, 0.909)},
     },
-    {"EAW": "eaw", "SBF": "sbf", "Our": "rae"},
+    {"AAF": "aaf", "EAW": "eaw", "SBF": "sbf", "Our": "rae"},
     notes=("The paper's EAW filters single frames, as sbf does; eaw filters accumulated ones.",),
 )
 

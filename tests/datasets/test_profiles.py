@@ -7,7 +7,7 @@ import pytest
 
 from datasets import pilots
 from datasets.adaptive_spp import noise_of_reference, samples_needed
-from datasets.channels import CHANNELS, MOTION_CHANNELS
+from datasets.channels import CHANNELS, HIT_CHANNELS, MOTION_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
@@ -195,7 +195,17 @@ def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
 
 def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
     clip = static_box(lean, "train")
-    names = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS, "gradient")
+    names = (
+        "emission",
+        "albedo",
+        "normal",
+        "depth",
+        "roughness",
+        "mesh_id",
+        *MOTION_CHANNELS,
+        "gradient",
+        *HIT_CHANNELS,
+    )
     assert set(AUXILIARY_CHANNELS) == set(names)
     stored = sum(stored_size(clip, name) for name in names)
     full = sum(size_in_full(clip, name) for name in names)
