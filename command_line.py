@@ -73,7 +73,7 @@ def dataset(
     Args:
         scene: instead of a profile, a scene of your own, as docs/scenes.md describes it. What of its file is not
             honoured is listed first.
-        reads: render for training only what these denoisers read, or else all known ones.
+        reads: render for training only what these denoisers read, or else all networks that can be trained.
         part: render only the K-th of N disjoint shares, to spread the work over machines.
         ray: render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach
             the data set's folder under the same path.
@@ -83,6 +83,7 @@ def dataset(
     from datasets.generate import Share, generate, render_here
     from models.registry import channels_read
     from render.clip import Options
+    from train.recipes import TRAINABLE
 
     if ray:
         from datasets.cluster import render_on_cluster
@@ -91,7 +92,13 @@ def dataset(
     options = Options(halton, regularise)
     render = render_on_cluster if ray else render_here
     rendered = generate(
-        folder, str(scene.resolve()) if scene else profile, seed, share, channels_read(reads), options, render
+        folder,
+        str(scene.resolve()) if scene else profile,
+        seed,
+        share,
+        channels_read(reads or TRAINABLE),
+        options,
+        render,
     )
     print(f"{folder}: {rendered} clips rendered")
 

@@ -10,9 +10,9 @@ class Channel(NamedTuple):
     """
 
     axes: tuple[str | int, ...]
-    dtype: str  # as stored; radiance is float32 where float16 would lose precision
+    dtype: str  # as stored, unless it widens
     unit: str
-    radiance: bool = False
+    widens: bool = False  # to float32 where float16 would lose precision
 
     @property
     def components(self) -> int:
@@ -39,13 +39,13 @@ LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (I
 ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
 CHANNELS: dict[str, Channel] = {
-    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "direct_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "indirect_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
-    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE_UNIT, radiance=True),
+    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "direct_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "indirect_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
+    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
     "albedo": Channel(("F", "H", "W", 3), "<f2", "1"),
     "normal": Channel(("F", "H", "W", 3), "<f2", "1"),
     "depth": Channel(("F", "H", "W", 1), "<f4", "world units"),
@@ -55,7 +55,10 @@ CHANNELS: dict[str, Channel] = {
     "dual_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
     "shadow_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
     "reflection_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
-    "gradient": Channel(("F", "H", "W", 2), "<f2", RADIANCE_UNIT, radiance=True),
+    "gradient": Channel(("F", "H", "W", 2), "<f2", RADIANCE_UNIT, widens=True),
+    "hit_distance": Channel(("F", "S", "H", "W", 2), "<f2", "world units", widens=True),
+    "light_distance": Channel(("F", "S", "H", "W", 1), "<f2", "world units", widens=True),
+    "light_angle": Channel(("F", "S", "H", "W", 1), "<f2", "rad", widens=True),
     "K": Channel(("F", 3, 3), "<f8", "px"),
     "camera_to_world": Channel(("F", 4, 4), "<f8", "world units"),
     "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
@@ -66,9 +69,8 @@ MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
 TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
 CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
 NOISY = ("direct", "indirect")
-HALVES = {
-    "direct": "direct_halves",
-    "indirect": "indirect_halves",
-}  # of noisy channels, where samples are in two halves
+HIT_CHANNELS = ("hit_distance", "light_distance", "light_angle")  # of the samples in NOISY; 0 where none met anything
+SAMPLED = (*NOISY, *HIT_CHANNELS)  # which each noise realisation has of its own
+HALVES = {"direct": "direct_halves", "indirect": "indirect_halves"}  # the samples of noisy channels, in two halves
 USUAL_CHANNELS = tuple(name for name in CHANNELS if name not in HALVES.values())  # halves are stored where asked for
 REFERENCES = ("direct_reference", "indirect_reference")

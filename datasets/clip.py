@@ -107,7 +107,7 @@ class Clip:
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
             leading = (2,) if spec.has_halves else ()
-            value = np.array(entry["value"], "<f4" if spec.radiance else spec.dtype)
+            value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
             return np.broadcast_to(value, (*leading, *area, spec.components))
         if "derived" in entry:
             return self.motion_to(frame, max(frame - 1, 0), window)

@@ -27,6 +27,9 @@ COMPONENTS = {
     "shadow_motion": "XY",
     "reflection_motion": "XY",
     "gradient": "XY",
+    "hit_distance": "XY",
+    "light_distance": "Z",
+    "light_angle": "Y",
 }
 HALVES = ("_a", "_b")  # endings of the two layers of a channel that has halves
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits

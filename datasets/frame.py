@@ -14,6 +14,7 @@ from datasets.channels import (
     CAMERA_CHANNELS,
     CHANNELS,
     HALVES,
+    HIT_CHANNELS,
     MOTION_CHANNELS,
     NOISY,
     REFERENCES,
@@ -34,6 +35,11 @@ def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
     rounding that 1/64 px allows for.
     """
     return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
+
+
+def mean_where_met(met: Tensor) -> Tensor:
+    """The mean along the first axis of what samples met, of those that met anything: that are not 0."""
+    return met.sum(dim=0) / (met > 0).sum(dim=0).clamp(min=1)
 
 
 @dataclass(frozen=True)
@@ -177,13 +183,15 @@ class Frame:
         return replace(self, channels=self.channels | mended) if bad else self
 
     def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
-        """The frame with the means of its noisy channels and those of `others`, further realisations of it."""
+        """The frame with the means over itself and `others`, further realisations of it, of noise and what it met."""
         frames = [self, *others]
-        noisy = {
-            name: torch.stack([frame.channels[name] for frame in frames]).mean(dim=0)
-            for name in self.channels.keys() & set(NOISY)
-        }
-        return replace(self, channels=self.channels | noisy, spp=len(frames) * self.samples)
+
+        def stacked(name: str) -> Tensor:
+            return torch.stack([frame.channels[name] for frame in frames])
+
+        means = {name: stacked(name).mean(dim=0) for name in self.channels.keys() & set(NOISY)}
+        means |= {name: mean_where_met(stacked(name)) for name in self.channels.keys() & set(HIT_CHANNELS)}
+        return replace(self, channels=self.channels | means, spp=len(frames) * self.samples)
 
     @property
     def has_halves(self) -> bool:

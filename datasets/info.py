@@ -7,7 +7,7 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, NOISY, REFERENCES, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
@@ -16,11 +16,10 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name
-    for name, channel in CHANNELS.items()
-    if channel.is_image and (not channel.radiance or name in ("emission", "gradient"))
+    name for name, channel in CHANNELS.items() if channel.is_image and name not in (*NOISY, *REFERENCES)
 )
-OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient")  # of rendering: each makes the channel of its name
+# Steps of rendering, each of which makes the channel of its name.
+OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient", "hit_distance")
 CLIP_HEAD = (
     "clip",
     "frames",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
-from datasets.channels import NOISY, REFERENCES
+from datasets.channels import REFERENCES, SAMPLED
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
 from datasets.shading import WanderingEdge
@@ -114,8 +114,9 @@ class TrainingSequences(TorchDataset[list[Frame]]):
             previous = playback[max(t - 1, 0)]
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
             if together > 1:
+                sampled = [name for name in self.channels if name in SAMPLED]
                 frame = frame.with_more_samples(
-                    [read_frame(clip, position, NOISY, i, window=window) for i in chosen[1:]]
+                    [read_frame(clip, position, sampled, i, window=window) for i in chosen[1:]]
                 )
             if edge is not None:
                 light = edge.light(t, *frame.size)

@@ -34,7 +34,7 @@ class RawChannel:
         self.nonfinite = 0
         self.first_pixel: NDArray[Any] | None = None  # of an image
         self.constant = self.channel.is_image  # whether all pixels so far are equal
-        self.half_loses = False  # whether float16 would lose precision of radiance
+        self.half_loses = False  # whether float16 would lose precision of what widens
 
     def add(self, array: NDArray[Any]) -> NDArray[Any]:
         """Append one frame, with the channel's axes but F. Non-finite numbers are counted and become 0.
@@ -50,7 +50,7 @@ class RawChannel:
             self.frame_shape = array.shape
             self.first_pixel = array[(0,) * (array.ndim - 1)] if self.channel.is_image else None
         self.constant = self.constant and bool((array == self.first_pixel).all())
-        if self.channel.radiance:
+        if self.channel.widens:
             with np.errstate(over="ignore"):
                 error = np.abs(array.astype("<f2").astype("<f8") - array).sum()
             self.half_loses |= not error <= HALF_PRECISION * np.abs(array).sum(dtype=np.float64)
@@ -65,7 +65,7 @@ class RawChannel:
         return np.fromfile(self.path, dtype, count, offset=frame * count * dtype.itemsize).reshape(self.frame_shape)
 
     def storage_dtype(self) -> str:
-        """float32 for radiance of which float16 would round some frame worse than it rounds normal numbers."""
+        """float32 for what widens, where float16 would round some frame worse than it rounds normal numbers."""
         return "<f4" if self.half_loses else self.channel.dtype
 
     def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:

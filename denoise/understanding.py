@@ -44,6 +44,10 @@ def understand(
         )
     if "shadow_motion" in reads:
         raise BadInput("trmv reads where shadows and reflections were, which only onespp's own renders have: use svgf")
+    if "hit_distance" in reads:
+        raise BadInput(
+            "aaf reads how far rays went and how large lights look, which only onespp's renders have: use sbf"
+        )
     first, _ = read_pixels(shots[0][0], sources)
     reading = camera_kind(first)
     words = [(quantity, found_in_words(sources, quantity)) for quantity in KNOWN if sources.has(quantity)]

@@ -17,7 +17,8 @@ from models.weights import load_weights
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
-AROUND = {registry.ADAPTIVE: "models.adaptive", registry.TAA: "models.taa"}  # where the parts of a name are defined
+# Where the parts of a name are defined.
+AROUND = {registry.ADAPTIVE: "models.adaptive", registry.TAA: "models.taa", registry.SHRINKING: "models.shrinkage"}
 OF_BUDGET = re.compile(r"([^@+]+)@([^@+]+)(\+.*)?")  # NAME@BUDGET
 
 

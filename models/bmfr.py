@@ -35,6 +35,7 @@ from models.compiled import bmfr as kernels
 from models.denoiser import CLASSICAL, State, matching_state
 from models.parameters import BLOCK_SIDE, FLATTEST, REGRESSORS
 from models.reprojection import reproject
+from models.surfaces import positions_around_eye, ray_axes
 
 NOISE = 0.01  # largest, of what is added to features against rank deficiency
 SMALLEST_SECOND_ALPHA = 0.1  # weight of the newest fit in a long history
@@ -90,14 +91,6 @@ class Blocks:
         return image[:, :, above : above + height, left : left + width]
 
 
-def positions_around_eye(depth: Tensor, axes: Tensor) -> Tensor:
-    """Where surfaces are, (B, 3, H, W) in float64: along the world's axes, from the camera. See `regress`."""
-    height, width = depth.shape[-2:]
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)]).to(axes)
-    return torch.einsum("bij,jhw->bihw", axes, pixels) * depth
-
-
 def features(normal: Tensor, position: Tensor, surface: Tensor) -> Tensor:
     """The features (N, 1024, 10) of blocks, from normals and positions (N, 1024, 3), 0 off surfaces (N, 1024, 1)."""
     low = torch.where(surface, position, torch.inf).amin(dim=1, keepdim=True)
@@ -111,7 +104,7 @@ def features(normal: Tensor, position: Tensor, surface: Tensor) -> Tensor:
 def regress(irradiance: Tensor, normal: Tensor, depth: Tensor, axes: Tensor, noise: Tensor, offset: Offset) -> Tensor:
     """Irradiance (B, 3, H, W), fitted in each block by the features with `noise` (1024, 10), made of those without.
 
-    axes (B, 3, 3), in float64, times (x, y, 1) is where the ray through there leads at depth 1, along the world's axes.
+    `axes` (B, 3, 3) are the camera's ray_axes.
     """
     blocks = Blocks((depth.shape[-2], depth.shape[-1]), offset)
     surface = blocks.split(depth) > 0
@@ -140,7 +133,7 @@ class BMFR(Accumulating):
         before = matching_state(state, BMFRState, frame)
         history = self.accumulated(frame, before)
         number = before.frames if before else 0
-        axes = frame.now.camera_to_world[:, :3, :3] @ torch.linalg.inv(frame.now.K)
+        axes = ray_axes(frame.now)
         noise = feature_noise(number).to(axes)
         fitted = regress(history.irradiance, frame.normal, frame.depth, axes, noise, grid_offset(number))
         fitted = fitted.clamp(0, LARGEST)

@@ -17,6 +17,7 @@ def shifted(x: Tensor, step: int) -> Tensor:
     return taps.view(batch, channels, 9, height, width)
 
 
+@compiled.by(kernels.mesh_sums)
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
     """Sums (B, C, H, W) over those of the 3 x 3 taps that lie on the pixel's own mesh."""
     same = shifted(mesh_id + 1, step) == mesh_id[:, :, None] + 1
@@ -45,6 +46,12 @@ def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     close = mesh_sums(summands(image), mesh_id, 1)
     return means_of(close, mesh_sums(close, mesh_id, 3))
+
+
+def mesh_least(image: Tensor, mesh_id: Tensor) -> Tensor:
+    """The least of each channel of the image (B, C, H, W) over the pixel's own mesh, of 3 x 3 pixels."""
+    same = shifted(mesh_id + 1, 1) == mesh_id[:, :, None] + 1
+    return torch.where(same, shifted(image, 1), torch.inf).amin(dim=2)
 
 
 def mesh_variance(image: Tensor, mesh_id: Tensor) -> Tensor:

@@ -36,6 +36,13 @@ FARTHEST = 1e30  # the distance to what is no surface
 RIDGE = 1e-5  # of the sum of weights, in squared units of features
 LARGEST_FITTED = 1e13  # irradiance; fits extrapolate it, and squares of that must stay finite
 
+# --- AAF (Mehta et al. 2012, 2013) ------------------------------------------------------------------------------------
+
+DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
+AAF_REACH = 50  # px
+AAF_TRUNCATION = 8**0.5  # standard deviations at which Gaussians end
+AAF_LEAST_COSINE = 0.99619  # of 5°, between normals
+
 # --- Weight-shared kernels (Fan et al. 2021) --------------------------------------------------------------------------
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # §5.3
@@ -49,6 +56,14 @@ LEAST_WEIGHT = 1e-30  # no sum of weights is smaller but 0
 # --- NBGD (Meng et al. 2020) ------------------------------------------------------------------------------------------
 
 GUIDES = 256  # values of a guide, which cells of a grid divide as they divide pixels
+
+# --- LBF (Kalantari et al. 2015) --------------------------------------------------------------------------------------
+
+FILTER_RADIUS = 27  # px: windows of 55 x 55
+GROUPS = (3, 3, 3, 1, 1)  # channels of each feature: position, normal, albedo, roughness, visibility
+COLOUR_SHARPNESS = 1 / (2 * 7**2)  # 1 / 2 β²
+LEAST_VARIANCE = 1e-30  # of colours, to divide by; far below that of any noise
+LARGEST_EXPONENT = 80.0  # what would weigh less than exp(-80) counts as that much
 
 # --- one --------------------------------------------------------------------------------------------------------------
 

@@ -16,17 +16,20 @@ from models import compiled
 from models.compiled import pixel_kernels as kernels
 
 
-def kernel_taps(logits: Tensor) -> Iterator[tuple[int, Any, Any]]:
-    """Of each tap t: its index, the pixels p for which p + t is inside the image, and these p + t, as indices."""
-    size = math.isqrt(logits.shape[1])
-    height, width = logits.shape[-2:]
-    for index in range(size * size):
-        dy = index // size - size // 2
-        dx = index % size - size // 2
+def window_taps(side: int, height: int, width: int) -> Iterator[tuple[int, Any, Any]]:
+    """Of each tap t of a window, row by row: its index, the pixels p with p + t inside, and these p + t, as indices."""
+    for index in range(side * side):
+        dy = index // side - side // 2
+        dx = index % side - side // 2
         if abs(dy) < height and abs(dx) < width:
             here = (slice(max(0, -dy), height - max(0, dy)), slice(max(0, -dx), width - max(0, dx)))
             there = (slice(max(0, dy), height + min(0, dy)), slice(max(0, dx), width + min(0, dx)))
             yield index, (..., *here), (..., *there)
+
+
+def kernel_taps(logits: Tensor) -> Iterator[tuple[int, Any, Any]]:
+    """The taps of the kernels that logits (B, k², H, W) stand for."""
+    return window_taps(math.isqrt(logits.shape[1]), logits.shape[-2], logits.shape[-1])
 
 
 def tap_logit(logits: Tensor, index: int, here: Any, there: Any, surface: Tensor | None) -> Tensor:

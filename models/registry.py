@@ -7,6 +7,7 @@ import torch
 
 from datasets.frame import Signal
 from errors import BadInput
+from models.aaf import AAF
 from models.adaptive import adaptive
 from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
@@ -14,6 +15,7 @@ from models.bmfr import BMFR
 from models.denoiser import Denoiser
 from models.eaw import EAW
 from models.fastest import bfloat16_pays
+from models.lbf import LBF
 from models.nbgd import NBGD
 from models.nfor import NFOR
 from models.ntd import NTD, NTDMean, NTDTraditional
@@ -21,6 +23,7 @@ from models.oidn import OIDN, OIDNAccumulated
 from models.one import One
 from models.rae import RAE
 from models.sbf import SBF
+from models.shrinkage import shrinking
 from models.svgf import SVGF
 from models.taa import antialiased, inner_denoiser
 from models.trmv import TRMV
@@ -29,6 +32,7 @@ from models.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
 
 TAA = "+taa"
 ADAPTIVE = "+adaptive"
+SHRINKING = "+js"
 DENOISERS: dict[str, type[Denoiser]] = {
     "noisy": Noisy,
     "accumulated": Accumulated,
@@ -37,6 +41,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "asvgf": ASVGF,
     "trmv": TRMV,
     "bmfr": BMFR,
+    "aaf": AAF,
     "sbf": SBF,
     "nfor": NFOR,
     "oidn": OIDN,
@@ -48,6 +53,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "kp": KP,
     "mr-kp": MRKP,
     "nbgd": NBGD,
+    "lbf": LBF,
     "ntd-a": NTDTraditional,
     "ntd-b": NTD,  # trained without the occlusion loss
     "ntd": NTD,
@@ -58,23 +64,26 @@ DENOISERS: dict[str, type[Denoiser]] = {
 
 def plain_name(name: str) -> str:
     """The name of the denoiser alone, without what is done before and after it: what its weights are called."""
-    return name.removesuffix(TAA).removesuffix(ADAPTIVE)
+    return name.partition("+")[0]
 
 
 def denoiser_class(name: str) -> type[Denoiser]:
     """The class of a denoiser, which tells what it reads and refuses. Raises BadInput for an unknown name.
 
     A name that ends in "+adaptive" means that denoiser on adaptively accumulated frames, which is another BadInput
-    where it does not accumulate; one that ends in "+taa", with temporal antialiasing after it.
+    where it does not accumulate; one that ends in "+taa", with temporal antialiasing after it; and one that ends in
+    "+js", with shrinkage last of all.
     """
+    if name.endswith(SHRINKING):
+        return shrinking(denoiser_class(name.removesuffix(SHRINKING)))  # type: ignore[arg-type]
     if name.endswith(TAA):
         return antialiased(denoiser_class(name.removesuffix(TAA)))  # type: ignore[arg-type]  # classes are hashable
     if name.endswith(ADAPTIVE):
         return adaptive(denoiser_class(name.removesuffix(ADAPTIVE)))  # type: ignore[arg-type]
     if name not in DENOISERS:
         raise BadInput(
-            f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA}, "
-            f"and those that accumulate with {ADAPTIVE}"
+            f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with {TAA} "
+            f"and {SHRINKING}, and those that accumulate with {ADAPTIVE}"
         )
     return DENOISERS[name]
 

@@ -33,6 +33,19 @@ def rays(K: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], dim=-1)
 
 
+def ray_axes(cameras: Cameras) -> Tensor:
+    """What times (x, y, 1) is where the ray through there leads at depth 1, along the world's axes: (B, 3, 3)."""
+    return cameras.camera_to_world[:, :3, :3] @ torch.linalg.inv(cameras.K)
+
+
+def positions_around_eye(depth: Tensor, axes: Tensor) -> Tensor:
+    """Where surfaces are, (B, 3, H, W) in float64: along the world's axes, from the camera, by its ray_axes."""
+    height, width = depth.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y, torch.ones_like(x)]).to(axes)
+    return torch.einsum("bij,jhw->bihw", axes, pixels) * depth
+
+
 def inverse_pose(matrix: Tensor) -> Tensor:
     """Inverse of rigid transforms (..., 4, 4)."""
     inverse = torch.zeros_like(matrix)

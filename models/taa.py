@@ -13,6 +13,7 @@ from datasets.frame import Frame, Signal
 from models.denoiser import Denoiser, State, matching_state
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
+from models.shrinkage import Shrunk
 from models.surfaces import Surfaces
 
 NEWEST = 0.1  # weight of the current frame
@@ -147,5 +148,7 @@ def antialiased(kind: type[Denoiser]) -> type[Antialiased]:
 
 
 def inner_denoiser(denoiser: Denoiser) -> Denoiser:
-    """The denoiser without antialiasing."""
-    return denoiser.inner if isinstance(denoiser, Antialiased) else denoiser
+    """The denoiser without what is done to its output."""
+    while isinstance(denoiser, Antialiased | Shrunk):
+        denoiser = denoiser.inner
+    return denoiser

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from render.gbuffer import render_gbuffer
 from render.gradient import Samples
+from render.hit_distance import HIT_CHANNELS, hit_channels
 from render.motion import dual_motion_vectors
-from render.path import PathTracer
+from render.path import Draw, PathTracer
 from render.stage import Stage
 from render.tracking import causes, tracked_motion
 from scenes.animation import Scene
@@ -130,42 +131,45 @@ def render_clip(
     wants_dual = channels is None or "dual_motion" in channels
     wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
     wants_gradient = channels is None or "gradient" in channels
+    wants_hits = channels is None or not HIT_CHANNELS.isdisjoint(channels)
     wants_halves = channels is not None and "direct_halves" in channels and sampling.noisy_spp % 2 == 0
-    parts = 2 if wants_halves else 1  # in which the samples of a noisy frame are drawn, with a seed each
+    streams = (NOISY_STREAM, OTHER_HALF_STREAM) if wants_halves else (NOISY_STREAM,)
+    spp = sampling.noisy_spp // len(streams)
     samples: Samples | None = None  # of the frame before
     before: View | None = None
     timer = StepTimer()
     for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
         ray = stage.rays(view)
-        spp = sampling.noisy_spp // parts
         # A Halton cycle goes on from frame to frame with the shift of its realisation.
         first = frame * sampling.noisy_spp if halton else 0
         shift = 0 if halton else frame
-        seeds = [
-            [stream_seed(seed, shift, stream, i) for stream in (NOISY_STREAM, OTHER_HALF_STREAM)[:parts]]
+        draws = [
+            [Draw(stream_seed(seed, shift, stream, i), spp, first + part * spp) for part, stream in enumerate(streams)]
             for i in range(sampling.realisations)
         ]
-        drawn = np.array(
-            [[noisy_tracer.radiance(ray, own, spp, first + i * spp) for i, own in enumerate(each)] for each in seeds]
-        )
-        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, parts, H, W, 3)
+        drawn = np.array([[noisy_tracer.radiance(ray, *draw) for draw in each] for each in draws])
+        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, halves, H, W, 3)
         arrays |= {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
         arrays |= {"direct_halves": direct, "indirect_halves": indirect} if wants_halves else {}
         timer.lap("noisy")
+        if wants_hits:
+            hits = [hit_channels(noisy_tracer, view, each) for each in draws]
+            arrays |= {name: np.stack([each[name] for each in hits]) for name in HIT_CHANNELS}
+            timer.lap("hit_distance")
         if wants_tracked:
-            met = causes(noisy_tracer, view, seeds[0][0], first)
+            met = causes(noisy_tracer, view, draws[0][0].seed, first)
             arrays |= tracked_motion(met, arrays, view, before or view)
             before = view
             timer.lap("shadow_motion")
         if wants_gradient:
             still = np.zeros((height, width, 2))
             arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still
-            drawn_by = {"seed": seeds[0][0], "spp": spp, "first": first}
+            drawn_by = draws[0][0]._asdict()
             choice = stream_seed(seed, frame, GRADIENT_STREAM, 0)
             samples = Samples.of(arrays, direct[0, 0], indirect[0, 0], view, stage.poses, drawn_by, choice)
             timer.lap("gradient")
-        spp = sampling.reference_spp // 2
-        halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), spp) for i in range(2)]
+        half = sampling.reference_spp // 2
+        halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), half) for i in range(2)]
         timer.lap("reference")
         arrays["direct_reference"] = np.stack([direct for direct, _ in halves])
         arrays["indirect_reference"] = np.stack([indirect for _, indirect in halves])

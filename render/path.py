@@ -7,6 +7,8 @@ but the primary ray is traced once however many samples a pixel gets, and the fi
 # In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
 # mypy: disable-error-code="arg-type, call-overload, operator, return-value"
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,6 +129,14 @@ def sample_mean(
 def all_objects(*_: object, **__: object) -> list[object]:
     """What Dr.Jit must know of beside the arguments of a frozen function: objects that kernels might call."""
     return palette()
+
+
+class Draw(NamedTuple):
+    """Which samples of every pixel are drawn."""
+
+    seed: int  # in [0, 2^32): different ones are independent
+    spp: int  # how many
+    first: int = 0  # index of the first, where they follow a sequence
 
 
 class PathTracer:

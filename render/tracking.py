@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
+from render.first_bounce import first_bounce
 from render.materials import registry_index
 from render.path import PathTracer
-from render.sampler import hash32
 from scenes.camera import FAR_OUTSIDE, Array, View, move, pixel_centres, project, unproject
 
 
@@ -51,20 +51,8 @@ def causes(tracer: PathTracer, view: View, seed: int, first: int) -> Causes:
     """What the samples met that `tracer.radiance` draws with this seed. The stage must be posed for `view`'s frame."""
     stage = tracer.stage
     scene = stage.mitsuba_scene
-    si = scene.ray_intersect(stage.rays(view), mi.RayFlags.All, coherent=True)
-    key = hash32(hash32(tracer.every_pixel) ^ dr.opaque(mi.UInt32, seed))
-    sampler = tracer.draw(key, dr.opaque(mi.UInt32, first), mi.UInt32(1))
-    u_emitter = sampler.next_2d()
-    u_lobe = sampler.next_1d()
-    u_direction = sampler.next_2d()
-
-    bsdf = si.bsdf()
-    smooth = si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, _ = stage.lights.sample_direction(si, u_emitter, smooth)
-    endless = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
-    faces = smooth & (light.pdf != 0) & (si.to_local(light.d).z * si.wi.z > 0)
+    si, light, _, endless, faces, sample = first_bounce(tracer, view, seed, first)
     blocker = scene.ray_intersect(si.spawn_ray_to(light.p), mi.RayFlags.Minimal, coherent=False, active=faces)
-    sample, _ = bsdf.sample(mi.BSDFContext(), si, u_lobe, u_direction, si.is_valid())
     glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
     mirrors = (sample.pdf > 0) & (glossy | mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection))
     onward = si.spawn_ray(si.to_world(sample.wo))

@@ -6,6 +6,7 @@ from typing import Any
 from datasets.sequences import Augmentation
 from errors import BadInput
 from train.losses.displayed import DisplayedTerms
+from train.losses.lbf import LBFTerms
 from train.losses.nbgd import NBGDTerms
 from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
@@ -43,6 +44,17 @@ NBGD_RECIPE = Recipe(
     length=1,
     crops=(50, 50),
     epochs=100,
+)
+
+# How its authors trained is not known but for their 4 to 64 samples a pixel, all in one network.
+LBF_RECIPE = Recipe(
+    loss=LBFTerms(),
+    rate=1e-2,
+    batch=4,
+    crop=128,
+    length=1,
+    epochs=100,
+    augmentation=Augmentation(samples=True),
 )
 
 NTD_RECIPE = Recipe(
@@ -93,6 +105,14 @@ WSKP_BUDGETS = {
 }
 # In so few steps the authors' rate leaves the weights where they began.
 NBGD_BUDGETS = WSKP_BUDGETS | {"tiny": WSKP_BUDGETS["tiny"] | {"rate": 2e-3}}
+# 436 weights learn from few pixels; each costs thousands of taps.
+LBF_BUDGETS: dict[str, dict[str, Any]] = {
+    "tiny": SHORT | {"epochs": 2, "crop": 32},
+    "quick": SHORT | {"epochs": 1, "crop": 64},
+    "release": RELEASE
+    | {"epochs": 1, "clip": 1.0, "augmentation": Augmentation(rotate=True, exposure=True, samples=True)},
+    "paper": {},
+}
 NTD_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
     "quick": SHORT | {"epochs": 40, "crop": 128},
@@ -117,6 +137,7 @@ PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
     "kp": (WSKP_RECIPE, WSKP_BUDGETS),
     "mr-kp": (WSKP_RECIPE, WSKP_BUDGETS),
     "nbgd": (NBGD_RECIPE, NBGD_BUDGETS),
+    "lbf": (LBF_RECIPE, LBF_BUDGETS),
     "ntd-a": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
     "ntd": (NTD_RECIPE, NTD_BUDGETS),

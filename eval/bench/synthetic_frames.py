@@ -104,6 +104,11 @@ def noisy(rng: np.random.Generator, mean: Array, share: float) -> Array:
     return mean * np.where(rng.random(size) < share, heavy_tailed / share, 0)
 
 
+def met(rng: np.random.Generator, hit: NDArray[np.bool_], share: float) -> Array:
+    """Distances (H, W) that a `share` of the surfaces' samples meet something at; 0 for the others."""
+    return np.where(hit & (rng.random(hit.shape) < share), rng.lognormal(0.0, 0.5, hit.shape), 0)
+
+
 def synthetic_frame(index: int, height: int, width: int) -> Frame:
     """Frame `index` of an endless sequence, with all channels but references. The same bytes whenever it is made."""
     pixels = pixel_centres(height, width)
@@ -136,6 +141,9 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "shadow_motion": motion,
         "reflection_motion": motion,
         "gradient": np.zeros_like(motion),
+        "hit_distance": np.stack([met(rng, hit[..., 0], 1.0), met(rng, hit[..., 0], 0.3)], axis=-1),
+        "light_distance": np.zeros_like(seen.depth)[..., None],
+        "light_angle": np.where(hit, 0.05, 0),
     }
     gain = to_tensor(np.ones((1, 1, 3)))
     tensors = {name: to_tensor(array) for name, array in channels.items()}

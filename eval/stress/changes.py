@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from datasets.channels import MOTION_CHANNELS
+from datasets.channels import HIT_CHANNELS, MOTION_CHANNELS
 from datasets.frame import Cameras, Frame
 
 FrameChange = Callable[[Frame], Frame]
 
 LIGHT_CHANNELS = ("direct", "indirect", "emission")
-SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS)
+SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS, *HIT_CHANNELS)
 
 
 def unchanged(frame: Frame) -> Frame:
@@ -65,8 +65,10 @@ def lengths_times(factor: float) -> FrameChange:
         return Cameras(at.K, at.camera_to_world * factors, at.object_to_world * factors)
 
     def change(frame: Frame) -> Frame:
-        channels = frame.channels | {"depth": factor * frame.depth}
-        return replace(frame, channels=channels, now=cameras(frame.now), previous=cameras(frame.previous))
+        lengths = {name: factor * frame.channels[name] for name in ("depth", "hit_distance", "light_distance")}
+        return replace(
+            frame, channels=frame.channels | lengths, now=cameras(frame.now), previous=cameras(frame.previous)
+        )
 
     return change
 

@@ -9,7 +9,7 @@ from datasets.frame import Frame
 from models.operators import finite
 
 # Filters whose output is a mean of irradiance that they have seen.
-CONVEX = ("eaw", "svgf", "asvgf", "trmv", "sbf", "wskp3", "wskp6", "kp", "one")
+CONVEX = ("eaw", "svgf", "asvgf", "trmv", "sbf", "aaf", "lbf", "wskp3", "wskp6", "kp", "one")
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 
@@ -17,11 +17,11 @@ DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 class IrradianceRange:
     """The irradiance of surfaces that a convex filter has seen since it began: its limits, for each colour.
 
-    SVGF and A-SVGF filter direct and indirect light separately, so its limits are sums of two.
+    Some filter direct and indirect light separately, so its limits are sums of two.
     """
 
     def __init__(self, name: str):
-        self.separate = name in ("svgf", "asvgf")
+        self.separate = name in ("svgf", "asvgf", "trmv", "aaf")
         self.low = torch.tensor(torch.inf)
         self.high = torch.tensor(-torch.inf)
 

@@ -102,6 +102,34 @@ def average(near: Any, around: Any, deviation: Any, close: Any, mesh: Any) -> No
         spread(deviation[y], sums[3], sums[4], sums[SUMS - 1])
 
 
+@jit_parallel
+def sum_taps(sums: Any, image: Any, mesh: Any, step: Any) -> None:
+    """sums (C, H, W) over 3 x 3 taps `step` pixels apart, from image (C, H, W) and mesh (H, W)."""
+    height, width = mesh.shape
+    for row in numba.prange(height):
+        y = np.int64(row)
+        same = np.empty(width, np.float32)
+        sums[:, y] = ZERO
+        for tap in range(9):
+            to = y + (tap // 3 - 1) * step
+            dx = (tap % 3 - 1) * step
+            low = max(0, -dx)
+            high = min(width, width - dx)
+            if to < 0 or to >= height or low >= high:
+                continue
+            compare(same[low:high], mesh[y, low:high], mesh[to, low + dx : high + dx])
+            for c in range(image.shape[0]):
+                add_product(sums[c, y, low:high], same[low:high], image[c, to, low + dx : high + dx])
+
+
+def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
+    """See models.neighbours.mesh_sums."""
+    sums = torch.empty_like(image, memory_format=torch.contiguous_format)
+    for item in range(len(image)):
+        sum_taps(sums[item].numpy(), array(image[item]), array(mesh_id[item, 0]), step)
+    return sums
+
+
 def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """See models.neighbours.mesh_means."""
     batch, _, height, width = image.shape

@@ -8,7 +8,7 @@ import torch
 
 from datasets import pilots
 from datasets.adaptive_spp import noise_of_reference, samples_needed
-from datasets.channels import CHANNELS, HALVES, MOTION_CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, HALVES, HIT_CHANNELS, MOTION_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
@@ -219,7 +219,17 @@ def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
 
 def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
     clip = static_box(lean, "train")
-    names = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS, "gradient")
+    names = (
+        "emission",
+        "albedo",
+        "normal",
+        "depth",
+        "roughness",
+        "mesh_id",
+        *MOTION_CHANNELS,
+        "gradient",
+        *HIT_CHANNELS,
+    )
     assert set(AUXILIARY_CHANNELS) == set(names)
     stored = sum(stored_size(clip, name) for name in names)
     full = sum(size_in_full(clip, name) for name in names)

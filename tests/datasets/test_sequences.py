@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from datasets.channels import CHANNELS, TEMPORAL_CHANNELS
+from datasets.channels import CHANNELS, HIT_CHANNELS, TEMPORAL_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
@@ -278,6 +278,9 @@ def test_means_of_frames_keep_everything_but_the_noise(clips):
     for name in frames[0].channels:
         if name in ("direct", "indirect"):
             torch.testing.assert_close(mean.channels[name], (frames[0].channels[name] + frames[1].channels[name]) / 2)
+        elif name in HIT_CHANNELS:  # of those that met anything
+            both = np.ma.masked_equal([frame.channels[name].numpy() for frame in frames], 0)
+            np.testing.assert_allclose(mean.channels[name], both.mean(axis=0).filled(0), rtol=1e-6)
         else:
             assert torch.equal(mean.channels[name], frames[0].channels[name])
 

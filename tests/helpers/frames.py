@@ -48,6 +48,9 @@ def flat_frame(
     channels["dual_motion"] = channels["motion"].clone()  # nothing is hidden
     channels["shadow_motion"] = channels["reflection_motion"] = channels["motion"]
     channels["gradient"] = torch.zeros(1, 2, height, width)  # and light does not change
+    channels["hit_distance"] = torch.tensor([1.0, 0.5])[None, :, None, None].expand(1, 2, height, width).contiguous()
+    channels["light_distance"] = 2 * ones
+    channels["light_angle"] = 0.2 * ones
     bodies = torch.eye(4, dtype=torch.float64).expand(1, MESHES, 4, 4)
     gain = torch.ones(1, 3, 1, 1)
     return Frame(channels, Cameras(K[None], now, bodies), Cameras(K[None], before, bodies), gain, "test")

@@ -2,38 +2,13 @@
 
 import numpy as np
 import pytest
-import trimesh
 
-from render.clip import Sampling, render_clip
-from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from render.clip import render_clip
 from scenes.registry import build_scene
+from tests.helpers.plates import DISTANCE, FOCAL, SAMPLING, frames_of, plate
 
-SIZE = 48  # px, at a field of view of 90°
-DISTANCE = 4.0  # of the eye from the wall at z = 0
-FOCAL = SIZE / 2
 STEP = 0.1
-GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 MIRROR = {"type": "conductor", "material": "none"}
-SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=2)
-
-
-def plate(name, side, place, bsdf=GREY, slides=0.0, radiance=None):
-    """A square parallel to the wall, of two sides, that slides to the right by so much a frame."""
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) * side / 2
-    mesh = trimesh.Trimesh(
-        np.concatenate([corners, corners]), [[0, 1, 2], [0, 2, 3], [6, 5, 4], [7, 6, 4]], process=False
-    )
-    start = np.array(place, float)
-    track = Track(np.stack([start, start + np.array([3 * slides, 0, 0])]), 0, 3) if slides else Track.constant(start)
-    shine = None if radiance is None else Track.constant([radiance] * 3)
-    return Shape(name, mesh, bsdf, motion=RigidMotion(track, Track.constant(0.0)), radiance=shine)
-
-
-def frames_of(*shapes, eye_slides=0.0, sky=None):
-    """Three frames: the eye looks along -z at a wall at z = 0, which is white or a mirror."""
-    eye = np.array([[0.0, 0, DISTANCE], [3 * eye_slides, 0, DISTANCE]])
-    camera = Camera(Track(eye, 0, 3), Track(eye - [0, 0, 1], 0, 3), Track.constant(90.0))
-    return [arrays for arrays, _ in render_clip(Scene(shapes, camera, sky=sky), 3, SIZE, SIZE, SAMPLING, 1)]
 
 
 def tracked(frame, name, mesh):

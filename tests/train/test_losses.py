@@ -21,6 +21,7 @@ from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
+from train.losses.lbf import LBFLoss, LBFTerms
 from train.losses.nbgd import NBGDLoss, NBGDTerms
 from train.losses.network_loss import surface_mean
 from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
@@ -34,6 +35,7 @@ LOSSES = {
     RAETerms: RAELoss,
     SMAPETerms: SMAPELoss,
     NBGDTerms: NBGDLoss,
+    LBFTerms: LBFLoss,
     NTDTerms: NTDLoss,
     DisplayedTerms: DisplayedLoss,
 }
@@ -158,6 +160,27 @@ def test_losses_of_crops_compare_radiance_as_exposed(batch_of, monkeypatch, name
     output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
     reference = exposure * (frame.direct_reference + frame.indirect_reference + frame.emission[:, None]).mean(1).numpy()
     assert value.item() == pytest.approx(error(output, reference).mean(), rel=1e-4)
+
+
+def test_lbf_loss_by_hand(batch_of, monkeypatch):
+    """The relative MSE of exposed radiance, emission included, times half the samples a pixel."""
+    batch = batch_of("lbf", 2)
+    denoiser = create("lbf")
+    (frame,) = batch.frames
+    frame = replace(frame, spp=torch.tensor([1.0, 4.0])[:, None, None, None])
+    _, state = denoiser.predict(frame, None)
+    guess = torch.rand_like(frame.albedo)
+    monkeypatch.setattr(denoiser, "predict", lambda frame, before: (guess, state))
+    value, _ = LBFLoss(denoiser)(Batch([frame]))
+    exposure = state.scale.exposure().numpy()
+    albedo = np.maximum(frame.albedo.numpy(), 0.01)
+    output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
+    halves = frame.direct_reference + frame.indirect_reference + frame.emission[:, None]
+    reference = exposure * halves.mean(dim=1).numpy()
+    error = (output - reference) ** 2 / (reference**2 + 0.01)
+    surface = np.broadcast_to(frame.depth.numpy() > 0, error.shape)
+    items = [samples / 2 * error[item][surface[item]].mean() for item, samples in enumerate((1, 4))]
+    assert value.item() == pytest.approx(np.mean(items), rel=1e-4)
 
 
 def test_ntd_loss_by_hand(batch_of, monkeypatch):
@@ -497,6 +520,7 @@ SAME_NETWORK = [  # as ntd's
         ("kp", 40, {}, 0.8),
         ("mr-kp", 40, {}, 0.8),
         ("nbgd", 40, {}, 0.8),
+        ("lbf", 40, {}, 0.95),
         ("ntd", 40, {"length": 4}, 0.8),
         ("one", 40, {"length": 4}, 0.8),
         *SAME_NETWORK,
@@ -505,7 +529,7 @@ SAME_NETWORK = [  # as ntd's
 def test_every_network_learns_one_batch(batch_of, name, steps, changes, left):
     """Some steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.
 
-    The other networks begin as filters already, so that less is left to learn.
+    The other networks begin as filters already, so that less is left to learn, and for the few weights of LBF little.
     """
     torch.manual_seed(0)
     loss = recipe_for(name, "tiny").loss.around(create(name)).train()

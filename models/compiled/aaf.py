@@ -1,0 +1,99 @@
+"""models.aaf for the processor: every row by itself, every loop along it vectorised."""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from models import parameters
+from models.compiled.eaw import columns_with_tap, divide
+from models.compiled.exponential import exp
+from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.lines import add_line, add_product, copy_line
+
+LEAST_COSINE = np.float32(parameters.AAF_LEAST_COSINE)
+LARGEST_EXPONENT = np.float32(parameters.AAF_TRUNCATION**2 / 2)
+NEAR = np.float32(2 * parameters.DIFFUSE_BAND)
+REACH = parameters.AAF_REACH
+HALF = np.float32(0.5)
+ZERO = np.float32(0)
+INFINITY = np.float32(np.inf)
+
+
+@jit_in_any_order
+def measure(distance: Any, along: Any, geometry: Any, row: Any, left: Any, dx: Any, dy: Any) -> None:
+    """Squared distances (n) of n pixels of a row to their taps, and in the plane of the surface.
+
+    geometry (6, H, W). They are infinite where normals differ.
+    """
+    right = left + distance.size
+    to = row + dy
+    x, y, z = geometry[0, row, left:right], geometry[1, row, left:right], geometry[2, row, left:right]
+    n_x, n_y, n_z = geometry[3, row, left:right], geometry[4, row, left:right], geometry[5, row, left:right]
+    left += dx
+    right += dx
+    to_x, to_y, to_z = geometry[0, to, left:right], geometry[1, to, left:right], geometry[2, to, left:right]
+    m_x, m_y, m_z = geometry[3, to, left:right], geometry[4, to, left:right], geometry[5, to, left:right]
+    for i in range(distance.size):
+        a = to_x[i] - x[i]
+        b = to_y[i] - y[i]
+        c = to_z[i] - z[i]
+        squared = a * a + b * b + c * c
+        off = a * n_x[i] + b * n_y[i] + c * n_z[i]
+        same = n_x[i] * m_x[i] + n_y[i] * m_y[i] + n_z[i] * m_z[i] > LEAST_COSINE
+        distance[i] = squared if same else INFINITY
+        along[i] = max(squared - off * off, ZERO)
+
+
+@jit_in_any_order
+def weigh(weight: Any, distance: Any, along: Any, width: Any, widest: Any) -> None:
+    """models.aaf.gaussian_weight (n)."""
+    for i in range(weight.size):
+        narrower = min(width[i], widest[i])
+        exponent = HALF * along[i] / (narrower * narrower)
+        reached = distance[i] < NEAR * NEAR * narrower * narrower and exponent <= LARGEST_EXPONENT
+        weight[i] = exp(-min(exponent, LARGEST_EXPONENT)) if reached else ZERO
+
+
+@jit_with_memory
+def filter_row(out: Any, row: Any, image: Any, width: Any, widest: Any, geometry: Any, down: Any) -> None:
+    """A row of out (S, 3, H, W) from image, width and widest (S, H, W)."""
+    signals, _, height, columns = image.shape
+    totals = np.ones((signals, columns), np.float32)
+    space = np.empty((3, columns), np.float32)
+    for s in range(signals):
+        for c in range(3):
+            copy_line(out[s, c, row], image[s, c, row])
+    for step in range(-REACH, REACH + 1):
+        dx, dy = (0, step) if down else (step, 0)
+        left, right = columns_with_tap(row, dx, dy, height, columns)
+        if step == 0 or left >= right:
+            continue
+        distance, along, weight = space[0, : right - left], space[1, : right - left], space[2, : right - left]
+        measure(distance, along, geometry, row, left, dx, dy)
+        for s in range(signals):
+            here, there = width[s, row, left:right], widest[s, row + dy, left + dx : right + dx]
+            weigh(weight, distance, along, here, there)
+            add_line(totals[s, left:right], weight)
+            for c in range(3):
+                add_product(out[s, c, row, left:right], weight, image[s, c, row + dy, left + dx : right + dx])
+    for s in range(signals):
+        for c in range(3):
+            divide(out[s, c, row], out[s, c, row], totals[s])
+
+
+@jit_parallel
+def filter_image(out: Any, image: Any, width: Any, widest: Any, geometry: Any, down: Any) -> None:
+    for row in numba.prange(image.shape[2]):
+        filter_row(out, np.int64(row), image, width, widest, geometry, down)
+
+
+def filter_lines(image: Tensor, width: Tensor, widest: Tensor, geometry: Tensor, down: bool) -> Tensor:
+    """See models.aaf.filter_lines."""
+    out = torch.empty_like(image, memory_format=torch.contiguous_format)
+    for item in range(len(image)):
+        images = array(image[item]), array(width[item, :, 0]), array(widest[item, :, 0]), array(geometry[item, 0])
+        filter_image(out[item].numpy(), *images, down)
+    return out

@@ -1,0 +1,138 @@
+"""A denoiser that converges: NAME+js. James and Stein's shrinkage of noise to the denoised image (Gu et al. 2022).
+
+A denoised image O has less noise than the mean N of a frame's samples, but an error that more samples do not take away.
+Of the images O + ρ (N - O) the one of least squared error has ρ = (Σ (N - O)² - v) / Σ (N - O)² over the pixels of a
+window, where v is the variance of N, and the noise of a pixel has little to do with O there. With two independent
+halves A and B of the samples, (A - B)² / 4 estimates v without bias. So more samples end at the truth, whatever the
+denoiser does, and few of them at the denoiser.
+
+What is ours, by measurement (docs/experiments.md, Shrinkage):
+
+- Irradiance is compared, relative to what is denoised: a window's bright pixels must not speak for the others.
+- Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less one standard error, and the other
+  so far as it differs by more than STANDARD_ERRORS: where noise is large, small windows would let it through. The
+  error is that of Σ a b for noise a and b of two halves, sqrt(Σ 2 v²).
+- ρ is averaged over 3 x 3 pixels of the own mesh.
+
+Without halves, as at one sample a pixel, it is the denoiser itself.
+"""
+
+from collections.abc import Iterable
+from functools import cache
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from datasets.channels import HALVES
+from datasets.frame import Frame, Signal
+from models.denoiser import Denoiser, State
+from models.neighbours import mesh_sums
+from models.operators import image_luminance
+from models.parameters import LEAST_DIVISOR
+
+STANDARD_ERRORS = 3.0
+LARGEST_RATIO = 1e6  # of noise to what is denoised; the square of a square must stay finite
+COMPARED_BY = ("albedo", "depth", "mesh_id")
+DARKEST = 0.01  # of the mean luminance: what is darker is not compared relative to itself
+
+
+class Window(NamedTuple):
+    """Means over a window around each pixel, (B, 3, H, W)."""
+
+    excess: Tensor  # (N - O)² - v: the denoiser's own squared error
+    distance: Tensor  # (N - O)²
+    error: Tensor  # standard error of `excess`
+
+
+def windows(distance: Tensor, variance: Tensor, mesh_id: Tensor) -> tuple[Window, Window]:
+    """Those of 9 x 9 and of 27 x 27 pixels of the own mesh, from squares (B, 3, H, W)."""
+    counted = torch.cat([distance - variance, distance, 2 * variance.square(), torch.ones_like(mesh_id)], dim=1)
+    small = mesh_sums(mesh_sums(counted, mesh_id, 1), mesh_id, 3)
+    return window_of(small), window_of(mesh_sums(small, mesh_id, 9))
+
+
+def window_of(sums: Tensor) -> Window:
+    """From sums (B, 10, H, W) of the three and of the number of pixels."""
+    pixels = sums[:, 9:]
+    excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
+    return Window(excess, distance.clamp(min=LEAST_DIVISOR), (squares / pixels).sqrt())
+
+
+def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor) -> Tensor:
+    """ρ (B, 3, H, W) in [0, 1], from N - O and the variance of N, relative to what is denoised."""
+    small, wide = windows(difference.square(), variance, mesh_id)
+    overall = ((wide.excess - wide.error) / wide.distance).clamp(0, 1)
+    off = small.excess - overall * small.distance
+    doubt = STANDARD_ERRORS * small.error
+    believed = 1 - (doubt / off.abs().clamp(min=LEAST_DIVISOR)).square().clamp(max=1)
+    rho = (overall + believed * off / small.distance).clamp(0, 1)
+    return mesh_means_of(rho, mesh_id)
+
+
+def mesh_means_of(image: Tensor, mesh_id: Tensor) -> Tensor:
+    """Means (B, C, H, W) over 3 x 3 pixels of the own mesh."""
+    sums = mesh_sums(torch.cat([image, torch.ones_like(mesh_id)], dim=1), mesh_id, 1)
+    return sums[:, :-1] / sums[:, -1:]
+
+
+def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
+    """The shrinkage of a frame that has halves to denoised irradiance (B, 3, H, W), as irradiance."""
+    a, b = (frame.half(which).irradiance(signal) for which in (0, 1))
+    luminance = mesh_means_of(image_luminance(denoised), frame.mesh_id)
+    darkest = DARKEST * luminance.mean(dim=(1, 2, 3), keepdim=True)
+    unit = (luminance + darkest).clamp(min=LEAST_DIVISOR)
+    off_a, off_b = (((half - denoised) / unit).clamp(-LARGEST_RATIO, LARGEST_RATIO) for half in (a, b))
+    rho = share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id)
+    return torch.lerp(denoised, (a + b) / 2, rho).clamp(min=0)
+
+
+class Shrunk(Denoiser):
+    """A denoiser of `inner_class` whose output is shrunk to where frames have halves; `shrinking` makes the class.
+
+    Its state is the inner one's.
+    """
+
+    inner_class: ClassVar[type[Denoiser]]
+
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inner = self.inner_class(signal=signal)
+        self.reads = with_halves(self.inner.reads)
+        self.constants = self.inner.constants
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        return cls.inner_class.unavailable()
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        self.inner.prepare(precision)
+        super().prepare(precision)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        output, after = self.inner.forward(frame, state)
+        if not frame.has_halves:
+            return output, after
+        reflected = output - frame.emission if self.signal == "total" else output
+        denoised = (reflected / frame.divisor).clamp(min=0)
+        return frame.remodulate(shrunk(frame, denoised, self.signal), self.signal), after
+
+
+def with_halves(reads: Iterable[str]) -> tuple[str, ...]:
+    """The channels `reads`, the halves of those that have any, and what shrinkage compares them by."""
+    return tuple(dict.fromkeys((*reads, *(HALVES[name] for name in HALVES if name in reads), *COMPARED_BY)))
+
+
+@cache
+def shrinking(kind: type[Denoiser]) -> type[Shrunk]:
+    """The class of denoisers of `kind` whose outputs are shrunk to."""
+
+    class ShrinkingKind(Shrunk):
+        inner_class = kind
+        reads = with_halves(kind.reads)
+        signal = kind.signal
+        refuses = kind.refuses
+        is_network = kind.is_network
+        offline = kind.offline
+
+    return ShrinkingKind

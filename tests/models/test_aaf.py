@@ -1,0 +1,225 @@
+"""AAF: widths against similar triangles, and its two passes against Gaussians in float64."""
+
+import contextlib
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.channels import HIT_CHANNELS
+from datasets.frame import to_tensor
+from eval.bench.synthetic_frames import synthetic_frame
+from models import compiled
+from models.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, pixel_size, positions, widths
+from models.neighbours import mesh_least
+from scenes.camera import View, pixel_centres, unproject
+from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
+from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
+
+WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+DEPTH = 2.0
+PIXEL = DEPTH / FOCAL_LENGTH  # on the wall of flat_frame
+
+
+@pytest.fixture(params=WAYS, autouse=True)
+def way(request):
+    """Every test runs with compiled kernels and the PyTorch way."""
+    with WAYS[request.param]():
+        yield
+
+
+def lit_frame(height=5, width=7, indirect=0.0, blocked=0.0, light=0.0, angle=0.0, roughness=1.0, **others):
+    """A wall whose samples all met the same."""
+    frame = flat_frame(height, width, depth=DEPTH, **others)
+
+    def image(*values):
+        return torch.tensor(values)[None, :, None, None].expand(1, -1, height, width).contiguous()
+
+    hits = {"hit_distance": image(indirect, blocked), "light_distance": image(light), "light_angle": image(angle)}
+    return replace(frame, channels=frame.channels | hits | {"roughness": image(roughness)})
+
+
+def width_of(**met):
+    """For direct and for indirect light, in the middle of a wall, in world units."""
+    direct, indirect = widths(lit_frame(**met))[0, :, 0, 2, 3].tolist()
+    return direct, indirect
+
+
+# --- Widths -----------------------------------------------------------------------------------------------------------
+
+
+def test_rendered_samples_tell_the_penumbra():
+    """Of a square lamp at 2, as much of its side as is seen; its blocker stands at 1.2."""
+    wall = plate("a wall", 20, (0, 0, 0), faces=TO_THE_EYE)
+    lamp = plate("c lamp", 0.8, (2.5, 0, 2.0), radiance=50, faces=TO_THE_WALL)
+    (rendered,) = frames_of(wall, plate("b blocker", 1.2, (1.6, 0, 1.2)), lamp, frames=1)
+    channels = {name: to_tensor(rendered[name][0]) for name in HIT_CHANNELS}
+    frame = replace(flat_frame(SIZE, SIZE), channels=channels)
+    on_wall = (rendered["mesh_id"][..., 0] == 1) & (channels["hit_distance"][0, 1].numpy() > 0)
+    cosine = 2.0 / channels["light_distance"][0, 0].numpy()[on_wall]
+    expected = 0.8 * np.sqrt(cosine) * 1.2 / (2.0 - 1.2) / math.sqrt(12)
+    assert len(expected) > 20
+    np.testing.assert_allclose(penumbra(frame)[0, 0].numpy()[on_wall], expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("height", [0.1, 1.0, 1.9])
+def test_a_penumbra_is_as_wide_as_similar_triangles_say(height):
+    """Of a blocker's edge at `height` over the wall, below a square lamp at 2: across the lamp is seen in part."""
+    lamp = 2.0
+    side = 0.3
+    across = side * height / (lamp - height)  # of the penumbra
+    found = penumbra(lit_frame(blocked=height, light=lamp, angle=side / math.sqrt(12) / lamp))
+    torch.testing.assert_close(found, torch.full_like(found, across / math.sqrt(12)))  # for even light, too
+
+
+def test_the_sun_s_penumbra_grows_with_the_distance_of_the_blocker():
+    found = penumbra(lit_frame(blocked=3.0, light=0.0, angle=0.01))
+    torch.testing.assert_close(found, torch.full_like(found, 0.03))
+
+
+def test_widths_are_the_papers():
+    large = 0.9 / 2.0  # angle of a lamp at 2 with σ = 0.9: σ s = 0.9 at half of the way
+    assert width_of(blocked=1.0, light=2.0, angle=large)[0] == pytest.approx(0.9 / 3)
+    assert width_of(blocked=1e-3, light=2.0, angle=large)[0] == pytest.approx(PIXEL / 3)  # 1 / Ω
+    assert width_of(light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # not blocked
+    assert width_of(blocked=1.9, light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # hardly
+    assert width_of(indirect=0.7)[1] == pytest.approx(0.7 / 5.6)
+    assert width_of(indirect=0.7, roughness=0.5)[1] == pytest.approx(0.7 / (2 * (3.5 + 0.2 * 1.5)))
+    assert width_of(indirect=0.7, roughness=0.0)[1] < 1e-4
+    limit = 50 * PIXEL / math.sqrt(8)
+    for far in ({}, {"indirect": 1e3, "light": 1e3}):
+        assert width_of(**far) == pytest.approx((limit, limit))
+
+
+def test_smoother_surfaces_reflect_finer_detail():
+    bands = band_limit(torch.tensor([1.0, 0.9, 0.5, 0.1, 0.0]))
+    assert bands[0] == pytest.approx(2.8) and (bands.diff() > 0).all() and torch.isfinite(bands).all()
+
+
+def test_the_least_counts_of_what_the_own_mesh_met():
+    mesh = torch.ones(1, 1, 6, 9)
+    mesh[..., 5:] = 2
+    frame = lit_frame(6, 9, indirect=2.0, mesh_id=mesh)
+    frame.channels["hit_distance"][0, 0, 2, 2] = 0.5
+    frame.channels["hit_distance"][0, 0, 2, 5] = 0.1
+    frame.channels["hit_distance"][0, 0, 4, 3] = 0.0  # met nothing
+    found = 5.6 * widths(frame)[0, 1, 0]
+    expected = torch.full((6, 9), 2.0)
+    expected[1:4, 1:4] = 0.5
+    expected[1:4, 5:7] = 0.1
+    torch.testing.assert_close(found, expected)
+    assert mesh_least(torch.full((1, 1, 1, 1), 3.0), torch.zeros(1, 1, 1, 1)).item() == 3
+
+
+def test_positions_are_where_the_camera_s_rays_end():
+    frame = synthetic_frame(7, 20, 30)
+    view = View(*(getattr(frame.now, name)[0].numpy() for name in View._fields))
+    points = unproject(pixel_centres(20, 30), frame.depth[0, 0].numpy().astype(float), view)
+    expected = np.moveaxis(points - view.camera_to_world[:3, 3], -1, 0)
+    hit = frame.depth[0, 0].numpy() > 0
+    np.testing.assert_allclose(positions(frame)[0].numpy()[:, hit], expected[:, hit], atol=1e-5)
+
+
+# --- The filter -------------------------------------------------------------------------------------------------------
+
+
+def test_on_a_wall_two_passes_are_one_gaussian():
+    """Of one width, it is separable: against the sum over the square of both ranges, away from the borders."""
+    size, sigma = 31, 3.0
+    rng = np.random.default_rng(0)
+    image = rng.random((3, size, size))
+    filtered = torch.from_numpy(np.float32(image))[None, None]
+    width = torch.full((1, 1, 1, size, size), sigma * PIXEL)
+    for down in (False, True):
+        filtered = filter_lines(filtered, width, width, pack_geometry(flat_frame(size, size, depth=DEPTH)), down)
+    reach = math.floor(math.sqrt(8) * sigma)
+    offset = np.arange(-reach, reach + 1)
+    kernel = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma**2))
+    for y, x in ((15, 15), (reach, size - 1 - reach)):
+        window = image[:, y - reach : y + reach + 1, x - reach : x + reach + 1]
+        np.testing.assert_allclose(filtered[0, 0, :, y, x], (window * kernel).sum((1, 2)) / kernel.sum(), rtol=1e-5)
+
+
+def naive_weight(geometry, width, p, q):
+    if p == q:
+        return 1.0
+    apart = geometry[:3, *q] - geometry[:3, *p]
+    exponent = (apart @ apart - (apart @ geometry[3:, *p]) ** 2) / (2 * width**2)
+    same = geometry[3:, *p] @ geometry[3:, *q] > math.cos(math.radians(5))
+    return math.exp(-exponent) if same and exponent <= 4 and math.sqrt(apart @ apart) < 5.6 * width else 0.0
+
+
+def naive_pass(image, width, widest, geometry, down):
+    """filter_lines of (3, H, W), (H, W), (H, W) and (6, H, W), pixel by pixel in float64."""
+    out = np.zeros_like(image)
+    for p in np.ndindex(width.shape):
+        line = [(y, p[1]) for y in range(width.shape[0])] if down else [(p[0], x) for x in range(width.shape[1])]
+        weights = [naive_weight(geometry, min(width[p], widest[q]), p, q) for q in line]
+        out[:, *p] = sum(w * image[:, *q] for w, q in zip(weights, line, strict=True)) / sum(weights)
+    return out
+
+
+@settings(max_examples=8, deadline=None)
+@given(size=st.tuples(st.integers(1, 12), st.integers(1, 12)), seed=st.integers(0, 999), down=st.booleans())
+def test_passes_are_gaussians_of_world_distances(size, seed, down):
+    rng = np.random.default_rng(seed)
+    frame = synthetic_frame(seed % 20, *size)
+    frame.channels["normal"] = frame.normal + 0.05 * torch.from_numpy(np.float32(rng.normal(size=(1, 3, *size))))
+    geometry = pack_geometry(frame)
+    image, width, widest = (np.float32(rng.random((c, *size))) for c in (3, 1, 1))
+    tensors = [torch.from_numpy(array)[None, None] for array in (image, width, widest)]
+    found = filter_lines(*tensors, geometry, down)[0, 0]
+    floats = [np.float64(array) for array in (image, width[0], widest[0], geometry[0, 0].numpy())]
+    np.testing.assert_allclose(found, naive_pass(*floats, down), rtol=1e-4)
+
+
+def test_kernels_and_pytorch_agree_over_frames():
+    frames = [synthetic_frame(index, 61, 70) for index in range(2)]
+    fast = run(AAF(), frames)
+    with compiled.disabled():
+        slow = run(AAF(), frames)
+    for a, b in zip(fast, slow, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_shadows_do_not_leak_to_where_filters_are_wide():
+    """A lit wall beside one in a hard shadow: within a pixel of the edge nothing changes."""
+    shaded = torch.arange(40) < 20
+    light = torch.where(shaded, 0.0, 1.0).expand(1, 3, 9, 40).contiguous()
+    frame = lit_frame(9, 40, light=5.0, angle=0.01, irradiance=light)
+    frame.channels["hit_distance"][0, 1, :, :20] = 0.01
+    (output,) = run(AAF(), [frame])
+    torch.testing.assert_close(output[..., :19], light[..., :19])
+    torch.testing.assert_close(output[..., 21:], light[..., 21:])
+
+
+def test_indirect_light_alone_is_filtered_as_in_the_total():
+    frame = synthetic_frame(3, 30, 40)
+    dark = replace(frame, channels=frame.channels | {"direct": torch.zeros_like(frame.direct)})
+    (indirect,) = run(AAF(signal="indirect"), [frame])
+    (total,) = run(AAF(), [dark])
+    torch.testing.assert_close(indirect + frame.emission, total)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    hits=st.tuples(*[st.sampled_from([0.0, 1e-30, 1e-7, 1.0, 65504.0, 3e38])] * 4),
+    depth=st.sampled_from([1e-4, 1.0, 1e6, 3e38]),
+    level=st.sampled_from([0.0, 1e-7, 6e4, 3e38]),
+)
+def test_extremes_stay_within_what_was_there(hits, depth, level):
+    frame = lit_frame(7, 9, *hits, irradiance=torch.full((1, 3, 7, 9), level))
+    frame.channels["depth"] = torch.full((1, 1, 7, 9), depth)
+    frame.direct[0, :, 3, 4] = 1.0
+    (output,) = run(AAF(), [frame])
+    low, high = sorted((min(level, 1e16), 1.0))
+    assert torch.isfinite(output).all()
+    assert low * (1 - 1e-5) <= output.min() and output.max() <= high * (1 + 1e-5)
+
+
+def test_pixels_are_as_large_as_they_lie_far():
+    torch.testing.assert_close(pixel_size(flat_frame(3, 4, depth=DEPTH)), torch.full((1, 1, 3, 4), PIXEL))
