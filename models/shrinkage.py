@@ -9,9 +9,9 @@ denoiser does, and few of them at the denoiser.
 What is ours, by measurement (docs/experiments.md, Shrinkage):
 
 - Irradiance is compared, relative to what is denoised: a window's bright pixels must not speak for the others.
-- Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less one standard error, and the other
-  so far as it differs by more than STANDARD_ERRORS: where noise is large, small windows would let it through. The
-  error is that of Σ a b for noise a and b of two halves, sqrt(Σ 2 v²).
+- Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less STANDARD_ERRORS, and the other so
+  far as it differs by more than as many: where noise is large, chance would let it through. The error is that of
+  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²).
 - ρ is averaged over 3 x 3 pixels of the own mesh.
 
 Without halves, as at one sample a pixel, it is the denoiser itself.
@@ -62,7 +62,7 @@ def window_of(sums: Tensor) -> Window:
 def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor) -> Tensor:
     """ρ (B, 3, H, W) in [0, 1], from N - O and the variance of N, relative to what is denoised."""
     small, wide = windows(difference.square(), variance, mesh_id)
-    overall = ((wide.excess - wide.error) / wide.distance).clamp(0, 1)
+    overall = ((wide.excess - STANDARD_ERRORS * wide.error) / wide.distance).clamp(0, 1)
     off = small.excess - overall * small.distance
     doubt = STANDARD_ERRORS * small.error
     believed = 1 - (doubt / off.abs().clamp(min=LEAST_DIVISOR)).square().clamp(max=1)

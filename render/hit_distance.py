@@ -42,7 +42,9 @@ def met_by_sample(tracer: PathTracer, view: View, seed: int, index: int) -> NDAr
 
 
 def hit_channels(tracer: PathTracer, view: View, draws: Sequence[Draw]) -> dict[str, NDArray[np.float64]]:
-    """HIT_CHANNELS (H, W, C) of the samples that `tracer.radiance` takes in all `draws`. The stage must be posed for the frame.
+    """HIT_CHANNELS (H, W, C) of the samples that `tracer.radiance` takes in all `draws`.
+
+    The stage must be posed for the frame.
 
     Distances in world units, each the mean over the samples that met something, 0 where none did.
 

@@ -24,7 +24,18 @@ def denoisers():
 
 
 @pytest.mark.parametrize(
-    "name", [*NAMES, "noisy+taa", "svgf+taa", "wskp6+taa", "ntd+taa", "eaw+adaptive", "wskp6+adaptive+taa"]
+    "name",
+    [
+        *NAMES,
+        "noisy+taa",
+        "svgf+taa",
+        "wskp6+taa",
+        "ntd+taa",
+        "eaw+adaptive",
+        "wskp6+adaptive+taa",
+        "svgf+js",
+        "ntd+taa+js",
+    ],
 )
 def test_classes_tell_what_their_instances_are(name):
     kind = registry.denoiser_class(name)

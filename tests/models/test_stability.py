@@ -24,7 +24,7 @@ from tests.helpers.frames import chain, flat_frame, play, run
 
 NAMES = [
     name
-    for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive")
+    for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive", "eaw+js")
     if not registry.unavailable(name)
 ]
 THREADS = torch.get_num_threads()

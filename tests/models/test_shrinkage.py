@@ -1,0 +1,180 @@
+"""NAME+js: shrinkage against a slow version, where it must end, and halves at the extremes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from datasets.frame import Frame
+from models import compiled, registry
+from models.denoiser import Denoiser, State
+from models.neighbours import mesh_sums
+from models.shrinkage import STANDARD_ERRORS, shrinking, shrunk
+from tests.helpers.frames import flat_frame, play
+
+SIZE = (24, 40)
+COLOUR = torch.tensor([1.0, 0.5, 0.25])[None, :, None, None]
+
+
+def with_halves(a: Tensor, b: Tensor, **channels: Tensor) -> Frame:
+    """A wall whose direct irradiance is known in two halves (1, 3, H, W)."""
+    frame = flat_frame(*a.shape[-2:], irradiance=(a + b) / 2)
+    halves = {"direct_halves": torch.stack([a, b], dim=1), "indirect_halves": torch.zeros(1, 2, *a.shape[1:])}
+    return replace(frame, channels=frame.channels | halves | channels, spp=torch.full((1, 1, 1, 1), 8.0))
+
+
+class Told(Denoiser):
+    """Returns what it is told."""
+
+    reads = ("direct", "indirect", "emission", "albedo", "depth")
+    image: Tensor
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        return frame.remodulate(self.image, self.signal), State(frame.moment)
+
+
+def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
+    """What `Told` of that irradiance becomes."""
+    denoiser = shrinking(Told)()
+    assert isinstance(denoiser.inner, Told)
+    denoiser.inner.image = image
+    return play(denoiser, [frame])[0][0]
+
+
+def noisy_halves(truth: Tensor, deviation: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Two independent unbiased estimates whose noise is relative to the truth and never below 0, nor bounded above."""
+    shape = 1 / deviation**2
+    gamma = np.random.default_rng(seed).gamma(shape, 1 / shape, (2, *truth.shape))
+    a, b = torch.from_numpy(gamma).float() * truth
+    return a, b
+
+
+def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """ρ of one colour, pixel by pixel: windows of 3 x 3 taps of 3 x 3 sums, all of the tap's own mesh; and so on."""
+    height, width = mesh.shape
+
+    def sums(image: np.ndarray, step: int) -> np.ndarray:
+        out = np.zeros_like(image)
+        for y in range(height):
+            for x in range(width):
+                for dy in (-step, 0, step):
+                    for dx in (-step, 0, step):
+                        inside = 0 <= y + dy < height and 0 <= x + dx < width
+                        if inside and mesh[y + dy, x + dx] == mesh[y, x]:
+                            out[..., y, x] += image[..., y + dy, x + dx]
+        return out
+
+    counted = np.stack([difference**2 - variance, difference**2, 2 * variance**2, np.ones_like(variance)])
+    small = sums(sums(counted, 1), 3)
+    wide = sums(small, 9)
+    mean_small, mean_wide = small / small[3], wide / wide[3]
+    error_small, error_wide = (np.sqrt(mean[2] / each[3]) for mean, each in ((mean_small, small), (mean_wide, wide)))
+    overall = np.clip((mean_wide[0] - STANDARD_ERRORS * error_wide) / mean_wide[1], 0, 1)
+    off = mean_small[0] - overall * mean_small[1]
+    believed = np.maximum(0, 1 - (STANDARD_ERRORS * error_small / off) ** 2)
+    rho = np.clip(overall + believed * off / mean_small[1], 0, 1)
+    smooth = sums(np.stack([rho, np.ones_like(rho)]), 1)
+    return np.asarray(smooth[0] / smooth[1])
+
+
+def test_shrinkage_is_what_the_formula_says_pixel_by_pixel():
+    rng = np.random.default_rng(3)
+    truth = torch.from_numpy(rng.uniform(0.2, 2, (1, 3, *SIZE))).float()
+    a, b = noisy_halves(truth, 0.5)
+    mesh = torch.ones(1, 1, *SIZE)
+    mesh[..., 17:] = 2
+    frame = with_halves(a, b, mesh_id=mesh)
+    denoised = 0.8 * truth.mean(dim=(2, 3), keepdim=True) * torch.ones_like(truth)  # alike everywhere: a unit of 1.01
+    got = shrunk(frame, denoised, "total")
+    luminance = (denoised[0, :, 0, 0] * torch.tensor([0.2126, 0.7152, 0.0722])).sum().item()
+    unit = 1.01 * luminance
+    for c in range(3):
+        a_c, b_c, o = (image[0, c].double().numpy() for image in (a, b, denoised))
+        rho = slow_rho(((a_c + b_c) / 2 - o) / unit, (a_c - b_c) ** 2 / 4 / unit**2, mesh[0, 0].numpy())
+        assert 0 < rho.min() < 0.3 or rho.std() > 0.01  # it is neither nothing nor everything
+        np.testing.assert_allclose(got[0, c], o + rho * ((a_c + b_c) / 2 - o), rtol=2e-4)
+
+
+def test_sums_over_meshes_are_the_same_by_kernel():
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(2, 5, 13, 17, generator=generator)
+    mesh = torch.randint(0, 3, (2, 1, 13, 17), generator=generator).float()
+    for step in (1, 3, 20):
+        by_kernel = mesh_sums(image, mesh, step)
+        with compiled.disabled():
+            torch.testing.assert_close(by_kernel, mesh_sums(image, mesh, step))
+
+
+@pytest.mark.parametrize("deviation", [1.0, 0.5, 0.1, 0.02])
+def test_it_is_no_worse_than_the_better_of_noise_and_denoiser(deviation):
+    """The denoiser is 10 % off everywhere: more samples must end at the truth, few at the denoiser."""
+    truth = COLOUR * (1 + torch.sin(torch.arange(96.0) / 7)[None, None, None, :] / 2).expand(1, 1, 64, 96)
+    a, b = noisy_halves(truth, deviation)
+    frame = with_halves(a, b)
+    denoised = 1.1 * truth
+    output = shrunk_to(denoised, frame)
+    errors = {
+        name: float((image - truth).square().mean())
+        for name, image in (("noise", (a + b) / 2), ("denoiser", denoised), ("shrunk", output))
+    }
+    assert errors["shrunk"] < 1.1 * min(errors["noise"], errors["denoiser"])
+    if deviation == 0.1:  # where both err as much, the mixture is better than both
+        assert errors["shrunk"] < 0.8 * min(errors["noise"], errors["denoiser"])
+
+
+def test_without_halves_it_is_the_denoiser():
+    frame = flat_frame(*SIZE, irradiance=torch.rand(1, 3, *SIZE))
+    for name in ("svgf", "eaw+taa"):
+        torch.testing.assert_close(
+            play(registry.create(name + "+js"), [frame])[0], play(registry.create(name), [frame])[0], rtol=0, atol=0
+        )
+
+
+def test_its_name_weights_and_channels_are_those_of_the_denoiser():
+    assert registry.plain_name("wskp6+adaptive+taa+js") == "wskp6"
+    kind = registry.denoiser_class("ntd+js")
+    assert kind.signal == "indirect" and kind.is_network
+    assert "indirect_halves" in kind.reads and "direct_halves" not in kind.reads
+    assert registry.denoiser_class("nfor+js").offline
+
+
+def test_equal_halves_have_no_noise():
+    image = torch.rand(1, 3, *SIZE) + 0.1
+    torch.testing.assert_close(shrunk_to(torch.ones_like(image), with_halves(image, image)), image)
+
+
+def test_black_halves_of_what_is_black_are_black():
+    black = torch.zeros(1, 3, *SIZE)
+    assert (shrunk_to(black, with_halves(black, black)) == 0).all()
+
+
+def test_a_firefly_in_one_half_stays_out():
+    a, b = noisy_halves(COLOUR.expand(1, 3, *SIZE), 0.3)
+    clean = COLOUR.expand(1, 3, *SIZE)
+    a[..., 12, 20] = 1e4
+    output = shrunk_to(clean, with_halves(a, b))
+    assert output[..., 12, 20].max() < 20  # of 5000
+    assert (output - clean).abs().median() < 0.05
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    height=st.integers(1, 12),
+    width=st.integers(1, 12),
+    levels=st.lists(st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20, 1e34]), min_size=3, max_size=3),
+)
+def test_any_halves_end_between_noise_and_denoiser(seed, height, width, levels):
+    generator = torch.Generator().manual_seed(seed)
+    a, b, denoised = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
+    mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
+    output = shrunk_to(denoised, with_halves(a, b, mesh_id=mesh, depth=mesh + 1))
+    noisy = (a + b) / 2
+    assert torch.isfinite(output).all()
+    tolerance = 1e-5 * torch.maximum(noisy, denoised)
+    assert (output >= torch.minimum(noisy, denoised) - tolerance).all()
+    assert (output <= torch.maximum(noisy, denoised) + tolerance).all()
