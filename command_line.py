@@ -455,6 +455,7 @@ def denoise(
     weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default those shipped")] = None,
     runs: Runs = Path("runs"),
     hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="the same as the colour's files")] = (),
+    half: Annotated[Patterns, arg(metavar="PATTERN...", help="the frames by as many other samples, for NAME+js")] = (),
     alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in files of its own")] = (),
     nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in files of their own")] = (),
     mv: Annotated[Patterns, arg(metavar="PATTERN...", help="motion vectors in files of their own")] = (),
@@ -469,7 +470,7 @@ def denoise(
     quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="OIDN's")] = None,
     stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as they were")] = None,
     png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
-    spp: Annotated[float, arg(metavar="N", help="samples a pixel that the frames were rendered with")] = 1.0,
+    spp: Annotated[float, arg(metavar="N", help="samples a pixel of the frames, of each --half")] = 1.0,
     threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
 ) -> None:
     """Denoise a sequence of OpenEXR files from any renderer, or go on with it.
@@ -490,7 +491,7 @@ def denoise(
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
     weights = weights or weights_of(denoiser, runs)
-    passes = {"colour": colour, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
+    passes = {"colour": colour, "half": half, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)
     with thread_count(threads_or_all(threads)):

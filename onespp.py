@@ -70,6 +70,7 @@ def frames(
     What may be in it, all (H, W, C), row 0 at the top:
 
     - "colour", which must be there: noisy radiance, linear RGB
+    - "half": the same frame's colour by as many other samples; the frame is the mean of both
     - "emission": light seen directly, part of the colour, which is not denoised
     - "albedo": reflectance in [0, 1]; without it radiance is filtered
     - "normal": in world space, of unit length

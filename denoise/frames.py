@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from datasets.channels import CHANNELS
 from datasets.exr import FACTS_ATTRIBUTE, channels_of, view_of_facts
 from datasets.frame import Cameras, Frame, to_tensor
 from denoise.cameras import (
@@ -142,12 +143,12 @@ class Shot:
         self.view = view
         self.depth = depth
         return Frame(
-            {name: to_tensor(channels[name]) for name in self.reads},
+            {name: to_tensor(channels[name], CHANNELS[name].has_halves) for name in self.reads if name in channels},
             now=Cameras.of(view),
             previous=Cameras.of(before if self.reading.has_history else NOWHERE),
             gain=torch.ones(1, 3, 1, 1),
             source=self.source,
-            spp=torch.full((1, 1, 1, 1), self.spp),
+            spp=torch.full((1, 1, 1, 1), self.spp * (2 if "half" in pixels.arrays else 1)),
         )
 
     def given_motion(self, pixels: Pixels) -> Image | None:
@@ -206,13 +207,18 @@ def derived_motion(pixels: Pixels, depth: Image, view: View, before: View) -> Im
 def light_of(pixels: Pixels) -> dict[str, Image]:
     """Radiance as our channels: what is reflected is direct. Background is emission, which nobody filters."""
     surface = pixels.surface[..., None]
-    colour = pixels.arrays["colour"]
+    halves = np.stack([pixels.arrays[name] for name in ("colour", "half") if name in pixels.arrays])
+    colour = halves.mean(axis=0)
     emitted = pixels.arrays.get("emission", np.zeros_like(colour))
-    return {
+    light = {
         "direct": np.where(surface, colour - emitted, 0),
         "indirect": np.zeros_like(colour),
         "emission": np.where(surface, emitted, colour),
     }
+    if len(halves) == 2:
+        light["direct_halves"] = np.where(surface, halves - emitted, 0)
+        light["indirect_halves"] = np.zeros_like(halves)
+    return light
 
 
 def depth_of(pixels: Pixels, seen: Sighting | None) -> Image:
@@ -308,7 +314,7 @@ class OwnShot:
         before = self.view if self.view is not None else view
         self.view = view
         return Frame(
-            {name: to_tensor(arrays[name]) for name in self.reads if name in arrays},
+            {name: to_tensor(arrays[name], CHANNELS[name].has_halves) for name in self.reads if name in arrays},
             now=Cameras.of(view),
             previous=Cameras.of(before),
             gain=torch.ones(1, 3, 1, 1),

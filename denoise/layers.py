@@ -19,6 +19,7 @@ VECTOR = ("xyz", "rgb")
 SCALAR = ("v", "z", "y", "r", "x", "d")
 KNOWN: dict[str, Known] = {
     "colour": Known(("noisyimage", "beauty", "combined", "", "rgba", "rgb", "color", "colour", "c"), RGB, "radiance"),
+    "half": Known(("otherhalf",), RGB, "radiance by as many other samples a pixel"),
     "emission": Known(("emission", "emit"), RGB, "light seen directly, free of noise"),
     "albedo": Known(("denoisingalbedo", "albedo", "visiblediffuse", "diffcol", "alb"), RGB, "reflectance"),
     "normal": Known(

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.channels import CHANNELS
 from datasets.frame import Cameras, Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
@@ -127,9 +128,13 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
     albedo = np.where(hit, colour * (0.6 + 0.4 * checker[..., None]), 1)
     lit = np.where(hit, albedo * (seen.normal @ TO_LIGHT).clip(0)[..., None], 0)
     rng = np.random.default_rng((SEED, index))
+    direct = noisy(rng, 2 * lit, HIT_DIRECT)
+    indirect = noisy(rng, np.where(hit, 0.3 * albedo, 0), HIT_INDIRECT)
     channels = {
-        "direct": noisy(rng, 2 * lit, HIT_DIRECT),
-        "indirect": noisy(rng, np.where(hit, 0.3 * albedo, 0), HIT_INDIRECT),
+        "direct": direct,
+        "indirect": indirect,
+        "direct_halves": np.stack([0.5 * direct, 1.5 * direct]),
+        "indirect_halves": np.stack([1.5 * indirect, 0.5 * indirect]),
         "emission": np.where(hit, 0, [0.4, 0.6, 1.0]),
         "albedo": albedo,
         "normal": seen.normal,
@@ -146,5 +151,5 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "light_angle": np.where(hit, 0.05, 0),
     }
     gain = to_tensor(np.ones((1, 1, 3)))
-    tensors = {name: to_tensor(array) for name, array in channels.items()}
+    tensors = {name: to_tensor(array, CHANNELS[name].has_halves) for name, array in channels.items()}
     return Frame(tensors, Cameras.of(now), Cameras.of(before), gain, "synthetic sequence")

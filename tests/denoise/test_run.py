@@ -379,6 +379,27 @@ def test_the_command_takes_patterns_files_and_oidns_flags(spheres, tmp_path, cap
     assert not (tmp_path / "c").exists()
 
 
+def test_another_half_of_the_samples_is_averaged_and_shrunk_by(spheres, tmp_path):
+    rng = np.random.default_rng(0)
+
+    def sampled(frame: Frame) -> np.ndarray:
+        return foreign.beauty(frame) * rng.gamma(4, 1 / 4, (*frame.size, 1))
+
+    for folder in ("a", "b"):
+        foreign.write_sequence(tmp_path / folder, spheres, lambda f: {"RGB": sampled(f)})
+    a, b = (outputs(tmp_path / folder) for folder in ("a", "b"))
+    halves = ["--half", str(tmp_path / "b" / "*.exr"), "--threads", "1", "--as", "float"]
+    shown = {}
+    for name in ("noisy", "eaw", "eaw+js"):
+        main(["denoise", str(tmp_path / "a" / "*.exr"), *halves, "--denoiser", name, "--out", str(tmp_path / name)])
+        shown[name] = outputs(tmp_path / name)
+    for noisy, filtered, shrunk, first, second in zip(*(shown[n] for n in shown), a, b, strict=True):
+        torch.testing.assert_close(noisy, (first + second) / 2)
+        assert (shrunk >= torch.minimum(noisy, filtered) - 1e-5).all()
+        assert (shrunk <= torch.maximum(noisy, filtered) + 1e-5).all()
+        assert not torch.equal(shrunk, filtered)
+
+
 @pytest.mark.parametrize("name", ["svgf", "eaw", "wskp3", "oidn"])
 @pytest.mark.parametrize("layers", [foreign.blender, foreign.pbrt])
 def test_one_pixel(spheres, tmp_path, name, layers):
