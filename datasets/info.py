@@ -16,7 +16,7 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name for name, channel in CHANNELS.items() if channel.is_image and name not in (*NOISY, *REFERENCES)
+    name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in (*NOISY, *REFERENCES)
 )
 # Steps of rendering, each of which makes the channel of its name.
 OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient", "hit_distance")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from datasets.channels import CHANNELS
+from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.histogram import BINS, difficulty_histograms
@@ -27,7 +27,7 @@ def test_info_tells_sizes_floors_and_what_is_missing(tiny_copy):
     clip = Dataset(tiny_copy).clips("test")[1]
     floor = f"{-10 * math.log10(clip.facts['floor_mse']):.1f}"
     assert rows["test/cornell_box_moving/000"][:5] == ["8", "64x64", "1", "128", floor.removesuffix(".0")]
-    assert set(CHANNELS) < set(rows)
+    assert set(USUAL_CHANNELS) < set(rows)
     assert rows["roughness"][0] == "value" and rows["motion"][:2] == ["<f4,", "derived"]
     assert rows["dual_motion"][0] == "<f4"
 

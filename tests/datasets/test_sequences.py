@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from datasets.channels import CHANNELS, HIT_CHANNELS, TEMPORAL_CHANNELS
+from datasets.channels import CHANNELS, HIT_CHANNELS, TEMPORAL_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from errors import BadInput
 
 FORWARD_ALONE = tuple(name for name in TEMPORAL_CHANNELS if name != "motion")
-IMAGE_CHANNELS = tuple(name for name, channel in CHANNELS.items() if channel.is_image and name not in FORWARD_ALONE)
+IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
 AUGMENTATIONS = {
     "none": Augmentation(),
     "reverse": Augmentation(reverse=True),

@@ -183,7 +183,7 @@ def test_noise_falls_with_samples(tiny):
     clip = a_clip(tiny)
     errors = []
     for spp in (1, 4, 16):
-        frame = next(rendered(clip, Dataset(tiny), spp))
+        frame = next(rendered(clip, Dataset(tiny), spp, False))
         truth = clip.read("direct_reference", 0).astype(np.float64).mean(axis=0)
         errors.append(float(((frame["direct"] - truth) ** 2).mean()))
     assert errors[1] < 0.5 * errors[0] and errors[2] < 0.5 * errors[1]

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from datasets.generate import generate
-from models.registry import channels_read
+from models.registry import DENOISERS, channels_read
 
 
 def dataset_command(root: Path) -> list[str]:
-    """`onespp dataset` for the tiny data set at `root`."""
-    return [sys.executable, "-m", "onespp", "dataset", "--profile", "tiny", "--data", str(root)]
+    """`onespp dataset` for the tiny data set at `root`, with what all denoisers read."""
+    everybody = ("--reads", *DENOISERS)
+    return [sys.executable, "-m", "onespp", "dataset", "--profile", "tiny", "--data", str(root), *everybody]
 
 
 @cache  # it creates every denoiser
