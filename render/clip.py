@@ -131,7 +131,7 @@ def render_clip(
     wants_dual = channels is None or "dual_motion" in channels
     wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
     wants_gradient = channels is None or "gradient" in channels
-    wants_hits = channels is None or not HIT_CHANNELS.isdisjoint(channels)
+    wants_hits = channels is None or any(name in channels for name in HIT_CHANNELS)
     wants_halves = channels is not None and "direct_halves" in channels and sampling.noisy_spp % 2 == 0
     streams = (NOISY_STREAM, OTHER_HALF_STREAM) if wants_halves else (NOISY_STREAM,)
     spp = sampling.noisy_spp // len(streams)

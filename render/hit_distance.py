@@ -17,7 +17,7 @@ from render.first_bounce import first_bounce
 from render.path import Draw, PathTracer
 from scenes.camera import View
 
-HIT_CHANNELS = frozenset({"hit_distance", "light_distance", "light_angle"})
+HIT_CHANNELS = ("hit_distance", "light_distance", "light_angle")
 EVEN_VARIANCE = 1 / 12  # of an even distribution over [0, 1]
 
 
