@@ -41,7 +41,7 @@ class Trunk(nn.Module):
     def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int]):
         super().__init__()
         a, b, c = widths
-        self.enter = nn.Sequential(ConvReLU(PATCH * inputs, a, 1), ConvReLU(a, a))
+        self.enter = nn.Sequential(ConvReLU(PATCH * inputs, a, 1), ConvReLU(a, a, 1))
         self.down_b = nn.Sequential(ConvReLU(a, b, 2, stride=2), ConvReLU(b, b))
         self.down_c = nn.Sequential(ConvReLU(b, c, 2, stride=2), ConvReLU(c, c), ConvReLU(c, c))
         self.up_b = nn.ConvTranspose2d(c, b, 2, stride=2)

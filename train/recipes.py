@@ -125,7 +125,7 @@ NTD_BUDGETS = {
 ONE_BUDGETS: dict[str, dict[str, Any]] = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
-    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 56, "loss": DisplayedTerms(temporal=0.5)},
+    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedTerms(temporal=0.5)},
     "paper": {},
 }
 
