@@ -242,7 +242,7 @@ def test_transposed_convolutions_count_their_inputs():
     a, b, c = One.widths
     inputs = sum(ONE_INPUTS.values())
     outputs = sum(outputs_of_one(len(STEPS)))
-    half = 4 * inputs * a + 2 * 9 * a * a + 4 * a * outputs
+    half = 4 * inputs * a + (1 + 9) * a * a + 4 * a * outputs
     quarter = 4 * a * b + 2 * 9 * b * b + 4 * b * a
     eighth = 4 * b * c + 2 * 9 * c * c + 4 * c * b
     assert macs_per_pixel(DenoiserSpec("one")) == half / 4 + quarter / 16 + eighth / 64
