@@ -28,9 +28,9 @@ from errors import BadInput
 from eval.bench.memory import status_mb
 from eval.spec import DenoiserSpec, precision_in_use
 from files import replacing
+from models.around import inner_denoiser
 from models.denoiser import Denoiser, State
 from models.oidn import OIDN, OIDNQuality
-from models.taa import inner_denoiser
 from provenance import DENOISING, file_digest, versions
 
 Precision = Literal["half", "float"]

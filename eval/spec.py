@@ -11,8 +11,8 @@ from datasets.frame import Signal
 from errors import BadInput
 from eval.extra_denoisers import EXTRA, WINDOW_SETS, windows_label
 from models import compiled, registry
+from models.around import inner_denoiser
 from models.denoiser import Denoiser
-from models.taa import inner_denoiser
 from models.weights import load_weights
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}

@@ -9,6 +9,7 @@ from datasets.frame import Signal
 from errors import BadInput
 from models.aaf import AAF
 from models.adaptive import adaptive
+from models.around import around, inner_denoiser
 from models.asvgf import ASVGF
 from models.baselines import Accumulated, Noisy
 from models.bmfr import BMFR
@@ -23,9 +24,9 @@ from models.oidn import OIDN, OIDNAccumulated
 from models.one import One
 from models.rae import RAE
 from models.sbf import SBF
-from models.shrinkage import shrinking
+from models.shrinkage import Shrunk
 from models.svgf import SVGF
-from models.taa import antialiased, inner_denoiser
+from models.taa import Antialiased
 from models.trmv import TRMV
 from models.weights import load_weights
 from models.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
@@ -75,9 +76,9 @@ def denoiser_class(name: str) -> type[Denoiser]:
     "+js", with shrinkage last of all.
     """
     if name.endswith(SHRINKING):
-        return shrinking(denoiser_class(name.removesuffix(SHRINKING)))  # type: ignore[arg-type]
+        return around(Shrunk, denoiser_class(name.removesuffix(SHRINKING)))  # type: ignore[arg-type]  # classes are hashable
     if name.endswith(TAA):
-        return antialiased(denoiser_class(name.removesuffix(TAA)))  # type: ignore[arg-type]  # classes are hashable
+        return around(Antialiased, denoiser_class(name.removesuffix(TAA)))  # type: ignore[arg-type]
     if name.endswith(ADAPTIVE):
         return adaptive(denoiser_class(name.removesuffix(ADAPTIVE)))  # type: ignore[arg-type]
     if name not in DENOISERS:

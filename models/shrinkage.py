@@ -18,15 +18,15 @@ Without halves, as at one sample a pixel, it is the denoiser itself.
 """
 
 from collections.abc import Iterable
-from functools import cache
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from datasets.channels import HALVES
 from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State
+from models.around import Around
+from models.denoiser import State
 from models.neighbours import mesh_sums
 from models.operators import image_luminance
 from models.parameters import LEAST_DIVISOR
@@ -87,27 +87,14 @@ def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
     return torch.lerp(denoised, (a + b) / 2, rho).clamp(min=0)
 
 
-class Shrunk(Denoiser):
-    """A denoiser of `inner_class` whose output is shrunk to where frames have halves; `shrinking` makes the class.
-
-    Its state is the inner one's.
-    """
-
-    inner_class: ClassVar[type[Denoiser]]
-
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.inner = self.inner_class(signal=signal)
-        self.reads = with_halves(self.inner.reads)
-        self.constants = self.inner.constants
+class Shrunk(Around):
+    """Shrinkage to a denoiser's output, where frames have halves. Its state is the inner one's."""
 
     @classmethod
-    def unavailable(cls) -> str | None:
-        return cls.inner_class.unavailable()
-
-    def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        self.inner.prepare(precision)
-        super().prepare(precision)
+    def reads_around(cls, reads: Iterable[str]) -> tuple[str, ...]:
+        """With the halves of those that have any, and what shrinkage compares them by."""
+        named = tuple(reads)
+        return tuple(dict.fromkeys((*named, *(HALVES[name] for name in HALVES if name in named), *COMPARED_BY)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.forward(frame, state)
@@ -116,23 +103,3 @@ class Shrunk(Denoiser):
         reflected = output - frame.emission if self.signal == "total" else output
         denoised = (reflected / frame.divisor).clamp(min=0)
         return frame.remodulate(shrunk(frame, denoised, self.signal), self.signal), after
-
-
-def with_halves(reads: Iterable[str]) -> tuple[str, ...]:
-    """The channels `reads`, the halves of those that have any, and what shrinkage compares them by."""
-    return tuple(dict.fromkeys((*reads, *(HALVES[name] for name in HALVES if name in reads), *COMPARED_BY)))
-
-
-@cache
-def shrinking(kind: type[Denoiser]) -> type[Shrunk]:
-    """The class of denoisers of `kind` whose outputs are shrunk to."""
-
-    class ShrinkingKind(Shrunk):
-        inner_class = kind
-        reads = with_halves(kind.reads)
-        signal = kind.signal
-        refuses = kind.refuses
-        is_network = kind.is_network
-        offline = kind.offline
-
-    return ShrinkingKind

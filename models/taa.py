@@ -2,18 +2,16 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State, matching_state
+from datasets.frame import Frame
+from models.around import Around
+from models.denoiser import State, matching_state
 from models.reprojection import reproject
 from models.running_scale import RunningScale, running_scale
-from models.shrinkage import Shrunk
 from models.surfaces import Surfaces
 
 NEWEST = 0.1  # weight of the current frame
@@ -92,34 +90,18 @@ class AntialiasedState(State):
         return self.inner.pictures()
 
 
-def with_history(reads: Iterable[str]) -> tuple[str, ...]:
-    """The channels `reads` and those that the history is fetched and tested by."""
-    return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
-
-
-class Antialiased(Denoiser):
-    """A denoiser of `inner_class` with temporal antialiasing after it; `antialiased` makes the class.
+class Antialiased(Around):
+    """Temporal antialiasing after a denoiser.
 
     The history follows the motion vectors and is blended across edges, which is what smooths them; it is dropped where
     reprojection finds no trace of the pixel's surface: disoccluded, or off-screen. Tone mapping needs an exposure: the
     causal one of the outputs so far.
     """
 
-    inner_class: ClassVar[type[Denoiser]]
-
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.inner = self.inner_class(signal=signal)
-        self.reads = with_history(self.inner.reads)
-        self.constants = self.inner.constants
-
     @classmethod
-    def unavailable(cls) -> str | None:
-        return cls.inner_class.unavailable()
-
-    def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        self.inner.prepare(precision)
-        super().prepare(precision)
+    def reads_around(cls, reads: Iterable[str]) -> tuple[str, ...]:
+        """With those that the history is fetched and tested by."""
+        return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = matching_state(state, AntialiasedState, frame)
@@ -131,24 +113,3 @@ class Antialiased(Denoiser):
             past = compress(fetch_bicubic(before.output, frame.motion) * exposure)
             output = expand(resolve(compress(output * exposure), past, found)) / exposure
         return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
-
-
-@cache
-def antialiased(kind: type[Denoiser]) -> type[Antialiased]:
-    """The class of denoisers of `kind` with temporal antialiasing after them."""
-
-    class AntialiasedKind(Antialiased):
-        inner_class = kind
-        reads = with_history(kind.reads)
-        signal = kind.signal
-        refuses = kind.refuses
-        is_network = kind.is_network
-
-    return AntialiasedKind
-
-
-def inner_denoiser(denoiser: Denoiser) -> Denoiser:
-    """The denoiser without what is done to its output."""
-    while isinstance(denoiser, Antialiased | Shrunk):
-        denoiser = denoiser.inner
-    return denoiser

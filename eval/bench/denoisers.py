@@ -22,9 +22,9 @@ from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
 from eval.selection import BASELINES, cannot_run, choose
 from eval.spec import DenoiserSpec, create_any, precisions_of, split_name
 from files import read_json, write_json
+from models.around import inner_denoiser
 from models.oidn import OIDN
 from models.registry import DENOISERS
-from models.taa import inner_denoiser
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models import compiled, registry
+from models.around import around
 from models.denoiser import Denoiser, State
 from models.neighbours import mesh_sums
-from models.shrinkage import STANDARD_ERRORS, shrinking, shrunk
+from models.shrinkage import STANDARD_ERRORS, Shrunk, shrunk
 from tests.helpers.frames import flat_frame, play
 
 SIZE = (24, 40)
@@ -39,7 +40,7 @@ class Told(Denoiser):
 
 def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     """What `Told` of that irradiance becomes."""
-    denoiser = shrinking(Told)()
+    denoiser = around(Shrunk, Told)()
     assert isinstance(denoiser.inner, Told)
     denoiser.inner.image = image
     return play(denoiser, [frame])[0][0]
