@@ -30,6 +30,7 @@ def test_untrained_and_unknown(capsys, tmp_path, shipped):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
 def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path):
     torch.manual_seed(0)
     folder = run_folder(tmp_path, "wskp3", "tiny")

@@ -29,6 +29,7 @@ def large_kernels(scene: str) -> set[str]:
 
 
 @pytest.mark.skipif(VARIANT != "llvm_ad_rgb", reason="counts the kernels of the CPU variant")
+@pytest.mark.slow
 def test_scenes_share_their_kernels():
     # Between them these have one to four lamps, and all kinds of materials with numbers and bitmaps.
     kernels = {scene: large_kernels(scene) for scene in ("cornell_box", "room-0", "room-1", "room-3", "room-7")}

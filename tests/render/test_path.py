@@ -51,6 +51,7 @@ def test_a_scene_may_ask_for_more_bounces():
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 5, 16, s) for s in range(30)]))
 
 
+@pytest.mark.slow
 def test_metal_plastic_and_sky_average_to_the_stock_integrator():
     """Long paths with Russian roulette over glossy materials, lit by a lamp and through the open front by the sky."""
     metal = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
