@@ -206,7 +206,9 @@ class Frame:
 
     def lit(self, light: Tensor) -> "Frame":
         """The frame with all light but emission, noisy and in references, times `light` (H, W)."""
-        lit = {name: self.channels[name] * light for name in self.channels.keys() & {*NOISY, *REFERENCES}}
+        lit = {
+            name: self.channels[name] * light for name in self.channels.keys() & {*NOISY, *HALVES.values(), *REFERENCES}
+        }
         return replace(self, channels=self.channels | lit)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":

@@ -42,7 +42,8 @@ def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
 
 def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
     """Where all the named channels are finite, (H, W)."""
-    return torch.stack([torch.isfinite(frame.channels[name]).all(dim=1)[0] for name in channels]).all(dim=0)
+    finite = [torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]  # halves are images, too
+    return torch.cat(finite).all(dim=0)
 
 
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
