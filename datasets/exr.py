@@ -31,14 +31,14 @@ COMPONENTS = {
     "light_distance": "Z",
     "light_angle": "Y",
 }
-HALVES = ("_a", "_b")  # endings of the two layers of a channel that has halves
+HALF_ENDINGS = ("_a", "_b")  # of the two layers of a channel that has halves
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 
 
 def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """EXR channels (H, W), named LAYER.COMPONENT, of a clip's channel (H, W, C), or (2, H, W, C) if it has halves."""
     if array.ndim == 4:
-        halves = zip(HALVES, array, strict=True)
+        halves = zip(HALF_ENDINGS, array, strict=True)
         return {key: plane for half, image in halves for key, plane in layers_of(name + half, image).items()}
     exact = array.astype(np.uint32) if array.dtype == np.uint16 else array  # EXR has no 16-bit integers
     components = COMPONENTS.get(name, "RGB")
@@ -112,7 +112,7 @@ def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     for name, channel in CHANNELS.items():
         components = COMPONENTS.get(name, "RGB")
-        layers = [name + half for half in HALVES] if channel.has_halves else [name]
+        layers = [name + half for half in HALF_ENDINGS] if channel.has_halves else [name]
         if channel.is_image and all(f"{layer}.{c}" in planes for layer in layers for c in components):
             images = [np.stack([planes[f"{layer}.{c}"] for c in components], axis=-1) for layer in layers]
             array = images[0] if len(images) == 1 else np.stack(images)

@@ -199,8 +199,9 @@ class Frame:
         return self.channels.keys() & set(HALVES.values()) != set()
 
     def half(self, which: int) -> "Frame":
-        """The frame with half of its samples alone: those of half 0 or 1. BadInput where it has no halves."""
-        noisy = {name: getattr(self, halves)[:, which] for name, halves in HALVES.items() if name in self.channels}
+        """The frame with half of its samples alone: those of half 0 or 1."""
+        known = {name: halves for name, halves in HALVES.items() if {name, halves} <= self.channels.keys()}
+        noisy = {name: self.channels[halves][:, which] for name, halves in known.items()}
         others = {name: tensor for name, tensor in self.channels.items() if name not in HALVES.values()}
         return replace(self, channels=others | noisy, spp=self.samples / 2)
 

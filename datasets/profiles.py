@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from datasets.channels import CAMERA_CHANNELS, CHANNELS, REFERENCES, USUAL_CHANNELS
+from datasets.channels import CAMERA_CHANNELS, CHANNELS, HALVES, REFERENCES, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
 from provenance import RENDERING, versions
@@ -250,6 +250,8 @@ def plan(
     check_seed(seed)
     described = profile_of(profile)
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
+    if not set(HALVES.values()).isdisjoint(reads):  # direct and indirect light are drawn together
+        reads = (*reads, *HALVES.values())
     train = rendered_channels(reads)
     test = [name for name in CHANNELS if name in USUAL_CHANNELS or name in reads]
     return {

@@ -207,15 +207,17 @@ def derived_motion(pixels: Pixels, depth: Image, view: View, before: View) -> Im
 def light_of(pixels: Pixels) -> dict[str, Image]:
     """Radiance as our channels: what is reflected is direct. Background is emission, which nobody filters."""
     surface = pixels.surface[..., None]
-    halves = np.stack([pixels.arrays[name] for name in ("colour", "half") if name in pixels.arrays])
-    colour = halves.mean(axis=0)
+    colour = pixels.arrays["colour"]
+    halves = np.stack([colour, pixels.arrays["half"]]) if "half" in pixels.arrays else None
+    if halves is not None:
+        colour = halves.mean(axis=0)
     emitted = pixels.arrays.get("emission", np.zeros_like(colour))
     light = {
         "direct": np.where(surface, colour - emitted, 0),
         "indirect": np.zeros_like(colour),
         "emission": np.where(surface, emitted, colour),
     }
-    if len(halves) == 2:
+    if halves is not None:
         light["direct_halves"] = np.where(surface, halves - emitted, 0)
         light["indirect_halves"] = np.zeros_like(halves)
     return light

@@ -164,9 +164,8 @@ def render_clip(
         if wants_gradient:
             still = np.zeros((height, width, 2))
             arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still
-            drawn_by = draws[0][0]._asdict()
             choice = stream_seed(seed, frame, GRADIENT_STREAM, 0)
-            samples = Samples.of(arrays, direct[0, 0], indirect[0, 0], view, stage.poses, drawn_by, choice)
+            samples = Samples.of(arrays, direct[0, 0], indirect[0, 0], view, stage.poses, draws[0][0], choice)
             timer.lap("gradient")
         half = sampling.reference_spp // 2
         halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), half) for i in range(2)]

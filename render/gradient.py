@@ -20,7 +20,7 @@ from render.backend import mi
 from render.gbuffer import trace_visible
 from render.loading import aligned, columns
 from render.motion import same_surface
-from render.path import PathTracer
+from render.path import Draw, PathTracer
 from scenes.camera import Array, View, move, project, unproject
 
 STRATUM = 3  # px, the side of the squares of which each has one sample
@@ -51,7 +51,7 @@ class Samples(NamedTuple):
     mesh_id: NDArray[np.integer]  # (N,)
     view: View
     poses: int  # of the stage: whether anything has changed since
-    random_numbers: dict[str, int]  # what the tracer drew them by: seed, spp, first
+    draw: Draw  # what the tracer drew them by
 
     @staticmethod
     def of(
@@ -60,7 +60,7 @@ class Samples(NamedTuple):
         indirect: NDArray[np.float32],
         view: View,
         poses: int,
-        random_numbers: dict[str, int],
+        draw: Draw,
         seed: int,
     ) -> "Samples":
         """One of each stratum of a `frame`, of which `direct` and `indirect` (H, W, 3) is what the tracer made."""
@@ -69,7 +69,7 @@ class Samples(NamedTuple):
         centre = np.stack([pixel % width, pixel // width], axis=-1) + 0.5
         point = unproject(centre, frame["depth"].ravel()[pixel].astype(np.float64), view)
         light = luminance(direct.reshape(-1, 3)[pixel] + indirect.reshape(-1, 3)[pixel])
-        return Samples(pixel, light, point, frame["mesh_id"].ravel()[pixel], view, poses, random_numbers)
+        return Samples(pixel, light, point, frame["mesh_id"].ravel()[pixel], view, poses, draw)
 
     def gradient(self, tracer: PathTracer, now: View) -> Array:
         """The channel `gradient` (H, W, 2) of the next frame, for which the tracer's stage must be posed.
@@ -86,7 +86,7 @@ class Samples(NamedTuple):
         visible = same_surface(point, self.mesh_id, place, trace_visible(stage, now, place), now)
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
         pixel = mi.UInt32(aligned(self.pixel.astype(np.uint32)))
-        direct, indirect = tracer.samples(stage.rays(now, place), pixel, **self.random_numbers)
+        direct, indirect = tracer.samples(stage.rays(now, place), pixel, *self.draw)
         shaded = luminance(columns(direct) + columns(indirect))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)
         column, row = place[visible & inside].astype(int).T

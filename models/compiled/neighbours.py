@@ -9,6 +9,7 @@ from torch import Tensor
 
 from datasets.channels import LUMINANCE_WEIGHTS
 from models import parameters
+from models.compiled.eaw import columns_with_tap
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
 from models.compiled.lines import add_line, add_product
 
@@ -68,14 +69,12 @@ def sum_close(sums: Any, image: Any, mesh: Any) -> None:
         same = np.empty(width, np.float32)
         sums[:, y] = ZERO
         for tap in range(9):
-            to = y + tap // 3 - 1
-            dx = tap % 3 - 1
-            low = max(0, -dx)
-            high = min(width, width - dx)
-            if to < 0 or to >= height or low >= high:
+            dy, dx = tap // 3 - 1, tap % 3 - 1
+            low, high = columns_with_tap(y, dx, dy, height, width)
+            if low >= high:
                 continue
-            compare(same[low:high], mesh[y, low:high], mesh[to, low + dx : high + dx])
-            add_pixels(sums, y, low, high, same[low:high], image, to, dx)
+            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
+            add_pixels(sums, y, low, high, same[low:high], image, y + dy, dx)
 
 
 @jit_parallel
@@ -87,15 +86,13 @@ def average(near: Any, around: Any, deviation: Any, close: Any, mesh: Any) -> No
         same = np.empty(width, np.float32)
         sums = np.zeros((SUMS, width), np.float32)
         for tap in range(9):
-            to = y + (tap // 3 - 1) * 3
-            dx = (tap % 3 - 1) * 3
-            low = max(0, -dx)
-            high = min(width, width - dx)
-            if to < 0 or to >= height or low >= high:
+            dy, dx = 3 * (tap // 3 - 1), 3 * (tap % 3 - 1)
+            low, high = columns_with_tap(y, dx, dy, height, width)
+            if low >= high:
                 continue
-            compare(same[low:high], mesh[y, low:high], mesh[to, low + dx : high + dx])
+            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
             for c in range(SUMS):
-                add_product(sums[c, low:high], same[low:high], close[c, to, low + dx : high + dx])
+                add_product(sums[c, low:high], same[low:high], close[c, y + dy, low + dx : high + dx])
         for c in range(3):
             divide(near[c, y], close[c, y], close[SUMS - 1, y])
             divide(around[c, y], sums[c], sums[SUMS - 1])
@@ -111,15 +108,13 @@ def sum_taps(sums: Any, image: Any, mesh: Any, step: Any) -> None:
         same = np.empty(width, np.float32)
         sums[:, y] = ZERO
         for tap in range(9):
-            to = y + (tap // 3 - 1) * step
-            dx = (tap % 3 - 1) * step
-            low = max(0, -dx)
-            high = min(width, width - dx)
-            if to < 0 or to >= height or low >= high:
+            dy, dx = step * (tap // 3 - 1), step * (tap % 3 - 1)
+            low, high = columns_with_tap(y, dx, dy, height, width)
+            if low >= high:
                 continue
-            compare(same[low:high], mesh[y, low:high], mesh[to, low + dx : high + dx])
+            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
             for c in range(image.shape[0]):
-                add_product(sums[c, y, low:high], same[low:high], image[c, to, low + dx : high + dx])
+                add_product(sums[c, y, low:high], same[low:high], image[c, y + dy, low + dx : high + dx])
 
 
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:

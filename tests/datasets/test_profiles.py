@@ -119,6 +119,13 @@ def test_halves_tell_the_noise_of_their_mean(moving_boxes):
         assert told == pytest.approx(np.var(noisy, axis=1, ddof=1).mean(), rel=0.3)
 
 
+def test_halves_are_stored_together_and_where_asked_for():
+    """A clip for denoisers of indirect light alone may be shown to others too."""
+    asked = plan("release", 0, channels_read(["ntd+js"]))["channels"]["test"]
+    assert set(HALVES.values()) < set(asked)
+    assert set(plan("release", 0, channels_read(["ntd"]))["channels"]["test"]) == set(USUAL_CHANNELS)
+
+
 def test_a_frame_gives_its_halves_as_frames(moving_boxes):
     frame = read_frame(moving_boxes["000-16spp"], 2, ("direct", "albedo", *HALVES.values()))
     a, b = frame.half(0), frame.half(1)

@@ -13,7 +13,7 @@ from models import strata
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import STRATUM, Samples, luminance, one_of_each_stratum
-from render.path import PathTracer
+from render.path import Draw, PathTracer
 from render.shot import Shot
 from render.stage import Stage
 from scenes.animation import RigidMotion, Scene, Track
@@ -28,8 +28,7 @@ def samples_of(tracer: PathTracer, frame: int, seed: int) -> Samples:
     stage = tracer.stage
     view = stage.view(frame)
     light = tracer.radiance(stage.rays(view), seed, 1)
-    drawn_by = {"seed": seed, "spp": 1, "first": 0}
-    return Samples.of(render_gbuffer(stage, view), *light, view, stage.poses, drawn_by, seed)
+    return Samples.of(render_gbuffer(stage, view), *light, view, stage.poses, Draw(seed, 1), seed)
 
 
 def still_camera(scene: Scene) -> Scene:
