@@ -1,11 +1,12 @@
 """A moving sequence made without a renderer, for measuring speed: shapes, motion and noise as those of real frames."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, HALVES
 from datasets.frame import Cameras, Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
@@ -105,6 +106,16 @@ def noisy(rng: np.random.Generator, mean: Array, share: float) -> Array:
     return mean * np.where(rng.random(size) < share, heavy_tailed / share, 0)
 
 
+def halves_of(light: Mapping[str, Array], seed: tuple[int, ...]) -> dict[str, Array]:
+    """Halves (2, H, W, 3), by their channels, of which `light` (H, W, 3) is the mean: each pixel is in one of them."""
+    rng = np.random.default_rng(seed)
+    halves = {}
+    for name, mean in light.items():
+        in_first = rng.random((*mean.shape[:2], 1)) < 0.5
+        halves[HALVES[name]] = 2 * mean * np.stack([in_first, ~in_first])
+    return halves
+
+
 def met(rng: np.random.Generator, hit: NDArray[np.bool_], share: float) -> Array:
     """Distances (H, W) that a `share` of the surfaces' samples meet something at; 0 for the others."""
     return np.where(hit & (rng.random(hit.shape) < share), rng.lognormal(0.0, 0.5, hit.shape), 0)
@@ -133,8 +144,7 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
     channels = {
         "direct": direct,
         "indirect": indirect,
-        "direct_halves": np.stack([0.5 * direct, 1.5 * direct]),
-        "indirect_halves": np.stack([1.5 * indirect, 0.5 * indirect]),
+        **halves_of({"direct": direct, "indirect": indirect}, (SEED, index, 1)),
         "emission": np.where(hit, 0, [0.4, 0.6, 1.0]),
         "albedo": albedo,
         "normal": seen.normal,

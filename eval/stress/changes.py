@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from datasets.channels import HIT_CHANNELS, MOTION_CHANNELS
+from datasets.channels import HALVES, HIT_CHANNELS, MOTION_CHANNELS, NOISY
 from datasets.frame import Cameras, Frame
 
 FrameChange = Callable[[Frame], Frame]
 
-LIGHT_CHANNELS = ("direct", "indirect", "emission")
+LIGHT_CHANNELS = (*NOISY, *HALVES.values(), "emission")
 SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS, *HIT_CHANNELS)
 
 

@@ -5,9 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from datasets.channels import CHANNELS, HALVES
 from datasets.frame import Frame, to_tensor
 from eval.bench.sizes import Size
-from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, synthetic_frame
+from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, halves_of, noisy, synthetic_frame
 from eval.stress.changes import FrameChange
 
 LIGHT_SHARES = {"direct": 0.7, "indirect": 0.3}  # of the irradiance
@@ -22,7 +23,12 @@ def lit(frame: Frame, seed: int | None) -> Frame:
     if seed is not None:
         rng = np.random.default_rng(seed)
         light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
-    return replace(frame, channels=frame.channels | {name: to_tensor(array) for name, array in light.items()})
+        halves = halves_of(light, (seed, 1))
+    else:
+        halves = {HALVES[name]: np.stack([mean, mean]) for name, mean in light.items()}
+    channels = light | halves
+    tensors = {name: to_tensor(array, CHANNELS[name].has_halves) for name, array in channels.items()}
+    return replace(frame, channels=frame.channels | tensors)
 
 
 @lru_cache(maxsize=4 * NOISE_PERIOD)
