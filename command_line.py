@@ -362,6 +362,16 @@ def bench_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget
     print(bench(runs, names, budget))
 
 
+def bench_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
+    """Whether the error that halves of the samples tell is the true one, and whether more are asked for than needed.
+
+    Renders four clips, ten minutes or so, and filters them at 4 to 128 samples a pixel; table, plots, results.json.
+    """
+    from eval.bench.error import bench_error as bench
+
+    print(bench(runs, names))
+
+
 def bench_loading(data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     """How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
     from eval.bench.loading import bench_loading as bench
@@ -471,6 +481,8 @@ def denoise(
     stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as they were")] = None,
     png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
     spp: Annotated[float, arg(metavar="N", help="samples a pixel of the frames, of each --half")] = 1.0,
+    error: Annotated[bool, FlagCreatePairsOff] = False,
+    until: Annotated[float | None, arg(metavar="E")] = None,
     threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
 ) -> None:
     """Denoise a sequence of OpenEXR files from any renderer, or go on with it.
@@ -480,6 +492,9 @@ def denoise(
     Args:
         layers: say yourself what is where, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
         motion: say yourself what motion vectors mean, such as XY,+x,-y,pixels, in the words that are printed.
+        error: add the layer `error` to each frame: how far pixels are from the truth, by NAME+js and halves, which take
+            three passes instead of one.
+        until: tell which frames have a relative error of at most E, such as 0.02, and how many samples the others take.
     """
     from denoise.run import Job
     from denoise.run import denoise as denoise_sequence
@@ -495,7 +510,7 @@ def denoise(
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)
     with thread_count(threads_or_all(threads)):
-        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png, spp))
+        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png, spp, error, until))
 
 
 def weights(
@@ -560,6 +575,7 @@ GROUPS: dict[str, Commands] = {
             "rendering": bench_rendering,
             "references": bench_references,
             "light": bench_light,
+            "error": bench_error,
             "loading": bench_loading,
             "training": bench_training,
         },
@@ -571,7 +587,7 @@ TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can tr
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
     "figure": "Draw a figure of the papers or of the docs: variance, unbiased, triptych.",
-    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, light, loading, training.",
+    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, light, error, loading, training.",
 }
 
 

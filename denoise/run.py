@@ -1,5 +1,6 @@
 """`onespp denoise`: anybody's frames through a denoiser, one after another, and what came of them on disk."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,11 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image as Picture
+from torch import Tensor
 from tqdm import tqdm
 
 from datasets.frame import Frame
 from datasets.tonemap import clip_exposure, display, luminance
 from denoise.comparison import compare, radiance
+from denoise.error_table import ErrorTable, FrameError
 from denoise.exr_image import ExrImage
 from denoise.frames import OwnShot, Shot
 from denoise.layers import stated_layers
@@ -30,10 +33,13 @@ from eval.spec import DenoiserSpec, precision_in_use
 from files import replacing
 from models.around import inner_denoiser
 from models.denoiser import Denoiser, State
+from models.error_estimate import with_error
 from models.oidn import OIDN, OIDNQuality
+from models.shrinkage import Shrunk
 from provenance import DENOISING, file_digest, versions
 
 Precision = Literal["half", "float"]
+ERROR_LAYER = "error"
 DTYPES: dict[str | None, type | None] = {None: None, "half": np.float16, "float": np.float32}
 
 
@@ -51,6 +57,8 @@ class Job:
         stored_as: precision of denoised channels, by default that of the input.
         previews: whether to write a PNG beside each frame.
         spp: samples a pixel of the colour; what our own files say is known.
+        error: whether to add the layer `error` to each frame: how far each pixel is from the truth, as halves tell.
+        until: the relative error at which a frame is done; the samples that the others need go into error.csv.
     """
 
     patterns: Mapping[str, Sequence[str]]
@@ -66,6 +74,12 @@ class Job:
     stored_as: Precision | None = None
     previews: bool = False
     spp: float = 1.0
+    error: bool = False
+    until: float | None = None
+
+    @property
+    def tells_error(self) -> bool:
+        return self.error or self.until is not None
 
 
 @torch.inference_mode()
@@ -81,6 +95,8 @@ def denoise(job: Job) -> None:
     sources = find_sources(open_passes(frames[0], header_only=True), stated_layers(job.layers))
     spec = DenoiserSpec(job.denoiser, "total", precision_in_use(job.denoiser), job.weights)
     denoiser = build(spec, job.quality)
+    if job.tells_error:
+        check_error_can_be_told(job, denoiser, sources)
     work = Work(job, spec, denoiser, sequence, sources)
     print(work.introduction())
     claim(job.out, work.settings())
@@ -89,6 +105,8 @@ def denoise(job: Job) -> None:
     print(f"{sum(nonfinite)} pixels were not finite and count as 0", end="")
     peak = status_mb("VmHWM")
     print(f"; peak memory {peak / 1000:.2f} GB" if peak else "")
+    if job.until is not None:
+        print(work.errors.summary(job.until))
     if references:
         print(compare(frames, references, job.out, sources.target, work.exposure))
 
@@ -102,6 +120,16 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
             raise BadInput(f"--quality is OIDN's, '{spec.name}' has none")
         inner.quality = quality
     return denoiser
+
+
+def check_error_can_be_told(job: Job, denoiser: Denoiser, sources: Sources) -> None:
+    """Raise BadInput for a denoiser that tells no error, frames that have no halves, and an error that none has."""
+    if not isinstance(denoiser, Shrunk):
+        raise BadInput(f"{job.denoiser} does not tell its error: name {job.denoiser}+js")
+    if not (sources.is_ours or sources.has("half")):
+        raise BadInput("how far frames are from the truth only halves of their samples tell: name the others by --half")
+    if job.until is not None and not 0 < job.until < math.inf:
+        raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
 
 
 def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
@@ -176,6 +204,8 @@ class Work:
             "motion": str(job.motion if self.sources.is_ours else self.understanding.reading.meaning),
             "as": job.stored_as,
             "spp": job.spp,
+            "error": job.error,
+            "until": job.until,
             "versions": versions(DENOISING),
         }
 
@@ -193,7 +223,9 @@ class Work:
     def is_finished(self, files: FrameFiles) -> bool:
         """Whether a frame's output is there, and no older than what it was made of."""
         outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.previews else [])]
-        if not all(path.exists() for path in outputs):
+        if not all(path.exists() for path in outputs) or (
+            self.job.tells_error and files.number not in self.errors.rows
+        ):
             return False
         newest = max(path.stat().st_mtime for path in files.passes.values())
         return all(path.stat().st_mtime >= newest for path in outputs)
@@ -213,11 +245,26 @@ class Work:
                     raise BadInput(
                         f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence"
                     )
-                output, state = self.denoiser(frame, state)
+                output, state = self.step(frame, state, image, files.number if index >= start else None)
                 if index >= start:
                     self.write(files, image, output[0].permute(1, 2, 0).numpy())
                     yield nonfinite
             progress.update()
+
+    def step(self, frame: Frame, state: State | None, image: ExrImage, number: int | None) -> tuple[Tensor, State]:
+        """Radiance of a frame, and the state after it; where it has a `number`, its error is told as asked for."""
+        if number is None or not isinstance(self.denoiser, Shrunk) or not self.job.tells_error:
+            output, after = self.denoiser(frame, state)
+            return output, after
+        output, after, estimate = with_error(self.denoiser, frame, state)
+        self.errors.add(FrameError.of(number, estimate, self.job.until or 0.0))
+        if self.job.error:
+            image.add(ERROR_LAYER, estimate.radiance()[0].permute(1, 2, 0).numpy())
+        return output, after
+
+    @cached_property
+    def errors(self) -> ErrorTable:
+        return ErrorTable(self.job.out)
 
     @cached_property
     def size(self) -> tuple[int, int]:

@@ -64,10 +64,14 @@ def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor) -> Ten
     small, wide = windows(difference.square(), variance, mesh_id)
     overall = ((wide.excess - STANDARD_ERRORS * wide.error) / wide.distance).clamp(0, 1)
     off = small.excess - overall * small.distance
-    doubt = STANDARD_ERRORS * small.error
-    believed = 1 - (doubt / off.abs().clamp(min=LEAST_DIVISOR)).square().clamp(max=1)
-    rho = (overall + believed * off / small.distance).clamp(0, 1)
+    rho = (overall + believed(off, small.error) * off / small.distance).clamp(0, 1)
     return mesh_means_of(rho, mesh_id)
+
+
+def believed(difference: Tensor, error: Tensor) -> Tensor:
+    """How much of a difference is no chance, in [0, 1], from its standard error."""
+    doubt = STANDARD_ERRORS * error
+    return 1 - (doubt / difference.abs().clamp(min=LEAST_DIVISOR)).square().clamp(max=1)
 
 
 def mesh_means_of(image: Tensor, mesh_id: Tensor) -> Tensor:
@@ -76,15 +80,36 @@ def mesh_means_of(image: Tensor, mesh_id: Tensor) -> Tensor:
     return sums[:, :-1] / sums[:, -1:]
 
 
-def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
-    """The shrinkage of a frame that has halves to denoised irradiance (B, 3, H, W), as irradiance."""
+def denoised_irradiance(output: Tensor, frame: Frame, signal: Signal) -> Tensor:
+    """What a denoiser made of the frame's irradiance, (B, 3, H, W), from the radiance that it returned."""
+    reflected = output - frame.emission if signal == "total" else output
+    return (reflected / frame.divisor).clamp(min=0)
+
+
+def share_let_in(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
+    """ρ (B, 3, H, W) of a frame that has halves, for denoised irradiance (B, 3, H, W)."""
     a, b = (frame.half(which).irradiance(signal) for which in (0, 1))
     luminance = mesh_means_of(image_luminance(denoised), frame.mesh_id)
+    unit = unit_of(luminance)
+    off_a, off_b = (relative(half - denoised, unit) for half in (a, b))
+    return share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id)
+
+
+def unit_of(luminance: Tensor) -> Tensor:
+    """What irradiance is compared by, from the luminance around each pixel, (B, 1, H, W): it is never 0."""
     darkest = DARKEST * luminance.mean(dim=(1, 2, 3), keepdim=True)
-    unit = (luminance + darkest).clamp(min=LEAST_DIVISOR)
-    off_a, off_b = (((half - denoised) / unit).clamp(-LARGEST_RATIO, LARGEST_RATIO) for half in (a, b))
-    rho = share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id)
-    return torch.lerp(denoised, (a + b) / 2, rho).clamp(min=0)
+    return (luminance + darkest).clamp(min=LEAST_DIVISOR)
+
+
+def relative(difference: Tensor, unit: Tensor) -> Tensor:
+    """A difference of irradiance (B, 3, H, W) over a unit (B, 1, H, W), within bounds."""
+    return (difference / unit).clamp(-LARGEST_RATIO, LARGEST_RATIO)
+
+
+def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
+    """The shrinkage of a frame that has halves to denoised irradiance (B, 3, H, W), as irradiance."""
+    rho = share_let_in(frame, denoised, signal)
+    return torch.lerp(denoised, frame.irradiance(signal), rho).clamp(min=0)
 
 
 class Shrunk(Around):
@@ -100,6 +125,5 @@ class Shrunk(Around):
         output, after = self.inner.forward(frame, state)
         if not frame.has_halves:
             return output, after
-        reflected = output - frame.emission if self.signal == "total" else output
-        denoised = (reflected / frame.divisor).clamp(min=0)
+        denoised = denoised_irradiance(output, frame, self.signal)
         return frame.remodulate(shrunk(frame, denoised, self.signal), self.signal), after

@@ -379,7 +379,9 @@ def test_the_command_takes_patterns_files_and_oidns_flags(spheres, tmp_path, cap
     assert not (tmp_path / "c").exists()
 
 
-def test_another_half_of_the_samples_is_averaged_and_shrunk_by(spheres, tmp_path):
+@pytest.fixture
+def halves(spheres, tmp_path) -> list[str]:
+    """The words by which `denoise` takes two sequences, in tmp_path / "a" and "b", of other samples of the same."""
     rng = np.random.default_rng(0)
 
     def sampled(frame: Frame) -> np.ndarray:
@@ -387,17 +389,68 @@ def test_another_half_of_the_samples_is_averaged_and_shrunk_by(spheres, tmp_path
 
     for folder in ("a", "b"):
         foreign.write_sequence(tmp_path / folder, spheres, lambda f: {"RGB": sampled(f)})
+    return [str(tmp_path / "a" / "*.exr"), "--half", str(tmp_path / "b" / "*.exr"), "--threads", "1", "--as", "float"]
+
+
+def test_another_half_of_the_samples_is_averaged_and_shrunk_by(halves, tmp_path):
     a, b = (outputs(tmp_path / folder) for folder in ("a", "b"))
-    halves = ["--half", str(tmp_path / "b" / "*.exr"), "--threads", "1", "--as", "float"]
     shown = {}
     for name in ("noisy", "eaw", "eaw+js"):
-        main(["denoise", str(tmp_path / "a" / "*.exr"), *halves, "--denoiser", name, "--out", str(tmp_path / name)])
+        main(["denoise", *halves, "--denoiser", name, "--out", str(tmp_path / name)])
         shown[name] = outputs(tmp_path / name)
     for noisy, filtered, shrunk, first, second in zip(*(shown[n] for n in shown), a, b, strict=True):
         torch.testing.assert_close(noisy, (first + second) / 2)
         assert (shrunk >= torch.minimum(noisy, filtered) - 1e-5).all()
         assert (shrunk <= torch.maximum(noisy, filtered) + 1e-5).all()
         assert not torch.equal(shrunk, filtered)
+
+
+def test_halves_tell_how_far_frames_are_from_the_truth(spheres, halves, tmp_path, capsys):
+    words = ["denoise", *halves, "--denoiser", "svgf+js", "--spp", "4", "--png"]
+    main([*words, "--out", str(tmp_path / "plain")])
+    capsys.readouterr()
+    told = [*words, "--out", str(tmp_path / "out"), "--error", "--until", "0.02"]
+    main(told)
+    said = capsys.readouterr().out
+    assert "0 of 4 frames have a relative error of at most 0.02; the others take" in said
+    for ours, theirs in zip(outputs(tmp_path / "out"), outputs(tmp_path / "plain"), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    with (tmp_path / "out" / "error.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["spp"] for row in rows] == ["8.0"] * 4
+    for row in rows:
+        assert 0 < float(row["relative_error"]) < float(row["at_most"]) < 3
+        assert float(row["samples"]) > 8
+    for image, frame in zip(outputs(tmp_path / "out", "error."), spheres, strict=True):
+        assert (image > 0).any() and ((image == 0) | (frame.depth > 0)).all()
+
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    (tmp_path / "out" / sorted(name for name in before if name.endswith(".exr"))[2]).unlink()
+    main(told)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    lines = (tmp_path / "out" / "error.csv").read_text().splitlines()
+    (tmp_path / "out" / "error.csv").write_text("\n".join(lines[:-1]) + "\n")
+    main(told)
+    assert (tmp_path / "out" / "error.csv").read_bytes() == before["error.csv"]
+
+
+@pytest.mark.parametrize(
+    "words, complaint",
+    [
+        (["--denoiser", "svgf", "--error"], "name svgf+js"),
+        (["--denoiser", "svgf+js", "--until", "0"], "no relative error"),
+    ],
+)
+def test_errors_that_cannot_be_told_are_refused(halves, tmp_path, capsys, words, complaint):
+    with pytest.raises(SystemExit) as exit_:
+        main(["denoise", *halves, *words, "--out", str(tmp_path / "out")])
+    assert exit_.value.code == 2 and complaint in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_an_error_takes_halves(halves, tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["denoise", halves[0], "--denoiser", "svgf+js", "--error", "--out", str(tmp_path / "out")])
+    assert exit_.value.code == 2 and "--half" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["svgf", "eaw", "wskp3", "oidn"])

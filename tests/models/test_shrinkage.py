@@ -1,7 +1,5 @@
 """NAME+js: shrinkage against a slow version, where it must end, and halves at the extremes."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -16,16 +14,10 @@ from models.denoiser import Denoiser, State
 from models.neighbours import mesh_sums
 from models.shrinkage import STANDARD_ERRORS, Shrunk, shrunk
 from tests.helpers.frames import flat_frame, play
+from tests.helpers.halves import noisy_halves, with_halves
 
 SIZE = (24, 40)
 COLOUR = torch.tensor([1.0, 0.5, 0.25])[None, :, None, None]
-
-
-def with_halves(a: Tensor, b: Tensor, **channels: Tensor) -> Frame:
-    """A wall whose direct irradiance is known in two halves (1, 3, H, W)."""
-    frame = flat_frame(*a.shape[-2:], irradiance=(a + b) / 2)
-    halves = {"direct_halves": torch.stack([a, b], dim=1), "indirect_halves": torch.zeros(1, 2, *a.shape[1:])}
-    return replace(frame, channels=frame.channels | halves | channels, spp=torch.full((1, 1, 1, 1), 8.0))
 
 
 class Told(Denoiser):
@@ -44,14 +36,6 @@ def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     assert isinstance(denoiser.inner, Told)
     denoiser.inner.image = image
     return play(denoiser, [frame])[0][0]
-
-
-def noisy_halves(truth: Tensor, deviation: float, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Two independent unbiased estimates whose noise is relative to the truth and never below 0, nor bounded above."""
-    shape = 1 / deviation**2
-    gamma = np.random.default_rng(seed).gamma(shape, 1 / shape, (2, *truth.shape))
-    a, b = torch.from_numpy(gamma).float() * truth
-    return a, b
 
 
 def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray) -> np.ndarray:

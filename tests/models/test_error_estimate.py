@@ -1,0 +1,138 @@
+"""The error that halves tell: without bias where the truth is known, and sane at the extremes."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn import functional as F
+
+from datasets.frame import Frame
+from errors import BadInput
+from models.around import around
+from models.denoiser import Denoiser, State
+from models.error_estimate import ErrorEstimate, estimated, with_error
+from models.shrinkage import Shrunk
+from tests.helpers.frames import flat_frame
+from tests.helpers.halves import noisy_halves, with_halves
+
+SIZE = (256, 256)
+SHAPES = (1, 3, *SIZE)
+
+
+class Blur(Denoiser):
+    """Means over 5 x 5 pixels: biased where the truth is curved, and correlated with the noise of the pixel itself."""
+
+    reads = ("direct", "indirect", "emission", "albedo", "depth")
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        blurred = F.avg_pool2d(frame.irradiance(self.signal), 5, 1, 2, count_include_pad=False)
+        return frame.remodulate(blurred, self.signal), State(frame.moment)
+
+
+def waves(length: float) -> Tensor:
+    """Irradiance (1, 3, H, W) that goes up and down within so many pixels, by a half."""
+    x = torch.arange(SIZE[1]) * (2 * torch.pi / length)
+    return (1 + torch.sin(x) / 2).expand(SHAPES).clone()
+
+
+def judged(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
+    a, b = noisy_halves(truth, deviation)
+    output, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b), None)
+    return output, estimate
+
+
+@pytest.mark.parametrize("length", [8.0, 30.0, 1e6])
+@pytest.mark.parametrize("deviation", [0.05, 0.3])
+def test_it_is_the_true_error(length, deviation):
+    truth = waves(length)
+    output, estimate = judged(truth, deviation)
+    true = (output - truth).square().mean().item()
+    told = (estimate.squared * estimate.scale.square()).mean().item()
+    chance = 3 * 2 * deviation**2 / 2 / (3 * SIZE[0] * SIZE[1]) ** 0.5
+    assert told == pytest.approx(true, rel=0.08, abs=chance)
+    mapped = estimate.radiance().square().mean().item()  # never below what is known for sure, so chance only adds to it
+    assert 0.8 * true < mapped < 1.5 * true + chance
+    assert estimate.most_relative_error() >= estimate.relative_error()
+
+
+def test_what_two_passes_err_by_is_told_without_bias():
+    """Of the mean of both passes itself, against the variance of sums and the bias that are known of a mean of 25."""
+    truth = waves(12)
+    deviation = 0.4
+    a, b = noisy_halves(truth, deviation)
+    passes = [F.avg_pool2d(half, 5, 1, 2, count_include_pad=False) for half in (a, b)]
+    mean = (passes[0] + passes[1]) / 2
+    estimate = estimated(with_halves(a, b), mean, passes, [a, b], torch.zeros(SHAPES))
+    scale = estimate.scale.square()
+    inner = (..., slice(4, -4), slice(4, -4))
+    bias = F.avg_pool2d(truth, 5, 1, 2, count_include_pad=False) - truth
+    variance = F.avg_pool2d((deviation * truth).square(), 5, 1, 2) / 25 / 2
+    expected = (bias.square() + variance)[inner].mean().item()
+    assert (estimate.filtered * scale)[inner].mean().item() == pytest.approx(expected, rel=0.06)
+    assert (estimate.spread * scale)[inner].mean().item() == pytest.approx(variance[inner].mean().item(), rel=0.06)
+    own = ((deviation * truth).square() / 2 / 25)[inner].mean().item()  # each pixel's noise is a 25th of its mean
+    assert (estimate.covariance * scale)[inner].mean().item() == pytest.approx(own, rel=0.06)
+
+
+def test_more_samples_are_asked_for_than_it_takes_but_not_by_much():
+    """Where error and noise are alike everywhere, (e² v) / (k e² + v) = t² gives k."""
+    truth = waves(9)
+    deviation = 0.5
+    _, estimate = judged(truth, deviation)
+    target = 0.02
+    taken = estimate.samples_for(target)
+    e2, v = estimate.over_surfaces(estimate.filtered), estimate.over_surfaces(estimate.noise)
+    assert taken == pytest.approx(8 * v * (e2 - target**2) / (e2 * target**2), rel=0.4)
+    assert estimate.samples_for(10.0) == 8  # those that there are
+    assert estimate.samples_for(1e-9) == float("inf")
+    assert estimate.samples_for(0.03) < taken
+
+
+def test_equal_halves_have_no_error():
+    image = 0.1 + torch.rand(1, 3, 40, 40)
+    output, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(image, image), None)
+    torch.testing.assert_close(output, image)
+    assert estimate.radiance().max() < 1e-5 and estimate.relative_error() < 1e-5
+
+
+def test_a_frame_without_halves_is_refused():
+    with pytest.raises(BadInput, match="no halves"):
+        with_error(around(Shrunk, Blur)(), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
+
+
+def test_it_gives_what_the_denoiser_gives():
+    a, b = noisy_halves(waves(20), 0.3)
+    frame = with_halves(a, b)
+    denoiser = around(Shrunk, Blur)()
+    torch.testing.assert_close(with_error(denoiser, frame, None)[0], denoiser(frame, None)[0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    height=st.integers(1, 12),
+    width=st.integers(1, 12),
+    levels=st.lists(st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20]), min_size=2, max_size=2),
+    background=st.booleans(),
+)
+def test_any_halves_tell_something_finite(seed, height, width, levels, background):
+    generator = torch.Generator().manual_seed(seed)
+    a, b = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
+    mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
+    depth = mesh if background else mesh + 1
+    output, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b, mesh_id=mesh, depth=depth), None)
+    error = estimate.radiance()
+    assert torch.isfinite(output).all() and torch.isfinite(error).all() and (error >= 0).all()
+    assert ((error == 0) | (depth > 0)).all()
+    assert 0 <= estimate.relative_error() <= estimate.most_relative_error() < float("inf")
+    assert estimate.samples_for(0.02) >= 8
+
+
+def test_a_firefly_in_one_half_is_told_where_it_is():
+    a, b = noisy_halves(torch.ones(1, 3, 64, 64), 0.3)
+    a[..., 32, 32] = 1e4
+    _, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b), None)
+    error = estimate.radiance()
+    assert torch.isfinite(error).all()
+    assert error[..., :8, :8].max() < 0.5
