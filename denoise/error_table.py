@@ -2,9 +2,10 @@
 
 import csv
 import io
-import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+
+import numpy as np
 
 from errors import BadInput
 from files import write_file
@@ -38,7 +39,7 @@ class FrameError:
             spp,
             estimate.relative_error(),
             estimate.most_relative_error(),
-            math.ceil(needed) if math.isfinite(needed := estimate.samples_for(target)) else needed,
+            np.ceil(estimate.samples_for(target)).item(),
         )
 
 

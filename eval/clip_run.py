@@ -18,9 +18,11 @@ from eval.comparison import Comparison, Luminances
 from eval.disocclusion_crops import densest_crop
 from eval.means import mean_floor, means
 from eval.metrics import Values, measure, noise_floors, temporal_error_floor
-from eval.results import REFERENCE, Result, result_key, save_picture
+from eval.results import REFERENCE, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
+from models.error_estimate import with_error
 from models.operators import finite
+from models.shrinkage import Shrunk
 from provenance import file_digest
 
 METRICS_CHANNELS = ("motion", "dual_motion")
@@ -73,6 +75,7 @@ class ClipRun:
     before: Luminances | None = None
     frames: list[Values] = field(default_factory=list)
     nonfinite: int = 0
+    error: Tensor | None = None  # that the last frame's samples tell, (1, 3, H, W), in exposed radiance
 
     @property
     def name(self) -> str:
@@ -91,7 +94,12 @@ class ClipRun:
 
     def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
-        output, self.state = self.entrant.denoiser(frame, self.state)
+        denoiser = self.entrant.denoiser
+        if isinstance(denoiser, Shrunk) and frame.has_halves:
+            output, self.state, estimate = with_error(denoiser, frame, self.state)
+            self.error = exposure * estimate.radiance()
+        else:
+            output, self.state = denoiser(frame, self.state)
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
         comparison = Comparison(output, halves, exposure, hidden(frame), self.before, still)
         self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})
@@ -169,3 +177,5 @@ def play(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool =
             output = run.step(frame, halves[run.signal], clip.exposure, still)
             image = display(finite(output), clip.exposure)
             save_picture(folder, index, image[0].permute(1, 2, 0).numpy())
+            if isinstance(run, ClipRun) and run.error is not None:
+                save_error(folder, index, run.error[0].mean(dim=0).numpy())

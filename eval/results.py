@@ -1,8 +1,8 @@
 """Results on disk: a folder for each denoiser on each clip, complete or nothing, and the two files made of them all.
 
 RUNS/eval/clips/SCENE-CLIP/DENOISER/ holds `result.json`, written last, and `0000.webp` and so on: what it shows, frame
-by frame and lossless. The reference's folder beside them holds the noise floors. Folders of indirect light end in
-`-indirect`.
+by frame and lossless; of NAME+js, where frames have halves, `error-0000.webp` and so on: the error that these tell. The
+reference's folder beside them holds the noise floors. Folders of indirect light end in `-indirect`.
 """
 
 import csv
@@ -29,6 +29,7 @@ from provenance import DENOISING, code_digest, versions
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 REFERENCE = "reference"  # the name under which the reference's noise floors are kept
 FLOOR = "(noise floor)"  # what tables call them
+BRIGHTEST_ERROR = 0.25  # of exposed radiance
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
 FRAMES_FILE = "frames.csv"
@@ -53,9 +54,19 @@ def picture_path(folder: Path, index: int) -> Path:
     return folder / f"{index:04d}.webp"
 
 
+def error_path(folder: Path, index: int) -> Path:
+    return folder / f"error-{index:04d}.webp"
+
+
 def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
     """Keep an image (H, W, 3) in [0, 1], rounded to 8 bits."""
     Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(picture_path(folder, index), lossless=True, method=2)
+
+
+def save_error(folder: Path, index: int, error: NDArray[np.floating]) -> None:
+    """Keep an error map (H, W) in exposed radiance, white from BRIGHTEST_ERROR on."""
+    shades = 255 * (error / BRIGHTEST_ERROR).clip(0, 1) + 0.5
+    Image.fromarray(shades.astype(np.uint8)).save(error_path(folder, index), lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:

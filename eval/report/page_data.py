@@ -13,7 +13,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from eval.metrics import METRICS, flip_map
-from eval.results import ClipResults, folders_of, load_picture, picture_path
+from eval.results import ClipResults, error_path, folders_of, load_picture, picture_path
 from timing import thread_count, threads_for
 
 WITH_FLIP_MAPS = 1.4  # bytes of images and their FLIP maps over those of images
@@ -30,6 +30,7 @@ class PageClip:
         frames: which of them have pictures.
         images: data URIs of each denoiser's pictures and of the reference's.
         flips: of each denoiser's FLIP maps.
+        told: of the maps of the errors that denoisers tell, of those that do.
         curves: each metric, frame by frame (all of them), of each denoiser, and of the reference its noise floor.
         crops: where most comes into view.
     """
@@ -41,6 +42,7 @@ class PageClip:
     width: int
     images: dict[str, list[str]]
     flips: dict[str, list[str]]
+    told: dict[str, list[str]]
     curves: dict[str, dict[str, list[float | None]]]
     crops: list[dict[str, int]]
 
@@ -93,6 +95,12 @@ def curves_of(clip: ClipResults) -> dict[str, dict[str, list[float | None]]]:
     }
 
 
+def told_maps(folder: Path, frames: Sequence[int]) -> list[str]:
+    """Data URIs of the error maps that a denoiser left for those frames; none unless it left all."""
+    paths = [error_path(folder, index) for index in frames]
+    return [data_uri(path.read_bytes(), "webp") for path in paths] if all(path.exists() for path in paths) else []
+
+
 def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
     """The clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
     folders = folders_of(runs, clip)
@@ -118,6 +126,7 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
         width=width,
         images=images,
         flips=flips,
+        told={name: maps for name, folder in folders.items() if (maps := told_maps(folder, frames))},
         curves=curves_of(clip),
         crops=chosen_crops(clip, frames),
     )

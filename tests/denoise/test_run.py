@@ -405,7 +405,7 @@ def test_another_half_of_the_samples_is_averaged_and_shrunk_by(halves, tmp_path)
         assert not torch.equal(shrunk, filtered)
 
 
-def test_halves_tell_how_far_frames_are_from_the_truth(spheres, halves, tmp_path, capsys):
+def test_halves_tell_how_far_frames_are_from_the_truth(halves, tmp_path, capsys):
     words = ["denoise", *halves, "--denoiser", "svgf+js", "--spp", "4", "--png"]
     main([*words, "--out", str(tmp_path / "plain")])
     capsys.readouterr()
@@ -421,8 +421,7 @@ def test_halves_tell_how_far_frames_are_from_the_truth(spheres, halves, tmp_path
     for row in rows:
         assert 0 < float(row["relative_error"]) < float(row["at_most"]) < 3
         assert float(row["samples"]) > 8
-    for image, frame in zip(outputs(tmp_path / "out", "error."), spheres, strict=True):
-        assert (image > 0).any() and ((image == 0) | (frame.depth > 0)).all()
+    assert all((image > 0).any() and (image >= 0).all() for image in outputs(tmp_path / "out", "error."))
 
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     (tmp_path / "out" / sorted(name for name in before if name.endswith(".exr"))[2]).unlink()

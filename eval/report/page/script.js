@@ -178,12 +178,14 @@ function paintNumbers(context, number, clip) { // number(pixel index * 4) in [0,
 
 const view = { clip: 0, left: "", right: REFERENCE, frame: 0, mode: "slider", split: 50, flipped: false, zoom: 1, metric: "rmse", hidden: new Set(), timer: 0, draws: 0 };
 const clipNow = () => data.clips[view.clip];
-const MODES = ["slider", "flip", "difference", "map"];
+const MODES = [...byId("views").children].map(button => button.dataset.view);
+const MAPS = { map: "flips", told: "told" }; // views of one picture
+const toldBy = clip => (view.left in clip.told ? view.left : view.right);
 
 async function paint() {
   const clip = clipNow(), turn = ++view.draws, canvas = byId("canvas");
-  const mapped = view.left === REFERENCE ? view.right : view.left;
-  const uris = view.mode === "map" ? [clip.flips[mapped]] : [clip.images[view.left], clip.images[view.right]];
+  const mapped = view.mode === "told" ? toldBy(clip) : view.left === REFERENCE ? view.right : view.left;
+  const uris = view.mode in MAPS ? [clip[MAPS[view.mode]][mapped]] : [clip.images[view.left], clip.images[view.right]];
   const [left, right] = await Promise.all(uris.map(list => (list ? load(list[view.frame]) : null)));
   if (turn !== view.draws) return; // something newer is on its way
   if (canvas.width !== clip.width || canvas.height !== clip.height) [canvas.width, canvas.height] = [clip.width, clip.height];
@@ -194,7 +196,7 @@ async function paint() {
     if (split) context.drawImage(left, 0, 0, split, height, 0, 0, split, height);
   } else if (view.mode === "flip") {
     context.drawImage(view.flipped ? right : left, 0, 0);
-  } else if (view.mode === "map" && left) {
+  } else if (view.mode in MAPS && left) {
     const map = pixels(left, width, height).data;
     paintNumbers(context, i => map[i], clip);
   } else if (view.mode === "difference") {
@@ -212,10 +214,14 @@ function measured(name) {
 }
 
 function describe() {
+  const clip = clipNow();
   const texts = {
     slider: "", flip: `Shown: ${view.flipped ? view.right : view.left}; press space. `,
     difference: `Mean difference of ${view.left} and ${view.right}: black 0, brightest 0.25 and more. `,
     map: `FLIP of ${view.left === REFERENCE ? view.right : view.left} against the reference: black 0, brightest 1. `,
+    told: toldBy(clip) in clip.told
+      ? `Error that the samples of ${toldBy(clip)} tell, in exposed radiance: black 0, brightest 0.25 and more. `
+      : "Neither tells its error: NAME+js does, where frames have halves of their samples. ",
   };
   byId("caption").textContent = texts[view.mode] + [...new Set([view.left, view.right])].map(measured).join("; ");
   byId("name-left").textContent = view.mode === "flip" && view.flipped ? "" : view.left;
