@@ -116,19 +116,24 @@ class ErrorEstimate:
         """Samples a pixel, the frame's own among them, by which the relative error is down to `target`, by shrinkage.
 
         Of a filter's squared error e², which is taken to stay, and noise of variance v / k for k times the samples, the
-        best mixture has e² v / (k e² + v). Infinite beyond MOST_SAMPLES.
+        best mixture has e² v / (k e² + v). By as much as the mean of that falls, the error is taken to fall. Infinite
+        beyond MOST_SAMPLES.
         """
         filtered = self.smoothed(self.filtered, self.spread, torch.ones_like(self.noise)).clamp(min=LEAST_DIVISOR)
+
+        def mixture(k: float) -> float:
+            return self.over_surfaces(filtered * self.noise / (k * filtered + self.noise).clamp(min=LEAST_DIVISOR))
+
         own = float(self.frame.samples.mean())
-        low, high = 1.0, MOST_SAMPLES / own
         if self.most_relative_error() <= target:
             return own
-        if self.over_surfaces(filtered * self.noise / (high * filtered + self.noise)) > target**2:
+        share = (target / max(self.relative_error(), target)) ** 2
+        low, high = 1.0, MOST_SAMPLES / own
+        if mixture(high) > share * mixture(1.0):
             return torch.inf
         while high / low > 1.01:
             k = (low * high) ** 0.5
-            left = self.over_surfaces(filtered * self.noise / (k * filtered + self.noise))
-            low, high = (k, high) if left > target**2 else (low, k)
+            low, high = (k, high) if mixture(k) > share * mixture(1.0) else (low, k)
         return own * high
 
 

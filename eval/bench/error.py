@@ -161,6 +161,9 @@ def calibration_figure(rows: Sequence[Told]) -> Figure:
         axes[-1].plot([row.spp for row in ours], [row.samples for row in ours], "o", ms=4, label=name)
     axes[-1].axhline(LEVELS[0], color="grey", lw=0.8)
     axes[-1].set(xscale="log", yscale="log", title=f"samples asked for, {LEVELS[0]} needed", xlabel="samples taken")
+    axes[-1].set_xticks(LEVELS[1:], map(str, LEVELS[1:]))
+    axes[-1].set_yticks((32, 64, 128, 256, 512), map(str, (32, 64, 128, 256, 512)))
+    axes[-1].minorticks_off()
     axes[-1].legend(fontsize=8)
     return figure
 

@@ -18,6 +18,7 @@ from eval.selection import with_indirect_baselines
 from eval.spec import DenoiserSpec, precision_in_use
 from eval.tradeoff.resampled_clips import Source, scene_of, source, with_samples
 from eval.tradeoff.samples import SampleTrade, sample_trades
+from eval.tradeoff.shrinkage import Gain, gains_of
 from eval.tradeoff.times import Times
 from render.clip import Options
 
@@ -33,12 +34,14 @@ class SampleTrades:
         levels: the numbers of samples.
         sources: how each clip's input was made.
         render_ms: the cost of samples in each clip's scene.
+        shrinkage: what NAME+js gains.
     """
 
     levels: list[int]
     sources: dict[str, Source]
     render_ms: dict[str, dict[str, float]]
     rows: list[SampleTrade]
+    shrinkage: list[Gain]
 
 
 def check_levels(levels: Sequence[int]) -> None:
@@ -97,4 +100,5 @@ def by_samples(
         sources={f"{clip.scene}/{clip.name}": source(clip, levels[-1]) for clip in clips},
         render_ms={name: clip_cost._asdict() for name, clip_cost in cost.items()},
         rows=sample_trades(specs, fed, render_ms, times),
+        shrinkage=[*gains_of(fed)],
     )

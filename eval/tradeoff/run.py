@@ -15,6 +15,7 @@ from eval.tradeoff.denoisers import TRADED, Trade, front_table, trades
 from eval.tradeoff.feeding import SPP_LEVELS, SampleTrades, by_samples, check_levels, sampled
 from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.samples import generalisation, samples_table
+from eval.tradeoff.shrinkage import gains_table
 from eval.tradeoff.times import Times
 from files import write_json
 from plotting import save_figure
@@ -81,5 +82,8 @@ def tables(rows: Sequence[Trade], samples: SampleTrades, title: str, times: Time
     if untimed := [row.label for row in rows if row.ms is None]:
         parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command}`.")
     parts.append(f"samples a pixel\n{samples_table(samples.rows)}")
+    if samples.shrinkage:
+        title = "what shrinkage gains on the better of noise and denoiser, dB: mean of the clips (worst)"
+        parts.append(f"{title}\n{gains_table(samples.shrinkage)}")
     parts.append(f"trained on 1 spp, fed more (after RAE, Fig. 9 and 11)\n{generalisation(samples.rows)}")
     return "\n\n".join(parts)

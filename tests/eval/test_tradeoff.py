@@ -15,7 +15,7 @@ from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
-from eval.results import REFERENCE, ClipResults, Result
+from eval.results import REFERENCE, ClipResults, Result, load_result
 from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
@@ -295,8 +295,8 @@ def traded(tiny, tmp_path_factory):
         label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
         save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
     write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
-    bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w"])
-    names = ("noisy", "accumulated", "svgf", "wskp6@tiny", "wskp6-2w")
+    bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w", "svgf+js"])
+    names = ("noisy", "accumulated", "svgf", "svgf+js", "wskp6@tiny", "wskp6-2w")
     text = trade(tiny, runs, "tiny", names, "48x32", levels=(1, 4))
     return runs, text
 
@@ -363,6 +363,25 @@ def test_generalisation_shows_what_was_fed(traded):
     rows = [SampleTrade(**row) for row in read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]]
     lines = [line.split()[:2] for line in generalisation(rows).splitlines()[2:]]
     assert lines == [[name, spp] for spp in ("1", "4") for name in ("noisy", "accumulated", "svgf")]
+
+
+def test_what_shrinkage_gains_is_of_the_worst_clip_too(traded):
+    runs, text = traded
+    by_psnr, by_mse = read_json(runs / "report" / "trade.json")["samples"]["shrinkage"]
+    assert (by_psnr["metric"], by_mse["metric"]) == ("psnr", "mse_unbiased")
+    for gain, value in ((by_psnr, decibels_of), (by_mse, lambda r: -10 * math.log10(r["mse_unbiased"]))):
+        assert (gain["label"], gain["spp"], len(gain["clips"])) == ("svgf+js", 4, 2)
+        for clip, gained in gain["clips"].items():
+            folder = runs / "trade" / "eval" / "clips" / clip.replace("/", "-")
+            shown = {name: value(load_result(folder / name).metrics) for name in ("noisy", "svgf", "svgf+js")}
+            assert gained == pytest.approx(shown["svgf+js"] - max(shown["noisy"], shown["svgf"]))
+    mean, worst = np.mean([*by_psnr["clips"].values()]), min(by_psnr["clips"].values())
+    assert f"{mean:+.2f} ({worst:+.2f})" in text
+
+
+def decibels_of(metrics: dict[str, float]) -> float:
+    """PSNR: none of these clips is within its noise floor."""
+    return metrics["psnr"]
 
 
 def test_clips_of_more_samples_are_left_out(tiny, tmp_path):

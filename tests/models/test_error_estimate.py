@@ -75,18 +75,17 @@ def test_what_two_passes_err_by_is_told_without_bias():
     assert (estimate.covariance * scale)[inner].mean().item() == pytest.approx(own, rel=0.06)
 
 
-def test_more_samples_are_asked_for_than_it_takes_but_not_by_much():
-    """Where error and noise are alike everywhere, (e² v) / (k e² + v) = t² gives k."""
+def test_samples_are_asked_for_as_errors_of_mixtures_fall():
+    """Where error and noise are alike everywhere, the error falls by (e² + v) / (k e² + v)."""
     truth = waves(9)
     deviation = 0.5
     _, estimate = judged(truth, deviation)
-    target = 0.02
-    taken = estimate.samples_for(target)
+    target = estimate.relative_error() / 2
     e2, v = estimate.over_surfaces(estimate.filtered), estimate.over_surfaces(estimate.noise)
-    assert taken == pytest.approx(8 * v * (e2 - target**2) / (e2 * target**2), rel=0.4)
+    assert estimate.samples_for(target) == pytest.approx(8 * (4 * (e2 + v) - v) / e2, rel=0.3)
     assert estimate.samples_for(10.0) == 8  # those that there are
     assert estimate.samples_for(1e-9) == float("inf")
-    assert estimate.samples_for(0.03) < taken
+    assert estimate.samples_for(1.2 * target) < estimate.samples_for(target)
 
 
 def test_equal_halves_have_no_error():
