@@ -18,7 +18,7 @@ class Gain:
     """Of one denoiser fed `spp` samples a pixel: dB on the better of noise and what it shrinks to.
 
     Attributes:
-        metric: "psnr", by which what is within the noise floor counts as at its edge, or "mse_unbiased", which has none.
+        metric: "psnr", by which what is within the noise floor counts as at its edge, or "mse_unbiased".
         clips: the gain on each clip, SCENE/CLIP.
     """
 
