@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -21,31 +22,35 @@ class FrameError:
     Attributes:
         spp: samples a pixel that the frame has.
         relative_error: root of the mean squared error relative to the light around each pixel.
-        at_most: the same, but for chance.
-        samples: a pixel, until `at_most` is what was asked for; `spp` where it is, infinite beyond reason.
+        at_most: the same with two standard errors added.
+        until: what `at_most` is to be; None where nobody asked.
+        samples: a pixel, that this takes; `spp` where it is reached, infinite beyond reason.
     """
 
     frame: int
     spp: float
     relative_error: float
     at_most: float
-    samples: float
+    until: float | None
+    samples: float | None
 
     @staticmethod
-    def of(frame: int, estimate: ErrorEstimate, target: float) -> "FrameError":
-        spp = float(estimate.frame.samples.mean())
+    def of(frame: int, estimate: ErrorEstimate, until: float | None) -> "FrameError":
         return FrameError(
             frame,
-            spp,
+            float(estimate.frame.samples.mean()),
             estimate.relative_error(),
             estimate.most_relative_error(),
-            np.ceil(estimate.samples_for(target)).item(),
+            until,
+            None if until is None else np.ceil(estimate.samples_for(until)).item(),
         )
 
 
 def row_of(words: dict[str, str]) -> FrameError:
     """Raises ValueError, KeyError or TypeError for what is no row."""
-    return FrameError(int(words.pop("frame")), **{name: float(word) for name, word in words.items()})
+    until, samples = (float(words[name]) if words[name] else None for name in ("until", "samples"))
+    spp, relative_error, at_most = (float(words[name]) for name in ("spp", "relative_error", "at_most"))
+    return FrameError(int(words["frame"]), spp, relative_error, at_most, until, samples)
 
 
 class ErrorTable:
@@ -58,7 +63,7 @@ class ErrorTable:
             try:
                 with self.path.open(newline="") as file:
                     rows = [row_of(words) for words in csv.DictReader(file)]
-            except (TypeError, ValueError, KeyError, AttributeError):
+            except (TypeError, ValueError, KeyError, csv.Error):
                 raise BadInput(f"{self.path} is damaged: delete it and run the command again") from None
             self.rows = {row.frame: row for row in rows}
 
@@ -70,11 +75,15 @@ class ErrorTable:
         writer.writerows(asdict(self.rows[number]) for number in sorted(self.rows))
         write_file(self.path, text.getvalue().encode())
 
-    def summary(self, target: float) -> str:
-        """Which frames are done, and how many samples the others take."""
-        waiting = [row.samples for row in self.rows.values() if row.at_most > target]
-        done = len(self.rows) - len(waiting)
-        text = f"{done} of {len(self.rows)} frames have a relative error of at most {target:g}"
+    def has(self, frame: int, until: float | None) -> bool:
+        """Whether there is a row of the frame for what is asked for now."""
+        return frame in self.rows and self.rows[frame].until == until
+
+    def summary(self, frames: Iterable[int]) -> str:
+        """Which of the frames are done, and how many samples the others take."""
+        rows = [self.rows[frame] for frame in frames]
+        waiting = [row.samples for row in rows if row.samples and row.samples > row.spp]
+        text = f"{len(rows) - len(waiting)} of {len(rows)} frames have a relative error of at most {rows[0].until:g}"
         if waiting:
             text += f"; the others take {min(waiting):g} to {max(waiting):g} samples a pixel"
         return f"{text} ({self.path})"

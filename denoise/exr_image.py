@@ -63,15 +63,19 @@ class ExrImage:
             limit = LARGEST_HALF if target == np.float16 else np.inf
             self.channels[name].pixels = np.ascontiguousarray(image[..., index].clip(-limit, limit), target)
 
-    def add(self, layer: str, image: NDArray[np.float32]) -> None:
-        """Put `image` (H, W, 3) beside what there is, in half precision, as R, G and B of a layer of the first part.
+    def add(self, layer: str, image: NDArray[np.float32], beside: str) -> None:
+        """Put `image` (H, W, 3), not negative, as R, G and B of a layer into the part that has the channel `beside`.
 
-        One of that name is replaced.
+        It is in half precision. A layer of that name, in whatever part, is replaced.
         """
+        home = next(part for part in self.file.parts if self.channels[beside] in part.channels.values())
         for index, component in enumerate("RGB"):
             name = f"{layer}.{component}"
             plane = np.ascontiguousarray(image[..., index].clip(0, LARGEST_HALF), np.float16)
-            self.channels[name] = self.file.parts[0].channels[name] = OpenEXR.Channel(name, plane)
+            if name in self.channels:
+                self.channels[name].pixels = plane
+            else:
+                self.channels[name] = home.channels[name] = OpenEXR.Channel(name, plane)
 
     def write(self, path: Path, note: str) -> None:
         """Write all parts, layers and attributes atomically, with `note` as the attribute `denoised`.

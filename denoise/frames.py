@@ -205,11 +205,16 @@ def derived_motion(pixels: Pixels, depth: Image, view: View, before: View) -> Im
 
 
 def light_of(pixels: Pixels) -> dict[str, Image]:
-    """Radiance as our channels: what is reflected is direct. Background is emission, which nobody filters."""
+    """Radiance as our channels: what is reflected is direct. Background is emission, which nobody filters.
+
+    Raises BadInput for two halves that are one: their difference would say that there is no noise.
+    """
     surface = pixels.surface[..., None]
     colour = pixels.arrays["colour"]
     halves = np.stack([colour, pixels.arrays["half"]]) if "half" in pixels.arrays else None
     if halves is not None:
+        if colour[pixels.surface].any() and np.array_equal(*halves):
+            raise BadInput(f"{pixels.source} and its other half are the same: render them with different seeds")
         colour = halves.mean(axis=0)
     emitted = pixels.arrays.get("emission", np.zeros_like(colour))
     light = {

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image as Picture
-from torch import Tensor
 from tqdm import tqdm
 
 from datasets.frame import Frame
@@ -25,7 +24,7 @@ from denoise.motion_meaning import Meaning
 from denoise.pixels import open_passes, read_pixels
 from denoise.sequence import COLOUR, FrameFiles, files_of, gaps, numbered, sequence_of, shots
 from denoise.settings import claim
-from denoise.sources import Sources, find_sources
+from denoise.sources import Sources, find_sources, has_halves
 from denoise.understanding import Understanding, report, understand
 from errors import BadInput
 from eval.bench.memory import status_mb
@@ -33,7 +32,7 @@ from eval.spec import DenoiserSpec, precision_in_use
 from files import replacing
 from models.around import inner_denoiser
 from models.denoiser import Denoiser, State
-from models.error_estimate import with_error
+from models.error_estimate import ErrorEstimate, with_error
 from models.oidn import OIDN, OIDNQuality
 from models.shrinkage import Shrunk
 from provenance import DENOISING, file_digest, versions
@@ -96,7 +95,7 @@ def denoise(job: Job) -> None:
     spec = DenoiserSpec(job.denoiser, "total", precision_in_use(job.denoiser), job.weights)
     denoiser = build(spec, job.quality)
     if job.tells_error:
-        check_error_can_be_told(job, denoiser, sources)
+        check_error_can_be_told(job, denoiser, sources, frames[0])
     work = Work(job, spec, denoiser, sequence, sources)
     print(work.introduction())
     claim(job.out, work.settings())
@@ -106,7 +105,7 @@ def denoise(job: Job) -> None:
     peak = status_mb("VmHWM")
     print(f"; peak memory {peak / 1000:.2f} GB" if peak else "")
     if job.until is not None:
-        print(work.errors.summary(job.until))
+        print(work.errors.summary(frame.number for frame in frames))
     if references:
         print(compare(frames, references, job.out, sources.target, work.exposure))
 
@@ -122,12 +121,12 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
     return denoiser
 
 
-def check_error_can_be_told(job: Job, denoiser: Denoiser, sources: Sources) -> None:
+def check_error_can_be_told(job: Job, denoiser: Denoiser, sources: Sources, first: FrameFiles) -> None:
     """Raise BadInput for a denoiser that tells no error, frames that have no halves, and an error that none has."""
     if not isinstance(denoiser, Shrunk):
         raise BadInput(f"{job.denoiser} does not tell its error: name {job.denoiser}+js")
-    if not (sources.is_ours or sources.has("half")):
-        raise BadInput("how far frames are from the truth only halves of their samples tell: name the others by --half")
+    if not (has_halves(ExrImage(first.passes[COLOUR], header_only=True)) if sources.is_ours else sources.has("half")):
+        raise BadInput("--error and --until need two halves of the samples: name the other by --half")
     if job.until is not None and not 0 < job.until < math.inf:
         raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
 
@@ -204,8 +203,7 @@ class Work:
             "motion": str(job.motion if self.sources.is_ours else self.understanding.reading.meaning),
             "as": job.stored_as,
             "spp": job.spp,
-            "error": job.error,
-            "until": job.until,
+            "error": job.error or None,
             "versions": versions(DENOISING),
         }
 
@@ -221,11 +219,11 @@ class Work:
                 yield from self.play_shot(shot, start, progress)
 
     def is_finished(self, files: FrameFiles) -> bool:
-        """Whether a frame's output is there, and no older than what it was made of."""
+        """Whether a frame's output is there, and its error if asked for, and no older than what it was made of."""
         outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.previews else [])]
-        if not all(path.exists() for path in outputs) or (
-            self.job.tells_error and files.number not in self.errors.rows
-        ):
+        if not all(path.exists() for path in outputs):
+            return False
+        if self.teller and not self.errors.has(files.number, self.job.until):
             return False
         newest = max(path.stat().st_mtime for path in files.passes.values())
         return all(path.stat().st_mtime >= newest for path in outputs)
@@ -245,22 +243,26 @@ class Work:
                     raise BadInput(
                         f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence"
                     )
-                output, state = self.step(frame, state, image, files.number if index >= start else None)
+                if self.teller and index >= start:
+                    output, state, estimate = with_error(self.teller, frame, state)
+                    self.keep_error(estimate, files.number, image)
+                else:
+                    output, state = self.denoiser(frame, state)
                 if index >= start:
                     self.write(files, image, output[0].permute(1, 2, 0).numpy())
                     yield nonfinite
             progress.update()
 
-    def step(self, frame: Frame, state: State | None, image: ExrImage, number: int | None) -> tuple[Tensor, State]:
-        """Radiance of a frame, and the state after it; where it has a `number`, its error is told as asked for."""
-        if number is None or not isinstance(self.denoiser, Shrunk) or not self.job.tells_error:
-            output, after = self.denoiser(frame, state)
-            return output, after
-        output, after, estimate = with_error(self.denoiser, frame, state)
-        self.errors.add(FrameError.of(number, estimate, self.job.until or 0.0))
+    @cached_property
+    def teller(self) -> Shrunk | None:
+        """The denoiser, where it is asked how far it is from the truth."""
+        return self.denoiser if self.job.tells_error and isinstance(self.denoiser, Shrunk) else None
+
+    def keep_error(self, estimate: ErrorEstimate, number: int, image: ExrImage) -> None:
+        """What is asked for of a frame's error: its row, its layer."""
+        self.errors.add(FrameError.of(number, estimate, self.job.until))
         if self.job.error:
-            image.add(ERROR_LAYER, estimate.radiance()[0].permute(1, 2, 0).numpy())
-        return output, after
+            image.add(ERROR_LAYER, estimate.radiance()[0].permute(1, 2, 0).numpy(), self.sources.target[0])
 
     @cached_property
     def errors(self) -> ErrorTable:

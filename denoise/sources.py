@@ -4,7 +4,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from datasets.exr import COMPONENTS, FACTS_ATTRIBUTE
+from datasets.channels import HALVES
+from datasets.exr import COMPONENTS, FACTS_ATTRIBUTE, HALF_ENDINGS
 from denoise.exr_image import ExrImage
 from denoise.layers import KNOWN, Layer, candidates, grouped, in_words, layer_of, plain, stated_layer
 from denoise.sequence import COLOUR
@@ -51,6 +52,11 @@ def is_ours(image: ExrImage) -> bool:
         return False
     needed = [f"{layer}.{c}" for layer in ("direct", "indirect", "emission") for c in COMPONENTS.get(layer, "RGB")]
     return isinstance(facts, dict) and all(name in image.channels for name in [*needed, *"RGB"])
+
+
+def has_halves(image: ExrImage) -> bool:
+    """Whether a file that `onespp exr` wrote holds the halves of its samples."""
+    return all(f"{channel}{ending}.R" in image.channels for channel in HALVES.values() for ending in HALF_ENDINGS)
 
 
 def find_sources(images: Mapping[str, ExrImage], stated: Mapping[str, str]) -> Sources:

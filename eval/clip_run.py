@@ -38,6 +38,7 @@ class Entrant:
         weights: the file of its weights, None where it has none.
         modules: of onespp, in which it is defined.
         build: makes it, ready to use; called once, and only if results are missing.
+        tells_error: whether to keep maps of the error that it tells, where it is a NAME+js and frames have halves.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Entrant:
     weights: Path | None
     modules: tuple[str, ...]
     build: Callable[[], Denoiser]
+    tells_error: bool = False
 
     @cached_property
     def denoiser(self) -> Denoiser:
@@ -75,7 +77,7 @@ class ClipRun:
     before: Luminances | None = None
     frames: list[Values] = field(default_factory=list)
     nonfinite: int = 0
-    error: Tensor | None = None  # that the last frame's samples tell, (1, 3, H, W), in exposed radiance
+    error: Tensor | None = None  # that the last frame's samples tell, (1, H, W), in exposed radiance
 
     @property
     def name(self) -> str:
@@ -95,9 +97,9 @@ class ClipRun:
     def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
         denoiser = self.entrant.denoiser
-        if isinstance(denoiser, Shrunk) and frame.has_halves:
+        if self.entrant.tells_error and isinstance(denoiser, Shrunk) and frame.has_halves:
             output, self.state, estimate = with_error(denoiser, frame, self.state)
-            self.error = exposure * estimate.radiance()
+            self.error = exposure * estimate.radiance().square().mean(dim=1).sqrt()
         else:
             output, self.state = denoiser(frame, self.state)
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
@@ -178,4 +180,4 @@ def play(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool =
             image = display(finite(output), clip.exposure)
             save_picture(folder, index, image[0].permute(1, 2, 0).numpy())
             if isinstance(run, ClipRun) and run.error is not None:
-                save_error(folder, index, run.error[0].mean(dim=0).numpy())
+                save_error(folder, index, run.error[0].numpy())

@@ -49,14 +49,15 @@ def clips_of_one_spp(dataset: Dataset) -> list[Clip]:
     return clips
 
 
-def entrant(spec: DenoiserSpec, name: str | None = None) -> Entrant:
+def entrant(spec: DenoiserSpec, name: str | None = None, tells_error: bool = False) -> Entrant:
     """The denoiser of a spec, under the name that results are to give it."""
-    return Entrant(name or spec.name, spec.returns, spec.precision, spec.weights, spec.modules, spec.build)
+    name = name or spec.name
+    return Entrant(name, spec.returns, spec.precision, spec.weights, spec.modules, spec.build, tells_error)
 
 
 def entrants_of(specs: Sequence[DenoiserSpec]) -> list[Entrant]:
     """An entrant for each spec, and for the baselines of indirect light if that is denoised."""
-    return [entrant(spec) for spec in with_indirect_baselines(specs)]
+    return [entrant(spec, tells_error=True) for spec in with_indirect_baselines(specs)]
 
 
 class Pass(NamedTuple):

@@ -3,10 +3,10 @@
 F(A) does not depend on the noise of B, so (F(A) - B)² - (A - B)² / 2 estimates its squared error without bias. In the
 same way that of M, the mean of F(A) and F(B), beside the mean N of all samples, whose variance is v = (A - B)² / 4:
 
-    e² = (M - N)² - v + 2 c,  where  c = (F(A) - F(B)) (A - B) / 4
+    e² = (M - N)² - v + 2 c = (A - M) (B - M) + 2 c,  where  c = (F(A) - F(B)) (A - B) / 4
 
-estimates the product of M's error with the noise of N. It is taken for the error of F(N), which is M's or up to a fifth
-less (docs/experiments.md, Error map). What is mixed of both, M + ρ (N - M), has the squared error
+estimates the product of M's error with the noise of N. M is taken for F(N), whose error is the same or a little less
+(docs/experiments.md, Error map). What is mixed of both, M + ρ (N - M), has the squared error
 
     (1 - ρ)² e² + 2 ρ (1 - ρ) c + ρ² v.
 
@@ -27,7 +27,7 @@ from models.denoiser import State
 from models.neighbours import mesh_sums
 from models.operators import image_luminance
 from models.parameters import LEAST_DIVISOR
-from models.shrinkage import Shrunk, believed, denoised_irradiance, relative, share_let_in, unit_of
+from models.shrinkage import Shrunk, believed, denoised_irradiance, mixture, relative, share_let_in, unit_of
 
 MOST_SAMPLES = 2.0**20  # a pixel; nobody is told to take more
 
@@ -37,32 +37,32 @@ class ErrorEstimate:
     """Of one frame: squares of irradiance relative to `unit`, (B, 3, H, W).
 
     Attributes:
-        filtered: squared error of what the filter returned; unbiased, so below 0 in places.
-        spread: the part of it that is this frame's noise, never below 0.
-        covariance: of that error with the noise of the frame.
-        noise: variance of the frame.
+        filter_error: squared error of what the filter returned; unbiased, so below 0 in places.
+        spread: the part of it that this frame's noise makes, never below 0.
+        covariance: of the filter's error with the frame's.
+        variance: of the frame.
         share: ρ of the noise that was let in.
         unit: luminance of the irradiance around each pixel, (B, 1, H, W), not 0.
         frame: the frame.
     """
 
-    filtered: Tensor
+    filter_error: Tensor
     spread: Tensor
     covariance: Tensor
-    noise: Tensor
+    variance: Tensor
     share: Tensor
     unit: Tensor
     frame: Frame
 
-    def mixed(self, filtered: Tensor) -> Tensor:
-        """The squared error of the output, for that of what the filter returned."""
+    def mixed(self, filter_error: Tensor) -> Tensor:
+        """The squared error of the output, but for the covariance, for that of what the filter returned."""
         rho = self.share
-        return (1 - rho).square() * filtered + rho.square() * self.noise
+        return (1 - rho).square() * filter_error + rho.square() * self.variance
 
     @property
     def squared(self) -> Tensor:
         """The squared error of the output, as noisy as it is unbiased."""
-        return self.mixed(self.filtered) + 2 * self.share * (1 - self.share) * self.covariance
+        return self.mixed(self.filter_error) + 2 * self.share * (1 - self.share) * self.covariance
 
     def smoothed(self, squares: Tensor, least: Tensor, weight: Tensor) -> Tensor:
         """Means of `squares`, which have `weight` times the noise, over 81 x 81 pixels of the own mesh.
@@ -71,7 +71,7 @@ class ErrorEstimate:
         (B, 3, H, W).
         """
         mesh = self.frame.mesh_id
-        chance = 2 * (weight * self.noise).square()
+        chance = 2 * (weight * self.variance).square()
         sums = mesh_sums(torch.cat([squares, chance, least, torch.ones_like(mesh)], dim=1), mesh, 1)
         windows = []
         for step in (3, 9, 27):
@@ -116,24 +116,24 @@ class ErrorEstimate:
         """Samples a pixel, the frame's own among them, by which the relative error is down to `target`, by shrinkage.
 
         Of a filter's squared error e², which is taken to stay, and noise of variance v / k for k times the samples, the
-        best mixture has e² v / (k e² + v). By as much as the mean of that falls, the error is taken to fall. Infinite
-        beyond MOST_SAMPLES.
+        best mixture has e² v / (k e² + v). By as much as the mean of that falls, `most_relative_error` is taken to
+        fall. Infinite beyond MOST_SAMPLES.
         """
-        filtered = self.smoothed(self.filtered, self.spread, torch.ones_like(self.noise)).clamp(min=LEAST_DIVISOR)
+        error = self.smoothed(self.filter_error, self.spread, torch.ones_like(self.variance)).clamp(min=LEAST_DIVISOR)
 
         def mixture(k: float) -> float:
-            return self.over_surfaces(filtered * self.noise / (k * filtered + self.noise).clamp(min=LEAST_DIVISOR))
+            return self.over_surfaces(error * self.variance / (k * error + self.variance).clamp(min=LEAST_DIVISOR))
 
         own = float(self.frame.samples.mean())
         if self.most_relative_error() <= target:
             return own
-        share = (target / max(self.relative_error(), target)) ** 2
+        wanted = mixture(1.0) * (target / self.most_relative_error()) ** 2
         low, high = 1.0, MOST_SAMPLES / own
-        if mixture(high) > share * mixture(1.0):
+        if mixture(high) > wanted:
             return torch.inf
         while high / low > 1.01:
             k = (low * high) ** 0.5
-            low, high = (k, high) if mixture(k) > share * mixture(1.0) else (low, k)
+            low, high = (k, high) if mixture(k) > wanted else (low, k)
         return own * high
 
 
@@ -149,8 +149,7 @@ def with_error(denoiser: Shrunk, frame: Frame, state: State | None) -> tuple[Ten
     halves = [frame.half(which) for which in (0, 1)]
     passes = [denoised_irradiance(inner(half, state)[0], half, signal) for half in halves]
     estimate = estimated(frame, filtered, passes, [half.irradiance(signal) for half in halves], share)
-    mixed = torch.lerp(filtered, frame.irradiance(signal), share).clamp(min=0)
-    return frame.remodulate(mixed, signal), after, estimate
+    return frame.remodulate(mixture(frame, filtered, share, signal), signal), after, estimate
 
 
 def estimated(
@@ -164,13 +163,12 @@ def estimated(
     mean = (passes[0] + passes[1]) / 2
     off_a, off_b = (relative(half - mean, unit) for half in halves)
     between = relative(passes[0] - passes[1], unit)
-    noise = (off_a - off_b).square() / 4
     covariance = between * (off_a - off_b) / 4
     return ErrorEstimate(
-        filtered=((off_a + off_b) / 2).square() - noise + 2 * covariance,
+        filter_error=off_a * off_b + 2 * covariance,
         spread=between.square() / 4,
         covariance=covariance,
-        noise=noise,
+        variance=(off_a - off_b).square() / 4,
         share=share,
         unit=unit,
         frame=frame,

@@ -106,10 +106,14 @@ def relative(difference: Tensor, unit: Tensor) -> Tensor:
     return (difference / unit).clamp(-LARGEST_RATIO, LARGEST_RATIO)
 
 
+def mixture(frame: Frame, denoised: Tensor, share: Tensor, signal: Signal) -> Tensor:
+    """Denoised irradiance (B, 3, H, W) with a share of the frame's own let in."""
+    return torch.lerp(denoised, frame.irradiance(signal), share).clamp(min=0)
+
+
 def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
     """The shrinkage of a frame that has halves to denoised irradiance (B, 3, H, W), as irradiance."""
-    rho = share_let_in(frame, denoised, signal)
-    return torch.lerp(denoised, frame.irradiance(signal), rho).clamp(min=0)
+    return mixture(frame, denoised, share_let_in(frame, denoised, signal), signal)
 
 
 class Shrunk(Around):

@@ -1,8 +1,8 @@
 """`onespp bench error`: whether the error that halves of the samples tell is the true one."""
 
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,13 @@ from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
 from datasets.channels import CAMERA_CHANNELS, HALVES, NOISY, REFERENCES
-from datasets.clip import Clip, is_clip
-from datasets.clip_job import write_clip
+from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
-from datasets.profiles import GENERATOR
 from datasets.tonemap import display
 from errors import BadInput
 from eval.bench.output import bench_folder
-from eval.selection import weights_of
+from eval.bench.own_clips import SEED, own_clip
+from eval.selection import cannot_run, choose, weights_of
 from eval.spec import DenoiserSpec, precision_in_use
 from files import write_file, write_json
 from models.denoiser import State
@@ -37,8 +36,8 @@ SCENES = ("cornell_box", "cornell_box_moving", "room-2002", "room-2004")
 SIZE = (12, 128, 128)  # frames, height, width
 SAMPLING = Sampling(realisations=64, noisy_spp=2, reference_spp=1024)
 SURFACES = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
+CHANNELS = (*NOISY, *REFERENCES, *SURFACES, *CAMERA_CHANNELS)
 LEVELS = (128, 64, 16, 4)  # samples a pixel; the first one's error is what samples are asked for
-SEED = 0
 BLOCK = 64  # px: squared errors are compared in means over such blocks and all frames
 BAND = (0.8, 1.25)  # of told over true
 SHOWN = ("room-2002", 16)  # scene and samples of the picture
@@ -67,14 +66,8 @@ class Told:
 
 
 def clip_of(scene: str, folder: Path) -> Clip:
-    """The clip of a scene, rendered unless it is there: its folder names all that it follows from."""
-    made_of = repr((GENERATOR, scene, SEED, SIZE, SAMPLING))
-    path = folder / f"{zlib.crc32(made_of.encode()):08x}" / scene / "000"
-    if not is_clip(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        channels = (*NOISY, *REFERENCES, *SURFACES, *CAMERA_CHANNELS)
-        write_clip(path, build_scene(scene, SEED, SIZE[0]), SIZE, SAMPLING, SEED, channels)
-    return Clip(path)
+    """The clip of a scene."""
+    return own_clip(folder, scene, lambda: build_scene(scene, SEED, SIZE[0]), SIZE, SAMPLING, CHANNELS)
 
 
 def fed(clip: Clip, index: int, spp: int, reads: Sequence[str]) -> Frame:
@@ -107,8 +100,8 @@ def told(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None
         scale = estimate.scale
         images = torch.cat([true, estimate.squared * scale.square(), estimate.radiance().square()])
         squares.append(avg_pool2d(images.mean(dim=1, keepdim=True), BLOCK).flatten(1))
-        shares = true / scale.square().clamp(min=1e-30)
-        relative.append((estimate.over_surfaces(shares), estimate.over_surfaces(estimate.squared)))
+        over_unit = true / scale.square().clamp(min=1e-30)
+        relative.append((estimate.over_surfaces(over_unit), estimate.over_surfaces(estimate.squared)))
         estimates.append(estimate)
     true_relative, estimated_relative = np.sqrt(np.maximum(np.mean(relative, axis=0), 0))
     true_blocks, estimated, mapped = torch.stack(squares).mean(dim=0).tolist()
@@ -185,12 +178,18 @@ def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
     return figure
 
 
-def shrunk(spec: DenoiserSpec) -> Shrunk:
-    """The denoiser, ready to use. Raises BadInput unless it is a NAME+js."""
-    denoiser = spec.build()
-    if not isinstance(denoiser, Shrunk):
-        raise BadInput(f"{spec.name} does not tell its error, {spec.name}+js does")
-    return denoiser
+def tellers(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
+    """The named denoisers, or DENOISERS, ready to use.
+
+    Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is no NAME+js.
+    """
+    found = {}
+    for name in choose(names or DENOISERS, DENOISERS, cannot_run):
+        denoiser = DenoiserSpec(name, "total", precision_in_use(name), weights_of(name, runs)).build()
+        if not isinstance(denoiser, Shrunk):
+            raise BadInput(f"{name} does not tell its error, {name}+js does")
+        found[name] = denoiser
+    return found
 
 
 @torch.inference_mode()
@@ -200,22 +199,19 @@ def bench_error(runs: Path, names: Sequence[str]) -> str:
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     folder = bench_folder(runs) / "error"
-    names = names or DENOISERS
-    specs = [DenoiserSpec(name, "total", precision_in_use(name), weights_of(name, runs)) for name in names]
+    denoisers = tellers(names, runs)
     clips = [clip_of(scene, folder) for scene in tqdm(SCENES, "clips", unit="clip")]
     rows: list[Told] = []
-    with tqdm(total=len(specs) * len(clips) * len(LEVELS), desc="errors", unit="clip") as progress:
-        for spec in specs:
-            denoiser = shrunk(spec)
-            for clip in clips:
-                target = None
-                for spp in LEVELS:
-                    rows.append(told(denoiser, spec.name, clip, spp, target))
-                    target = target or rows[-1].true_relative
-                    progress.update()
+    with tqdm(total=len(denoisers) * len(clips) * len(LEVELS), desc="errors", unit="clip") as progress:
+        for (name, denoiser), clip in product(denoisers.items(), clips):
+            target = None
+            for spp in LEVELS:
+                rows.append(told(denoiser, name, clip, spp, target))
+                target = target or rows[-1].true_relative
+                progress.update()
     save_figure(folder / "calibration.png", calibration_figure(rows))
     scene, spp = SHOWN
-    save_figure(folder / "map.png", map_figure(shrunk(specs[0]), clips[SCENES.index(scene)], spp))
+    save_figure(folder / "map.png", map_figure(next(iter(denoisers.values())), clips[SCENES.index(scene)], spp))
     table = table_of(rows)
     write_file(folder / "table.md", f"{table}\n".encode())
     write_json(

@@ -1,6 +1,5 @@
 """`onespp bench light`: how soon a denoiser shows a change of light, by its quality in light that never changed."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,12 +11,11 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS
-from datasets.clip import Clip, is_clip
-from datasets.clip_job import write_clip
+from datasets.clip import Clip
 from datasets.frame import read_frame, to_tensor
-from datasets.profiles import GENERATOR
 from datasets.tonemap import display, psnr
 from eval.bench.output import bench_folder
+from eval.bench.own_clips import SEED, own_clip
 from eval.selection import evaluated
 from eval.spec import DenoiserSpec
 from files import write_file, write_json
@@ -35,7 +33,6 @@ AFTER = (0, 1, 2, 4, 8)  # frames after it that the table shows
 SIZE = (CHANGE + AFTER[-1] + 1, 128, 128)  # frames, height, width
 SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=1024)
 SCENE = "cornell_box"
-SEED = 0
 STILL = "still"
 # What the lamp was like before the change: its brightness, times that after it, and where it was.
 BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
@@ -79,13 +76,9 @@ def changed(change: str) -> Scene:
 
 
 def clip_of(change: str, folder: Path) -> Clip:
-    """The clip of a change, rendered unless it is there: its folder names all that it follows from."""
-    made_of = repr((GENERATOR, SCENE, SEED, SIZE, SAMPLING, CHANGE, BEFORE[change]))
-    path = folder / f"{zlib.crc32(made_of.encode()):08x}" / f"{SCENE}-{change}" / "000"
-    if not is_clip(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_clip(path, changed(change), SIZE, SAMPLING, SEED, tuple(CHANNELS))
-    return Clip(path)
+    """The clip of a change."""
+    made_of = CHANGE, BEFORE[change]
+    return own_clip(folder, f"{SCENE}-{change}", lambda: changed(change), SIZE, SAMPLING, tuple(CHANNELS), made_of)
 
 
 @torch.inference_mode()

@@ -83,7 +83,7 @@ def tables(rows: Sequence[Trade], samples: SampleTrades, title: str, times: Time
         parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command}`.")
     parts.append(f"samples a pixel\n{samples_table(samples.rows)}")
     if samples.shrinkage:
-        title = "what shrinkage gains on the better of noise and denoiser, dB: mean of the clips (worst)"
-        parts.append(f"{title}\n{gains_table(samples.shrinkage)}")
+        words = "what shrinkage gains on the better of noise and denoiser, dB: mean of the clips (worst)"
+        parts.append(f"{words}\n{gains_table(samples.shrinkage)}")
     parts.append(f"trained on 1 spp, fed more (after RAE, Fig. 9 and 11)\n{generalisation(samples.rows)}")
     return "\n\n".join(parts)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 from tabulate import tabulate
 
@@ -10,7 +11,7 @@ from eval.metrics import METRICS, Values, within_floor
 from eval.results import ClipResults
 from models.registry import SHRINKING
 
-NOISY = "noisy"
+INPUT = "noisy"  # the denoiser that returns what it is given
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Gain:
     """Of one denoiser fed `spp` samples a pixel: dB on the better of noise and what it shrinks to.
 
     Attributes:
-        metric: "psnr", by which what is within the noise floor counts as at its edge, or "mse_unbiased".
+        metric: "psnr" or "mse_unbiased"; what is within the noise floor counts as at its edge.
         clips: the gain on each clip, SCENE/CLIP.
     """
 
@@ -30,35 +31,34 @@ class Gain:
 
 def decibels(metric: str, values: Values, floors: Values) -> float:
     """A metric in dB, more is better."""
-    value = values[metric]
-    assert value is not None
-    if metric == "mse_unbiased":
-        return -10 * math.log10(max(value, 1e-12))
-    floor = floors[metric]
-    return METRICS[metric].edge(floor) if within_floor(metric, value, floor) else value  # type: ignore[arg-type]
+    value, floor = values[metric], floors[metric]
+    assert value is not None and floor is not None
+    if within_floor(metric, value, floor):
+        value = METRICS[metric].edge(floor)
+    return value if metric == "psnr" else -10 * math.log10(value)
 
 
 def gains_of(fed: Mapping[int, Sequence[ClipResults]]) -> Iterator[Gain]:
     """Those of all NAME+js that were fed beside NAME and `noisy`, where there are two samples or more."""
     for spp, clips in fed.items():
-        known = {result.denoiser for clip in clips for result in clip.results}
-        pairs = [(name, name.replace(SHRINKING, "")) for name in sorted(known) if SHRINKING in name]
-        for name, own in pairs:
-            if spp > 1 and {own, NOISY} <= known:
-                for metric in ("psnr", "mse_unbiased"):
-                    yield Gain(name, spp, metric, dict(clip_gains(clips, metric, name, own)))
+        names = sorted({result.denoiser for clip in clips for result in clip.results if SHRINKING in result.denoiser})
+        for name, metric in product(names, ("psnr", "mse_unbiased")):
+            gained = dict(clip_gains(clips, metric, name))
+            if spp > 1 and gained:
+                yield Gain(name, spp, metric, gained)
 
 
-def clip_gains(clips: Sequence[ClipResults], metric: str, name: str, own: str) -> Iterator[tuple[str, float]]:
+def clip_gains(clips: Sequence[ClipResults], metric: str, name: str) -> Iterator[tuple[str, float]]:
     """The gain on each clip that has results of all three."""
+    others = {name.replace(SHRINKING, ""), INPUT}
     for clip in clips:
         found = {
             result.denoiser: decibels(metric, result.metrics, clip.reference.metrics)
             for result in clip.results
-            if result.denoiser in (name, own, NOISY)
+            if result.denoiser in {name, *others}
         }
-        if len(found) == 3:
-            yield clip.name, found[name] - max(found[own], found[NOISY])
+        if found.keys() == {name, *others}:
+            yield clip.name, found[name] - max(found[other] for other in others)
 
 
 def gains_table(gains: Sequence[Gain]) -> str:

@@ -19,6 +19,7 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.exr import export_clip
 from datasets.frame import Frame, read_frame
+from denoise.exr_image import ExrImage
 from denoise.run import Job, denoise
 from errors import BadInput
 from models.registry import create, load
@@ -431,6 +432,40 @@ def test_halves_tell_how_far_frames_are_from_the_truth(halves, tmp_path, capsys)
     (tmp_path / "out" / "error.csv").write_text("\n".join(lines[:-1]) + "\n")
     main(told)
     assert (tmp_path / "out" / "error.csv").read_bytes() == before["error.csv"]
+
+    capsys.readouterr()
+    main([*told[:-1], "5"])  # another relative error: the frames stay as they are, the table follows
+    assert "4 of 4 frames have a relative error of at most 5" in capsys.readouterr().out
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.exr")}.items() <= before.items()
+    main(told[:-2])
+    with (tmp_path / "out" / "error.csv").open() as file:
+        assert all(row["until"] == row["samples"] == "" for row in csv.DictReader(file))
+
+
+def test_the_error_is_a_layer_of_the_part_that_holds_the_colour(tmp_path):
+    """Of a file with another part before it, and with an older layer of that name."""
+    names = {"mask": ("Y",), "image": ("R", "G", "B", "error.R")}
+    parts = [OpenEXR.Part({}, {c: np.zeros((4, 6), np.float32) for c in names[part]}, part) for part in names]
+    OpenEXR.File(parts).write(str(tmp_path / "in.exr"))
+    image = ExrImage(tmp_path / "in.exr")
+    image.add("error", np.full((4, 6, 3), 0.5, np.float32), next(name for name in image.channels if name.endswith("G")))
+    image.write(tmp_path / "out.exr", "here")
+    first, second = OpenEXR.File(str(tmp_path / "out.exr"), separate_channels=True).parts
+    assert set(first.channels) == {"Y"} and set(second.channels) == {"R", "G", "B", "error.R", "error.G", "error.B"}
+    assert all((second.channels[f"error.{c}"].pixels == 0.5).all() for c in "RGB")
+
+
+def test_halves_that_are_one_are_refused(halves, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["denoise", halves[0], "--half", halves[0], "--denoiser", "svgf+js", "--out", str(tmp_path / "out")])
+    assert "different seeds" in capsys.readouterr().err
+
+
+def test_our_own_frames_without_halves_tell_no_error(tiny, tmp_path):
+    export_clip(next(iter(Dataset(tiny).clips("test"))).path, tmp_path / "exr")
+    with pytest.raises(BadInput, match="need two halves"):
+        denoise(job(tmp_path / "exr", tmp_path / "out", "svgf+js", error=True))
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.disocclusion_crops import Crop, densest_crop
-from eval.harness import entrant, evaluate_clip
+from eval.harness import entrants_of, evaluate_clip
 from eval.metrics import METRICS, flip_map
 from eval.report.page import report
 from eval.report.page_data import page_clip
@@ -147,7 +147,7 @@ def test_errors_that_samples_tell_are_a_view_of_their_own(tiny, page, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
     fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", halves=True)
     specs = [DenoiserSpec("noisy"), DenoiserSpec("eaw+js")]
-    (results,) = by_clip(evaluate_clip(fed, [entrant(spec) for spec in specs], tmp_path))
+    (results,) = by_clip(evaluate_clip(fed, entrants_of(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
     assert list(shown.told) == ["eaw+js"] and len(shown.told["eaw+js"]) == len(shown.frames)
     shade = pixels(shown.told["eaw+js"][1])[..., 0]
@@ -155,7 +155,7 @@ def test_errors_that_samples_tell_are_a_view_of_their_own(tiny, page, tmp_path):
     state = None
     for index in range(4):
         _, state, told = with_error(denoiser, read_frame(fed, index, specs[1].kind.reads), state)
-    expected = (fed.exposure * told.radiance()[0].mean(dim=0) / BRIGHTEST_ERROR).clamp(0, 1)
+    expected = (fed.exposure * told.radiance()[0].square().mean(dim=0).sqrt() / BRIGHTEST_ERROR).clamp(0, 1)
     assert shade.max() > 0
     assert np.abs(shade / 255 - expected.numpy()).max() <= 0.51 / 255
     assert all(clip["told"] == {} for clip in page.data["clips"])

@@ -69,7 +69,7 @@ def test_what_two_passes_err_by_is_told_without_bias():
     bias = F.avg_pool2d(truth, 5, 1, 2, count_include_pad=False) - truth
     variance = F.avg_pool2d((deviation * truth).square(), 5, 1, 2) / 25 / 2
     expected = (bias.square() + variance)[inner].mean().item()
-    assert (estimate.filtered * scale)[inner].mean().item() == pytest.approx(expected, rel=0.06)
+    assert (estimate.filter_error * scale)[inner].mean().item() == pytest.approx(expected, rel=0.06)
     assert (estimate.spread * scale)[inner].mean().item() == pytest.approx(variance[inner].mean().item(), rel=0.06)
     own = ((deviation * truth).square() / 2 / 25)[inner].mean().item()  # each pixel's noise is a 25th of its mean
     assert (estimate.covariance * scale)[inner].mean().item() == pytest.approx(own, rel=0.06)
@@ -80,8 +80,8 @@ def test_samples_are_asked_for_as_errors_of_mixtures_fall():
     truth = waves(9)
     deviation = 0.5
     _, estimate = judged(truth, deviation)
-    target = estimate.relative_error() / 2
-    e2, v = estimate.over_surfaces(estimate.filtered), estimate.over_surfaces(estimate.noise)
+    target = estimate.most_relative_error() / 2
+    e2, v = estimate.over_surfaces(estimate.filter_error), estimate.over_surfaces(estimate.variance)
     assert estimate.samples_for(target) == pytest.approx(8 * (4 * (e2 + v) - v) / e2, rel=0.3)
     assert estimate.samples_for(10.0) == 8  # those that there are
     assert estimate.samples_for(1e-9) == float("inf")
@@ -125,7 +125,7 @@ def test_any_halves_tell_something_finite(seed, height, width, levels, backgroun
     assert torch.isfinite(output).all() and torch.isfinite(error).all() and (error >= 0).all()
     assert ((error == 0) | (depth > 0)).all()
     assert 0 <= estimate.relative_error() <= estimate.most_relative_error() < float("inf")
-    assert estimate.samples_for(0.02) >= 8
+    assert estimate.samples_for(0.02) >= 8 and estimate.samples_for(0.0) >= 8
 
 
 def test_a_firefly_in_one_half_is_told_where_it_is():

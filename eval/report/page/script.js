@@ -180,12 +180,14 @@ const view = { clip: 0, left: "", right: REFERENCE, frame: 0, mode: "slider", sp
 const clipNow = () => data.clips[view.clip];
 const MODES = [...byId("views").children].map(button => button.dataset.view);
 const MAPS = { map: "flips", told: "told" }; // views of one picture
-const toldBy = clip => (view.left in clip.told ? view.left : view.right);
+const mappedOf = { // whose picture that is
+  map: () => (view.left === REFERENCE ? view.right : view.left),
+  told: clip => (view.left in clip.told ? view.left : view.right),
+};
 
 async function paint() {
   const clip = clipNow(), turn = ++view.draws, canvas = byId("canvas");
-  const mapped = view.mode === "told" ? toldBy(clip) : view.left === REFERENCE ? view.right : view.left;
-  const uris = view.mode in MAPS ? [clip[MAPS[view.mode]][mapped]] : [clip.images[view.left], clip.images[view.right]];
+  const uris = view.mode in MAPS ? [clip[MAPS[view.mode]][mappedOf[view.mode](clip)]] : [clip.images[view.left], clip.images[view.right]];
   const [left, right] = await Promise.all(uris.map(list => (list ? load(list[view.frame]) : null)));
   if (turn !== view.draws) return; // something newer is on its way
   if (canvas.width !== clip.width || canvas.height !== clip.height) [canvas.width, canvas.height] = [clip.width, clip.height];
@@ -218,9 +220,9 @@ function describe() {
   const texts = {
     slider: "", flip: `Shown: ${view.flipped ? view.right : view.left}; press space. `,
     difference: `Mean difference of ${view.left} and ${view.right}: black 0, brightest 0.25 and more. `,
-    map: `FLIP of ${view.left === REFERENCE ? view.right : view.left} against the reference: black 0, brightest 1. `,
-    told: toldBy(clip) in clip.told
-      ? `Error that the samples of ${toldBy(clip)} tell, in exposed radiance: black 0, brightest 0.25 and more. `
+    map: `FLIP of ${mappedOf.map()} against the reference: black 0, brightest 1. `,
+    told: mappedOf.told(clip) in clip.told
+      ? `Error that the samples of ${mappedOf.told(clip)} tell, in exposed radiance: black 0, brightest 0.25 and more. `
       : "Neither tells its error: NAME+js does, where frames have halves of their samples. ",
   };
   byId("caption").textContent = texts[view.mode] + [...new Set([view.left, view.right])].map(measured).join("; ");
