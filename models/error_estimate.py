@@ -105,35 +105,42 @@ class ErrorEstimate:
         """Of the frame: the root of the mean squared error relative to `unit`. Not smoothed, so without its bias."""
         return max(self.over_surfaces(self.squared), 0.0) ** 0.5
 
-    def most_relative_error(self) -> float:
-        """The same, but for chance: with two standard errors of the mean more."""
-        mean = self.over_surfaces(self.squared)
-        spread = self.over_surfaces((self.squared.mean(dim=1, keepdim=True) - mean).square().expand_as(self.squared))
+    def chance(self) -> float:
+        """Two standard errors of the mean squared error relative to `unit`."""
+        colours = self.squared.mean(dim=1, keepdim=True)
+        off = (colours - self.over_surfaces(self.squared)).square().expand_as(self.squared)
         pixels = self.unit.numel() if self.frame.surface is None else float(self.frame.surface.sum())
-        return max(mean + 2 * (spread / max(pixels, 1)) ** 0.5, 0.0) ** 0.5
+        return 2 * (self.over_surfaces(off) / max(pixels, 1)) ** 0.5
+
+    def most_relative_error(self) -> float:
+        """The same as `relative_error`, with what may be chance added."""
+        return max(self.over_surfaces(self.squared) + self.chance(), 0.0) ** 0.5
 
     def samples_for(self, target: float) -> float:
-        """Samples a pixel, the frame's own among them, by which the relative error is down to `target`, by shrinkage.
+        """Samples a pixel, the own among them, by which `most_relative_error` is down to `target`, by shrinkage.
 
         Of a filter's squared error e², which is taken to stay, and noise of variance v / k for k times the samples, the
-        best mixture has e² v / (k e² + v). By as much as the mean of that falls, `most_relative_error` is taken to
-        fall. Infinite beyond MOST_SAMPLES.
+        best mixture has e² v / (k e² + v). By as much as the mean of that falls, the error is taken to fall, and chance
+        by k. Infinite beyond MOST_SAMPLES.
         """
         error = self.smoothed(self.filter_error, self.spread, torch.ones_like(self.variance)).clamp(min=LEAST_DIVISOR)
+        now, chance = self.relative_error() ** 2, self.chance()
 
         def mixture(k: float) -> float:
             return self.over_surfaces(error * self.variance / (k * error + self.variance).clamp(min=LEAST_DIVISOR))
 
+        def left(k: float) -> float:
+            return now * mixture(k) / max(mixture(1.0), LEAST_DIVISOR) + chance / k
+
         own = float(self.frame.samples.mean())
         if self.most_relative_error() <= target:
             return own
-        wanted = mixture(1.0) * (target / self.most_relative_error()) ** 2
         low, high = 1.0, MOST_SAMPLES / own
-        if mixture(high) > wanted:
+        if left(high) > target**2:
             return torch.inf
         while high / low > 1.01:
             k = (low * high) ** 0.5
-            low, high = (k, high) if mixture(k) > wanted else (low, k)
+            low, high = (k, high) if left(k) > target**2 else (low, k)
         return own * high
 
 

@@ -11,7 +11,8 @@ What is ours, by measurement (docs/experiments.md, Shrinkage):
 - Irradiance is compared, relative to what is denoised: a window's bright pixels must not speak for the others.
 - Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less STANDARD_ERRORS, and the other so
   far as it differs by more than as many: where noise is large, chance would let it through. The error is that of
-  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²).
+  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²); and with few samples, which may all have missed the same light
+  and then seem to have no noise, what SCARCE / samples pixels of the window add to its distance.
 - ρ is averaged over 3 x 3 pixels of the own mesh.
 
 Without halves, as at one sample a pixel, it is the denoiser itself.
@@ -32,6 +33,7 @@ from models.operators import image_luminance
 from models.parameters import LEAST_DIVISOR
 
 STANDARD_ERRORS = 3.0
+SCARCE = 16.0  # samples a pixel
 LARGEST_RATIO = 1e6  # of noise to what is denoised; the square of a square must stay finite
 COMPARED_BY = ("albedo", "depth", "mesh_id")
 DARKEST = 0.01  # of the mean luminance: what is darker is not compared relative to itself
@@ -45,23 +47,24 @@ class Window(NamedTuple):
     error: Tensor  # standard error of `excess`
 
 
-def windows(distance: Tensor, variance: Tensor, mesh_id: Tensor) -> tuple[Window, Window]:
-    """Those of 9 x 9 and of 27 x 27 pixels of the own mesh, from squares (B, 3, H, W)."""
+def windows(distance: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> tuple[Window, Window]:
+    """Those of 9 x 9 and of 27 x 27 pixels of the own mesh, from squares (B, 3, H, W) of `samples` (B, 1, 1, 1)."""
     counted = torch.cat([distance - variance, distance, 2 * variance.square(), torch.ones_like(mesh_id)], dim=1)
     small = mesh_sums(mesh_sums(counted, mesh_id, 1), mesh_id, 3)
-    return window_of(small), window_of(mesh_sums(small, mesh_id, 9))
+    return window_of(small, samples), window_of(mesh_sums(small, mesh_id, 9), samples)
 
 
-def window_of(sums: Tensor) -> Window:
+def window_of(sums: Tensor, samples: Tensor) -> Window:
     """From sums (B, 10, H, W) of the three and of the number of pixels."""
     pixels = sums[:, 9:]
     excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
-    return Window(excess, distance.clamp(min=LEAST_DIVISOR), (squares / pixels).sqrt())
+    error = (squares / pixels).sqrt() + SCARCE / samples * distance / pixels
+    return Window(excess, distance.clamp(min=LEAST_DIVISOR), error)
 
 
-def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor) -> Tensor:
+def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
     """ρ (B, 3, H, W) in [0, 1], from N - O and the variance of N, relative to what is denoised."""
-    small, wide = windows(difference.square(), variance, mesh_id)
+    small, wide = windows(difference.square(), variance, mesh_id, samples)
     overall = ((wide.excess - STANDARD_ERRORS * wide.error) / wide.distance).clamp(0, 1)
     off = small.excess - overall * small.distance
     rho = (overall + believed(off, small.error) * off / small.distance).clamp(0, 1)
@@ -92,7 +95,7 @@ def share_let_in(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
     luminance = mesh_means_of(image_luminance(denoised), frame.mesh_id)
     unit = unit_of(luminance)
     off_a, off_b = (relative(half - denoised, unit) for half in (a, b))
-    return share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id)
+    return share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id, frame.samples)
 
 
 def unit_of(luminance: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """NAME+js: shrinkage against a slow version, where it must end, and halves at the extremes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from models import compiled, registry
 from models.around import around
 from models.denoiser import Denoiser, State
 from models.neighbours import mesh_sums
-from models.shrinkage import STANDARD_ERRORS, Shrunk, shrunk
+from models.shrinkage import SCARCE, STANDARD_ERRORS, Shrunk, shrunk
 from tests.helpers.frames import flat_frame, play
 from tests.helpers.halves import noisy_halves, with_halves
 
@@ -38,7 +40,7 @@ def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     return play(denoiser, [frame])[0][0]
 
 
-def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray, samples: float) -> np.ndarray:
     """ρ of one colour, pixel by pixel: windows of 3 x 3 taps of 3 x 3 sums, all of the tap's own mesh; and so on."""
     height, width = mesh.shape
 
@@ -57,7 +59,10 @@ def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray) -> 
     small = sums(sums(counted, 1), 3)
     wide = sums(small, 9)
     mean_small, mean_wide = small / small[3], wide / wide[3]
-    error_small, error_wide = (np.sqrt(mean[2] / each[3]) for mean, each in ((mean_small, small), (mean_wide, wide)))
+    error_small, error_wide = (
+        np.sqrt(mean[2] / each[3]) + SCARCE / samples * mean[1] / each[3]
+        for mean, each in ((mean_small, small), (mean_wide, wide))
+    )
     overall = np.clip((mean_wide[0] - STANDARD_ERRORS * error_wide) / mean_wide[1], 0, 1)
     off = mean_small[0] - overall * mean_small[1]
     believed = np.maximum(0, 1 - (STANDARD_ERRORS * error_small / off) ** 2)
@@ -79,7 +84,7 @@ def test_shrinkage_is_what_the_formula_says_pixel_by_pixel():
     unit = 1.01 * luminance
     for c in range(3):
         a_c, b_c, o = (image[0, c].double().numpy() for image in (a, b, denoised))
-        rho = slow_rho(((a_c + b_c) / 2 - o) / unit, (a_c - b_c) ** 2 / 4 / unit**2, mesh[0, 0].numpy())
+        rho = slow_rho(((a_c + b_c) / 2 - o) / unit, (a_c - b_c) ** 2 / 4 / unit**2, mesh[0, 0].numpy(), 8)
         assert 0 < rho.min() < 0.3 or rho.std() > 0.01  # it is neither nothing nor everything
         np.testing.assert_allclose(got[0, c], o + rho * ((a_c + b_c) / 2 - o), rtol=2e-4)
 
@@ -127,9 +132,24 @@ def test_its_name_weights_and_channels_are_those_of_the_denoiser():
     assert registry.denoiser_class("nfor+js").offline
 
 
+def test_a_few_black_samples_are_not_taken_for_the_truth():
+    """Of a small mesh which few samples a pixel may have missed; many would not all have."""
+    mesh = torch.ones(1, 1, *SIZE)
+    mesh[..., 10:12, 20:22] = 2
+    a, b = noisy_halves(COLOUR.expand(1, 3, *SIZE), 0.1)
+    for half in (a, b):
+        half[..., 10:12, 20:22] = 0
+    denoised = COLOUR.expand(1, 3, *SIZE)
+    for spp, kept in ((2.0, True), (1024.0, False)):
+        frame = replace(with_halves(a, b, mesh_id=mesh), spp=torch.full((1, 1, 1, 1), spp))
+        shown = shrunk_to(denoised, frame)[..., 10:12, 20:22]
+        assert torch.allclose(shown, COLOUR) == kept and (shown.max() < 0.05) != kept
+
+
 def test_equal_halves_have_no_noise():
     image = torch.rand(1, 3, *SIZE) + 0.1
-    torch.testing.assert_close(shrunk_to(torch.ones_like(image), with_halves(image, image)), image)
+    frame = replace(with_halves(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
+    torch.testing.assert_close(shrunk_to(torch.ones_like(image), frame), image)
 
 
 def test_black_halves_of_what_is_black_are_black():
