@@ -284,10 +284,12 @@ class Work:
             own = OwnShot(self.denoiser.reads)
 
             def ours(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-                image = ExrImage(files.passes[COLOUR])
-                frame = own.frame(image)
-                bad = [~torch.isfinite(channel).all(dim=1) for channel in frame.channels.values()]
-                return image, frame, int(torch.stack(bad).any(dim=0).sum())
+                file = ExrImage(files.passes[COLOUR])
+                frame = own.frame(file)
+                bad = [
+                    ~torch.isfinite(image).flatten(1, -3).all(dim=1) for image in frame.channels.values()
+                ]  # halves, too
+                return file, frame, int(torch.stack(bad).any(dim=0).sum())
 
             return ours
         shot = Shot(self.understanding.reading, self.denoiser.reads, str(self.shots[0][0].passes[COLOUR]), self.job.spp)

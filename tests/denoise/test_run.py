@@ -19,9 +19,11 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.exr import export_clip
 from datasets.frame import Frame, read_frame
+from denoise.error_table import ErrorTable
 from denoise.exr_image import ExrImage
 from denoise.run import Job, denoise
 from errors import BadInput
+from eval.tradeoff.resampled_clips import with_samples
 from models.registry import create, load
 from models.weights import save_weights
 from tests.denoise.conftest import as_foreign
@@ -459,6 +461,17 @@ def test_halves_that_are_one_are_refused(halves, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["denoise", halves[0], "--half", halves[0], "--denoiser", "svgf+js", "--out", str(tmp_path / "out")])
     assert "different seeds" in capsys.readouterr().err
+
+
+def test_our_own_frames_have_their_halves_with_them(tiny, tmp_path):
+    clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
+    two = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "clips", halves=True)
+    export_clip(two.path, tmp_path / "exr")
+    denoise(job(tmp_path / "exr", tmp_path / "out", "eaw+js", error=True, until=0.5))
+    denoiser = load("eaw+js", None, signal="total")
+    expected = run(denoiser, (read_frame(two, index, denoiser.reads) for index in range(two.frames)))
+    assert all(torch.equal(a, b) for a, b in zip(outputs(tmp_path / "out"), expected, strict=True))
+    assert len(ErrorTable(tmp_path / "out").rows) == two.frames
 
 
 def test_our_own_frames_without_halves_tell_no_error(tiny, tmp_path):
