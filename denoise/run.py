@@ -286,9 +286,8 @@ class Work:
             def ours(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
                 file = ExrImage(files.passes[COLOUR])
                 frame = own.frame(file)
-                bad = [
-                    ~torch.isfinite(image).flatten(1, -3).all(dim=1) for image in frame.channels.values()
-                ]  # halves, too
+                images = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # halves are images, too
+                bad = [~torch.isfinite(image).all(dim=1) for image in images]
                 return file, frame, int(torch.stack(bad).any(dim=0).sum())
 
             return ours

@@ -179,12 +179,12 @@ def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
 
 
 def tellers(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
-    """The named denoisers, or DENOISERS, ready to use.
+    """The named denoisers, or those of DENOISERS that can run, ready to use.
 
     Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is no NAME+js.
     """
     found = {}
-    for name in choose(names or DENOISERS, DENOISERS, cannot_run):
+    for name in choose(names, DENOISERS, cannot_run):
         denoiser = DenoiserSpec(name, "total", precision_in_use(name), weights_of(name, runs)).build()
         if not isinstance(denoiser, Shrunk):
             raise BadInput(f"{name} does not tell its error, {name}+js does")
