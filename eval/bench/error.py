@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tabulate import tabulate
 from torch import Tensor
@@ -131,33 +132,42 @@ def table_of(rows: Sequence[Told]) -> str:
     return tabulate(lines, heads, tablefmt="github", disable_numparse=True)
 
 
+def draw_errors(axis: Axes, rows: Sequence[Told]) -> None:
+    """Told against true errors of all blocks of one denoiser, and the band that they should be in."""
+    for spp in LEVELS[::-1]:
+        true, estimated = (
+            np.sqrt(np.maximum(np.concatenate([getattr(row, kind) for row in rows if row.spp == spp]), 1e-10))
+            for kind in ("true", "estimated")
+        )
+        axis.plot(true, estimated, "o", ms=3, label=f"{spp} spp")
+    low, high = axis.get_xlim()
+    line = np.geomspace(max(low, 1e-4), high, 2)
+    axis.plot(line, line, color="grey", lw=0.8)
+    axis.fill_between(line, *(line * np.sqrt(bound) for bound in BAND), color="grey", alpha=0.2)
+    axis.set(xscale="log", yscale="log", title=rows[0].denoiser, xlabel="true error of a block, radiance", ylabel="told")
+    axis.legend(fontsize=8)
+
+
+def draw_samples(axis: Axes, rows: Sequence[Told]) -> None:
+    """Samples asked for against those taken, of all denoisers."""
+    for name in dict.fromkeys(row.denoiser for row in rows):
+        ours = [row for row in rows if row.denoiser == name and row.spp != LEVELS[0]]
+        axis.plot([row.spp for row in ours], [row.samples for row in ours], "o", ms=4, label=name)
+    axis.axhline(LEVELS[0], color="grey", lw=0.8)
+    axis.set(xscale="log", yscale="log", title=f"samples asked for, {LEVELS[0]} needed", xlabel="samples taken")
+    for ticks, place in ((LEVELS[1:], axis.set_xticks), ((32, 64, 128, 256, 512), axis.set_yticks)):
+        place(ticks, map(str, ticks))
+    axis.minorticks_off()
+    axis.legend(fontsize=8)
+
+
 def calibration_figure(rows: Sequence[Told]) -> Figure:
-    """Told against true errors of all blocks, a panel for each denoiser; and samples asked for against those spent."""
+    """A panel of errors for each denoiser, and one of the samples asked for."""
     names = list(dict.fromkeys(row.denoiser for row in rows))
     figure, axes = plt.subplots(1, len(names) + 1, figsize=(3.4 * (len(names) + 1), 3.6), dpi=DPI, layout="constrained")
-    for axis, name in zip(axes, names, strict=False):
-        for spp in LEVELS[::-1]:
-            ours = [row for row in rows if (row.denoiser, row.spp) == (name, spp)]
-            true, estimated = (
-                np.sqrt(np.maximum(np.concatenate([getattr(row, kind) for row in ours]), 1e-10))
-                for kind in ("true", "estimated")
-            )
-            axis.plot(true, estimated, "o", ms=3, label=f"{spp} spp")
-        low, high = axis.get_xlim()
-        line = np.geomspace(max(low, 1e-4), high, 2)
-        axis.plot(line, line, color="grey", lw=0.8)
-        axis.fill_between(line, *(line * np.sqrt(bound) for bound in BAND), color="grey", alpha=0.2)
-        axis.set(xscale="log", yscale="log", title=name, xlabel="true error of a block, radiance", ylabel="told")
-        axis.legend(fontsize=8)
-    for name in names:
-        ours = [row for row in rows if row.denoiser == name and row.spp != LEVELS[0]]
-        axes[-1].plot([row.spp for row in ours], [row.samples for row in ours], "o", ms=4, label=name)
-    axes[-1].axhline(LEVELS[0], color="grey", lw=0.8)
-    axes[-1].set(xscale="log", yscale="log", title=f"samples asked for, {LEVELS[0]} needed", xlabel="samples taken")
-    axes[-1].set_xticks(LEVELS[1:], map(str, LEVELS[1:]))
-    axes[-1].set_yticks((32, 64, 128, 256, 512), map(str, (32, 64, 128, 256, 512)))
-    axes[-1].minorticks_off()
-    axes[-1].legend(fontsize=8)
+    for axis, name in zip(axes[:-1], names, strict=True):
+        draw_errors(axis, [row for row in rows if row.denoiser == name])
+    draw_samples(axes[-1], rows)
     return figure
 
 
