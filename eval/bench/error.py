@@ -144,7 +144,8 @@ def draw_errors(axis: Axes, rows: Sequence[Told]) -> None:
     line = np.geomspace(max(low, 1e-4), high, 2)
     axis.plot(line, line, color="grey", lw=0.8)
     axis.fill_between(line, *(line * np.sqrt(bound) for bound in BAND), color="grey", alpha=0.2)
-    axis.set(xscale="log", yscale="log", title=rows[0].denoiser, xlabel="true error of a block, radiance", ylabel="told")
+    axis.set(xscale="log", yscale="log", title=rows[0].denoiser)
+    axis.set(xlabel="true error of a block, radiance", ylabel="told")
     axis.legend(fontsize=8)
 
 
