@@ -17,9 +17,9 @@ NOISE_PERIOD = 100  # frames until the noise of a long sequence repeats
 
 
 def lit(frame: Frame, seed: int | None) -> Frame:
-    """The frame under light of irradiance 1 everywhere: as one sample a pixel finds it, or even without a seed."""
-    divisor = frame.divisor[0].permute(1, 2, 0).double().numpy()
-    light = {name: share * divisor for name, share in LIGHT_SHARES.items()}
+    """The frame, its surfaces under light of irradiance 1: as one sample a pixel finds it, or even without a seed."""
+    reflected = (frame.divisor * (frame.depth > 0))[0].permute(1, 2, 0).double().numpy()
+    light = {name: share * reflected for name, share in LIGHT_SHARES.items()}
     if seed is not None:
         rng = np.random.default_rng(seed)
         light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}

@@ -330,8 +330,11 @@ def test_cases_reach_their_values():
 def test_light_is_even_and_then_as_bright_on_average():
     case = replace(STRESS_CASES[0], frame_count=60)
     frames = list(case.frames())
-    assert all((frame.irradiance("total") - 1).abs().max() < 1e-6 for frame in frames[: case.even_frames])
-    noisy = torch.cat([frame.irradiance("total") for frame in frames[case.even_frames :]])
+    light = [(frame.irradiance("total"), (frame.depth > 0).expand(-1, 3, -1, -1)) for frame in frames]
+    assert all(irradiance[~surface].max() == 0 for irradiance, surface in light)
+    on_surfaces = [irradiance[surface] for irradiance, surface in light]
+    assert all((irradiance - 1).abs().max() < 1e-6 for irradiance in on_surfaces[: case.even_frames])
+    noisy = torch.cat(on_surfaces[case.even_frames :])
     assert noisy.mean() == pytest.approx(1, abs=0.05) and (noisy == 0).float().mean() > 0.3
 
 

@@ -109,16 +109,20 @@ def header(path: Path) -> dict[str, Any]:
 
 
 def main(source: str, out: Path) -> None:
-    """Write a clip's folder, or three synthetic frames of a size "WxH", as Blender would; references beside them."""
+    """Write what Blender would of a clip's folder, references beside it, or of three synthetic frames of a size "WxH".
+
+    Of these, frames/ has one half of the samples and half/ the other.
+    """
     if Path(source).is_dir():
         clip = Clip(Path(source))
         reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "motion")
-        frames: Iterable[Frame] = (read_frame(clip, index, reads) for index in range(clip.frames))
+        write_sequence(out / "frames", (read_frame(clip, index, reads) for index in range(clip.frames)), blender)
         for index in range(clip.frames):
             write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
     else:
-        frames = (synthetic_frame(index, *parse_size(source)) for index in range(3))
-    write_sequence(out / "frames", frames, blender)
+        for which, folder in enumerate(("frames", "half")):
+            halves = (synthetic_frame(index, *parse_size(source)).half(which) for index in range(3))
+            write_sequence(out / folder, halves, blender)
 
 
 if __name__ == "__main__":
