@@ -11,7 +11,7 @@ from datasets.clip import Dataset
 from datasets.clip_job import ClipOutcome, RenderJob, run_clip_job
 from datasets.generate import check_versions
 from errors import BadInput
-from render.backend import VARIANT, dr
+from render.backend import LEAST_THREADS, VARIANT, dr
 
 WORKERS_PER_CLIP = 4  # that may die before the clip counts as failed
 SECONDS_TO_CLEAN_UP = 10  # for workers when the job is given up
@@ -80,8 +80,8 @@ def reserved_resources() -> dict[str, Any]:
 
 
 def render_on_worker(job: RenderJob) -> ClipOutcome:
-    """Render a clip on the one core that its task reserves: clips side by side use cores better than threads do."""
-    dr.set_thread_count(1)
+    """Render a clip on as few threads as can: clips side by side use cores better than threads do."""
+    dr.set_thread_count(LEAST_THREADS)
     check_versions(Dataset(job.path.parents[2]))
     return run_clip_job(job)
 

@@ -16,6 +16,7 @@ from errors import BadInput
 
 OLDEST_LLVM = 17
 TESTED_LLVM = 19
+LEAST_THREADS = 2  # with one alone, Mitsuba waits forever for the first EXR that it reads or writes
 
 
 def installed_llvms() -> list[tuple[int, str]]:
@@ -78,5 +79,6 @@ import mitsuba as mi  # noqa: E402
 
 mi.set_variant(VARIANT)
 mi.set_log_level(mi.LogLevel.Error)
+dr.set_thread_count(max(LEAST_THREADS, dr.thread_count()))
 
-__all__ = ["VARIANT", "dr", "mi"]
+__all__ = ["LEAST_THREADS", "VARIANT", "dr", "mi"]
