@@ -11,8 +11,9 @@ What is ours, by measurement (docs/experiments.md, Shrinkage):
 - Irradiance is compared, relative to what is denoised: a window's bright pixels must not speak for the others.
 - Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less STANDARD_ERRORS, and the other so
   far as it differs by more than as many: where noise is large, chance would let it through. The error is that of
-  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²); and with few samples, which may all have missed the same light
-  and then seem to have no noise, what SCARCE / samples pixels of the window add to its distance.
+  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²). All samples of a window may have missed the same light, and then
+  seem to have no noise: so there is added what SCARCE / samples pixels have for distance, and RARE pixels for variance
+  in the 81 x 81 of the own mesh around, where rare light was found.
 - ρ is averaged over 3 x 3 pixels of the own mesh.
 
 Without halves, as at one sample a pixel, it is the denoiser itself.
@@ -34,6 +35,7 @@ from models.parameters import LEAST_DIVISOR
 
 STANDARD_ERRORS = 3.0
 SCARCE = 16.0  # samples a pixel
+RARE = 2.0  # pixels
 LARGEST_RATIO = 1e6  # of noise to what is denoised; the square of a square must stay finite
 COMPARED_BY = ("albedo", "depth", "mesh_id")
 DARKEST = 0.01  # of the mean luminance: what is darker is not compared relative to itself
@@ -49,16 +51,20 @@ class Window(NamedTuple):
 
 def windows(distance: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> tuple[Window, Window]:
     """Those of 9 x 9 and of 27 x 27 pixels of the own mesh, from squares (B, 3, H, W) of `samples` (B, 1, 1, 1)."""
-    counted = torch.cat([distance - variance, distance, 2 * variance.square(), torch.ones_like(mesh_id)], dim=1)
+    squares = [distance - variance, distance, 2 * variance.square(), variance]
+    counted = torch.cat([*squares, torch.ones_like(mesh_id)], dim=1)
     small = mesh_sums(mesh_sums(counted, mesh_id, 1), mesh_id, 3)
-    return window_of(small, samples), window_of(mesh_sums(small, mesh_id, 9), samples)
+    wide = mesh_sums(small, mesh_id, 9)
+    around = mesh_sums(wide[:, 9:], mesh_id, 27)
+    rare = RARE * around[:, :3] / around[:, 3:]
+    return window_of(small, rare, samples), window_of(wide, rare, samples)
 
 
-def window_of(sums: Tensor, samples: Tensor) -> Window:
-    """From sums (B, 10, H, W) of the three and of the number of pixels."""
-    pixels = sums[:, 9:]
+def window_of(sums: Tensor, rare: Tensor, samples: Tensor) -> Window:
+    """From sums (B, 13, H, W) of the four and of the number of pixels, and the sum that light not found may have."""
+    pixels = sums[:, 12:]
     excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
-    error = (squares / pixels).sqrt() + SCARCE / samples * distance / pixels
+    error = (squares / pixels).sqrt() + (SCARCE / samples * distance + rare) / pixels
     return Window(excess, distance.clamp(min=LEAST_DIVISOR), error)
 
 
