@@ -22,5 +22,6 @@ def test_one_core_is_enough_to_read_exr(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": np.ones((64, 128, 3), np.float32)}) as file:
         file.write(str(path))
-    run = subprocess.run([sys.executable, "-c", READ_ON_ONE_CORE, str(path)], capture_output=True, text=True, timeout=60)
+    command = [sys.executable, "-c", READ_ON_ONE_CORE, str(path)]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert run.stdout == "[128, 64]\n"
