@@ -41,8 +41,8 @@ class StressCase:
         frame_count: of the sequence; the first `even_frames` of them are in even light.
         still: the camera and everything else stand still.
         compare_with: "truth", which is known in even light; "own", the denoiser's output without `change`, times
-            `gain`; "float32", its output in that precision; "past", its output for the same noise early in a long
-            sequence.
+            `gain`; "float32", its output in that precision; "past", its output for the same noise half a long
+            sequence earlier.
         logits: what the largest output of a kernel predictor's last layers is scaled to.
         precision: the denoiser's, a key of PRECISIONS.
     """
