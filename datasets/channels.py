@@ -64,6 +64,9 @@ CHANNELS: dict[str, Channel] = {
     "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
 }
 
+SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", "motion")  # of what a pixel shows
+MIRRORED = {name: f"mirrored_{name}" for name in SURFACE_CHANNELS}  # of what mirrors show, in scenes that have any
+CHANNELS |= {mirrored: CHANNELS[name] for name, mirrored in MIRRORED.items()}
 TRACKED_CHANNELS = ("shadow_motion", "reflection_motion")  # of what causes a pixel's light
 MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
 TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
@@ -72,5 +75,6 @@ NOISY = ("direct", "indirect")
 HIT_CHANNELS = ("hit_distance", "light_distance", "light_angle")  # of the samples in NOISY; 0 where none met anything
 SAMPLED = (*NOISY, *HIT_CHANNELS)  # which each noise realisation has of its own
 HALVES = {"direct": "direct_halves", "indirect": "indirect_halves"}  # the samples of noisy channels, in two halves
-USUAL_CHANNELS = tuple(name for name in CHANNELS if name not in HALVES.values())  # halves are stored where asked for
+# Halves are stored where asked for.
+USUAL_CHANNELS = tuple(name for name in CHANNELS if name not in {*HALVES.values(), *MIRRORED.values()})
 REFERENCES = ("direct_reference", "indirect_reference")

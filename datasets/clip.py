@@ -2,7 +2,7 @@
 
 import resource
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS
+from datasets.mirrors import seen
 from errors import BadInput
 from files import read_json
 from scenes.camera import View, motion_vectors, pixel_centres
@@ -110,23 +111,33 @@ class Clip:
             value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
             return np.broadcast_to(value, (*leading, *area, spec.components))
         if "derived" in entry:
-            return self.motion_to(frame, max(frame - 1, 0), window)
+            return self._motion(self.read, frame, max(frame - 1, 0), window)
         array = self.map(channel)
         images = array[frame, realisation] if "S" in spec.axes else array[frame]
         return images[..., rows, columns, :]
+
+    def seen(self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0) -> NDArray[Any]:
+        """As `read`, but in mirrors of what these show, which is what denoisers see. See datasets.mirrors."""
+        return seen(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
 
     def view(self, frame: int) -> View:
         """The camera and the poses of all meshes in one frame."""
         return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
     def motion_to(self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE) -> NDArray[np.float32]:
-        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip.
+        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip, of what denoisers see.
 
         They are computed from depth, the cameras and the poses of the meshes.
         """
+        return self._motion(self.seen, frame, other, window)
+
+    def _motion(
+        self, surface: Callable[..., NDArray[Any]], frame: int, other: int, window: ImageWindow
+    ) -> NDArray[np.float32]:
+        """Motion vectors of the surfaces that are read by `surface`: `read` or `seen`."""
         pixels = pixel_centres(self.height, self.width)[window]
-        depth = self.read("depth", frame, window)[..., 0].astype(np.float64)
-        mesh_id = self.read("mesh_id", frame, window)[..., 0]
+        depth = surface("depth", frame, window)[..., 0].astype(np.float64)
+        mesh_id = surface("mesh_id", frame, window)[..., 0]
         return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
 
     def reference(self, frame: int, signal: Literal["total", "indirect"] = "total") -> NDArray[np.float32]:

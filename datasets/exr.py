@@ -10,7 +10,7 @@ import OpenEXR
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, MIRRORED
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
@@ -31,6 +31,7 @@ COMPONENTS = {
     "light_distance": "Z",
     "light_angle": "Y",
 }
+COMPONENTS |= {mirrored: COMPONENTS[name] for name, mirrored in MIRRORED.items() if name in COMPONENTS}
 HALF_ENDINGS = ("_a", "_b")  # of the two layers of a channel that has halves
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 

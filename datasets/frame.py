@@ -298,6 +298,8 @@ def read_frame(
 ) -> Frame:
     """Frame `index` (B = 1) of a clip, with the named channels of one noise realisation, cut to `window`.
 
+    In mirrors they are of what these show (see datasets.mirrors).
+
     `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
     another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
 
@@ -316,7 +318,7 @@ def read_frame(
         if name in TEMPORAL_CHANNELS and previous != stored_previous:
             array = for_playback(clip, name, index, previous, window)
         else:
-            array = clip.read(name, index, window, realisation)
+            array = clip.seen(name, index, window, realisation)
         tensors[name] = to_tensor(array, has_halves=CHANNELS[name].has_halves)
     return Frame(
         tensors,

@@ -18,7 +18,7 @@ from render.clip import NO_OPTIONS, Options
 from render.scene_file.load import own_scene
 from scenes.description import Split, read_description
 
-GENERATOR = 7  # raise it when the same seed renders different bytes
+GENERATOR = 8  # raise it when the same seed renders different bytes
 
 # Without these a clip has no picture, no reference or no geometry that other channels could be derived from.
 ESSENTIAL_CHANNELS = {"direct", "indirect", *REFERENCES, "emission", "albedo", "depth", "mesh_id", *CAMERA_CHANNELS}

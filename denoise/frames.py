@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from datasets import mirrors
 from datasets.channels import CHANNELS
 from datasets.exr import FACTS_ATTRIBUTE, channels_of, view_of_facts
 from datasets.frame import Cameras, Frame, to_tensor
@@ -321,7 +322,11 @@ class OwnShot:
         before = self.view if self.view is not None else view
         self.view = view
         return Frame(
-            {name: to_tensor(arrays[name], CHANNELS[name].has_halves) for name in self.reads if name in arrays},
+            {
+                name: to_tensor(mirrors.seen(name, arrays, arrays.__getitem__), CHANNELS[name].has_halves)
+                for name in self.reads
+                if name in arrays
+            },
             now=Cameras.of(view),
             previous=Cameras.of(before),
             gain=torch.ones(1, 3, 1, 1),

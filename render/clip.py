@@ -83,6 +83,8 @@ def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTi
     view = stage.view(0)
     arrays = render_gbuffer(stage, view)
     arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
+    if stage.has_mirrors:
+        arrays["mirrored_motion"] = arrays["motion"]
     timer.lap("gbuffer")
     for following in range(1, frames):
         stage.pose(following)
@@ -93,6 +95,9 @@ def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTi
         mesh_id = ahead["mesh_id"][..., 0]
         motion = motion_vectors(centres, depth, mesh_id, following_view, view)
         ahead["motion"] = motion
+        if stage.has_mirrors:
+            shown = ahead["mirrored_depth"][..., 0].astype(np.float64), ahead["mirrored_mesh_id"][..., 0]
+            ahead["mirrored_motion"] = motion_vectors(centres, *shown, following_view, view)
         timer.lap("motion")
         stage.pose(following - 1)
         timer.lap("gbuffer")
@@ -119,8 +124,9 @@ def render_clip(
 ) -> Iterator[tuple[Arrays, dict[str, float]]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
-    With `channels` only those are yielded, and the time that the others alone would take is saved. Noisy frames of an
-    even number of samples a pixel are drawn in two halves where these are named, which makes them other samples.
+    With `channels` only those are yielded, in a scene with mirrors also `mirrored_`NAME of what they show, and the time
+    that the others alone would take is saved. Noisy frames of an even number of samples a pixel are drawn in two halves
+    where these are named, which makes them other samples.
 
     Deterministic in its arguments on one variant and processor.
     """
@@ -173,4 +179,9 @@ def render_clip(
         arrays["direct_reference"] = np.stack([direct for direct, _ in halves])
         arrays["indirect_reference"] = np.stack([indirect for _, indirect in halves])
         arrays |= view._asdict()  # K, camera_to_world, object_to_world
-        yield {name: array for name, array in arrays.items() if channels is None or name in channels}, timer.read()
+        wanted = {
+            name: array
+            for name, array in arrays.items()
+            if channels is None or name.removeprefix("mirrored_") in channels
+        }
+        yield wanted, timer.read()

@@ -1,5 +1,8 @@
 """What the primary rays see, free of noise: geometry, material and light seen directly."""
 
+# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
+# mypy: disable-error-code="arg-type"
+
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,13 +10,20 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.loading import columns
+from render.mirrors import Seen, look_through
 from render.stage import Stage
 from scenes.camera import Array, View
 
 
-def depth_along_axis(stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View) -> NDArray[np.float32]:
-    """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored."""
-    distance = np.array(dr.select(si.is_valid(), si.t, 0), dtype=np.float64) * stage.unit
+def depth_along_axis(
+    stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View, beyond: mi.Float | None = None
+) -> NDArray[np.float32]:
+    """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored.
+
+    `beyond` is how much farther, in Mitsuba's units, rays go that a mirror at `si` reflects.
+    """
+    length = si.t if beyond is None else si.t + beyond
+    distance = np.array(dr.select(si.is_valid(), length, 0), dtype=np.float64) * stage.unit
     cosine = columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2]
     depth = distance * cosine
     if stage.has_holes:  # rays begin behind what they have passed through
@@ -42,6 +52,20 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
     return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 
+def surface_channels(stage: Stage, seen: Seen) -> dict[str, dr.AnyArray]:
+    """Normals, albedo, roughness and mesh ids of what is seen."""
+    hit = seen.si.is_valid()
+    normal = stage.normals.evaluate(seen.si, hit)
+    normal = seen.in_mirrors(dr.select(dr.dot(normal, seen.ray.d) > 0, -normal, normal))
+    albedo, roughness = stage.materials.evaluate(seen.si, hit)
+    return {
+        "normal": dr.select(hit, normal, mi.Vector3f(0)),
+        "albedo": seen.tint * albedo,
+        "roughness": roughness,
+        "mesh_id": stage.mesh_id(seen.si),
+    }
+
+
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     """The noise-free channels (H, W, C), named and shaped as in the channel table (datasets/channels.py).
 
@@ -53,21 +77,22 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     emission: the radiance of lamps and sky that are seen directly.
     depth: along the viewing axis, in world units; 0 for background.
     mesh_id: index of the shape + 1; 0 for background.
+
+    In a scene with mirrors all but emission also as `mirrored_`NAME: in mirrors of what they show, as if it stood
+    behind them. Albedo is times theirs, depth follows from the length of the whole way.
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    hit = si.is_valid()
-    normal = stage.normals.evaluate(si, hit)
-    normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
-    albedo, roughness = stage.materials.evaluate(si, hit)
-    channels: dict[str, dr.AnyArray] = {
-        "normal": dr.select(hit, normal, mi.Vector3f(0)),
-        "albedo": albedo,
-        "roughness": roughness,
-        "emission": stage.lights.at(si).eval(si),
-        "mesh_id": stage.mesh_id(si),
-    }
+    own = Seen.directly(si, ray)
+    channels = {**surface_channels(stage, own), "emission": stage.lights.at(si).eval(si)}
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
+    if stage.has_mirrors:
+        seen = look_through(stage, own)
+        shown = {f"mirrored_{name}": value for name, value in surface_channels(stage, seen).items()}
+        dr.eval(shown, seen.beyond)
+        arrays |= {name: stage.image(value) for name, value in shown.items()}
+        depth = depth_along_axis(stage, si, ray, view, seen.beyond)
+        arrays["mirrored_depth"] = depth.reshape(stage.height, stage.width, 1)
     return arrays

@@ -94,6 +94,7 @@ def diffuse_fresnel(eta: float) -> float:
 
 
 UNSCALED = np.ones(3, np.float32)
+SMOOTH = 0.002  # GGX alpha below which a reflection is a picture: blurred by some pixels at most
 
 
 def diffuse_material(parameters: BsdfParameters) -> Material:
@@ -238,6 +239,12 @@ def bsdfs_of(shapes: Iterable[mi.Shape]) -> dict[int, mi.BSDF]:
 ColumnT = TypeVar("ColumnT", bound=dr.AnyArray)
 
 
+def is_mirror(bsdf: mi.BSDF, material: Material | Mixture) -> bool:
+    """Whether a BSDF of that material does nothing but reflect, and that like a mirror."""
+    scatters = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse) or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+    return not scatters and isinstance(material, Material) and float(np.array(material.roughness.mean())[0]) < SMOOTH
+
+
 class MaterialTable:
     """The materials of Mitsuba shapes as columns, with a row for each, looked up by the BSDF's registry index."""
 
@@ -249,6 +256,7 @@ class MaterialTable:
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
         self.depth = max(map(depth_of, trees), default=0)
         rows = [self.add(tree) for tree in trees]
+        self.has_mirrors = any(map(is_mirror, bsdfs.values(), trees))
         if not rows:
             self.add(Material(constant(1), constant(1), constant(0), UNSCALED))  # an empty scene needs a row, too
         table = np.zeros(max(bsdfs, default=0) + 1, np.uint32)

@@ -90,6 +90,7 @@ class Stage:
         self.stock = [StockParameters(each, self.parameters, self.unit) for each in moving]
         visible = [*self.shapes, *loader.grouped]
         self.materials = MaterialTable(visible)
+        self.has_mirrors = self.materials.has_mirrors
         self.normals = ShadingNormals(visible)
         self.has_holes = any(map(lets_through, bsdfs_of(visible).values()))
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
@@ -149,10 +150,12 @@ class Stage:
         origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:] / self.unit))
         ray = mi.Ray3f(origin, mi.Vector3f(*map(upload, towards.T)))
         dr.eval(ray)
-        return self.past_holes(ray) if self.has_holes else ray
+        return self.past_holes(ray)
 
     def past_holes(self, ray: mi.Ray3f) -> mi.Ray3f:
         """The rays from behind the last of the first MOST_HOLES surfaces that let all light through where they hit."""
+        if not self.has_holes:
+            return ray
         for _ in range(MOST_HOLES):
             si = self.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
             hit = si.is_valid()

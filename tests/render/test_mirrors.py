@@ -1,0 +1,202 @@
+"""G-buffers that look through mirrors: a mirror shows what a window would, were the room behind it built."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import trimesh
+
+from render.clip import Sampling, render_clip
+from render.gbuffer import render_gbuffer
+from render.stage import Stage
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.bsdf import Bsdf
+from scenes.camera import pixel_centres, unproject
+
+SIZE = (48, 64)
+FRAMES = 3
+SILVER = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+SURFACE = ("normal", "depth", "roughness", "albedo")
+
+
+def painted(red: float) -> Bsdf:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [red, 0.4, 0.6]}}
+
+
+def panel(width: float, height: float) -> trimesh.Trimesh:
+    """A rectangle in z = 0 that faces +z."""
+    x, y = width / 2, height / 2
+    corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def behind(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh as a mirror in z = 0 shows it."""
+    copy = mesh.copy()
+    copy.apply_scale([1, 1, -1])
+    return copy
+
+
+def placed(mesh: trimesh.Trimesh, at: list[float]) -> trimesh.Trimesh:
+    copy = mesh.copy()
+    copy.apply_translation(at)
+    return copy
+
+
+BOX = placed(trimesh.creation.box([0.5, 0.8, 0.4]), [-0.3, 0.2, 1.2])
+GLIDES = RigidMotion(
+    Track(np.array([[0.0, 0, 0], [0.5, 0.2, 0]]), last=FRAMES - 1.0), Track.constant(0.0)
+)  # along the mirror
+CAMERA = Camera(
+    Track(np.array([[1.2, 0.3, 3.0], [1.5, 0.2, 2.8]]), last=FRAMES - 1.0),
+    Track.constant([0.0, 0, 0]),
+    Track.constant(60.0),
+)
+
+
+def slanted() -> trimesh.Trimesh:
+    """A wall behind the camera that the mirror shows everywhere, at a slant."""
+    wall = placed(panel(50, 50), [0, 0, 6])
+    wall.apply_transform(trimesh.transformations.rotation_matrix(np.pi + 0.2, [0, 1, 0], [0, 0, 6]))
+    return wall
+
+
+def room(surface: Bsdf) -> Scene:
+    """A picture on the wall of which is `surface`, a box that glides along it and a slanted wall behind the camera."""
+    shapes = (
+        Shape("picture", panel(5, 5), surface),
+        Shape("box", BOX, painted(0.2), motion=GLIDES),
+        Shape("wall", slanted(), painted(0.7)),
+    )
+    return Scene(shapes, CAMERA)
+
+
+def room_twice() -> Scene:
+    """The room with its mirror image built where the picture was. The image's ids are those of what it is of, + 3."""
+    ours = room(SILVER).shapes
+    box, wall = (
+        Shape(f"{shape.name} behind", behind(shape.mesh), shape.bsdf, motion=shape.motion) for shape in ours[1:]
+    )
+    far = replace(ours[0], mesh=placed(ours[0].mesh, [0, 0, -1000]))
+    return Scene((far, *ours[1:], Shape("nothing", placed(panel(1, 1), [0, 0, 900]), SILVER), box, wall), CAMERA)
+
+
+def rendered(scene: Scene) -> list[dict]:
+    return [frame for frame, _ in render_clip(scene, FRAMES, *SIZE, Sampling(1, 1, 2), seed=3)]
+
+
+@pytest.fixture(scope="module")
+def seen() -> list[tuple[dict, dict]]:
+    """Each frame of the room with the mirror, and of that which is built twice."""
+    return list(zip(rendered(room(SILVER)), rendered(room_twice()), strict=True))
+
+
+def test_a_mirror_shows_what_a_window_would(seen):
+    """Surfaces and motion, but for single pixels at edges."""
+    for own, twice in seen:
+        picture = own["mesh_id"][..., 0] == 1
+        same = picture & (own["mirrored_mesh_id"] + 3 == twice["mesh_id"])[..., 0]
+        assert picture.mean() > 0.4 and same.sum() >= picture.sum() - 3
+        assert {2, 3} <= set(own["mirrored_mesh_id"][picture].ravel())
+        for name in (*SURFACE, "motion"):
+            shown = own[f"mirrored_{name}"][same]
+            np.testing.assert_allclose(shown, twice[name][same], rtol=1e-4, atol=1e-3, err_msg=name)
+    assert np.abs(seen[-1][0]["mirrored_motion"]).max() > 1
+
+
+def test_elsewhere_all_is_as_it_is(seen):
+    for own, _ in seen:
+        elsewhere = own["mesh_id"][..., 0] != 1
+        assert elsewhere.any()
+        for name in (*SURFACE, "mesh_id", "motion"):
+            np.testing.assert_array_equal(own[f"mirrored_{name}"][elsewhere], own[name][elsewhere], err_msg=name)
+
+
+def test_a_scene_without_mirrors_has_no_such_channels():
+    (frame, *_) = rendered(room(painted(0.5)))
+    assert not [name for name in frame if name.startswith("mirrored")]
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        painted(0.5),
+        {"type": "roughconductor", "material": "Ag", "alpha": 0.01},
+        {"type": "dielectric"},
+        {"type": "plastic"},
+        {"type": "conductor", "material": "Ag"},  # whose back is black
+    ],
+    ids=lambda bsdf: bsdf["type"],
+)
+def test_what_is_no_mirror_is_not_looked_through(surface):
+    scene = room(surface)
+    if surface["type"] == "conductor":
+        scene.shapes[0].mesh.invert()
+    hand_mirror = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
+    stage = Stage(replace(scene, shapes=(*scene.shapes, hand_mirror)), *SIZE)
+    buffer = render_gbuffer(stage, stage.view(0))
+    for name in (*SURFACE, "mesh_id"):
+        np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
+
+
+def test_a_mirror_that_shows_the_sky_is_a_mirror():
+    scene = Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA)
+    stage = Stage(scene, *SIZE)
+    buffer = render_gbuffer(stage, stage.view(0))
+    assert buffer["mesh_id"].mean() > 0.6
+    for name in (*SURFACE, "mesh_id"):
+        np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
+
+
+def test_a_tinted_mirror_tints_albedo():
+    """By its reflectance at normal incidence, the more often the more mirrors there are."""
+    tinted = {
+        "type": "conductor",
+        "material": "none",
+        "specular_reflectance": {"type": "rgb", "value": [0.9, 0.6, 0.3]},
+    }
+    stage = Stage(room(tinted), *SIZE)
+    buffer = render_gbuffer(stage, stage.view(0))
+    behind_glass = buffer["mirrored_mesh_id"][..., 0] == 3
+    assert behind_glass.any()
+    expected = np.array([0.7, 0.4, 0.6]) * [0.9, 0.6, 0.3]
+    np.testing.assert_allclose(
+        buffer["mirrored_albedo"][behind_glass], np.broadcast_to(expected, (behind_glass.sum(), 3)), rtol=1e-5
+    )
+
+
+def test_mirrors_in_mirrors_turn_what_they_show_in_their_order():
+    """A ball between two mirrors at 50 degrees: each image is a sphere around the ball's centre, reflected in turn."""
+    angle = np.radians(50)
+    normals = {"a": np.array([0.0, 0, 1]), "b": np.array([-np.sin(angle), 0, np.cos(angle)])}
+    centre, radius = np.array([0.9, 0.1, 0.45]), 0.25
+    ball = placed(trimesh.creation.icosphere(subdivisions=5, radius=radius), list(centre))
+    across = placed(panel(4, 4), [2.0, 0, 0])
+    other = across.copy()
+    other.apply_transform(trimesh.transformations.rotation_matrix(-angle, [0, 1, 0]))
+    shapes = (
+        Shape("a", across, SILVER),
+        Shape("b", other, SILVER),
+        Shape("ball", ball, painted(0.5), smooth=True),
+    )
+    camera = Camera(Track.constant([3.0, 0.4, 1.4]), Track.constant([0.0, 0, 0]), Track.constant(70.0))
+    stage = Stage(Scene(shapes, camera), 96, 96)
+    view = stage.view(0)
+    buffer = render_gbuffer(stage, view)
+    hit = buffer["mirrored_mesh_id"][..., 0] == 3
+    points = unproject(pixel_centres(96, 96), buffer["mirrored_depth"][..., 0].astype(float), view)[hit]
+    reflect = {name: np.eye(3) - 2 * np.outer(n, n) for name, n in normals.items()}
+    shown = np.full(hit.sum(), "", dtype=object)
+    for order in ("", *("".join(each) for count in (1, 2, 3) for each in product("ab", repeat=count))):
+        if "aa" in order or "bb" in order:
+            continue
+        image = centre
+        for name in reversed(order):  # the first mirror on the way is the last to reflect
+            image = reflect[name] @ image
+        outward = (points - image) / radius
+        on_it = np.abs(np.linalg.norm(outward, axis=-1) - 1) < 5e-3
+        matches = on_it & (np.abs(outward - buffer["mirrored_normal"][hit]).max(axis=-1) < 2e-2)
+        shown[matches & (shown == "")] = order or "itself"
+    assert (shown != "").all()
+    assert {"itself", "a", "b"} <= set(shown) and {"ab", "ba"} & set(shown)
