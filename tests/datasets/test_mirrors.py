@@ -1,0 +1,100 @@
+"""Clips of scenes with mirrors: what is stored, and what denoisers see."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from datasets.channels import MIRRORED, USUAL_CHANNELS
+from datasets.clip import Clip
+from datasets.clip_job import write_clip
+from datasets.exr import write_exr
+from datasets.frame import read_frame
+from denoise.exr_image import ExrImage
+from denoise.frames import OwnShot
+from render.clip import Sampling
+from scenes.animation import Scene
+from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, room
+
+LAST = FRAMES - 1
+OTHER_MOTION = ("dual_motion", "shadow_motion", "reflection_motion")
+SEEN = (*MIRRORED, *OTHER_MOTION, "emission", "direct")
+
+
+def clip_of(scene: Scene, folder: Path, channels: tuple[str, ...] = USUAL_CHANNELS) -> Clip:
+    path = folder / "test" / "room" / "000"
+    write_clip(path, scene, (FRAMES, *SIZE), Sampling(1, 1, 2), 0, channels)
+    return Clip(path)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Clip:
+    return clip_of(room(SILVER), tmp_path_factory.mktemp("mirror"))
+
+
+def test_denoisers_see_what_mirrors_show(clip):
+    frame = read_frame(clip, LAST, SEEN)
+    stored = {
+        name: np.moveaxis(clip.read(name, LAST).astype(np.float32), -1, 0) for name in clip.channels if name in SEEN
+    }
+    shown = {name: np.moveaxis(clip.read(MIRRORED[name], LAST).astype(np.float32), -1, 0) for name in MIRRORED}
+    picture = stored["mesh_id"][0] == 1
+    for name in MIRRORED:
+        np.testing.assert_array_equal(getattr(frame, name)[0], shown[name], err_msg=name)
+    for name in OTHER_MOTION:
+        seen = getattr(frame, name)[0].numpy()
+        np.testing.assert_array_equal(seen[:, picture], shown["motion"][:, picture], err_msg=name)
+        np.testing.assert_array_equal(seen[:, ~picture], stored[name][:, ~picture], err_msg=name)
+    for name in ("emission", "direct"):
+        np.testing.assert_array_equal(getattr(frame, name)[0], stored[name], err_msg=name)
+    assert picture.mean() > 0.4 and (frame.mesh_id[0, 0].numpy()[picture] != 1).all()
+
+
+def test_what_is_stored_by_its_old_name_is_the_mirror(clip):
+    depth, mesh_id = (clip.read(name, LAST)[..., 0] for name in ("depth", "mesh_id"))
+    assert (mesh_id == 1).mean() > 0.4
+    shown = clip.read("mirrored_depth", LAST)[..., 0]
+    assert (shown[mesh_id == 1] > depth[mesh_id == 1]).all()
+
+
+def test_motion_to_any_frame_is_that_of_what_is_seen(clip):
+    """And where only the camera moves, so that the mirror's own motion is not stored, that still is the mirror's."""
+    stored = clip.read("mirrored_motion", LAST)
+    np.testing.assert_allclose(clip.motion_to(LAST, LAST - 1), stored, atol=2e-2)
+    assert not clip.motion_to(LAST, LAST).any()
+
+
+def test_derived_motion_is_the_mirrors_own(clip, tmp_path):
+    scene = room(SILVER)
+    still = replace(scene, shapes=tuple(replace(shape, motion=scene.shapes[0].motion) for shape in scene.shapes))
+    derived = clip_of(still, tmp_path)
+    assert "derived" in derived.channels["motion"] and "file" in derived.channels["mirrored_motion"]
+    mirror = ((clip.read("mesh_id", LAST) == 1) & (derived.read("mesh_id", LAST) == 1))[..., 0]
+    np.testing.assert_allclose(derived.read("motion", LAST)[mirror], clip.read("motion", LAST)[mirror], atol=1e-3)
+    assert np.abs(derived.read("motion", LAST) - derived.read("mirrored_motion", LAST)).max() > 0.5
+
+
+def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
+    reads = ("direct", "indirect", "direct_reference", "indirect_reference", "emission", "albedo", "depth", "mesh_id")
+    few = clip_of(room(SILVER), tmp_path / "few", (*reads, "K", "camera_to_world", "object_to_world"))
+    assert {name for name in few.channels if name in MIRRORED.values()} == {
+        "mirrored_albedo",
+        "mirrored_depth",
+        "mirrored_mesh_id",
+    }
+    none = clip_of(room(painted(0.5)), tmp_path / "none")
+    assert not set(MIRRORED.values()) & set(none.channels)
+
+
+def test_exported_frames_are_seen_alike(clip, tmp_path):
+    shot = OwnShot(SEEN)
+    for index in range(FRAMES):
+        path = tmp_path / f"{index}.exr"
+        write_exr(path, clip, index)
+        frame = shot.frame(ExrImage(path))
+        expected = read_frame(clip, index, SEEN)
+        assert frame.channels.keys() == expected.channels.keys()
+        for name, tensor in expected.channels.items():
+            assert torch.equal(frame.channels[name], tensor), name

@@ -1,0 +1,56 @@
+"""A room with a mirror."""
+
+import numpy as np
+import trimesh
+
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.bsdf import Bsdf
+
+SIZE = (48, 64)
+FRAMES = 3
+SILVER = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+
+
+def painted(red: float) -> Bsdf:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [red, 0.4, 0.6]}}
+
+
+def panel(width: float, height: float) -> trimesh.Trimesh:
+    """A rectangle in z = 0 that faces +z."""
+    x, y = width / 2, height / 2
+    corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def placed(mesh: trimesh.Trimesh, at: list[float]) -> trimesh.Trimesh:
+    copy = mesh.copy()
+    copy.apply_translation(at)
+    return copy
+
+
+BOX = placed(trimesh.creation.box([0.5, 0.8, 0.4]), [-0.3, 0.2, 1.2])
+GLIDES = RigidMotion(
+    Track(np.array([[0.0, 0, 0], [0.5, 0.2, 0]]), last=FRAMES - 1.0), Track.constant(0.0)
+)  # along the mirror
+CAMERA = Camera(
+    Track(np.array([[1.2, 0.3, 3.0], [1.5, 0.2, 2.8]]), last=FRAMES - 1.0),
+    Track.constant([0.0, 0, 0]),
+    Track.constant(60.0),
+)
+
+
+def slanted() -> trimesh.Trimesh:
+    """A wall behind the camera that the mirror shows everywhere, at a slant."""
+    wall = placed(panel(50, 50), [0, 0, 6])
+    wall.apply_transform(trimesh.transformations.rotation_matrix(np.pi + 0.2, [0, 1, 0], [0, 0, 6]))
+    return wall
+
+
+def room(surface: Bsdf) -> Scene:
+    """A picture on the wall of which is `surface`, a box that glides along it and a slanted wall behind the camera."""
+    shapes = (
+        Shape("picture", panel(5, 5), surface),
+        Shape("box", BOX, painted(0.2), motion=GLIDES),
+        Shape("wall", slanted(), painted(0.7)),
+    )
+    return Scene(shapes, CAMERA)
