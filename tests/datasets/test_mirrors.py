@@ -20,7 +20,7 @@ from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, room
 
 LAST = FRAMES - 1
 OTHER_MOTION = ("dual_motion", "shadow_motion", "reflection_motion")
-SEEN = (*MIRRORED, *OTHER_MOTION, "emission", "direct")
+SEEN = (*MIRRORED, *OTHER_MOTION, "gradient", "emission", "direct")
 
 
 def clip_of(scene: Scene, folder: Path, channels: tuple[str, ...] = USUAL_CHANNELS) -> Clip:
@@ -47,6 +47,9 @@ def test_denoisers_see_what_mirrors_show(clip):
         seen = getattr(frame, name)[0].numpy()
         np.testing.assert_array_equal(seen[:, picture], shown["motion"][:, picture], err_msg=name)
         np.testing.assert_array_equal(seen[:, ~picture], stored[name][:, ~picture], err_msg=name)
+    gradient = frame.gradient[0].numpy()
+    assert stored["gradient"][:, picture].any() and not gradient[:, picture].any()
+    np.testing.assert_array_equal(gradient[:, ~picture], stored["gradient"][:, ~picture])
     for name in ("emission", "direct"):
         np.testing.assert_array_equal(getattr(frame, name)[0], stored[name], err_msg=name)
     assert picture.mean() > 0.4 and (frame.mesh_id[0, 0].numpy()[picture] != 1).all()

@@ -51,6 +51,6 @@ def room(surface: Bsdf) -> Scene:
     shapes = (
         Shape("picture", panel(5, 5), surface),
         Shape("box", BOX, painted(0.2), motion=GLIDES),
-        Shape("wall", slanted(), painted(0.7)),
+        Shape("wall", slanted(), painted(0.7), radiance=Track.constant([1.0, 1.0, 1.0])),
     )
     return Scene(shapes, CAMERA)
