@@ -36,7 +36,7 @@ has all of this page for programs.
 
 {channels}
 
-Clips of scenes with mirrors have `mirrored_albedo` and so on besides: the same channels of what the mirrors show.
+Clips in which mirrors are seen have `mirrored_albedo` and so on besides: the same channels of what the mirrors show.
 
 Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or follows
 from others: `clip.json` of each clip.

@@ -3,13 +3,14 @@
 import shutil
 import zlib
 from contextlib import suppress
+from filecmp import cmp
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, REFERENCES, Channel
+from datasets.channels import CHANNELS, MIRRORED, REFERENCES, Channel
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
 from files import write_json
 
@@ -168,10 +169,19 @@ class ClipWriter:
             floors.append(noise_of_halves(a, b))
         return float(np.mean(floors))
 
+    def leave_out_unseen_mirrors(self) -> None:
+        """Drop the channels of what mirrors show where none is in view: what one shows is always farther away."""
+        shown = self.channels.get(MIRRORED["depth"])
+        if shown is None or not cmp(shown.path, self.channels["depth"].path, shallow=False):
+            return
+        for name in MIRRORED.values() & self.channels.keys():
+            self.channels.pop(name).path.unlink()
+
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
         """Complete the clip. `facts` join clip.json; `derived` says which channels readers derive, and from what."""
         for raw in self.channels.values():
             raw.file.close()
+        self.leave_out_unseen_mirrors()
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape

@@ -15,8 +15,8 @@ from datasets.frame import read_frame
 from denoise.exr_image import ExrImage
 from denoise.frames import OwnShot
 from render.clip import Sampling
-from scenes.animation import Scene
-from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, room
+from scenes.animation import Scene, Shape
+from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, panel, placed, room
 
 LAST = FRAMES - 1
 OTHER_MOTION = ("dual_motion", "shadow_motion", "reflection_motion")
@@ -88,7 +88,11 @@ def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
         "mirrored_mesh_id",
     }
     none = clip_of(room(painted(0.5)), tmp_path / "none")
-    assert not set(MIRRORED.values()) & set(none.channels)
+    scene = room(painted(0.5))
+    hand_mirror = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
+    unseen = clip_of(replace(scene, shapes=(*scene.shapes, hand_mirror)), tmp_path / "unseen")
+    assert not set(MIRRORED.values()) & (none.channels.keys() | unseen.channels.keys())
+    assert not [path.name for path in unseen.path.iterdir() if "mirrored" in path.name]
 
 
 def test_exported_frames_are_seen_alike(clip, tmp_path):
