@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from provenance import ROOT
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
 from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, painted, panel, placed, room
+from tests.helpers.scene_files import own
 
 SURFACE = ("normal", "depth", "roughness", "albedo")
 
@@ -46,23 +48,23 @@ def seen() -> list[tuple[dict, dict]]:
 
 def test_a_mirror_shows_what_a_window_would(seen):
     """Surfaces and motion, but for single pixels at edges."""
-    for own, twice in seen:
-        picture = own["mesh_id"][..., 0] == 1
-        same = picture & (own["mirrored_mesh_id"] + 3 == twice["mesh_id"])[..., 0]
+    for frame, twice in seen:
+        picture = frame["mesh_id"][..., 0] == 1
+        same = picture & (frame["mirrored_mesh_id"] + 3 == twice["mesh_id"])[..., 0]
         assert picture.mean() > 0.4 and same.sum() >= picture.sum() - 3
-        assert {2, 3} <= set(own["mirrored_mesh_id"][picture].ravel())
+        assert {2, 3} <= set(frame["mirrored_mesh_id"][picture].ravel())
         for name in (*SURFACE, "motion"):
-            shown = own[f"mirrored_{name}"][same]
+            shown = frame[f"mirrored_{name}"][same]
             np.testing.assert_allclose(shown, twice[name][same], rtol=1e-4, atol=1e-3, err_msg=name)
     assert np.abs(seen[-1][0]["mirrored_motion"]).max() > 1
 
 
 def test_elsewhere_all_is_as_it_is(seen):
-    for own, _ in seen:
-        elsewhere = own["mesh_id"][..., 0] != 1
+    for frame, _ in seen:
+        elsewhere = frame["mesh_id"][..., 0] != 1
         assert elsewhere.any()
         for name in (*SURFACE, "mesh_id", "motion"):
-            np.testing.assert_array_equal(own[f"mirrored_{name}"][elsewhere], own[name][elsewhere], err_msg=name)
+            np.testing.assert_array_equal(frame[f"mirrored_{name}"][elsewhere], frame[name][elsewhere], err_msg=name)
 
 
 def test_a_scene_without_mirrors_has_no_such_channels():
@@ -152,3 +154,16 @@ def test_mirrors_in_mirrors_turn_what_they_show_in_their_order():
         shown[matches & (shown == "")] = order or "itself"
     assert (shown != "").all()
     assert {"itself", "a", "b"} <= set(shown) and {"ab", "ba"} & set(shown)
+
+
+def test_the_ball_of_the_docs_shows_its_room(tmp_path):
+    """A curved mirror in a scene file: a picture of the room, farther away than the ball, no sky and no ball in it."""
+    found = own(tmp_path, (ROOT / "docs" / "mirror-ball.xml").read_text())
+    assert found.notes == []
+    buffer = render_gbuffer(found.stage, found.stage.view(0))
+    ball = buffer["mesh_id"][..., 0] == [shape.name for shape in found.scene.meshes].index("ball") + 1
+    assert ball.mean() > 0.05
+    assert len(np.unique(buffer["mirrored_mesh_id"][ball])) > 3
+    assert (buffer["mirrored_mesh_id"][ball] != buffer["mesh_id"][ball]).all()
+    assert (buffer["mirrored_depth"][ball] > buffer["depth"][ball]).all()
+    np.testing.assert_allclose(np.linalg.norm(buffer["mirrored_normal"][ball], axis=-1), 1, atol=1e-5)
