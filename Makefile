@@ -50,8 +50,9 @@ stress: $(READY)
 report: $(READY)
 	$(BIN)/onespp report --runs $(RUNS)
 
-# Two tests at a time, each on one thread: threads that wait for each other would keep both cores busy.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
+# Two tests at a time, each on one thread: threads that wait for each other would keep both cores busy. Tests of a file
+# share what they prepare, so each file goes to one process.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test: $(READY)
 	$(PYTEST)

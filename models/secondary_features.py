@@ -27,7 +27,8 @@ def box_sum(image: Tensor, side: int) -> Tensor:
 
 def block_statistics(features: Tensor, surface: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation over blocks of 7 x 7 pixels."""
-    counted = torch.cat([features, features.square(), torch.ones_like(surface)], dim=1).double() * surface
+    exact = features.double()  # squares too: the rounding of a square in float32 would look like a spread of 2e-4 of it
+    counted = torch.cat([exact, exact.square(), torch.ones_like(surface)], dim=1) * surface
     count = features.shape[1]
     total, square, pixels = box_sum(counted, BLOCK).split([count, count, 1], dim=1)
     mean = total / pixels.clamp(min=1)

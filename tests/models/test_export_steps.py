@@ -236,7 +236,7 @@ def test_float16_in_the_network_alone(weights):
             assert b["radiance"].max() > 65504
 
 
-@pytest.fixture(scope="module", params=["one", pytest.param("wskp3", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["wskp3", pytest.param("one", marks=pytest.mark.slow)])
 def written(request, weights, tmp_path_factory):
     """A denoiser of each kind as ONNX, moving its history itself; the folder has its name."""
     name = request.param
