@@ -1,5 +1,7 @@
 """What a training step reads: batches of sequences or of accumulated crops, and who reads which."""
 
+import gc
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +19,9 @@ from train.recipe import Recipe
 from train.whole_frames import WholeFrames
 
 Items = TrainingSequences | AccumulatedCrops
+
+# A forked worker must not collect its parent's garbage: Dr.Jit's would wait for ever for threads that it does not have.
+os.register_at_fork(before=gc.freeze, after_in_parent=gc.unfreeze)
 
 PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, if not told otherwise
 

@@ -6,13 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from datasets.channels import CHANNELS, HIT_CHANNELS, TEMPORAL_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.sequences import Augmentation, TrainingSequences, collate
 from errors import BadInput
+from train.data import loader
 
 FORWARD_ALONE = tuple(name for name in TEMPORAL_CHANNELS if name != "motion")
 IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
@@ -144,7 +144,8 @@ def are_equal(a: Frame, b: Frame) -> bool:
 def test_batches_are_the_same_whatever_the_number_of_workers(clips):
     data = sequences(clips, AUGMENTATIONS["all"])
     data.set_epoch(4)
-    alone, shared = (list(DataLoader(data, 2, collate_fn=collate, num_workers=workers)) for workers in (0, 2))
+    batches = [[index, index + 1] for index in range(0, len(data) - 1, 2)]
+    alone, shared = (list(loader(data, batches, workers)) for workers in (0, 2))
     assert len(alone) == len(shared) > 1
     for a, b in zip(alone, shared, strict=True):
         assert all(are_equal(x, y) for x, y in zip(a.frames, b.frames, strict=True))

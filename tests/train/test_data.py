@@ -1,10 +1,14 @@
 """Who reads which items, in what parts."""
 
+import gc
+import os
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils.data import DataLoader
 
 from timing import thread_count
 from train.data import ahead, equal_parts, micro_batches
@@ -31,6 +35,37 @@ def test_processes_share_what_one_would_read(world, largest, first):
     for step, expected in enumerate(whole):
         seen = [i for share in shares for part in share[step * parts : (step + 1) * parts] for i in part]
         assert sorted(seen) == expected
+
+
+class Trap:
+    """Garbage that tells in which process it was collected."""
+
+    def __init__(self, told: Path):
+        self.told = told
+        self.itself = self  # so that only the garbage collector finds it
+
+    def __del__(self) -> None:
+        (self.told / str(os.getpid())).touch()
+
+
+class Collecting(list):
+    """Items that are read beside the garbage collector."""
+
+    def __getitem__(self, index):
+        gc.collect()
+        return index
+
+
+def test_workers_leave_the_garbage_of_their_parent_alone(tmp_path):
+    """Its destructors may wait for threads that a forked process does not have."""
+    gc.disable()
+    try:
+        Trap(tmp_path)
+        assert [list(batch) for batch in DataLoader(Collecting([0, 1]), collate_fn=list, num_workers=1)] == [[0], [1]]
+    finally:
+        gc.enable()
+    gc.collect()
+    assert [path.name for path in tmp_path.iterdir()] == [str(os.getpid())]
 
 
 def test_loading_ahead_leaves_the_number_of_threads():
