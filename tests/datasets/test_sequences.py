@@ -144,7 +144,8 @@ def are_equal(a: Frame, b: Frame) -> bool:
 def test_batches_are_the_same_whatever_the_number_of_workers(clips):
     data = sequences(clips, AUGMENTATIONS["all"])
     data.set_epoch(4)
-    batches = [[index, index + 1] for index in range(0, len(data) - 1, 2)]
+    numbers = list(range(len(data)))
+    batches = [numbers[first : first + 2] for first in range(0, len(data), 2)]
     alone, shared = (list(loader(data, batches, workers)) for workers in (0, 2))
     assert len(alone) == len(shared) > 1
     for a, b in zip(alone, shared, strict=True):
