@@ -65,7 +65,7 @@ CHANNELS: dict[str, Channel] = {
 }
 
 SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", "motion")  # of what a pixel shows
-MIRRORED = {name: f"mirrored_{name}" for name in SURFACE_CHANNELS}  # of what mirrors show, in scenes that have any
+MIRRORED = {name: f"mirrored_{name}" for name in SURFACE_CHANNELS}  # of what mirrors show, where any is in view
 CHANNELS |= {mirrored: CHANNELS[name] for name, mirrored in MIRRORED.items()}
 TRACKED_CHANNELS = ("shadow_motion", "reflection_motion")  # of what causes a pixel's light
 MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
