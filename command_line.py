@@ -80,13 +80,13 @@ def dataset(
         halton: draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE).
         regularise: blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
     """
-    from datasets.generate import Share, generate, render_here
     from models.registry import channels_read
     from render.clip import Options
+    from render.job.generate import Share, generate, render_here
     from train.recipes import TRAINABLE
 
     if ray:
-        from datasets.cluster import render_on_cluster
+        from render.job.cluster import render_on_cluster
     folder = data_folder(data, scene.stem if scene else profile)
     share = Share.parse(part or "1/1")
     options = Options(halton, regularise)
@@ -231,24 +231,6 @@ def show(
         print(path)
 
 
-def figure_variance(out: Png = Path("runs/variance.png")) -> None:
-    """Draw SVGF's Fig. 9: its estimates of variance, spatial and temporal, on noise that grows from left to right."""
-    from eval.figures.variance import variance_figure
-
-    out.parent.mkdir(parents=True, exist_ok=True)
-    variance_figure(out)
-    print(out)
-
-
-def figure_unbiased(out: Png = Path("runs/unbiased.png")) -> None:
-    """Draw plain and unbiased MSE against references of 16 to 1024 spp, and how true noise floors are."""
-    from eval.figures.unbiased import unbiased_figure
-
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unbiased_figure(out)
-    print(out)
-
-
 def figure_triptych(
     scene: Annotated[str, Positional, arg(metavar="SCENE", help="a built-in one")] = "room-2014",
     denoiser: Annotated[str, arg(metavar="NAME")] = "one",
@@ -258,7 +240,7 @@ def figure_triptych(
     spp: Annotated[int, arg(metavar="N", help="samples a pixel of the reference")] = 512,
 ) -> None:
     """Draw a frame of 1280 x 720 in three strips: one sample a pixel, denoised, and the reference. Minutes."""
-    from eval.figures.triptych import triptych
+    from eval.studies.triptych import triptych
 
     out.parent.mkdir(parents=True, exist_ok=True)
     triptych(out, scene, denoiser, runs, frame, spp)
@@ -306,29 +288,6 @@ def bench_denoisers(
     print(bench(runs, names, size, threads))
 
 
-def bench_scaling(
-    names: Denoisers = (),
-    runs: Runs = Path("runs"),
-    size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="by default 320x180 to 1920x1080")] = (),
-    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
-) -> None:
-    """Milliseconds against pixels, of all denoisers or those named; with a plot."""
-    from eval.bench.scaling import bench_scaling as bench
-
-    print(bench(runs, names, size, threads))
-
-
-def bench_fusion(
-    runs: Runs = Path("runs"),
-    size: Size = "1280x720",
-    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
-) -> None:
-    """Weight-shared kernel fusion, next to the straightforward way."""
-    from eval.bench.fusion import bench_fusion as bench
-
-    print(bench(runs, size, threads))
-
-
 def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
     """Samples a second and seconds to a noise floor of 40 dB, next to stock Mitsuba, of eight scenes or those named."""
     from eval.bench.rendering import bench_rendering as bench
@@ -336,28 +295,12 @@ def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
     print(bench(runs, names))
 
 
-def bench_references(
-    data: DataOfBudget = None,
-    runs: Runs = Path("runs"),
-    budget: Budget = "quick",
-    seeds: Annotated[int, arg(metavar="N", help="trainings of each network; mean and spread are shown")] = 2,
-) -> None:
-    """What a render budget is best spent on: many rooms with noisy references or few with clean. An hour or two.
-
-    Renders rooms, trains wskp6 and ntd-mean with each split and with two losses, judges them on the test clips: table,
-    plot, results.json.
-    """
-    from eval.bench.references import bench_references as bench
-
-    print(bench(data_folder(data, budget), runs, seeds))
-
-
 def bench_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
     """How soon a change of light shows: quality frame by frame after a lamp is switched or moved, next to still light.
 
     Renders four clips of the Cornell box, a minute or a few; table, plot, results.json.
     """
-    from eval.bench.light import bench_light as bench
+    from eval.studies.light import bench_light as bench
 
     print(bench(runs, names, budget))
 
@@ -367,16 +310,9 @@ def bench_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
 
     Renders four clips, ten minutes or so, and filters them at 4 to 128 samples a pixel; table, plots, results.json.
     """
-    from eval.bench.error import bench_error as bench
+    from eval.studies.error import bench_error as bench
 
     print(bench(runs, names))
-
-
-def bench_loading(data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
-    """How fast training sequences come from disk, next to how fast they are trained on, and in how much memory."""
-    from eval.bench.loading import bench_loading as bench
-
-    print(bench(data_folder(data, budget), runs, budget))
 
 
 def bench_training(
@@ -406,27 +342,6 @@ def stress(
         sys.exit(1)
 
 
-def ablate(
-    what: Annotated[Literal["rae-inputs", "rae-loss", "wskp-windows", "wskp-repvgg", "ntd", "one"], Positional],
-    data: DataOfBudget = None,
-    runs: Runs = Path("runs"),
-    budget: Budget = "quick",
-    seeds: Annotated[int, arg(metavar="N", help="trainings of each network; mean and spread are shown")] = 1,
-) -> None:
-    """Repeat an ablation of the papers, or ours, or go on with it: table beside the findings, plot, results.json.
-
-    rae-inputs: what RAE gains by demodulation, normals, depth and roughness (Fig. 3).
-    rae-loss: what the gradient and temporal terms of its loss add to the spatial one (§4.4).
-    wskp-windows: windows of 3 to 13 pixels alone and together (WSKP, Fig. 9 and 10).
-    wskp-repvgg: wskp6 and kp with and without RepVGG blocks (WSKP, Table 5).
-    ntd: ntd-a, ntd-b and ntd where meshes move (NTD §6.3).
-    one: our network without history, latent channels, levels of its filter, terms of its loss.
-    """
-    from eval.ablation.run import ablate as repeat
-
-    print(repeat(what, data_folder(data, budget), runs, budget, seeds))
-
-
 def trade(
     names: Denoisers = (),
     data: DataOfBudget = None,
@@ -444,13 +359,6 @@ def trade(
     from eval.tradeoff.run import trade as weigh
 
     print(weigh(data_folder(data, budget), runs, budget, names, size, threads, spp))
-
-
-def papers(runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
-    """Print what the papers measured on their scenes beside what was measured here, and which orders hold here too."""
-    from eval.papers.compare import against_papers
-
-    print(against_papers(runs, budget))
 
 
 Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
@@ -556,12 +464,8 @@ GROUPS: dict[str, Commands] = {
     "A closer look": {
         "show": show,
         "figure": {
-            "variance": figure_variance,
-            "unbiased": figure_unbiased,
             "triptych": figure_triptych,
         },
-        "papers": papers,
-        "ablate": ablate,
     },
     "Elsewhere": {
         "export": export,
@@ -569,14 +473,10 @@ GROUPS: dict[str, Commands] = {
     "What it costs, what it stands": {
         "bench": {
             "denoisers": bench_denoisers,
-            "scaling": bench_scaling,
-            "fusion": bench_fusion,
             "export": bench_export,
             "rendering": bench_rendering,
-            "references": bench_references,
             "light": bench_light,
             "error": bench_error,
-            "loading": bench_loading,
             "training": bench_training,
         },
         "trade": trade,

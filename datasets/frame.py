@@ -108,8 +108,8 @@ class Frame:
     BadInput.
     Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
     networks multiply their exposure by it, while radiance stays as rendered. `whole` belongs to training crops: what
-    models.running_scale measures in the whole frame, (B, 2); None where this is the whole frame. `spp` are the samples
-    a pixel of the noisy channels; None where that is not known.
+    models.history.running_scale measures in the whole frame, (B, 2); None where this is the whole frame. `spp` are the
+    samples a pixel of the noisy channels; None where that is not known.
     """
 
     channels: dict[str, Tensor]

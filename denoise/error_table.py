@@ -10,7 +10,7 @@ import numpy as np
 
 from errors import BadInput
 from files import write_file
-from models.error_estimate import ErrorEstimate
+from models.wrappers.error_estimate import ErrorEstimate
 
 FILE = "error.csv"
 

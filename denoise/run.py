@@ -28,13 +28,13 @@ from denoise.sources import Sources, find_sources, has_halves
 from denoise.understanding import Understanding, report, understand
 from errors import BadInput
 from eval.bench.memory import status_mb
-from eval.spec import DenoiserSpec, precision_in_use
 from files import replacing
-from models.around import inner_denoiser
 from models.denoiser import Denoiser, State
-from models.error_estimate import ErrorEstimate, with_error
-from models.oidn import OIDN, OIDNQuality
-from models.shrinkage import Shrunk
+from models.filters.oidn import OIDN, OIDNQuality
+from models.spec import DenoiserSpec, precision_in_use
+from models.wrappers.error_estimate import ErrorEstimate, with_error
+from models.wrappers.shrinkage import Shrunk
+from models.wrappers.wrapper import inner_denoiser
 from provenance import DENOISING, file_digest, versions
 
 Precision = Literal["half", "float"]

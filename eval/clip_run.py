@@ -20,9 +20,9 @@ from eval.means import mean_floor, means
 from eval.metrics import Values, measure, noise_floors, temporal_error_floor
 from eval.results import REFERENCE, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
-from models.error_estimate import with_error
 from models.operators import finite
-from models.shrinkage import Shrunk
+from models.wrappers.error_estimate import with_error
+from models.wrappers.shrinkage import Shrunk
 from provenance import file_digest
 
 METRICS_CHANNELS = ("motion", "dual_motion")

@@ -4,11 +4,11 @@ from pathlib import Path
 
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.selection import weights_of
-from eval.spec import split_name
 from models.export.package import Export, write_export
 from models.export.program import Format, check_installed
 from models.export.registry import check_exportable
 from models.export.step import Warp
+from models.spec import split_name
 
 GOLDEN_SIZE = (72, 104)  # height and width in pixels, neither a multiple of 16
 GOLDEN_FRAMES = 4

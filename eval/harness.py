@@ -32,9 +32,9 @@ from eval.results import (
     write_results,
 )
 from eval.selection import evaluated, with_indirect_baselines
-from eval.spec import DenoiserSpec
 from eval.strip import save_strip
 from eval.text_table import results_table
+from models.spec import DenoiserSpec
 from provenance import device_in_words
 from timing import thread_count, threads_for
 

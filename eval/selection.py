@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 
 from errors import BadInput
-from eval.extra_denoisers import WINDOW_SETS, windows_label
-from eval.spec import DenoiserSpec, class_of, precision_in_use, split_name, with_budget
+from models.extra_denoisers import WINDOW_SETS, windows_label
 from models.registry import ADAPTIVE, DENOISERS, plain_name
 from models.shipped_weights import shipped_weights
+from models.spec import DenoiserSpec, class_of, precision_in_use, split_name, with_budget
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 

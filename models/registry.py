@@ -7,29 +7,29 @@ import torch
 
 from datasets.frame import Signal
 from errors import BadInput
-from models.aaf import AAF
-from models.adaptive import adaptive
-from models.around import around, inner_denoiser
-from models.asvgf import ASVGF
-from models.baselines import Accumulated, Noisy
-from models.bmfr import BMFR
 from models.denoiser import Denoiser
-from models.eaw import EAW
 from models.fastest import bfloat16_pays
-from models.lbf import LBF
-from models.nbgd import NBGD
-from models.nfor import NFOR
-from models.ntd import NTD, NTDMean, NTDTraditional
-from models.oidn import OIDN, OIDNAccumulated
-from models.one import One
-from models.rae import RAE
-from models.sbf import SBF
-from models.shrinkage import Shrunk
-from models.svgf import SVGF
-from models.taa import Antialiased
-from models.trmv import TRMV
+from models.filters.aaf import AAF
+from models.filters.asvgf import ASVGF
+from models.filters.baselines import Accumulated, Noisy
+from models.filters.bmfr import BMFR
+from models.filters.eaw import EAW
+from models.filters.nfor import NFOR
+from models.filters.oidn import OIDN, OIDNAccumulated
+from models.filters.sbf import SBF
+from models.filters.svgf import SVGF
+from models.filters.trmv import TRMV
+from models.networks.lbf import LBF
+from models.networks.nbgd import NBGD
+from models.networks.ntd import NTD, NTDMean, NTDTraditional
+from models.networks.one import One
+from models.networks.rae import RAE
+from models.networks.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
 from models.weights import load_weights
-from models.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
+from models.wrappers.adaptive import adaptive
+from models.wrappers.shrinkage import Shrunk
+from models.wrappers.taa import Antialiased
+from models.wrappers.wrapper import around, inner_denoiser
 
 TAA = "+taa"
 ADAPTIVE = "+adaptive"

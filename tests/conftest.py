@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
-from datasets.generate import generate
 from models import shipped_weights
 from models.registry import channels_read
+from render.job.generate import generate
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.registry import build_scene

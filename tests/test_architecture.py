@@ -26,7 +26,7 @@ MAY_IMPORT = {
         "denoise",
         "eval.comparison",
         "eval.metrics",
-        "eval.spec",
+        "models.spec",
         "eval.bench.memory",
         "models",
         "datasets",

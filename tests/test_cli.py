@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from command_line import GROUPS, main
-from datasets.profiles import DATA_PROFILES
+from render.job.profiles import DATA_PROFILES
 from train.recipes import RECIPES
 
 

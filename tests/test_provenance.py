@@ -40,7 +40,7 @@ def test_a_digest_changes_with_what_is_imported_and_with_nothing_else(project, c
     assert (code_digest("models.a") == before) == same
 
 
-@pytest.mark.parametrize("module", ["eval.clip_run", "models.svgf"])
+@pytest.mark.parametrize("module", ["eval.clip_run", "models.filters.svgf"])
 def test_whatever_python_loads_is_among_the_sources(module):
     code = f"import sys, {module}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
@@ -48,8 +48,8 @@ def test_whatever_python_loads_is_among_the_sources(module):
 
 
 def test_results_of_one_denoiser_do_not_follow_from_another():
-    assert "models.rae" not in sources("eval.clip_run", "models.svgf")
-    assert "models.svgf" not in sources("eval.clip_run", "models.rae")
+    assert "models.networks.rae" not in sources("eval.clip_run", "models.filters.svgf")
+    assert "models.filters.svgf" not in sources("eval.clip_run", "models.networks.rae")
     assert {"eval.metrics", "eval.results", "datasets.frame"} <= set(sources("eval.clip_run"))
 
 

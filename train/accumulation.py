@@ -12,7 +12,7 @@ import torch
 from datasets.clip import Clip
 from datasets.frame import read_frame
 from models.denoiser import State
-from models.wskp import KernelPredictor
+from models.networks.wskp import KernelPredictor
 from provenance import code_digest, versions
 
 ACCUMULATION_PACKAGES = ("torch", "numpy", "numba")  # that accumulation computes with

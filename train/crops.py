@@ -13,10 +13,10 @@ from tqdm import tqdm
 from datasets.channels import REFERENCES
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
-from datasets.sequences import check_fits, random_window
-from models.running_scale import RunningMean, RunningScale
-from models.wskp import KernelPredictor
+from models.history.running_scale import RunningMean, RunningScale
+from models.networks.wskp import KernelPredictor
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
+from train.sequences import check_fits, random_window
 
 
 class Crops:

@@ -11,11 +11,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from datasets.clip import Clip
-from datasets.sequences import Augmentation, TrainingSequences, collate
 from models.denoiser import Denoiser
-from models.wskp import KernelPredictor
+from models.networks.wskp import KernelPredictor
 from train.crops import AccumulatedCrops, Crops
 from train.recipe import Recipe
+from train.sequences import Augmentation, TrainingSequences, collate
 from train.whole_frames import WholeFrames
 
 Items = TrainingSequences | AccumulatedCrops

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-from datasets.sequences import Augmentation
 from errors import BadInput
 from train.losses.displayed import DisplayedTerms
 from train.losses.lbf import LBFTerms
@@ -12,6 +11,7 @@ from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipe import Recipe
+from train.sequences import Augmentation
 
 RAE_RECIPE = Recipe(
     loss=RAETerms(),  # §4.4

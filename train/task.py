@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datasets.clip import Dataset
-from datasets.sequences import check_fits
 from errors import BadInput
 from models.denoiser import Denoiser
 from train.recipe import Recipe
+from train.sequences import check_fits
 
 WEIGHTS_FILE = "weights.safetensors"
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from datasets.clip import Clip
 from datasets.frame import Signal, read_frame
-from models.running_scale import measure
+from models.history.running_scale import measure
 
 
 class WholeFrames:

@@ -18,13 +18,13 @@ from eval.bench.output import bench_folder
 from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
 from eval.selection import BASELINES, cannot_run, choose
-from eval.spec import DenoiserSpec, create_any, precisions_of, split_name
 from files import read_json, write_json
-from models.around import inner_denoiser
-from models.oidn import OIDN
+from models.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
+from models.filters.oidn import OIDN
 from models.registry import DENOISERS
+from models.spec import DenoiserSpec, create_any, precisions_of, split_name
+from models.wrappers.wrapper import inner_denoiser
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 

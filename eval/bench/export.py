@@ -15,7 +15,6 @@ from eval.bench.output import bench_folder
 from eval.bench.race import TIMED_FRAMES, WARM_UP_FRAMES, Contender
 from eval.bench.sizes import Size, parse_size, threads_or_all
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.spec import DenoiserSpec
 from files import write_json
 from models.export.package import largest_difference
 from models.export.playing import play
@@ -23,6 +22,7 @@ from models.export.program import check_installed, trace, write_onnx
 from models.export.registry import check_exportable, step_of
 from models.export.runtime import run_onnx
 from models.export.step import Step, Warp
+from models.spec import DenoiserSpec
 from provenance import device_in_words
 from timing import take_turns, thread_count
 

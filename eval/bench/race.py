@@ -12,9 +12,9 @@ from datasets.frame import Frame
 from eval.bench.memory import release_memory
 from eval.bench.sizes import Size, size_name
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.spec import DenoiserSpec
-from models.around import inner_denoiser
 from models.denoiser import Denoiser, State
+from models.spec import DenoiserSpec
+from models.wrappers.wrapper import inner_denoiser
 from timing import device_clock, take_turns
 
 WARM_UP_FRAMES = 2

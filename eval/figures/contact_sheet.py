@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.clip_scene import clip_of_own_scene
 from datasets.tonemap import clip_exposure, display, luminance
 from plotting import DPI, plt, save_figure
+from render.job.clip_scene import clip_of_own_scene
 from render.shot import Shot
 from render.stage import Stage
 from scenes.registry import build_scene

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from eval.means import scores_of
 from eval.results import ClipResults, by_signal, of_one_spp
-from eval.spec import DenoiserSpec
 from eval.tradeoff.pareto import Offer, beaten_by
 from eval.tradeoff.times import Times
+from models.spec import DenoiserSpec
 
 PLOTTED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
 

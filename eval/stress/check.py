@@ -8,7 +8,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.spec import PRECISIONS
 from eval.stress.cases import RECOVERY_LIMIT, SPOILED_FRAME, StressCase
 from eval.stress.changes import FrameChange, PixelChange, unchanged
 from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
@@ -16,6 +15,7 @@ from eval.stress.lit_frames import NOISE_PERIOD
 from eval.stress.logits import largest_logits
 from eval.stress.outcome import StressOutcome
 from models.denoiser import Denoiser
+from models.spec import PRECISIONS
 
 FORGOTTEN = 1e-3  # of the brightest pixel: what changes none by more has no effect any more
 ROUNDINGS = 10  # of half precision are no effect either: networks amplify them, RAE by its power of 5 alone

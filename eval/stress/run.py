@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from errors import BadInput
 from eval.selection import cannot_run, choose, untrained, weights_file
-from eval.spec import DenoiserSpec, create_any, precisions_of, split_name
 from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
 from eval.stress.check import StressCheck
 from eval.stress.logits import last_layers
@@ -19,6 +18,7 @@ from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
 from models.registry import DENOISERS
+from models.spec import DenoiserSpec, create_any, precisions_of, split_name
 from plotting import save_figure
 from provenance import DENOISING, versions
 from timing import thread_count

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from eval.extra_denoisers import EXTRA, WINDOW_SETS
 from eval.selection import cannot_run, choose, untrained, weights_file
-from eval.spec import DenoiserSpec, precisions_of
 from files import read_json
+from models.extra_denoisers import EXTRA, WINDOW_SETS
 from models.registry import DENOISERS
+from models.spec import DenoiserSpec, precisions_of
 from models.weights import read_metadata
 
 

@@ -9,11 +9,11 @@ from datasets.frame import Signal
 from eval.means import scores_of
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.spec import DenoiserSpec
 from eval.text_table import LEGEND, NEAR, value_cell
 from eval.tradeoff.candidates import trained_epochs
 from eval.tradeoff.pareto import Offer, Point, beaten_by
 from eval.tradeoff.times import Times
+from models.spec import DenoiserSpec
 
 TRADED = ("psnr", "ssim", "rmse")
 

@@ -15,11 +15,11 @@ from eval.bench.sample_cost import Cost, sample_cost
 from eval.harness import entrant, evaluate_clip
 from eval.results import ClipResults, Result, by_clip
 from eval.selection import with_indirect_baselines
-from eval.spec import DenoiserSpec, precision_in_use
 from eval.tradeoff.resampled_clips import Source, scene_of, source, with_samples
 from eval.tradeoff.samples import SampleTrade, sample_trades
 from eval.tradeoff.shrinkage import Gain, gains_of
 from eval.tradeoff.times import Times
+from models.spec import DenoiserSpec, precision_in_use
 from render.clip import Options
 
 SPP_LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)

@@ -11,13 +11,13 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS, HALVES, NOISY
 from datasets.clip import Clip, Dataset
-from datasets.clip_scene import scene_of_clip
-from datasets.generate import check_versions
-from datasets.profiles import GENERATOR, profile_of, source_of
 from datasets.writer import to_storage
 from errors import BadInput
 from files import locked, read_json, write_json
 from render.clip import Options, Sampling, render_clip
+from render.job.clip_scene import scene_of_clip
+from render.job.generate import check_versions
+from render.job.profiles import GENERATOR, profile_of, source_of
 from render.sampler import CYCLE
 from scenes.animation import Scene
 

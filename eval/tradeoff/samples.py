@@ -9,11 +9,11 @@ from datasets.frame import Signal
 from eval.means import scores_of
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.spec import DenoiserSpec
 from eval.text_table import value_cell
 from eval.tradeoff.denoisers import TRADED
 from eval.tradeoff.pareto import Offer, beaten_by
 from eval.tradeoff.times import Times
+from models.spec import DenoiserSpec
 
 # The table after RAE §5.4: who is compared, fed how many samples a pixel.
 GENERALISED = ("noisy", "accumulated", "svgf", "rae")

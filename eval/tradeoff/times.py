@@ -6,9 +6,9 @@ from pathlib import Path
 from errors import BadInput
 from eval.bench.denoisers import results_file
 from eval.bench.sizes import Size, size_name
-from eval.extra_denoisers import ALL_WINDOWS
-from eval.spec import DenoiserSpec, split_name
 from files import read_json
+from models.extra_denoisers import ALL_WINDOWS
+from models.spec import DenoiserSpec, split_name
 
 TIMED_AS = {ALL_WINDOWS: "wskp6", "ntd-b": "ntd"}  # the same computation: another training of a network
 

@@ -1,4 +1,4 @@
-"""models.aaf for the processor: every row by itself, every loop along it vectorised."""
+"""models.filters.aaf for the processor: every row by itself, every loop along it vectorised."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ def measure(distance: Any, along: Any, geometry: Any, row: Any, left: Any, dx: A
 
 @jit_in_any_order
 def weigh(weight: Any, distance: Any, along: Any, width: Any, widest: Any) -> None:
-    """models.aaf.gaussian_weight (n)."""
+    """models.filters.aaf.gaussian_weight (n)."""
     for i in range(weight.size):
         narrower = min(width[i], widest[i])
         exponent = HALF * along[i] / (narrower * narrower)
@@ -91,7 +91,7 @@ def filter_image(out: Any, image: Any, width: Any, widest: Any, geometry: Any, d
 
 
 def filter_lines(image: Tensor, width: Tensor, widest: Tensor, geometry: Tensor, down: bool) -> Tensor:
-    """See models.aaf.filter_lines."""
+    """See models.filters.aaf.filter_lines."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         images = array(image[item]), array(width[item, :, 0]), array(widest[item, :, 0]), array(geometry[item, 0])

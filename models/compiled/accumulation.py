@@ -1,4 +1,4 @@
-"""models.accumulation for the processor: history is found, fetched and blended row by row, in one pass."""
+"""models.history.accumulation for the processor: history is found, fetched and blended row by row, in one pass."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from models.compiled.reprojection import (
     find_row,
     new_search,
 )
-from models.surfaces import Surfaces
+from models.history.surfaces import Surfaces
 
 SMALLEST_ALPHA = np.float32(parameters.SMALLEST_ALPHA)
 
@@ -74,7 +74,7 @@ def accumulate_image(
 def accumulate_samples(
     frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, surfaces: Surfaces
 ) -> tuple[Tensor, Tensor]:
-    """See models.accumulation.accumulate_samples."""
+    """See models.history.accumulation.accumulate_samples."""
     irradiance = torch.empty_like(noisy, memory_format=torch.contiguous_format)
     length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
     for item in range(len(noisy)):

@@ -1,4 +1,4 @@
-"""models.affinity for the processor, with its gradients: every loop along a row is vectorised."""
+"""models.networks.affinity for the processor, with its gradients: every loop along a row is vectorised."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -184,7 +184,7 @@ def flat(tensor: Tensor) -> Any:
 def filter_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> tuple[Tensor, Tensor]:
-    """See models.affinity.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
+    """See models.networks.affinity.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
     for item in range(len(image)):

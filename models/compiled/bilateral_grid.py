@@ -1,4 +1,4 @@
-"""models.bilateral_grid for the processor: two rows of cells at a time, which stay in the cache."""
+"""models.networks.bilateral_grid for the processor: two rows of cells at a time, which stay in the cache."""
 
 from typing import Any
 
@@ -135,7 +135,7 @@ def fill_cells(cells: Any, row: Any, image: Any, guide: Any, surface: Any, level
 
 @jit_parallel
 def filter_image(out: Any, image: Any, guide: Any, surface: Any, spacing: int) -> None:
-    """out and image (3, H, W), guide (H, W), surface (H, W) or empty, see models.bilateral_grid.grid_mean."""
+    """out and image (3, H, W), guide (H, W), surface (H, W) or empty, see models.networks.bilateral_grid.grid_mean."""
     height, width = guide.shape
     levels = GUIDES // spacing + 2
     columns = (width + spacing - 1) // spacing + 2
@@ -158,7 +158,7 @@ def filter_image(out: Any, image: Any, guide: Any, surface: Any, spacing: int) -
 
 
 def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None = None) -> Tensor:
-    """See models.bilateral_grid.grid_mean."""
+    """See models.networks.bilateral_grid.grid_mean."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         planes = array(image[item]), array(guide[item, 0]), plane_or_empty(surface, item)

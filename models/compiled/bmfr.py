@@ -1,4 +1,4 @@
-"""models.bmfr for the processor: every block by itself, its matrix in the cache, column by column."""
+"""models.filters.bmfr for the processor: every block by itself, its matrix in the cache, column by column."""
 
 from typing import Any
 
@@ -152,7 +152,7 @@ def regress_block(
 def regress_image(
     fitted: Any, irradiance: Any, normal: Any, depth: Any, axes: Any, noise: Any, above: int, before: int
 ) -> None:
-    """fitted (3, H, W), as models.bmfr.regress, with noise (10, P)."""
+    """fitted (3, H, W), as models.filters.bmfr.regress, with noise (10, P)."""
     height, width = depth.shape
     down = (height + above + BLOCK_SIDE - 1) // BLOCK_SIDE
     across = (width + before + BLOCK_SIDE - 1) // BLOCK_SIDE
@@ -166,7 +166,7 @@ def regress_image(
 def regress(
     irradiance: Tensor, normal: Tensor, depth: Tensor, axes: Tensor, noise: Tensor, offset: tuple[int, int]
 ) -> Tensor:
-    """See models.bmfr.regress."""
+    """See models.filters.bmfr.regress."""
     fitted = torch.empty_like(irradiance, memory_format=torch.contiguous_format)
     for item in range(len(irradiance)):
         regress_image(

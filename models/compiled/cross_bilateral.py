@@ -1,4 +1,4 @@
-"""models.cross_bilateral for the processor, with its gradient: every row by itself, every loop along it vectorised."""
+"""models.networks.cross_bilateral for the CPU, with its gradient: a row at a time, every loop along it vectorised."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_
 from models.compiled.lines import add_product, fill_line, scale_line
 
 if TYPE_CHECKING:
-    from models.cross_bilateral import Pixels
+    from models.networks.cross_bilateral import Pixels
 
 ZERO = np.float32(0)
 COLOUR_SHARPNESS = np.float32(parameters.COLOUR_SHARPNESS)
@@ -46,7 +46,7 @@ def decay_where(weight: Any, exponent: Any, surface: Any) -> None:
 
 
 class Planes(NamedTuple):
-    """What a filter takes of one item: arrays (·, H, W), see models.cross_bilateral."""
+    """What a filter takes of one item: arrays (·, H, W), see models.networks.cross_bilateral."""
 
     image: Any
     variance: Any
@@ -112,7 +112,7 @@ def planes(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
 
 
 def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
-    """See models.cross_bilateral.weighted_mean."""
+    """See models.networks.cross_bilateral.weighted_mean."""
     out = torch.empty_like(pixels.image, memory_format=torch.contiguous_format)
     total = torch.empty_like(pixels.surface, memory_format=torch.contiguous_format)
     for item in range(len(out)):
@@ -169,7 +169,7 @@ def pull_image(pulled: Any, gradient: Any, out: Any, total: Any, given: Any) -> 
 
 
 def pull_sharpness(gradient: Tensor, pixels: "Pixels", sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:
-    """See models.cross_bilateral.pull_sharpness."""
+    """See models.networks.cross_bilateral.pull_sharpness."""
     pulled = torch.empty_like(sharpness, memory_format=torch.contiguous_format)
     for item in range(len(pulled)):
         given = planes(pixels, sharpness, item)

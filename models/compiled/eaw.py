@@ -1,4 +1,4 @@
-"""models.eaw for the processor: every row by itself, every loop along it vectorised."""
+"""models.filters.eaw for the processor: every row by itself, every loop along it vectorised."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.atrous import B3_SPLINE, RADIUS
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.filters.atrous import B3_SPLINE, RADIUS
 
 SPLINE = np.array(B3_SPLINE, np.float32)
 NEGLIGIBLE = np.float32(30)  # e^-30 = 1e-13 counts as 0: denormal numbers are slow
@@ -96,7 +96,7 @@ def filter_eaw_image(out: Any, colour: Any, features: Any, step: int) -> None:
 
 
 def eaw_level(colour: Tensor, features: Tensor, step: int) -> Tensor:
-    """See models.eaw.eaw_level."""
+    """See models.filters.eaw.eaw_level."""
     out = torch.empty_like(colour, memory_format=torch.contiguous_format)
     for item in range(len(colour)):
         filter_eaw_image(out[item].numpy(), array(colour[item]), array(features[item]), step)

@@ -1,4 +1,4 @@
-"""models.features for the processor: in one pass, and in the order of memory that convolutions like."""
+"""models.networks.features for the processor: in one pass, and in the order of memory that convolutions like."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,8 +13,8 @@ from datasets.frame import Frame
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
 from models.compiled.lines import interleave, scale_depth
+from models.history.running_scale import RunningScale
 from models.parameters import FEATURES, GAMMA
-from models.running_scale import RunningScale
 
 ONE = np.float32(1)
 HALF = np.float32(0.5)
@@ -72,7 +72,7 @@ def feature_image(
 def network_features(
     frame: Frame, irradiance: Tensor, scale: RunningScale, seen: Sequence[str] = tuple(FEATURES)
 ) -> Tensor:
-    """See models.features.network_features; channels come last in memory."""
+    """See models.networks.features.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
     out = torch.empty(len(irradiance), *frame.size, sum(FEATURES[name] for name in seen))

@@ -1,4 +1,4 @@
-"""models.fusion for the processor: strips of rows, each within a core's cache, every loop along a row vectorised.
+"""models.networks.fusion for the CPU: strips of rows, each within a core's cache, every loop along a row vectorised.
 
 Loops run over rows that are sliced off as wholes: indices that are sums might be negative, which NumPy takes from the
 end, and slices of several dimensions might have any stride. Neither is vectorised.
@@ -324,7 +324,7 @@ def fuse(
     windows: Sequence[int] = WINDOWS,
     surface: Tensor | None = None,
 ) -> Tensor:
-    """See models.fusion.fuse. The maps are read as they lie in memory."""
+    """See models.networks.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     threads = numba.get_num_threads()
     width = image.shape[-1]

@@ -1,4 +1,4 @@
-"""models.fusion for CUDA devices, with Triton (which comes with PyTorch's CUDA builds): one kernel for all windows."""
+"""models.networks.fusion for CUDA devices, with Triton (part of PyTorch's CUDA builds): one kernel for all windows."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -87,7 +87,7 @@ def fuse_rows(
 def fuse(
     image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int], surface: Tensor | None = None
 ) -> Tensor:
-    """See models.fusion.fuse."""
+    """See models.networks.fusion.fuse."""
     batch, _, height, width = image.shape
     fused = torch.empty_like(image, memory_format=torch.contiguous_format)
     radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)

@@ -1,4 +1,4 @@
-"""models.neighbours for the processor: rows in parallel, every loop along them vectorised."""
+"""models.filters.neighbours for the processor: rows in parallel, every loop along them vectorised."""
 
 from typing import Any
 
@@ -118,7 +118,7 @@ def sum_taps(sums: Any, image: Any, mesh: Any, step: Any) -> None:
 
 
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
-    """See models.neighbours.mesh_sums."""
+    """See models.filters.neighbours.mesh_sums."""
     sums = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         sum_taps(sums[item].numpy(), array(image[item]), array(mesh_id[item, 0]), step)
@@ -126,7 +126,7 @@ def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
 
 
 def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.neighbours.mesh_means."""
+    """See models.filters.neighbours.mesh_means."""
     batch, _, height, width = image.shape
     near = torch.empty(batch, 3, height, width)
     around = torch.empty(batch, 3, height, width)

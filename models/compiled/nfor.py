@@ -1,4 +1,4 @@
-"""models.nfor for the processor: every loop along a row is vectorised."""
+"""models.filters.nfor for the processor: every loop along a row is vectorised."""
 
 from typing import Any
 
@@ -92,7 +92,7 @@ def measure_patches(out: Any, guide: Any, variance: Any, surface: Any, radius: i
 
 
 def patch_distances(guide: Tensor, variance: Tensor, surface: Tensor, radius: int) -> Tensor:
-    """See models.nfor.patch_distances."""
+    """See models.filters.nfor.patch_distances."""
     batch, _, height, width = guide.shape
     out = torch.empty(batch, WINDOW**2, height, width)
     for item in range(batch):
@@ -141,7 +141,7 @@ def average_similar(out: Any, image: Any, distances: Any, sharpness: Any) -> Non
 
 
 def nl_means(image: Tensor, distances: Tensor, bandwidth: float) -> Tensor:
-    """See models.nfor.nl_means."""
+    """See models.filters.nfor.nl_means."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         average_similar(out[item].numpy(), array(image[item]), array(distances[item]), np.float32(bandwidth**-2))
@@ -291,7 +291,7 @@ def predict_image(out: Any, models: Any, features: Any, distances: Any, sharpnes
 
 
 def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float) -> Tensor:
-    """See models.nfor.regress."""
+    """See models.filters.nfor.regress."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     height, width = image.shape[2:]
     models = np.empty((COORDINATES + features.shape[1], 3, height, width), np.float32)

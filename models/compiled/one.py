@@ -15,10 +15,10 @@ from models import parameters
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
 from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line
-from models.running_scale import RunningScale
+from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
-    from models.one import Evidence
+    from models.networks.one import Evidence
 
 ONE = np.float32(1)
 ZERO = np.float32(0)
@@ -200,7 +200,7 @@ def write_inputs(patches: Any, hidden: Any, seen: Seen, layer: Layer) -> None:
 
 
 def network_inputs(frame: Frame, scale: RunningScale, known: "Evidence", hidden: nn.Linear) -> tuple[Tensor, Tensor]:
-    """See models.one.network_inputs; the channels of patches come last in memory."""
+    """See models.networks.one.network_inputs; the channels of patches come last in memory."""
     batch, height, width = frame.shape
     rows, columns = (parameters.MULTIPLE * -(-size // parameters.MULTIPLE) // 2 for size in (height, width))
     out = torch.empty(batch, rows, columns, 2, 2, hidden.in_features)
@@ -289,7 +289,7 @@ def mix(line: Any, past: Any, new: Any, alpha: Any) -> None:
 
 
 class Told(NamedTuple):
-    """What models.one.Said holds of one image, (c, H, W) and length (H, W)."""
+    """What models.networks.one.Said holds of one image, (c, H, W) and length (H, W)."""
 
     features: Any
     sharpness: Any
@@ -347,7 +347,7 @@ def read_outputs(
 
 
 def interpret(said: Tensor, hidden: Tensor, last: nn.Linear, known: "Evidence", samples: Tensor) -> tuple[Tensor, ...]:
-    """See models.one.interpret."""
+    """See models.networks.one.interpret."""
     batch, _, height, width = said.shape
     levels = (said.shape[1] - sum(parameters.outputs_of_one(0))) // 3
     counts = (parameters.COMPARED, levels, 2 * levels, 2, parameters.LATENT, 3, 1)

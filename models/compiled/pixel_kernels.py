@@ -1,4 +1,4 @@
-"""models.pixel_kernels for the processor: rows in parallel, each with its logits in a core's cache."""
+"""models.networks.pixel_kernels for the processor: rows in parallel, each with its logits in a core's cache."""
 
 import math
 from typing import Any
@@ -97,7 +97,7 @@ def apply_to_image(output: Any, image: Any, surface: Any, logits: Any, size: int
 
 
 def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
-    """See models.pixel_kernels.apply_kernels; logits are read as they lie in memory, bfloat16 without a copy."""
+    """See models.networks.pixel_kernels.apply_kernels; logits are read in place, bfloat16 without a copy."""
     output = torch.empty_like(image, memory_format=torch.contiguous_format)
     bfloat = logits.dtype == torch.bfloat16
     bits = logits.view(torch.int16) if bfloat else logits.float()

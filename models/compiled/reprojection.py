@@ -1,4 +1,4 @@
-"""models.reprojection for the processor: rows in parallel, each split into runs of pixels whose taps lie side by side.
+"""models.history.reprojection for the CPU: rows in parallel, each split into runs of pixels whose taps lie side by side.
 
 Where neighbours show one mesh and move by the same whole pixels, their taps are contiguous lines of memory, and every
 loop over them is vectorised; the few pixels of short runs and at borders are looked at one by one. Points and
@@ -17,7 +17,7 @@ from datasets.frame import Frame
 from models import parameters
 from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_reciprocals
 from models.compiled.lines import add_product
-from models.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
+from models.history.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
 
 HALF = np.float32(0.5)
 ONE = np.float32(1)
@@ -444,7 +444,7 @@ def fetch_image(fetched: Any, found: Any, history: Any, motion: Any, now: Buffer
 
 
 def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
-    """See models.reprojection.reproject."""
+    """See models.history.reprojection.reproject."""
     fetched = torch.empty_like(history, memory_format=torch.contiguous_format)
     found = torch.empty((len(history), 1, *frame.size), dtype=torch.bool)
     for item in range(len(history)):

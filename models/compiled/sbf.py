@@ -1,4 +1,4 @@
-"""models.sbf for the processor: every row by itself, every loop along it vectorised."""
+"""models.filters.sbf for the processor: every row by itself, every loop along it vectorised."""
 
 from typing import Any
 
@@ -56,7 +56,7 @@ def sum_image(sums: Any, image: Any, guides: Any, gaussians: Any) -> None:
 
 
 def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
-    """See models.sbf.window_sums."""
+    """See models.filters.sbf.window_sums."""
     batch, channels, height, width = image.shape
     sums = torch.empty(batch, gaussians.shape[1], channels, height, width)
     flat = F.pad(guides.flatten(2), (0, 0, 0, -guides.shape[1] % STRIDE))  # features are compared so many at a time

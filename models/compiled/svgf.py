@@ -1,4 +1,4 @@
-"""models.svgf for the processor: every row by itself, every loop along it vectorised.
+"""models.filters.svgf for the processor: every row by itself, every loop along it vectorised.
 
 Each line of memory has a name of its own in the innermost functions: Numba knows slices along the last dimension as
 contiguous, unlike lines of a slice in two dimensions. Scratch memory is flat, with offsets that are constants: LLVM
@@ -17,7 +17,6 @@ from torch import Tensor
 from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.frame import Frame
 from models import parameters
-from models.atrous import B3_SPLINE, RADIUS
 from models.compiled.exponential import exp
 from models.compiled.jit import (
     array,
@@ -30,8 +29,9 @@ from models.compiled.jit import (
 )
 from models.compiled.lines import copy_line
 from models.compiled.reprojection import BLOCK_ROWS, ONE, Buffers, Past, Views, fetch, find_row, new_search
+from models.filters.atrous import B3_SPLINE, RADIUS
+from models.history.surfaces import Surfaces
 from models.parameters import SPATIAL_RADIUS, SQUARINGS
-from models.surfaces import Surfaces
 
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
 ALPHA = np.float32(parameters.ALPHA)
@@ -136,7 +136,7 @@ def integrate_samples(
     surfaces: Surfaces,
     change: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.svgf.integrate_samples."""
+    """See models.filters.svgf.integrate_samples."""
     colour = torch.empty_like(noisy, memory_format=torch.contiguous_format)
     moments = torch.empty_like(past_moments, memory_format=torch.contiguous_format)
     length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
@@ -215,7 +215,7 @@ def pack_geometry_image(packed: Any, depth: Any, normal: Any, mesh: Any) -> None
 
 
 def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
-    """See models.svgf.pack_geometry."""
+    """See models.filters.svgf.pack_geometry."""
     packed = depth.new_empty(len(depth), 1, 7, *depth.shape[-2:])
     for item in range(len(depth)):
         pack_geometry_image(
@@ -240,7 +240,7 @@ def geometry_terms(
     dx: Any,
     dy: Any,
 ) -> tuple[Any, Any]:
-    """models.svgf.geometry_weight of one pixel as w times e to the power of -exponent."""
+    """models.filters.svgf.geometry_weight of one pixel as w times e to the power of -exponent."""
     w_n = x * to_x + y * to_y + z * to_z
     w_n = w_n if w_n > LEAST_COSINE else np.float32(0)
     for _ in range(SQUARINGS):
@@ -257,7 +257,7 @@ def weight(w: Any, exponent: Any) -> Any:
 
 @jit_in_any_order
 def geometry_weights(weights: Any, geometry: Any, row: Any, left: int, dx: int, dy: int) -> None:
-    """As weights (n) models.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W)."""
+    """As weights (n) filters.svgf.geometry_weight of the n pixels from `left` on in a row of the geometry (7, H, W)."""
     right = left + weights.size
     to = row + dy
     to_left = left + dx
@@ -421,7 +421,7 @@ def finish_edge(luminance: Any, scale: Any, r: Any, g: Any, b: Any, columns: Any
 
 @jit_with_memory
 def edge_row(signals: Any, surfaces: Any, row: Any, s: int) -> None:
-    """Luminance and models.svgf.edge_scale of a row."""
+    """Luminance and models.filters.svgf.edge_scale of a row."""
     height, _, _, width = signals.shape
     columns = np.zeros(width + 2, np.float32)
     inside = np.zeros(width + 2, np.float32)
@@ -480,7 +480,7 @@ def planes_of(signals: NDArray[np.float32], margin: int) -> Tensor:
 def svgf_levels(
     colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.svgf.svgf_levels."""
+    """See models.filters.svgf.svgf_levels."""
     count_signals, _, height, width = colour.shape[1:]
     margin = RADIUS * max(steps)
     first = torch.empty_like(colour, memory_format=torch.contiguous_format)
@@ -581,7 +581,7 @@ def spatial_variance_image(out: Any, variance: Any, mean: Any, geometry: Any, wh
 
 
 def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
-    """See models.svgf.spatial_variance."""
+    """See models.filters.svgf.spatial_variance."""
     out = variance.clone(memory_format=torch.contiguous_format)
     for item in range(len(variance)):
         images = array(variance[item, :, 0]), array(mean[item, :, 0]), array(geometry[item, 0])

@@ -1,4 +1,4 @@
-"""Weight-shared kernels (models/fusion.py) in few operators: the box sums of all windows are two convolutions."""
+"""Weight-shared kernels (networks/fusion.py) in few operators: the box sums of all windows are two convolutions."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ def careful_sums(logits: Tensor, values: Sequence[Tensor], windows: Sequence[int
 
 
 class BoxWindows(nn.Module):
-    """models.fusion.fuse for B = 1, exact for any finite logits like that.
+    """models.networks.fusion.fuse for B = 1, exact for any finite logits like that.
 
     Logits that span at most SAFE_RANGE, as those of trained networks do, are shifted as a whole. Else a branch is taken
     that is slower and takes memory for some hundred images.

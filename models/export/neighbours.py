@@ -1,4 +1,4 @@
-"""Sums over neighbours (models/neighbours.py, models/affinity.py) in few operators: taps are slices, all in one tensor.
+"""Sums over neighbours (filters/neighbours.py, networks/affinity.py) in few operators: taps are slices, all in one tensor.
 
 Slices are exact in every engine; convolutions round meshes and bright pixels where engines shorten their inputs.
 """
@@ -20,7 +20,7 @@ def around(x: Tensor, step: int) -> Tensor:
 
 
 def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
-    """See models.neighbours.mesh_sums. `mesh` (1, 1, H, W) is nowhere 0."""
+    """See models.filters.neighbours.mesh_sums. `mesh` (1, 1, H, W) is nowhere 0."""
     values, meshes = around(torch.cat([image, mesh], dim=1), step).split([image.shape[1], 1], dim=1)
     return image + torch.where(meshes == mesh, values, 0).sum(dim=0, keepdim=True)
 
@@ -28,7 +28,7 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
 def affinity_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> Tensor:
-    """See models.affinity.affinity_level; `image` is 0 for background."""
+    """See models.networks.affinity.affinity_level; `image` is 0 for background."""
     values = torch.cat([image, surface], dim=1)
     difference = around(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)

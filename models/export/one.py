@@ -1,4 +1,4 @@
-"""`one` (models/one.py) as a step: evidence, network and affinity filter in one graph."""
+"""`one` (models/networks/one.py) as a step: evidence, network and affinity filter in one graph."""
 
 import torch
 from torch import Tensor, nn
@@ -8,8 +8,8 @@ from models.export.neighbours import affinity_level, mesh_sums
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
-from models.neighbours import means_of, summands
-from models.one import PATCH, Evidence, One, Said, meaning
+from models.filters.neighbours import means_of, summands
+from models.networks.one import PATCH, Evidence, One, Said, meaning
 from models.parameters import BRIGHTEST, LARGEST_IRRADIANCE, LATENT, MULTIPLE
 
 READS = (
@@ -105,7 +105,7 @@ class OneStep(RecurrentStep):
         return Evidence(noisy, *means, past, found)
 
     def features(self, x: dict[str, Tensor], known: Evidence, scale: Scale) -> Tensor:
-        """models.one.network_inputs."""
+        """models.networks.one.network_inputs."""
         past, accumulated, length, latent = known.past.split([3, 3, 1, LATENT], dim=1)
         past = torch.where(known.found > 0, past, known.around)
         accumulated = torch.where(known.found > 0, accumulated, known.noisy)

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models.export.step import Step, Tensors
-from models.reprojection import reproject
-from models.surfaces import Surfaces
+from models.history.reprojection import reproject
+from models.history.surfaces import Surfaces
 
 Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, of inputs by name
 

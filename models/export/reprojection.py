@@ -1,4 +1,4 @@
-"""Reprojection (models/reprojection.py) in a graph: taps are rows of one table that holds all they are tested on.
+"""Reprojection (history/reprojection.py) in a graph: taps are rows of one table that holds all they are tested on.
 
 Pixels are in one dimension of n = H W.
 """
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.history.surfaces import BACKGROUND_ID
 from models.parameters import NORMAL_TOLERANCE, PLANE_TOLERANCE
-from models.surfaces import BACKGROUND_ID
 
 NOWHERE = -1.0  # mesh id around the image
 

@@ -1,4 +1,4 @@
-"""Running exposure and depth scale (models/running_scale.py) in a graph: float32 alone, and any size of image."""
+"""Running exposure and depth scale (history/running_scale.py) in a graph: float32 alone, and any size of image."""
 
 from typing import NamedTuple
 
@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.history.running_scale import LUMINANCE_BLOCK, MEDIAN_GRID, MIDDLE_GREY, SLOWEST_RATE
 from models.operators import image_luminance
-from models.running_scale import LUMINANCE_BLOCK, MEDIAN_GRID, MIDDLE_GREY, SLOWEST_RATE
 
 LEAST_LUMINANCE = 1e-37  # normal in float32
 # Zeros that fill up the last block of rows and columns, and one more, which tells tracers that there are two.
@@ -22,7 +22,7 @@ class Scale(NamedTuple):
     depth: Tensor  # the running median
 
     def normalised_depth(self, depth: Tensor) -> Tensor:
-        """See models.running_scale.RunningScale.normalised_depth."""
+        """See models.history.running_scale.RunningScale.normalised_depth."""
         return torch.where(depth > 0, depth / (depth + self.depth), 1)
 
 
@@ -54,7 +54,7 @@ def measured_depth(depth: Tensor, height: int, width: int) -> tuple[Tensor, Tens
 
 
 def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tensor, Scale]:
-    """The next `state`, and what it says: see models.running_scale.running_scale.
+    """The next `state`, and what it says: see models.history.running_scale.running_scale.
 
     The state (4,) are the running means of what is measured, and how many frames count in each; zeros at first.
     """

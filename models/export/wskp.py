@@ -1,4 +1,4 @@
-"""WSKP (models/wskp.py) as a step: accumulation, network and shared kernels in one graph."""
+"""WSKP (models/networks/wskp.py) as a step: accumulation, network and shared kernels in one graph."""
 
 import torch
 from torch import Tensor, nn
@@ -7,9 +7,9 @@ from models.export.box_windows import BoxWindows
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
+from models.networks.repvgg import RepVGGBlock
+from models.networks.wskp import WSKP
 from models.parameters import GAMMA, SMALLEST_ALPHA
-from models.repvgg import RepVGGBlock
-from models.wskp import WSKP
 
 READS = ("noisy", "emission", "albedo", "normal", "depth")
 HISTORY = image("history", 4, "accumulated irradiance, linear RGB, and its length in frames")
@@ -37,7 +37,7 @@ class WSKPStep(RecurrentStep):
         self.fusion = BoxWindows(denoiser.windows)
 
     def features(self, x: dict[str, Tensor], radiance: Tensor, scale: Scale) -> Tensor:
-        """models.features.network_features of accumulated `radiance`."""
+        """models.networks.features.network_features of accumulated `radiance`."""
         features = {
             "colour": (radiance * scale.exposure).clamp(0, 1) ** (1 / GAMMA),
             "albedo": x["albedo"],

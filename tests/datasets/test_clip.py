@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from datasets.clip import Clip, Dataset
-from datasets.clip_scene import scene_of_clip
-from datasets.profiles import profile_of
 from errors import BadInput
 from render.clip import Sampling, render_clip
+from render.job.clip_scene import scene_of_clip
+from render.job.profiles import profile_of
 
 
 def test_plan_and_layout(tiny):

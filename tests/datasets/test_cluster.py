@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from datasets.clip_job import ClipOutcome, RenderJob
-from datasets.cluster import connected_ray, outcomes_of, render_on_cluster
 from errors import BadInput
+from render.job.clip_job import ClipOutcome, RenderJob
+from render.job.cluster import connected_ray, outcomes_of, render_on_cluster
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 
 

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import datasets.clip_job
-import datasets.clip_scene
+import render.job.clip_job
+import render.job.clip_scene
 from datasets.clip import Dataset, is_clip
-from datasets.clip_job import RenderJob
-from datasets.generate import Share, generate
 from datasets.info import summarise
-from datasets.profiles import plan
 from errors import BadInput
 from files import locked
+from render.job.clip_job import RenderJob
+from render.job.generate import Share, generate
+from render.job.profiles import plan
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 
 
@@ -128,7 +128,7 @@ def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path)
     def copied(jobs: list[RenderJob]):
         for job in jobs:
             shutil.copytree(tiny / job.path.relative_to(root), job.path)
-            yield datasets.clip_job.ClipOutcome(job.path, "rendered")
+            yield render.job.clip_job.ClipOutcome(job.path, "rendered")
 
     roots = [tmp_path / str(index) for index in range(1, count + 1)]
     counts = []
@@ -156,14 +156,14 @@ def test_what_is_no_share_is_refused(text):
 
 def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
     failing, other = remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = datasets.clip_scene.build_scene
+    genuine = render.job.clip_scene.build_scene
 
     def broken(name, seed, frames):
         if name == "cornell_box":
             raise RuntimeError("no such texture")
         return genuine(name, seed, frames)
 
-    monkeypatch.setattr(datasets.clip_scene, "build_scene", broken)
+    monkeypatch.setattr(render.job.clip_scene, "build_scene", broken)
     with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
         generate_tiny(tiny_copy)
     assert is_clip(other)
@@ -172,7 +172,7 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
 
 def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(tiny_copy, monkeypatch):
     remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = datasets.clip_job.render_clip
+    genuine = render.job.clip_job.render_clip
 
     def faulty(scene, *arguments):
         for index, (channels, seconds) in enumerate(genuine(scene, *arguments)):
@@ -181,7 +181,7 @@ def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(tiny_copy, mo
                 channels["indirect_reference"][1, 0, 0, 2] = np.inf
             yield channels, seconds
 
-    monkeypatch.setattr(datasets.clip_job, "render_clip", faulty)
+    monkeypatch.setattr(render.job.clip_job, "render_clip", faulty)
     assert generate_tiny(tiny_copy) == 2
     box, moving = Dataset(tiny_copy).clips("val")
     assert {name: count for name, count in box.facts["nonfinite"].items() if count} == {

@@ -9,12 +9,12 @@ import torch
 
 from datasets.channels import MIRRORED, USUAL_CHANNELS
 from datasets.clip import Clip
-from datasets.clip_job import write_clip
 from datasets.exr import write_exr
 from datasets.frame import read_frame
 from denoise.exr_image import ExrImage
 from denoise.frames import OwnShot
 from render.clip import Sampling
+from render.job.clip_job import write_clip
 from scenes.animation import Scene, Shape
 from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, panel, placed, room
 

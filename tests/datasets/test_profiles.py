@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from datasets import pilots
-from datasets.adaptive_spp import noise_of_reference, samples_needed
 from datasets.channels import CHANNELS, HALVES, HIT_CHANNELS, MOTION_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
-from datasets.clip_job import render_to_folder
 from datasets.clip_kind import ClipKind
 from datasets.frame import read_frame
-from datasets.generate import Share, generate
 from datasets.info import AUXILIARY_CHANNELS, size_in_full, stored_size, summarise
-from datasets.pilots import choose_rooms
-from datasets.profiles import (
+from errors import BadInput
+from models.registry import channels_read, create
+from render.clip import NO_OPTIONS
+from render.job import pilots
+from render.job.adaptive_spp import noise_of_reference, samples_needed
+from render.job.clip_job import render_to_folder
+from render.job.generate import Share, generate
+from render.job.pilots import choose_rooms
+from render.job.profiles import (
     DataProfile,
     SamplingQuality,
     clips_of,
@@ -25,9 +28,6 @@ from datasets.profiles import (
     rendered_channels,
     rooms_of,
 )
-from errors import BadInput
-from models.registry import channels_read, create
-from render.clip import NO_OPTIONS
 from render.stage import Stage
 from scenes.registry import build_scene
 

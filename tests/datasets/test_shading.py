@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datasets.shading import WanderingEdge
+from train.shading import WanderingEdge
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 11))

@@ -7,20 +7,20 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
+from eval.bench.scaling import exponent, in_use
 
 import eval.bench.denoisers
 from command_line import main
 from errors import BadInput
 from eval.bench.denoisers import bench_denoisers, cost, macs_per_pixel, measure_races, ways
 from eval.bench.race import FEWEST_FRAMES, TIMED_FRAMES, race
-from eval.bench.scaling import exponent, in_use
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.extra_denoisers import WINDOW_SETS
 from eval.selection import cannot_run
-from eval.spec import DenoiserSpec, create_any, precision_in_use
-from models.one import One
+from models.extra_denoisers import WINDOW_SETS
+from models.networks.one import One
 from models.parameters import ONE_INPUTS, STEPS, outputs_of_one
+from models.spec import DenoiserSpec, create_any, precision_in_use
 from provenance import device_in_words
 
 FIELDS = [

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from errors import BadInput
-from eval.bench import error
-from eval.bench.error import Told, bench_error, in_band, table_of
+from eval.studies import error
+from eval.studies.error import Told, bench_error, in_band, table_of
 from files import read_json
 from render.clip import Sampling
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eval.bench import light
-from eval.bench.light import AFTER, BEFORE, CHANGE, STILL, bench_light, changed
+from eval.studies import light
+from eval.studies.light import AFTER, BEFORE, CHANGE, STILL, bench_light, changed
 from files import read_json
 from render.clip import Sampling
 

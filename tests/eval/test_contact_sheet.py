@@ -6,8 +6,8 @@ from matplotlib import pyplot as plt
 
 from errors import BadInput
 from eval.figures.contact_sheet import TITLE_INCHES, contact_sheet, displayed_frame
-from eval.figures.reference_halves import reference_halves
 from plotting import DPI
+from tests.helpers.references import reference_halves
 
 
 def test_contact_sheet_shows_every_scene(tmp_path):

@@ -16,10 +16,10 @@ from errors import BadInput
 from eval import selection
 from eval.harness import entrants_of, evaluate
 from eval.results import load_picture
-from eval.spec import DenoiserSpec
 from files import read_json, write_json
 from models import registry
 from models.registry import create
+from models.spec import DenoiserSpec
 from models.weights import save_weights
 from train.task import run_folder
 

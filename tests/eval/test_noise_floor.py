@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from eval.comparison import Comparison
-from eval.figures.unbiased import measure_references, spread
 from eval.metrics import METRICS, noise_floors, within_floor
 from eval.metrics import measure as measure_frame
+from tests.helpers.references import measure_references, spread
 
 HIDDEN = torch.zeros(1, 1, 48, 64, dtype=torch.bool).index_fill(3, torch.arange(8), True)
 

@@ -24,10 +24,10 @@ from eval.report.page import report
 from eval.report.page_data import page_clip
 from eval.report.table_rows import TableRow, best_denoisers
 from eval.results import BRIGHTEST_ERROR, FLOOR, by_clip, folder_of, load_picture, load_result
-from eval.spec import DenoiserSpec
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.resampled_clips import with_samples
-from models.error_estimate import with_error
+from models.spec import DenoiserSpec
+from models.wrappers.error_estimate import with_error
 
 NAMES = ["noisy", "accumulated", "eaw", "ntd"]
 

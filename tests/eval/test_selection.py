@@ -8,9 +8,10 @@ import torch
 
 from errors import BadInput
 from eval import selection
-from eval.extra_denoisers import EXTRA
 from eval.selection import choose, evaluated, untrained, weights_file, weights_of, with_indirect_baselines
-from eval.spec import (
+from models.extra_denoisers import EXTRA
+from models.registry import DENOISERS, create
+from models.spec import (
     PRECISIONS,
     DenoiserSpec,
     class_of,
@@ -20,7 +21,6 @@ from eval.spec import (
     split_name,
     with_budget,
 )
-from models.registry import DENOISERS, create
 from models.weights import save_weights
 from train.task import WEIGHTS_FILE, run_folder
 

@@ -12,7 +12,6 @@ from PIL import Image
 
 from command_line import main
 from errors import BadInput
-from eval.spec import DenoiserSpec
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
 from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
 from eval.stress.check import FORGOTTEN, StressCheck
@@ -24,6 +23,7 @@ from eval.stress.run import applies, cases_in, check_all, stressed, weights_labe
 from eval.stress.tables import heat_map, verdict_text
 from models import registry
 from models.denoiser import Denoiser, State
+from models.spec import DenoiserSpec
 from models.weights import save_weights
 from plotting import plt
 

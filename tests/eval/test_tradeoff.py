@@ -11,12 +11,10 @@ from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.sample_cost import fit_cost, sample_cost
-from eval.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
 from eval.results import REFERENCE, ClipResults, Result, load_result
-from eval.spec import DenoiserSpec, create_any
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.feeding import check_levels
@@ -27,7 +25,9 @@ from eval.tradeoff.run import trade
 from eval.tradeoff.samples import SampleTrade, generalisation, sample_trades
 from eval.tradeoff.times import Times, timed_as
 from files import read_json, write_json
+from models.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
 from models.parameters import WINDOWS
+from models.spec import DenoiserSpec, create_any
 from models.weights import save_weights
 from render.clip import NO_OPTIONS
 from train.task import WEIGHTS_FILE, run_folder

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from errors import BadInput
-from eval.figures.triptych import in_strips, triptych
+from eval.studies.triptych import in_strips, triptych
 
 
 def test_strips_are_in_their_order_and_slant_to_the_left():

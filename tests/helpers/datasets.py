@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from datasets.generate import generate
 from models.registry import DENOISERS, channels_read
+from render.job.generate import generate
 
 
 def dataset_command(root: Path) -> list[str]:
@@ -23,7 +23,7 @@ def channels_read_by_all() -> tuple[str, ...]:
 
 
 def generate_tiny(root: Path, **arguments: Any) -> int:
-    """What `dataset_command` does, in this process. `arguments` are further ones of datasets.generate.generate."""
+    """What `dataset_command` does, in this process. `arguments` are further ones of render.job.generate.generate."""
     return generate(root, "tiny", seed=0, reads=channels_read_by_all(), **arguments)
 
 

@@ -14,8 +14,8 @@ from datasets.channels import HIT_CHANNELS
 from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
-from models.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, pixel_size, positions, widths
-from models.neighbours import mesh_least
+from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, pixel_size, positions, widths
+from models.filters.neighbours import mesh_least
 from scenes.camera import View, pixel_centres, unproject
 from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate

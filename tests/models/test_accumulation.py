@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from models.accumulation import Accumulation, accumulate
-from models.surfaces import Surfaces
+from models.history.accumulation import Accumulation, accumulate
+from models.history.surfaces import Surfaces
 from tests.helpers.frames import flat_frame
 
 

@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-import models.adaptive
+import models.wrappers.adaptive
 from errors import BadInput
 from models import registry
-from models.accumulation import accumulate
-from models.adaptive import (
+from models.filters.baselines import Accumulated
+from models.history.accumulation import accumulate
+from models.wrappers.adaptive import (
     BRIGHTEST,
     LARGEST_GAIN,
     Neighbourhoods,
@@ -16,7 +17,6 @@ from models.adaptive import (
     brightest,
     gain,
 )
-from models.baselines import Accumulated
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 48
@@ -44,7 +44,7 @@ def play_noise(monkeypatch, frames: int, firefly: float, every: int) -> tuple[fl
         factors.append(gain(*arguments))
         return factors[-1]
 
-    monkeypatch.setattr(models.adaptive, "gain", listening)
+    monkeypatch.setattr(models.wrappers.adaptive, "gain", listening)
     generator = torch.Generator().manual_seed(1)
     history = None
     shown = []

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from models.asvgf import ASVGF, change_of_light
-from models.strata import STRATUM, middles, repeated, sums
-from models.svgf import ALPHA, SVGF, SVGFState
+from models.filters.asvgf import ASVGF, change_of_light
+from models.filters.svgf import ALPHA, SVGF, SVGFState
+from models.history.strata import STRATUM, middles, repeated, sums
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 24

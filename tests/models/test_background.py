@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.frame import Frame
-from eval.bench.fusion import unfold_kernel
 from eval.stress.irradiance_range import CONVEX
 from models import compiled, registry
-from models.fusion import fuse
-from models.ntd import reconstruct_image
+from models.history.running_scale import running_scale
+from models.networks.fusion import fuse
+from models.networks.ntd import reconstruct_image
+from models.networks.pixel_kernels import apply_kernels
 from models.operators import halve, halve_surface
-from models.pixel_kernels import apply_kernels
-from models.running_scale import running_scale
 from tests.helpers.frames import chain, flat_frame, play, run
+from tests.helpers.unfold import unfold_kernel
 
 NAMES = [name for name in registry.DENOISERS if not registry.unavailable(name)]
 WINDOWS = (3, 5, 13)

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from datasets.frame import Cameras
 from eval.bench.synthetic_frames import synthetic_frame
-from models import bmfr, compiled
-from models.baselines import Accumulated
-from models.bmfr import BMFR, Blocks
+from models import compiled
+from models.filters import bmfr
+from models.filters.baselines import Accumulated
+from models.filters.bmfr import BMFR, Blocks
 from tests.helpers.frames import chain, flat_frame, play, run
 
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}

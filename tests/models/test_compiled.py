@@ -59,4 +59,6 @@ def test_results_follow_from_all_kernels():
     """Whoever names the code that made a result finds them by their import statements."""
     kernels = {f"models.compiled.{file.stem}" for file in (ROOT / "models" / "compiled").glob("[!_]*.py")}
     assert kernels and kernels <= sources("models.registry").keys()
-    assert "models.compiled.svgf" in sources("models.svgf") and "models.compiled.svgf" not in sources("models.eaw")
+    assert "models.compiled.svgf" in sources("models.filters.svgf") and "models.compiled.svgf" not in sources(
+        "models.filters.eaw"
+    )

@@ -10,7 +10,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
-from models.rae import RAE, RAEState
+from models.networks.rae import RAE, RAEState
 from models.weights import load_weights, save_weights
 from tests.helpers.frames import flat_frame, run
 
@@ -168,7 +168,7 @@ def test_rae_recurrence_is_the_paper_s_equation():
     """h = C(C(C(I) ++ h_prev)), by numpy's slow way through scipy."""
     from scipy.ndimage import correlate
 
-    from models.rae import RecurrentBlock
+    from models.networks.rae import RecurrentBlock
 
     torch.manual_seed(1)
     block = RecurrentBlock(2).double()

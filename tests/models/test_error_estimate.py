@@ -11,10 +11,10 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.around import around
 from models.denoiser import Denoiser, State
-from models.error_estimate import ErrorEstimate, estimated, with_error
-from models.shrinkage import Shrunk
+from models.wrappers.error_estimate import ErrorEstimate, estimated, with_error
+from models.wrappers.shrinkage import Shrunk
+from models.wrappers.wrapper import around
 from tests.helpers.frames import flat_frame
 from tests.helpers.halves import noisy_halves, with_halves
 

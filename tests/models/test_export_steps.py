@@ -14,10 +14,8 @@ from torch.nn import functional as F
 from datasets.clip import Dataset
 from datasets.frame import Cameras, read_frame
 from errors import BadInput
-from eval.bench.fusion import unfold_kernel
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled, neighbours
-from models.affinity import plain_level
+from models import compiled
 from models.denoiser import Denoiser
 from models.export import program as programs
 from models.export.box_windows import BoxWindows
@@ -28,14 +26,17 @@ from models.export.program import trace, write_onnx, write_pt2
 from models.export.registry import STEPS, load_step
 from models.export.reprojection import View, expectation, fetch, places, table_of
 from models.export.runtime import run_onnx, run_pt2
+from models.filters import neighbours
+from models.history.reprojection import reproject
+from models.history.surfaces import Surfaces, to_previous_camera
+from models.networks.affinity import plain_level
 from models.parameters import WINDOWS
 from models.registry import create, load
-from models.reprojection import reproject
-from models.surfaces import Surfaces, to_previous_camera
 from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.exports import check_page
 from tests.helpers.frames import flat_frame, run
+from tests.helpers.unfold import unfold_kernel
 
 SIZES = ((64, 96), (77, 131))
 FRAMES = 10

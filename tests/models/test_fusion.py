@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from eval.bench.fusion import unfold_fuse
 from models import compiled
-from models.fusion import box_sum, fuse, shared_kernel, windowed_sums
+from models.networks.fusion import box_sum, fuse, shared_kernel, windowed_sums
 from models.parameters import WINDOWS
+from tests.helpers.unfold import unfold_fuse
 
 
 def both_ways(image, importance, mixture, windows=WINDOWS):
@@ -117,8 +117,8 @@ def test_a_poisoned_pixel_stays_within_its_windows():
 
 ON_GPU = """
 import torch
-import models.fusion as PyTorch
-from eval.bench.fusion import unfold_fuse
+import models.networks.fusion as PyTorch
+from tests.helpers.unfold import unfold_fuse
 from models.compiled.fusion_triton import fuse
 
 device = "cuda" if torch.cuda.is_available() else "cpu"

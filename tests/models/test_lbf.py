@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from models import compiled, registry
-from models.cross_bilateral import Pixels, cross_bilateral
-from models.lbf import features_of, remove_spikes
+from models.history.running_scale import running_scale
+from models.networks.cross_bilateral import Pixels, cross_bilateral
+from models.networks.lbf import features_of, remove_spikes
+from models.networks.secondary_features import secondary_features
 from models.parameters import GROUPS
-from models.running_scale import running_scale
-from models.secondary_features import secondary_features
 from tests.helpers.frames import flat_frame, run
 
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}

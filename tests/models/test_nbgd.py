@@ -9,8 +9,8 @@ from torch import Tensor
 
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, registry
-from models.bilateral_grid import grid_mean, grid_shape
-from models.nbgd import SPACINGS
+from models.networks.bilateral_grid import grid_mean, grid_shape
+from models.networks.nbgd import SPACINGS
 from tests.helpers.frames import flat_frame, run
 
 
@@ -177,7 +177,7 @@ def test_large_frames_are_filtered_in_strips(height, monkeypatch):
     denoiser.prepare()
     with torch.inference_mode():
         whole, _ = denoiser(frame, None)
-        monkeypatch.setattr("models.wskp.LARGEST_WHOLE", 1)
-        monkeypatch.setattr("models.wskp.STRIP_PIXELS", 32 * 90)
+        monkeypatch.setattr("models.networks.wskp.LARGEST_WHOLE", 1)
+        monkeypatch.setattr("models.networks.wskp.STRIP_PIXELS", 32 * 90)
         strips, _ = denoiser(frame, None)
     assert torch.equal(strips, whole)

@@ -1,4 +1,4 @@
-"""models.neighbours against means taken pixel by pixel in float64, by kernels and by PyTorch."""
+"""models.filters.neighbours against means taken pixel by pixel in float64, by kernels and by PyTorch."""
 
 import contextlib
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from models import compiled
-from models.neighbours import mesh_means
+from models.filters.neighbours import mesh_means
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

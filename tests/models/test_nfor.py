@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import compiled
-from models.nfor import NFOR, chequered_halves, features_of, nfor, nl_means, patch_distances, regress
+from models.filters.nfor import NFOR, chequered_halves, features_of, nfor, nl_means, patch_distances, regress
 from tests.helpers.frames import flat_frame, run
 
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}

@@ -12,9 +12,9 @@ from torch.nn import functional as F
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
-from models import ntd as ntd_module
-from models.convolution import ConvReLU
-from models.ntd import NTD, NTDMean, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
+from models.networks import ntd as ntd_module
+from models.networks.convolution import ConvReLU
+from models.networks.ntd import NTD, NTDMean, NTDState, NTDTraditional, combine_levels, reconstruct_image, warp
 from models.registry import create
 from tests.helpers.frames import flat_frame, play, run
 

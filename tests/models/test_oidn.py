@@ -10,7 +10,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
-from models.oidn import OIDN, OIDNAccumulated
+from models.filters.oidn import OIDN, OIDNAccumulated
 from tests.helpers.frames import flat_frame, run
 
 pytest.importorskip("pyoidn")

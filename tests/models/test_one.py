@@ -10,10 +10,10 @@ from torch import Tensor
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
-from models.one import One
+from models.history.reprojection import reproject
+from models.history.surfaces import Surfaces
+from models.networks.one import One
 from models.parameters import COMPARED
-from models.reprojection import reproject
-from models.surfaces import Surfaces
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = (24, 40)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models import compiled
-from models.pixel_kernels import ApplyKernels, apply_kernels
+from models.networks.pixel_kernels import ApplyKernels, apply_kernels
 
 
 def naive(image: Tensor, logits: Tensor) -> Tensor:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
-from models.reprojection import reproject
-from models.surfaces import Surfaces
+from models.history.reprojection import reproject
+from models.history.surfaces import Surfaces
 from tests.helpers.frames import flat_frame
 
 

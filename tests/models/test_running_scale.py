@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from models.running_scale import running_scale
+from models.history.running_scale import running_scale
 
 
 def test_running_scale_by_hand():

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models import compiled
-from models.neighbours import mesh_variance
-from models.sbf import BANK, SBF, best_filtered, filter_with_risk, guides
+from models.filters.neighbours import mesh_variance
+from models.filters.sbf import BANK, SBF, best_filtered, filter_with_risk, guides
 from tests.helpers.frames import flat_frame, run
 
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from datasets.frame import Frame
-from models import compiled, registry, shrinkage
-from models.around import around
+from models import compiled, registry
 from models.denoiser import Denoiser, State
-from models.neighbours import mesh_sums
-from models.shrinkage import RARE, SCARCE, STANDARD_ERRORS, Shrunk, shrunk
+from models.filters.neighbours import mesh_sums
+from models.wrappers import shrinkage
+from models.wrappers.shrinkage import RARE, SCARCE, STANDARD_ERRORS, Shrunk, shrunk
+from models.wrappers.wrapper import around
 from tests.helpers.frames import flat_frame, play
 from tests.helpers.halves import noisy_halves, with_halves
 

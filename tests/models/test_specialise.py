@@ -13,8 +13,8 @@ from datasets.frame import Frame
 from errors import BadInput
 from models import compiled, registry
 from models.denoiser import Denoiser
-from models.features import network_features
-from models.running_scale import running_scale
+from models.history.running_scale import running_scale
+from models.networks.features import network_features
 from models.specialise import drop_inputs, specialise
 from models.weights import save_weights
 from tests.helpers.frames import chain, flat_frame, run

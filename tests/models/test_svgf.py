@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled, eaw, svgf
-from models.baselines import Accumulated
-from models.eaw import EAW
-from models.running_scale import running_scale
-from models.surfaces import Surfaces
-from models.svgf import SVGF, Integrated
+from models import compiled
+from models.filters import eaw, svgf
+from models.filters.baselines import Accumulated
+from models.filters.eaw import EAW
+from models.filters.svgf import SVGF, Integrated
+from models.history.running_scale import running_scale
+from models.history.surfaces import Surfaces
 from tests.helpers.frames import flat_frame, play, run
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])

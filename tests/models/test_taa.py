@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from errors import BadInput
-from models.around import around
-from models.baselines import Accumulated, Noisy
 from models.denoiser import CLASSICAL
-from models.rae import RAE
-from models.taa import Antialiased, compress, expand, largest_around
+from models.filters.baselines import Accumulated, Noisy
+from models.networks.rae import RAE
+from models.wrappers.taa import Antialiased, compress, expand, largest_around
+from models.wrappers.wrapper import around
 from tests.helpers.frames import chain, flat_frame, run
 
 

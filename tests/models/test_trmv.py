@@ -8,7 +8,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from eval.bench.synthetic_frames import synthetic_frame
 from models import registry
-from models.trmv import offset_around, reliable_vectors
+from models.filters.trmv import offset_around, reliable_vectors
 from tests.helpers.frames import chain, flat_frame, run
 
 SIZE = 36

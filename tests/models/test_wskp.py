@@ -10,15 +10,15 @@ from torch.nn import functional as F
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
-from eval.bench.fusion import unfold_fuse
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, registry
-from models.accumulation import accumulate
 from models.compiled.exponential import exp, log
-from models.repvgg import PairedConv2d, RepVGGBlock, merge, repvgg
-from models.running_scale import running_scale
-from models.wskp import combine_resolutions
+from models.history.accumulation import accumulate
+from models.history.running_scale import running_scale
+from models.networks.repvgg import PairedConv2d, RepVGGBlock, merge, repvgg
+from models.networks.wskp import combine_resolutions
 from tests.helpers.frames import flat_frame, run
+from tests.helpers.unfold import unfold_fuse
 
 
 @pytest.mark.parametrize("widths", [(10, 24, 24, 12), (10, 24, 24, 24, 24, 24, 12), (3, 3)])
@@ -170,8 +170,8 @@ def test_large_frames_are_filtered_in_strips_bit_for_bit(name, height, monkeypat
     denoiser.prepare()
     with torch.inference_mode():
         whole, state = denoiser(frame, None)
-        monkeypatch.setattr("models.wskp.LARGEST_WHOLE", 1)
-        monkeypatch.setattr("models.wskp.STRIP_PIXELS", 32 * 90)
+        monkeypatch.setattr("models.networks.wskp.LARGEST_WHOLE", 1)
+        monkeypatch.setattr("models.networks.wskp.STRIP_PIXELS", 32 * 90)
         strips, state_of_strips = denoiser(frame, None)
     assert torch.equal(strips, whole)
     assert all(

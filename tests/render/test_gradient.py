@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import render.gradient
 from datasets import channels
-from models import strata
+from models.history import strata
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import STRATUM, Samples, luminance, one_of_each_stratum

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datasets.profiles import OWN_CLIPS, OWN_QUALITY
 from errors import BadInput
 from provenance import ROOT
+from render.job.profiles import OWN_CLIPS, OWN_QUALITY
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Track
 from scenes.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
 

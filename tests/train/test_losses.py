@@ -13,11 +13,10 @@ from torchmetrics.functional import symmetric_mean_absolute_percentage_error
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, disoccluded
-from datasets.sequences import Batch
-from models.ntd import NTD
-from models.rae import RAE
+from models.networks.ntd import NTD
+from models.networks.rae import RAE
+from models.networks.wskp import WSKP
 from models.registry import create
-from models.wskp import WSKP
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
@@ -30,6 +29,7 @@ from train.losses.relative import RelativeTerms
 from train.losses.wskp import SMAPELoss, SMAPETerms, smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
+from train.sequences import Batch
 
 LOSSES = {
     RAETerms: RAELoss,

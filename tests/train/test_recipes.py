@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from datasets.sequences import Augmentation
 from errors import BadInput
 from models.registry import DENOISERS, create
 from train.losses.displayed import DisplayedTerms
@@ -14,6 +13,7 @@ from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
+from train.sequences import Augmentation
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
 ENDS_WELL = {"anneal", "average", "rate"}

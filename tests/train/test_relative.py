@@ -9,12 +9,11 @@ from torch import Tensor
 
 from datasets.clip import Dataset
 from datasets.frame import Frame
-from datasets.sequences import Batch
-from models.ntd import NTD
-from models.rae import RAE
+from models.history.running_scale import RunningScale
+from models.networks.ntd import NTD
+from models.networks.rae import RAE
+from models.networks.wskp import WSKP
 from models.registry import create
-from models.running_scale import RunningScale
-from models.wskp import WSKP
 from tests.helpers.frames import flat_frame
 from tests.helpers.training import short_task, tensors
 from train.crops import Crops
@@ -26,6 +25,7 @@ from train.losses.outputs import raised
 from train.losses.relative import RelativeLoss, RelativeTerms
 from train.losses.wskp import SMAPELoss
 from train.recipes import recipe_for
+from train.sequences import Batch
 
 SIZE = 64
 MEAN = 0.3  # of the noisy targets' radiance

@@ -7,9 +7,9 @@ import torch
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
-from datasets.sequences import Augmentation, TrainingSequences, collate
 from models.registry import create
 from train import whole_frames
+from train.sequences import Augmentation, TrainingSequences, collate
 from train.whole_frames import WholeFrames
 
 Played = tuple[Clip, int, int]

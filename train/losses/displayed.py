@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from datasets.sequences import Batch
 from models.denoiser import Denoiser
 from models.parameters import GAMMA
 from train.crops import Crops
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 from train.losses.outputs import exposed_outputs
+from train.sequences import Batch
 
 DARKEST = 1e-4  # exposed radiance, below which the curve is no steeper
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datasets.sequences import Batch
 from models.denoiser import Denoiser
-from models.lbf import LBF
+from models.networks.lbf import LBF
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 from train.losses.outputs import exposed_outputs
+from train.sequences import Batch
 
 
 @dataclass(frozen=True)

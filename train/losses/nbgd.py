@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from models.nbgd import NBGD
+from models.networks.nbgd import NBGD
 from train.crops import Crops
 from train.losses.displayed import cut_tone
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from datasets.frame import disoccluded
-from datasets.sequences import Batch
 from models.denoiser import Denoiser, State
-from models.ntd import NTD
+from models.networks.ntd import NTD
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from train.sequences import Batch
 
 FEWEST_OCCLUDED = 1e-3  # share of a sequence's pixels: the mean over fewer would be noise, and is that share of them
 

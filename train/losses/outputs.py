@@ -6,11 +6,11 @@ from typing import Any
 from torch import Tensor
 
 from datasets.frame import Frame
-from datasets.sequences import Batch
 from models.denoiser import Denoiser
-from models.rae import POWER, RAE
-from models.running_scale import RunningScale
+from models.history.running_scale import RunningScale
+from models.networks.rae import POWER, RAE
 from train.crops import Crops
+from train.sequences import Batch
 
 DARKEST_SLOPE = 0.01  # exposed irradiance, below which RAE's output has no flatter slope
 

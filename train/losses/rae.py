@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from datasets.sequences import Batch
 from models.denoiser import Denoiser, State
-from models.rae import RAE
+from models.networks.rae import RAE
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from train.sequences import Batch
 
 
 def laplacian_of_gaussian(sigma: float = 1.5, size: int = 15) -> Tensor:

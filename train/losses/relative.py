@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datasets.sequences import Batch
 from models.denoiser import Denoiser
 from train.crops import Crops
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 from train.losses.outputs import exposed_outputs
+from train.sequences import Batch
 
 
 @dataclass(frozen=True)

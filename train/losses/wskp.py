@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from models.wskp import KernelPredictor
+from models.networks.wskp import KernelPredictor
 from train.crops import Crops
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 

@@ -1,0 +1,1 @@
+"""Studies that the documentation cites: run when their finding is in doubt."""

@@ -1,0 +1,145 @@
+"""`onespp bench light`: how soon a denoiser shows a change of light, by its quality in light that never changed."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from tabulate import tabulate
+from tqdm import tqdm
+
+from datasets.channels import CHANNELS
+from datasets.clip import Clip
+from datasets.frame import read_frame, to_tensor
+from datasets.tonemap import display, psnr
+from eval.bench.output import bench_folder
+from eval.selection import evaluated
+from eval.studies.own_clips import SEED, own_clip
+from files import write_file, write_json
+from models.denoiser import Denoiser, State
+from models.operators import finite
+from models.spec import DenoiserSpec
+from plotting import DPI, plt, save_figure
+from provenance import device_in_words
+from render.clip import Sampling
+from scenes.animation import KeyframedTrack, RigidMotion, Scene, Track
+from scenes.camera import Array
+from scenes.registry import build_scene
+
+CHANGE = 8  # the first frame in the new light
+AFTER = (0, 1, 2, 4, 8)  # frames after it that the table shows
+SIZE = (CHANGE + AFTER[-1] + 1, 128, 128)  # frames, height, width
+SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=1024)
+SCENE = "cornell_box"
+STILL = "still"
+# What the lamp was like before the change: its brightness, times that after it, and where it was.
+BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
+    STILL: (1.0, (0.0, 0.0, 0.0)),
+    "switched-on": (0.05, (0.0, 0.0, 0.0)),
+    "switched-down": (8.0, (0.0, 0.0, 0.0)),
+    "moved": (1.0, (0.6, 0.0, -0.5)),
+}
+
+
+@dataclass(frozen=True)
+class Lag:
+    """One denoiser: PSNR in dB of every frame, by the name of the change."""
+
+    denoiser: str
+    psnr: dict[str, list[float]]
+
+    def behind(self, after: int) -> float:
+        """By how many dB the worst change is behind light that never changed, `after` frames after it."""
+        frame = CHANGE + after
+        return max(self.psnr[STILL][frame] - values[frame] for name, values in self.psnr.items() if name != STILL)
+
+
+def stepped(before: Array, after: Array) -> Track:
+    """From one value to the other between two frames."""
+    times = np.array([CHANGE - 1.0, CHANGE])
+    return KeyframedTrack(np.array([before, after]), times=times, straight=True)
+
+
+def changed(change: str) -> Scene:
+    """The Cornell box whose lamp becomes what it is in the clip `cornell_box` in the frame CHANGE."""
+    scene = build_scene(SCENE, SEED, SIZE[0])
+    *others, lamp = scene.shapes
+    gain, shift = BEFORE[change]
+    assert lamp.radiance is not None and isinstance(lamp.motion, RigidMotion)
+    radiance = lamp.radiance.at(0)
+    place = lamp.motion.position.at(0)
+    motion = replace(lamp.motion, position=stepped(place + shift, place))
+    lamp = replace(lamp, radiance=stepped(gain * radiance, radiance), motion=motion)
+    return replace(scene, shapes=(*others, lamp))
+
+
+def clip_of(change: str, folder: Path) -> Clip:
+    """The clip of a change."""
+    made_of = CHANGE, BEFORE[change]
+    return own_clip(folder, f"{SCENE}-{change}", lambda: changed(change), SIZE, SAMPLING, tuple(CHANNELS), made_of)
+
+
+@torch.inference_mode()
+def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[float]:
+    """PSNR in dB of each frame of the light that the denoiser returns, displayed."""
+    found = []
+    state: State | None = None
+    for index in range(clip.frames):
+        output, state = denoiser(read_frame(clip, index, denoiser.reads), state)
+        reference = to_tensor(clip.reference(index, denoiser.signal).mean(axis=0))
+        error = display(finite(output), exposure) - display(reference, exposure)
+        found.append(psnr(error.square().mean().item()))
+    return found
+
+
+def lag_of(spec: DenoiserSpec, clips: dict[str, Clip]) -> Lag:
+    """All clips are displayed as the one whose light never changes."""
+    denoiser = spec.build()
+    exposure = clips[STILL].exposure
+    return Lag(spec.name, {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()})
+
+
+def lag_table(lags: Sequence[Lag]) -> str:
+    """Fewest dB behind first, once all frames have passed."""
+    heads = ["denoiser", f"still light, frame {SIZE[0] - 1}", *(f"behind, {n} after" for n in AFTER)]
+    rows = [
+        [lag.denoiser, f"{lag.psnr[STILL][-1]:.1f} dB", *(f"{lag.behind(n):.1f} dB" for n in AFTER)]
+        for lag in sorted(lags, key=lambda lag: lag.behind(AFTER[-1]))
+    ]
+    return tabulate(rows, heads, tablefmt="github", disable_numparse=True)
+
+
+def lag_figure(lags: Sequence[Lag]) -> Figure:
+    """PSNR of every frame; a panel for each change, beside light that never changes."""
+    figure, axes = plt.subplots(
+        1, len(BEFORE), figsize=(3 * len(BEFORE), 4), dpi=DPI, layout="constrained", sharey=True
+    )
+    for axis, change in zip(axes, BEFORE, strict=True):
+        for lag in lags:
+            axis.plot(lag.psnr[change], label=lag.denoiser)
+        axis.axvline(CHANGE, color="grey", lw=0.8, ls=":")
+        axis.set(title=change, xlabel="frame")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("PSNR dB")
+    axes[0].legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
+    """Judge the named denoisers, or all that can run: RUNS/bench/light gets clips, table.md, plot.png, results.json.
+
+    Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
+    """
+    specs = evaluated(names, runs, budget)
+    folder = bench_folder(runs) / "light"
+    clips = {change: clip_of(change, folder) for change in BEFORE}
+    lags = [lag_of(spec, clips) for spec in tqdm(specs, "denoisers", unit="denoiser")]
+    save_figure(folder / "plot.png", lag_figure(lags))
+    table = lag_table(lags)
+    write_file(folder / "table.md", f"{table}\n".encode())
+    write_json(
+        folder / "results.json", {"schema": 1, "device": device_in_words(), "rows": [asdict(lag) for lag in lags]}
+    )
+    return table

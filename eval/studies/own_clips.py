@@ -1,0 +1,34 @@
+"""Clips that a bench renders for itself, and keeps."""
+
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from datasets.clip import Clip, is_clip
+from render.clip import Sampling
+from render.job.clip_job import write_clip
+from render.job.profiles import GENERATOR
+from scenes.animation import Scene
+
+SEED = 0
+
+
+def own_clip(
+    folder: Path,
+    name: str,
+    scene: Callable[[], Scene],
+    size: tuple[int, int, int],
+    sampling: Sampling,
+    channels: Sequence[str],
+    made_of: object = None,
+) -> Clip:
+    """The clip `name` of a scene, of `size` (frames, height, width), rendered unless it is there.
+
+    Its folder is named by all that it follows from, `made_of` among it: what the scene is made of beside its name.
+    """
+    digest = zlib.crc32(repr((GENERATOR, name, SEED, size, sampling, *channels, made_of)).encode())
+    path = folder / f"{digest:08x}" / name / "000"
+    if not is_clip(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_clip(path, scene(), size, sampling, SEED, channels)
+    return Clip(path)

@@ -1,0 +1,86 @@
+"""One large frame in three strips under slanting cuts: as rendered, denoised, and the reference."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from datasets.channels import CHANNELS
+from datasets.clip import Clip
+from datasets.frame import read_frame
+from datasets.tonemap import clip_exposure, display, luminance
+from errors import BadInput
+from eval.selection import USUAL_BUDGET, evaluated
+from files import replacing
+from models.denoiser import Denoiser, State
+from render.clip import Sampling
+from render.job.clip_job import write_clip
+from render.shot import Shot
+from render.stage import Stage
+from scenes.registry import build_scene
+
+SLANT = 0.15  # px to the left for each row down
+CUTS = (0.36, 0.70)  # of the width, in the middle row
+CUT_WIDTH = 3  # px
+NOISY_ONLY = Sampling(realisations=1, noisy_spp=1, reference_spp=2)
+
+Picture = NDArray[np.float64]
+
+
+@torch.inference_mode()
+def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
+    """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all others."""
+    state: State | None = None
+    for index in range(clip.frames):
+        frame = read_frame(clip, index, (*network.reads, "direct", "indirect", "emission"))
+        output, state = network(frame, state)
+    noisy, denoised = (image[0].permute(1, 2, 0).double().numpy() for image in (frame.radiance("total"), output))
+    return noisy, denoised
+
+
+def in_strips(pictures: tuple[Picture, Picture, Picture]) -> Picture:
+    """The left, the middle and the right of three pictures (H, W, 3), with white lines between."""
+    height, width = pictures[0].shape[:2]
+    x = np.arange(width) + SLANT * (np.arange(height)[:, None] - height / 2)
+    picture = pictures[0]
+    for cut, right in zip(CUTS, pictures[1:], strict=True):
+        picture = np.where((x > cut * width)[..., None], right, picture)
+    lines = np.min([np.abs(x - cut * width) for cut in CUTS], axis=0) < CUT_WIDTH / 2
+    return np.where(lines[..., None], 1.0, picture)
+
+
+def triptych(
+    out: Path,
+    scene_name: str,
+    denoiser: str,
+    runs: Path,
+    frame: int,
+    spp: int,
+    size: tuple[int, int] = (720, 1280),
+    seed: int = 0,
+) -> None:
+    """Write a PNG of a built-in scene's frame, whose reference has `spp` samples a pixel, in `size` (height, width).
+
+    Raises BadInput for an unknown scene or denoiser, a frame before the first, and no samples.
+    """
+    if frame < 0 or spp < 1:
+        raise BadInput(f"frame {frame} of {spp} spp: name a frame from 0 on, and 1 sample a pixel or more")
+    (spec,) = evaluated([denoiser], runs, USUAL_BUDGET)
+    if spec.returns != "total":
+        raise BadInput(f"{denoiser} returns indirect light alone, which is not the picture: name another")
+    scene = build_scene(scene_name, seed, 2 * frame)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "test" / scene_name / "000"
+        path.parent.mkdir(parents=True)
+        write_clip(path, scene, (frame + 1, *size), NOISY_ONLY, seed, tuple(CHANNELS))
+        noisy, denoised = last_frame(Clip(path), spec.build())
+    shot = Shot(Stage(scene, *size), frame)
+    reflected = shot.reflected(seed, spp)
+    exposure = clip_exposure(luminance(reflected))
+    shown = [display(image, exposure) for image in (noisy, denoised, reflected + shot.emission)]
+    picture = in_strips((shown[0], shown[1], shown[2]))
+    with replacing(out) as temporary:
+        Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(temporary, format="png", optimize=True)

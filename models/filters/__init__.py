@@ -1,0 +1,1 @@
+"""Denoisers without a network, and OIDN."""

@@ -1,0 +1,49 @@
+"""The two baselines that every denoiser must beat: nothing, and temporal accumulation alone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from datasets.frame import Frame
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
+from models.history.accumulation import Accumulation, accumulate
+
+
+class Noisy(Denoiser):
+    """The noisy frame itself."""
+
+    reads = ("direct", "indirect", "emission")
+    refuses = CLASSICAL
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        return frame.radiance(self.signal), State(frame.moment)
+
+
+@dataclass(frozen=True)
+class AccumulatedState(State):
+    history: Accumulation
+
+    def pictures(self) -> dict[str, Tensor]:
+        return {"history length": self.history.length}
+
+
+class Accumulating(Denoiser):
+    """A denoiser that begins with temporal accumulation, in whose place models.wrappers.adaptive puts its own."""
+
+    accumulation: Callable[[Frame, Tensor, Accumulation | None], Accumulation] = staticmethod(accumulate)
+
+    def accumulated(self, frame: Frame, before: AccumulatedState | None) -> Accumulation:
+        """The history with the frame's irradiance."""
+        return self.accumulation(frame, frame.irradiance(self.signal), before.history if before else None)
+
+
+class Accumulated(Accumulating):
+    """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), no spatial filter."""
+
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    refuses = CLASSICAL
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
+        return frame.remodulate(history.irradiance, self.signal), AccumulatedState(frame.moment, history)

@@ -1,0 +1,136 @@
+"""OIDN: Intel Open Image Denoise, the denoiser that renderers ship, to compare with."""
+
+import weakref
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from datasets.frame import Frame, Signal
+from errors import BadInput
+from models.denoiser import Denoiser, State, matching_state
+from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+
+OIDNQuality = Literal["high", "balanced", "fast"]
+
+IMAGES = ("color", "albedo", "normal", "output")
+
+
+def open_device(threads: int) -> Any:
+    """A committed CPU device of pyoidn. Raises BadInput, with what to install, where there is none to be had."""
+    try:
+        import pyoidn
+
+        device = pyoidn.Device()
+        device.set_int("numThreads", threads)
+        # By default OIDN pins its threads to cores, where PyTorch's and other processes' threads get in their way.
+        device.set_bool("setAffinity", False)
+        device.commit()
+        problem = device.get_error()
+    except (ImportError, OSError) as error:  # the library itself is loaded at the first call
+        problem = str(error)
+    if problem:
+        raise BadInput(f"OIDN does not run here ({problem}); get it with `pip install 'onespp[oidn]'`")
+    return device
+
+
+def release_native(device: Any, filter_: Any) -> None:
+    filter_.release()
+    device.release()
+
+
+class RayTracingFilter:
+    """OIDN's filter "RT" for images of one size. OIDN reads and writes the tensors of `images` in place.
+
+    Settings are those that OIDN's documentation recommends for the best image: HDR; albedo and normals as auxiliary
+    images, here free of noise and said to be so (`cleanAux`); the exposure left to OIDN (`inputScale` not set).
+    """
+
+    def __init__(self, height: int, width: int, threads: int, quality: OIDNQuality):
+        device = open_device(threads)
+        import pyoidn
+
+        self.device = device
+        self.filter = pyoidn.Filter(device)
+        self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at exit at the latest
+        with torch.inference_mode(False):  # else they could not be written to outside of it
+            self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
+        for name, image in self.images.items():
+            self.filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+        self.filter.set_bool("hdr", True)
+        self.filter.set_bool("cleanAux", True)
+        self.filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
+        self.filter.commit()
+        self.check()
+
+    def check(self) -> None:
+        """Raise BadInput where OIDN reports an error, such as too little memory."""
+        if problem := self.device.get_error():
+            raise BadInput(f"OIDN failed: {problem}")
+
+    def __call__(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """Denoised radiance (3, H, W) from `colour` >= 0, `albedo` in [0, 1] and `normal` in [-1, 1], all (3, H, W)."""
+        for name, value in zip(IMAGES, (colour, albedo, normal), strict=False):
+            self.images[name].copy_(value.permute(1, 2, 0))
+        self.filter.execute()
+        self.check()
+        return (
+            self.images["output"].permute(2, 0, 1).to(colour.device, memory_format=torch.contiguous_format, copy=True)
+        )
+
+
+class OIDN(Denoiser):
+    """Denoises each noisy frame by itself; reflected radiance only: emission, free of noise, is added afterwards.
+
+    Runs on CPU threads, as many as PyTorch has. The quality is "high" (for final frames; OIDN's default), "balanced" or
+    "fast" (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
+    """
+
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
+    refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
+
+    def __init__(self, quality: OIDNQuality = "high", *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.quality = quality
+        self.key: tuple[int, int, int] | None = None  # (H, W, threads) that the filter was made for
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        try:
+            open_device(threads=1).release()
+        except BadInput as error:
+            return str(error)
+        return None
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        super().prepare(precision)
+        open_device(torch.get_num_threads()).release()
+
+    def filter_for(self, height: int, width: int) -> RayTracingFilter:
+        """The filter of the last frame, or a new one where size or threads have changed: making one takes long."""
+        key = (height, width, torch.get_num_threads())
+        if key != self.key:
+            self.filter = RayTracingFilter(*key, self.quality)
+            self.key = key
+        return self.filter
+
+    def denoise(self, frame: Frame, radiance: Tensor) -> Tensor:
+        """The denoised image of reflected `radiance` (B, 3, H, W), with emission for "total"."""
+        denoise = self.filter_for(*frame.size)
+        inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
+        denoised = torch.stack([denoise(*item) for item in zip(*inputs, strict=True)])
+        return frame.complete(denoised, self.signal)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        reflected = frame.indirect if self.signal == "indirect" else frame.direct + frame.indirect
+        return self.denoise(frame, reflected), State(frame.moment)
+
+
+class OIDNAccumulated(Accumulating, OIDN):
+    """Denoises temporally accumulated irradiance, re-modulated. The history is not filtered."""
+
+    reads = Accumulated.reads
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
+        return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.moment, history)

@@ -1,0 +1,118 @@
+"""SBF: SURE-based filtering (Li et al. 2012), without its adaptive sampling: of a bank of filters the best at a pixel.
+
+The bank are cross-bilateral filters, whose Gaussians are of different widths in the image. Stein's unbiased risk
+estimate (SURE) tells the squared error of each from the noisy image c alone, (F(c) - c)² + 2 σ² dF/dc - σ², where σ²
+is the variance of the noise.
+
+Where the paper leaves it open, we choose:
+
+- The filters have no range term on colour (σ_r = ∞), nor has the authors' code, which says that results are noisy with
+  one. So they are linear in colours, and dF/dc is the pixel's share of its own weights.
+- Distances of features are not divided by their variances: ours are free of noise, for which the authors advise so
+  (Schied et al. 2017, §5.1). Depth counts in units of the frame's largest, as in the authors' code.
+- σ_f are its defaults, 0.8 for normals, 0.25 for albedo, 0.6 for depth; windows end at 2 σ_s.
+- It filters irradiance, with albedo still among the features. The paper filters radiance; but with one sample a pixel
+  σ² has to come from other pixels, among which texture would count as noise.
+- σ² is how far each colour spreads over 9 x 9 pixels of the own mesh. That is the variance of the pixel as it is,
+  however many samples it is the mean of.
+- A filter's risk is the mean over colours; it is smoothed as by a filter of the bank, of σ_s = 8, before the choice.
+- Background lies far from all surfaces in its features, so that no surface gathers from it.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from datasets.frame import Frame
+from models import compiled
+from models.compiled import sbf as kernels
+from models.denoiser import CLASSICAL, Denoiser, State
+from models.filters.neighbours import mesh_variance
+from models.parameters import LARGEST_LUMINANCE, LEAST_DIVISOR
+
+BANK = tuple(2 ** (i / 2) for i in range(7))  # px; σ_s from 1 to 8
+RISK_SIGMA = 8.0  # px
+SIGMA_NORMAL = 0.8
+SIGMA_ALBEDO = 0.25
+SIGMA_DEPTH = 0.6  # of the frame's largest
+FAR_AWAY = 1e3  # what background has in place of a depth; what is outside the image lies as far on the other side
+STRIP_ROWS = 16  # that are worked on at once: all taps along a row are gathered
+
+
+def gaussians(sigmas: Sequence[float]) -> Tensor:
+    """Gaussians of offsets along an axis, each cut off at 2 σ: (2 radius + 1, S), with the radius of the widest."""
+    widths = torch.tensor(sigmas)
+    radii = (2 * widths).round()
+    radius = int(radii.max())
+    offsets = torch.arange(-radius, radius + 1)[:, None]
+    return torch.where(offsets.abs() <= radii, torch.exp(-((offsets / widths) ** 2) / 2), 0)
+
+
+def guides(frame: Frame) -> Tensor:
+    """Features f (B, 7, H, W), so scaled that exp(-|f(p) - f(q)|²) is the product of their Gaussians."""
+    furthest = frame.depth.amax((2, 3), keepdim=True).clamp(min=LEAST_DIVISOR)
+    depth = torch.where(frame.depth > 0, frame.depth / furthest / SIGMA_DEPTH, FAR_AWAY)
+    return torch.cat([frame.normal / SIGMA_NORMAL, frame.albedo / SIGMA_ALBEDO, depth], dim=1) / math.sqrt(2)
+
+
+@compiled.by(kernels.window_sums)
+def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
+    """Sums (B, S, C, H, W) over windows of an image (B, C, H, W), with the weights of S cross-bilateral filters.
+
+    A weight is exp(-|f(p) - f(q)|²) of `guides` f (B, F, H, W), times one of `gaussians` (2 radius + 1, S) along each
+    axis.
+    """
+    taps = len(gaussians)
+    around = (taps // 2,) * 4
+    padded_image = F.pad(image, around)
+    padded_guides = F.pad(guides, around, value=-FAR_AWAY)
+    batch, channels, height, width = image.shape
+    strips = []
+    for top in range(0, height, STRIP_ROWS):
+        bottom = min(top + STRIP_ROWS, height)
+        here = guides[:, :, top:bottom, :, None]
+        sums = image.new_zeros(batch, channels, bottom - top, width, gaussians.shape[1])
+        for dy in range(taps):
+            rows = (..., slice(top + dy, bottom + dy), slice(None))
+            there = padded_guides[rows].unfold(-1, taps, 1)
+            weight = (there - here).square_().sum(dim=1, keepdim=True).neg_().exp_()
+            sums += (weight * padded_image[rows].unfold(-1, taps, 1)) @ (gaussians * gaussians[dy])
+        strips.append(sums)
+    return torch.cat(strips, dim=2).movedim(-1, 1)
+
+
+def filter_with_risk(
+    colour: Tensor, variance: Tensor, guides: Tensor, sigmas: Sequence[float]
+) -> tuple[Tensor, Tensor]:
+    """What each filter makes of colour (B, 3, H, W), and its risk: both (B, S, 3, H, W).
+
+    `variance` (B, 3, H, W) is that of the colour's noise, `sigmas` are the filters' σ_s.
+    """
+    ones = torch.ones_like(colour[:, :1])
+    sums = window_sums(torch.cat([colour, ones], dim=1), guides, gaussians(sigmas).to(colour))
+    filtered = sums[:, :, :3] / sums[:, :, 3:]
+    derivative = 1 / sums[:, :, 3:]  # the weight of a pixel for itself is 1
+    return filtered, (filtered - colour[:, None]).square() + (2 * derivative - 1) * variance[:, None]
+
+
+def best_filtered(colour: Tensor, variance: Tensor, guides: Tensor) -> Tensor:
+    """Colour (B, 3, H, W), at each pixel by the filter of BANK whose risk is the least around it."""
+    filtered, risk = filter_with_risk(colour, variance, guides, BANK)
+    smoothed = window_sums(risk.mean(dim=2), guides, gaussians([RISK_SIGMA]).to(colour))  # times the same for all
+    best = smoothed.argmin(dim=2, keepdim=True)
+    return filtered.take_along_dim(best, dim=1)[:, 0]
+
+
+class SBF(Denoiser):
+    """Filters each frame by itself, within the range of its irradiance."""
+
+    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id")
+    refuses = CLASSICAL
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        colour = frame.irradiance(self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+        filtered = best_filtered(colour, mesh_variance(colour, frame.mesh_id), guides(frame))
+        return frame.remodulate(filtered, self.signal), State(frame.moment)

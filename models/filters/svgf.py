@@ -1,0 +1,247 @@
+"""SVGF: spatiotemporal variance-guided filtering (Schied et al. 2017).
+
+Where the paper is silent, we choose:
+
+- A sample's history length counts the sample itself; "< 4 frames" (§4.2) compares it, rounded, with 4.
+- The temporal variance, that of single samples, is the first level's as it is, although integration has averaged it.
+- Depths are along the viewing axis (clip-space depth is affine in them). ∇z takes, along each axis, the smaller of the
+  differences to the two neighbours of the same mesh, so that it never sees across a silhouette; 0 without any.
+- ε of Eq. 3 is relative to the depth, so that the scene's scale cancels; ε of Eq. 5 is below any radiance's square.
+- The spatial estimate (§4.2) averages the integrated moments over its 7 × 7 pixels with the weights w_z · w_n.
+- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis, over the pixels that show surfaces.
+- Background has no normal: its weight is 0 except for itself, so it is neither filtered nor mixed with surfaces.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal
+from models import compiled
+from models.compiled import svgf as kernels
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
+from models.filters.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
+from models.history.reprojection import reproject
+from models.history.surfaces import Surfaces
+from models.operators import image_luminance
+from models.parameters import (
+    ALPHA,
+    EPSILON_L,
+    EPSILON_Z,
+    LARGEST_LUMINANCE,
+    LEAST_DIVISOR,
+    SIGMA_L,
+    SIGMA_Z,
+    SPATIAL_RADIUS,
+    SQUARINGS,
+)
+
+STEPS = tuple(2**level for level in range(ATROUS_LEVELS))  # px from tap to tap
+RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """The temporally integrated samples of S signals, which are the next frame's history (§4.1, §4.2).
+
+    colour (B, S, 3, H, W): irradiance; moments (B, S, 2, H, W): raw moments of its luminance; length (B, 1, H, W).
+    """
+
+    colour: Tensor
+    moments: Tensor
+    length: Tensor
+    surfaces: Surfaces
+
+
+def luminance_moments(colour: Tensor) -> Tensor:
+    """Raw moments (B, S, 2, H, W) of the luminance of single samples (B, S, 3, H, W)."""
+    y = image_luminance(colour.flatten(0, 1)).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+    return torch.cat([y, y.square()], dim=1).unflatten(0, colour.shape[:2])
+
+
+@compiled.by(kernels.integrate_samples)
+def integrate_samples(
+    frame: Frame,
+    noisy: Tensor,
+    past_colour: Tensor,
+    past_moments: Tensor,
+    past_length: Tensor,
+    surfaces: Surfaces,
+    change: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`integrate` with a history, whose G-buffer is `surfaces`: colour, moments and length of Integrated."""
+    before = [past_colour.flatten(1, 2), past_moments.flatten(1, 2), past_length]
+    past, found = reproject(frame, torch.cat(before, dim=1), surfaces)
+    change = torch.zeros_like(past_length) if change is None else change
+    alpha = torch.where(found, (1 - change) * ALPHA + change, 1)
+    colour, moments, length = past.split([part.shape[1] for part in before], dim=1)
+    return (
+        torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
+        torch.lerp(moments.view_as(past_moments), luminance_moments(noisy), alpha[:, None]),
+        torch.where(found, length * (1 - change) + 1, 1),
+    )
+
+
+def integrate(frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None) -> Integrated:
+    """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1).
+
+    `change` (B, 1, H, W) in [0, 1] is how much of the history to give up (see models.filters.asvgf), by default none.
+    """
+    if history is None:
+        return Integrated(colour, luminance_moments(colour), torch.ones_like(frame.depth), Surfaces.of(frame))
+    past = history.colour, history.moments, history.length, history.surfaces
+    return Integrated(*integrate_samples(frame, colour, *past, change), Surfaces.of(frame))
+
+
+def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
+    """Change of depth per pixel along `dim`, from the nearer in depth of the two neighbours on the same mesh."""
+    depth = depth.movedim(dim, -1)
+    mesh_id = mesh_id.movedim(dim, -1)
+    step = torch.where(mesh_id[..., 1:] == mesh_id[..., :-1], depth.diff(dim=-1), torch.inf)
+    ahead = F.pad(step, (0, 1), value=torch.inf)
+    behind = F.pad(step, (1, 0), value=torch.inf)
+    smaller = torch.where(ahead.abs() < behind.abs(), ahead, behind)
+    return torch.where(smaller.isinf(), 0, smaller).movedim(-1, dim)
+
+
+@compiled.by(kernels.pack_geometry)
+def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
+    """What stops the filters at the edges of surfaces, (B, 1, 7, H, W).
+
+    Unit normal (3; 0 for background), depth, σ_z ∇z (2: along x and y, per pixel), ε of Eq. 3.
+    """
+    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=LEAST_DIVISOR), 0)
+    gradient = [SIGMA_Z * slope(depth, mesh_id, dim) for dim in (-1, -2)]
+    epsilon = EPSILON_Z * depth.abs() + LEAST_DIVISOR
+    return torch.cat([unit, depth, *gradient, epsilon], dim=1)[:, None]
+
+
+def geometry_weight(p: Tensor, q: Tensor, dx: int, dy: int) -> Tensor:
+    """w_z · w_n (Eq. 3 and 4) of q = p + (dx, dy), like one channel of the geometry (..., 7, h, w) at p and q."""
+    x, y, z, depth, along_x, along_y, epsilon = p.split(1, dim=-3)
+    to_x, to_y, to_z, to_depth = q.split(1, dim=-3)[:4]
+    w_n = (x * to_x).addcmul_(y, to_y).addcmul_(z, to_z).clamp_(min=0)
+    for _ in range(SQUARINGS):
+        w_n.square_()
+    expected = (along_x * dx).add_(along_y, alpha=dy).abs_()
+    return w_n.mul_((depth - to_depth).abs_().div_(expected.add_(epsilon)).neg_().exp_())
+
+
+@compiled.by(kernels.spatial_variance)
+def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
+    """Variance (B, S, 1, H, W) of luminance, replaced `where` (B, 1, H, W) by a 7 x 7 bilateral estimate (§4.2).
+
+    `variance` and `mean` (B, S, 1, H, W) are of the integrated moments. The estimate is the mean of the variances plus
+    the variance of the means about the window's centre: the number that the averaged moments give, without their
+    cancellation.
+    """
+    total = WindowSum(torch.ones_like(geometry[:, :, :1]), 1)
+    spread = WindowSum(variance, 1)
+    first = torch.zeros_like(mean)
+    second = torch.zeros_like(mean)
+    for tap in strip_taps(mean.shape[-2:], SPATIAL_RADIUS):
+        weight = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
+        off = mean[tap.q] - mean[tap.p]
+        total.add(tap, weight)
+        spread.add(tap, weight)
+        first[tap.p].addcmul_(weight, off)
+        second[tap.p].addcmul_(weight, off.square_())
+    estimate = (spread.sum + second) / total.sum - (first / total.sum).square()
+    return torch.where(where[:, None], estimate.clamp(min=0), variance)
+
+
+def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
+    """Variance (B, S, 1, H, W) of luminance: temporal, or spatial while the history is short (§4.2)."""
+    mean, square = integrated.moments.split(1, dim=2)
+    variance = (square - mean.square()).clamp(min=0)
+    short = integrated.length.round() < RELIABLE  # interpolated from whole numbers, not always exactly
+    return spatial_variance(variance, mean, geometry, short) if short.any() else variance
+
+
+def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
+    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W); g takes pixels that show a `surface` (B, 1, 1, H, W)."""
+    total = WindowSum(surface.to(variance), 1 / 4)
+    mean = WindowSum(variance * surface, 1 / 4)
+    for tap in strip_taps(variance.shape[-2:], 1):
+        weight = variance.new_tensor(1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy)))
+        total.add(tap, weight)
+        mean.add(tap, weight)
+    return 1 / (SIGMA_L * (mean.sum / total.sum.clamp(min=1 / 16) + EPSILON_L).sqrt())
+
+
+def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
+    """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered.
+
+    Taps are `step` pixels apart.
+    """
+    y = image_luminance(colour.flatten(0, 1)).view_as(variance)
+    scale = edge_scale(variance, geometry[:, :, 3:4] > 0)
+    total = WindowSum(torch.ones_like(variance), CENTRE)
+    mean = WindowSum(colour, CENTRE)
+    spread = WindowSum(variance, CENTRE**2)
+    for tap in strip_taps(variance.shape[-2:], RADIUS, step):
+        w_l = (y[tap.p] - y[tap.q]).abs_().mul_(scale[tap.p]).neg_().exp_()
+        w_zn = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
+        weight = w_l.mul_(w_zn.mul_(b3_spline(tap, step)))
+        total.add(tap, weight)
+        mean.add(tap, weight)
+        spread.add(tap, weight.square_())
+    return mean.sum / total.sum, spread.sum / total.sum.square()
+
+
+@compiled.by(kernels.svgf_levels)
+def svgf_levels(
+    colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Level after level of the à-trous transform, with those steps: the first colour, the last colour and variance."""
+    first, variance = svgf_level(colour, variance, geometry, steps[0])
+    colour = first
+    for step in steps[1:]:
+        colour, variance = svgf_level(colour, variance, geometry, step)
+    return first, colour, variance
+
+
+@dataclass(frozen=True)
+class SVGFState(State):
+    """What is integrated in the next frame, and the estimated variance (B, S, 1, H, W) of this one."""
+
+    history: Integrated
+    variance: Tensor
+
+    def pictures(self) -> dict[str, Tensor]:
+        names = ("variance direct", "variance indirect")[-self.variance.shape[1] :]
+        variances = dict(zip(names, self.variance.unbind(dim=1), strict=True))
+        return {"history length": self.history.length} | variances
+
+
+def irradiances(frame: Frame, signal: Signal) -> Tensor:
+    """Noisy demodulated direct and indirect, (B, 2, 3, H, W), or indirect alone, (B, 1, 3, H, W)."""
+    parts = [frame.direct, frame.indirect] if signal == "total" else [frame.indirect]
+    return torch.stack([part / frame.divisor for part in parts], dim=1)
+
+
+class SVGF(Denoiser):
+    """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset.
+
+    Their sum so stays within the sums of these limits.
+    """
+
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
+    refuses = CLASSICAL
+
+    def change(self, frame: Frame) -> Tensor | None:
+        """How much of the history to give up, (B, 1, H, W) in [0, 1]; None for nothing anywhere."""
+        return None
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        before = matching_state(state, SVGFState, frame)
+        history = before.history if before else None
+        integrated = integrate(frame, irradiances(frame, self.signal), history, self.change(frame))
+        geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
+        estimated = estimate_variance(integrated, geometry)
+        first, colour, _ = svgf_levels(integrated.colour, estimated, geometry, STEPS)
+        history = replace(integrated, colour=first)  # §4.3: the first level's output
+        return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)

@@ -1,0 +1,1 @@
+"""Denoisers with a network, and the layers they are built from."""

@@ -1,0 +1,262 @@
+"""NTD: neural temporal denoising for indirect illumination, Zeng et al. 2021."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal, disoccluded
+from models.denoiser import Denoiser, State, as_it_is, matching_state
+from models.history.running_scale import RunningScale, running_scale
+from models.networks.convolution import ConvReLU
+from models.networks.pixel_kernels import apply_kernels
+from models.operators import halve, halve_surface, pad_to_multiple
+
+INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
+WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
+TAPS = 25  # of a 5 x 5 kernel
+Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, of the pixels that show a surface
+LEAST_SHARE = 1e-6  # of surfaces in what bilinear filters gather; with less there is none
+MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
+
+
+class Decode(nn.Module):
+    """Two convolutions of the upsampled features beside those skipped to here.
+
+    The first one is a sum of two, one a source: the same as one over both concatenated, without writing that down.
+    """
+
+    def __init__(self, below: int, skip: int):
+        super().__init__()
+        self.skip = nn.Conv2d(skip, skip, 3, padding=1, bias=False)
+        self.up = ConvReLU(below, skip)
+        self.second = ConvReLU(skip, skip)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        return self.second(self.up(F.interpolate(x, scale_factor=2.0), self.skip(skip)))
+
+
+class KernelNet(nn.Module):
+    """A U-Net (Ronneberger et al. 2015) that predicts kernels and weights in its last three layers (Fig. 6).
+
+    Where the paper is silent we choose two 3 x 3 convolutions and ReLU a level, nearest upsampling, and 1 x 1 heads.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        inputs = (sum(INPUTS.values()), *WIDTHS[:-1])
+        self.encode = nn.ModuleList(
+            nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
+        )
+        self.decode = nn.ModuleList(Decode(WIDTHS[i + 1], WIDTHS[i]) for i in reversed(range(len(WIDTHS) - 1)))
+        outputs = (TAPS + 1, TAPS + 1, 2 * TAPS + 1)
+        self.heads = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(WIDTHS[2::-1], outputs, strict=True))
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                nn.init.xavier_uniform_(layer.weight)  # §5
+                if layer.bias is not None:
+                    nn.init.zeros_(layer.bias)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Predictions at 1/4 and 1/2 (26 channels) and at full resolution (51), from x (B, 13, H, W)."""
+        skips: list[Tensor] = []
+        for level, encode in enumerate(self.encode):
+            x = encode(F.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        predictions = []
+        for decode, skip in zip(self.decode, skips[-2::-1], strict=True):
+            x = decode(x, skip)
+            predictions.append(x)
+        return [head(x) for head, x in zip(self.heads, predictions[-3:], strict=True)]
+
+
+def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """image(p + motion(p)), bilinear (Eq. 3), and whether p + motion(p) is inside the image, (B, 1, H, W).
+
+    Outside, the border continues. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
+    """
+    height, width = image.shape[-2:]
+    x = torch.arange(width, device=motion.device) + 0.5
+    y = torch.arange(height, device=motion.device) + 0.5
+    grid = torch.stack([(x + motion[:, 0]) * (2 / width), (y[:, None] + motion[:, 1]) * (2 / height)], dim=-1) - 1
+    inside = (grid.abs() <= 1).all(dim=-1)[:, None]
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
+
+
+def maximum_pool(image: Tensor, surface: Tensor | None = None) -> Tensor:
+    """The maximum of 2 x 2 pixels, of an image that is not negative: D of the paper's Eq. 4."""
+    return F.max_pool2d(image if surface is None else image * surface, 2, ceil_mode=True)
+
+
+def combine_levels(
+    fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None, pool: Pool = maximum_pool
+) -> Tensor:
+    """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D is `pool`, U is bilinear.
+
+    U is linear and so applied once. `fine` (B, C, H, W) is not negative; `coarse`, and `alpha` (B, 1, ·, ·), have half
+    the size, rounded up. D and U take pixels that show a `surface` (B, 1, H, W) of 1 and 0. With the paper's maximum,
+    what is taken away is brighter than what is put in its place.
+    """
+    height, width = fine.shape[-2:]
+
+    def enlarge(x: Tensor) -> Tensor:
+        return F.interpolate(x, scale_factor=2.0, mode="bilinear")[..., :height, :width]
+
+    change = alpha * (coarse - pool(fine, surface))
+    if surface is None:
+        return fine + enlarge(change)
+    there = F.max_pool2d(surface, 2, ceil_mode=True)
+    return fine + enlarge(change * there) / enlarge(there).clamp(min=LEAST_SHARE)
+
+
+def reconstruct_image(
+    noisy: Tensor,
+    warped: Tensor,
+    predictions: Sequence[Tensor],
+    surface: Tensor | None = None,
+    pool: Pool = maximum_pool,
+) -> tuple[Tensor, Tensor]:
+    """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
+
+    Args:
+        noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
+        predictions: of the network, coarse to fine, at least as large as the images.
+        surface: what pixels may be gathered from, see Frame.surface.
+        pool: D of Eq. 4.
+    """
+    pyramid = [noisy]
+    surfaces = [surface]
+    for _ in predictions[1:]:  # averages: maxima of noise would be biased
+        pyramid.append(halve(pyramid[-1], surfaces[-1]))
+        surfaces.append(halve_surface(surfaces[-1]))
+    output = pyramid[-1]
+    alpha: Tensor | None = None
+    for image, there, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
+        prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
+        filtered = apply_kernels(image, prediction[:, :TAPS], there)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha, there, pool)
+        alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
+    assert alpha is not None
+    return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS], surface), output, alpha), alpha
+
+
+@dataclass(frozen=True)
+class NTDState(State):
+    """The output to reproject, demodulated, and the running scales; the rest is to look at."""
+
+    irradiance: Tensor  # (B, 3, H, W)
+    scale: RunningScale
+    warped: Tensor  # (B, 3, H, W), irradiance
+    alpha: Tensor  # (B, 1, H, W)
+    motion: Tensor
+    dual_motion: Tensor | None
+    surface: Tensor | None  # see Frame.surface
+
+    def pictures(self) -> dict[str, Tensor]:
+        shown = {"alpha_t": self.alpha, "warped previous": self.warped}
+        if self.dual_motion is not None:
+            shown["disocclusion mask"] = disoccluded(self.motion, self.dual_motion).float()
+        return shown
+
+
+def warp_output(state: NTDState, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """The previous output where this frame's pixels were, as `warp` does; nothing is gathered from background."""
+    if state.surface is None:
+        return warp(state.irradiance, motion)
+    past, inside = warp(torch.cat([state.irradiance, state.surface], dim=1), motion)
+    share = past[:, 3:]
+    return past[:, :3] / share.clamp(min=LEAST_SHARE), inside & (share > LEAST_SHARE)
+
+
+class NTD(Denoiser):
+    """Predicts kernels for this frame's noise at three resolutions and for the previous output, reprojected.
+
+    Where the motion vector leaves the image, or leads to background, there is no previous output, and this frame's
+    noise stands in for it, as it does for all of the first frame (§5): so what comes into view, and all of the image
+    where a cut moves the camera far away, starts anew. The paper leaves the rest to the network and tests no surfaces,
+    and neither do we.
+
+    It denoises indirect light, as in the paper, unless it is built for "total".
+
+    Attributes:
+        vectors: the channel by which the previous output is fetched.
+    """
+
+    vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
+    # The traditional vectors tell what is disoccluded, for the loss and for pictures.
+    reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
+    signal: Signal = "indirect"
+    refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+    is_network = True
+    dispensable: ClassVar = {"albedo": as_it_is, "normal": as_it_is}
+
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inputs = dict(INPUTS)
+        if self.signal == "total":
+            self.reads = ("direct", "emission", *type(self).reads)
+        self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.encode[0][0]]
+
+    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
+        """D of Eq. 4: `image` (B, 3, H, W) in half the size, rounded up."""
+        return maximum_pool(image, surface)
+
+    def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
+        """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
+        x = irradiance * (scale.exposure() * frame.gain)
+        return torch.log1p(x.abs()).copysign(x)
+
+    def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
+        """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state, in which it is not."""
+        before = matching_state(state, NTDState, frame)
+        noisy = frame.irradiance(self.signal).clamp(min=0)
+        scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
+        warped = noisy
+        if before:
+            previous, found = warp_output(before, getattr(frame, self.vectors))
+            warped = torch.where(found, previous, noisy)
+        parts = {
+            "noisy": self.compress(noisy, scale, frame),
+            "warped": self.compress(warped, scale, frame),
+            "albedo": frame.albedo,
+            "normal": frame.normal,
+            "depth": scale.normalised_depth(frame.depth),
+        }
+        x = torch.cat([parts[name] for name in self.inputs], dim=1)
+        x = x.to(self.precision, memory_format=torch.channels_last)
+        predictions = self.network(pad_to_multiple(x, MULTIPLE))
+        surface = frame.surface
+        irradiance, alpha = reconstruct_image(noisy, warped, predictions, surface, self.pool)
+        if surface is not None:
+            irradiance = irradiance * surface
+        dual = frame.dual_motion if self.vectors == "dual_motion" else None
+        kept = irradiance.clamp(min=0)
+        return irradiance, NTDState(frame.moment, kept, scale, warped, alpha, frame.motion, dual, surface)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        _, after = self.predict(frame, state)
+        return frame.remodulate(after.irradiance, self.signal), after
+
+
+class NTDTraditional(NTD):
+    """The paper's ablation A (§6.3): the previous output is fetched by traditional motion vectors."""
+
+    vectors = "motion"
+    reads = ("indirect", "albedo", "normal", "depth", "motion")
+
+
+class NTDMean(NTD):
+    """NTD with averages for the maxima in Eq. 4, so that combining levels keeps the light: ours.
+
+    Taking away the maximum of four noisy pixels and putting the coarser level's mean in its place darkens, which the
+    network must learn to make up for. Eq. 7 of WSKP (Fan et al. 2021), of the same form, averages as well.
+    """
+
+    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
+        return halve(image, surface)

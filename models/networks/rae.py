@@ -1,0 +1,147 @@
+"""RAE: the recurrent denoising autoencoder of Chaitanya et al. 2017."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal
+from models.denoiser import Denoiser, State, as_it_is, matching_state
+from models.history.running_scale import RunningScale, running_scale
+from models.operators import pad_to_multiple
+
+POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
+SLOPE = 0.1  # §5.3: leaky ReLU
+ENCODER = (32, 32, 43, 57, 76, 101, 101)
+DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
+# The auxiliary inputs (§3.2): how many channels each has, and how they are made.
+AUXILIARY: dict[str, tuple[int, Callable[[Frame, RunningScale], Tensor]]] = {
+    "normal": (2, lambda frame, scale: frame.view_normal()[:, :2]),
+    "depth": (1, lambda frame, scale: scale.normalised_depth(frame.depth)),
+    "roughness": (1, lambda frame, scale: frame.roughness),
+}
+
+
+def conv(inputs: int, outputs: int) -> nn.Conv2d:
+    """A 3 x 3 convolution with He initialisation for leaky ReLU (§5.3)."""
+    layer = nn.Conv2d(inputs, outputs, 3, padding=1)
+    nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def activate(x: Tensor) -> Tensor:
+    return F.leaky_relu(x, SLOPE, inplace=True)
+
+
+class RecurrentBlock(nn.Module):
+    """h_i = O_i = C(C(C(I_i) ++ h_{i-1})) (§4.2), ++ concatenation."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.input = conv(width, width)
+        self.merge = conv(2 * width, width)
+        self.output = conv(width, width)
+
+    def forward(self, x: Tensor, hidden: Tensor | None) -> Tensor:
+        x = activate(self.input(x))
+        hidden = torch.zeros_like(x) if hidden is None else hidden.to(x.dtype)
+        return activate(self.output(activate(self.merge(torch.cat([x, hidden], dim=1)))))
+
+
+class RecurrentAutoencoder(nn.Module):
+    """The network of Fig. 2: images whose sides are multiples of 32 in, images of the same size out.
+
+    36 convolutions: 7 in the encoder, 3 in each of 6 recurrent blocks, 10 in the decoder, one linear output layer.
+    The widths `encoder` and `decoder` are ours: those drawn in the paper are not known.
+    """
+
+    def __init__(self, inputs: int = 7, encoder: Sequence[int] = ENCODER, decoder: Sequence[tuple[int, int]] = DECODER):
+        super().__init__()
+        widths = encoder[1:]  # after the second convolution of full resolution, one width a resolution
+        self.first = conv(inputs, encoder[0])
+        self.encoder = nn.ModuleList(conv(a, b) for a, b in zip(encoder, widths, strict=False))
+        self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
+        below = widths[-1]
+        stages = []
+        for skip, (middle, out) in zip(widths[-2::-1], decoder, strict=True):
+            stages.append(
+                nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE, inplace=True), conv(middle, out))
+            )
+            below = out
+        self.decoder = nn.ModuleList(stages)
+        self.output = conv(below, 3)
+
+    def forward(self, x: Tensor, hidden: Sequence[Tensor] | None) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Output (B, 3, H, W) and the new hidden features, finest first."""
+        features: list[Tensor] = []
+        x = activate(self.first(x))
+        for level, (encode, recur) in enumerate(zip(self.encoder, self.recurrent, strict=True)):
+            if level:
+                x = F.max_pool2d(x, 2)
+            x = recur(activate(encode(x)), hidden[level] if hidden else None)
+            features.append(x)
+        for skip, decode in zip(features[-2::-1], self.decoder, strict=True):
+            x = activate(decode(torch.cat([F.interpolate(x, scale_factor=2.0), skip], dim=1)))
+        return self.output(x), tuple(features)
+
+
+@dataclass(frozen=True)
+class RAEState(State):
+    """Hidden features, finest first, (B, w, H / 2^k, W / 2^k), and the running exposure and depth scale."""
+
+    hidden: tuple[Tensor, ...]
+    scale: RunningScale
+
+
+class RAE(Denoiser):
+    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2).
+
+    Args:
+        auxiliary: inputs beside irradiance, names of AUXILIARY; fewer for the paper's ablation (§5.1).
+    """
+
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
+    is_network = True
+    dispensable: ClassVar = {"roughness": as_it_is}
+
+    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inputs = {"colour": 3} | {name: AUXILIARY[name][0] for name in auxiliary}
+        needed = {*auxiliary, "depth"}  # depth has its running scale in any case
+        self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
+        network = RecurrentAutoencoder(sum(self.inputs.values()))
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.first]
+
+    def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
+        """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
+        height, width = frame.size
+        before = matching_state(state, RAEState, frame)
+        irradiance = frame.irradiance(self.signal).clamp(min=0)
+        scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
+        colour = self.compress(irradiance, scale, frame)
+        auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.inputs if name in AUXILIARY)
+        x = pad_to_multiple(torch.cat([colour, *auxiliary], dim=1), 32)
+        x = x.to(self.precision, memory_format=torch.channels_last)
+        p, hidden = self.network(x, before.hidden if before else None)
+        return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
+
+    def target(self, frame: Frame) -> Tensor:
+        """What training holds the output to, irradiance (B, 3, H, W)."""
+        return frame.reference_irradiance(self.signal)
+
+    def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
+        """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""
+        return (irradiance * scale.exposure() * frame.gain) ** POWER
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        p, state = self.predict(frame, state)
+        irradiance = p.clamp(min=0) ** (1 / POWER) / (state.scale.exposure() * frame.gain)
+        return frame.remodulate(irradiance, self.signal), state

@@ -1,0 +1,276 @@
+"""WSKP: weight-sharing kernel prediction of Fan et al. 2021, its multi-resolution variant and its baseline KP."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from datasets.frame import Frame, Signal
+from models.compiled.fusion import THREAD_ROWS
+from models.denoiser import State, as_it_is, matching_state
+from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.history.running_scale import RunningScale, running_scale
+from models.networks.features import network_features, scaled_normal
+from models.networks.fusion import fuse
+from models.networks.pixel_kernels import apply_kernels
+from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
+from models.operators import halve, halve_surface, pad_to_multiple
+from models.parameters import FEATURES, WINDOWS
+
+WIDTH = 24  # ours: the widths drawn in the paper are not known
+LARGEST_WHOLE = 1920 * 1080  # px; the network's images of larger frames would take gigabytes: they are cut into strips
+STRIP_PIXELS = 1 << 20
+
+
+@dataclass(frozen=True)
+class WSKPState(AccumulatedState):
+    """Accumulated frames, running exposure and depth scale, and what the network chose between windows, to look at."""
+
+    scale: RunningScale
+    mixture: Tensor | None  # logits (B, M, H, W)
+
+    def pictures(self) -> dict[str, Tensor]:
+        shown = super().pictures()
+        if self.mixture is not None:
+            windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
+            shares = torch.softmax(self.mixture, dim=1)
+            shown["mean window (px)"] = (shares * windows[:, None, None]).sum(dim=1, keepdim=True)
+        return shown
+
+
+class KernelPredictor(Accumulating):
+    """Temporal accumulation, a network that predicts how to filter, the filter on irradiance, re-modulation (§4)."""
+
+    reads = Accumulated.reads
+    is_network = True
+    dispensable: ClassVar = {"albedo": as_it_is, "normal": scaled_normal}
+    filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
+    network: nn.Module
+    reach: int | None = None  # rows above and below that a pixel's result follows from; None for all
+
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.inputs = dict(FEATURES)
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        first = next(iter(self.network.children()))
+        assert isinstance(first, RepVGGBlock)
+        return first.branches
+
+    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
+        """The network's input, see network_features."""
+        return network_features(frame, irradiance, scale, tuple(self.inputs))
+
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any.
+
+        Nothing is gathered from background: see Frame.surface.
+        """
+        raise NotImplementedError
+
+    def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
+        """The state after a frame, before any filter: accumulated irradiance and running scales."""
+        before = matching_state(state, WSKPState, frame)
+        history = self.accumulated(frame, before)
+        radiance = history.irradiance * frame.divisor
+        scale = running_scale(radiance, frame.depth, before.scale if before else None)
+        return WSKPState(frame.moment, history, scale, None)
+
+    def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
+        """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any.
+
+        Large images are filtered in strips of rows, with the same result.
+        """
+        height, width = frame.size
+        if self.reach is None or height * width <= LARGEST_WHOLE:
+            return self.filter_whole(frame, irradiance, scale)
+        rows = max(1, STRIP_PIXELS // width // THREAD_ROWS) * THREAD_ROWS
+        strips = [self.filter_rows(frame, irradiance, scale, top, top + rows) for top in range(0, height, rows)]
+        filtered, mixtures = zip(*strips, strict=True)
+        return torch.cat(filtered, dim=-2), None if mixtures[0] is None else torch.cat(mixtures, dim=-2)
+
+    def filter_rows(
+        self, frame: Frame, irradiance: Tensor, scale: RunningScale, top: int, bottom: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """What `filter_whole` returns, of the rows from `top` to before `bottom`."""
+        assert self.reach is not None
+        first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # the kernel rounds by its own strips: keep them
+        around = slice(first, bottom + self.reach)
+        inner = slice(top - first, bottom - first)
+        part = replace(frame, channels={name: frame.channels[name][..., around, :] for name in self.filter_reads})
+        filtered, mixture = self.filter_whole(part, irradiance[..., around, :], scale)
+        return filtered[..., inner, :], None if mixture is None else mixture[..., inner, :]
+
+    def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
+        """What `filter` returns, in one piece."""
+        x = self.features(frame, irradiance, scale)
+        predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
+        return self.reconstruct(irradiance, predicted, frame.surface)
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        after = self.accumulate(frame, state)
+        irradiance, mixture = self.filter(frame, after.history.irradiance, after.scale)
+        return frame.remodulate(irradiance, self.signal), replace(after, mixture=mixture)
+
+    def prepare(self, precision: torch.dtype = torch.float32) -> None:
+        merge(self.network)  # in the precision of training
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        super().prepare(precision)
+
+
+def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
+    """`layers` RepVGG blocks from the inputs to `outputs` channels."""
+    return repvgg([sum(FEATURES.values()), *[WIDTH] * (layers - 1), outputs], sizes)
+
+
+class WSKP(KernelPredictor):
+    """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
+
+    layers: ClassVar[int] = 6
+
+    def __init__(
+        self, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None
+    ):
+        super().__init__(signal=signal)
+        self.windows = tuple(windows)
+        self.network = trunk(self.layers, 2 * len(windows), sizes)
+        self.reach = self.layers * (max(sizes) // 2) + max(windows) // 2
+
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
+        return fuse(irradiance, importance, mixture, self.windows, surface), mixture
+
+
+class WSKP3(WSKP):
+    """The smaller of the paper's two networks."""
+
+    layers = 3
+
+
+class KP(KernelPredictor):
+    """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel a pixel."""
+
+    window = 13
+
+    def __init__(self, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.network = trunk(WSKP.layers, self.window**2, sizes)
+        self.reach = WSKP.layers * (max(sizes) // 2) + self.window // 2
+
+    def reconstruct(
+        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        return apply_kernels(irradiance, predicted, surface), None
+
+
+def convolutions(inputs: int, outputs: int) -> nn.Sequential:
+    layers = [nn.Conv2d(inputs, outputs, 3, padding=1), nn.Conv2d(outputs, outputs, 3, padding=1)]
+    return nn.Sequential(layers[0], nn.ReLU(inplace=True), layers[1], nn.ReLU(inplace=True))
+
+
+class MultiResolutionNet(nn.Module):
+    """A U-Net with an output for each of its three resolutions (§5.2). The widths are ours, the paper's not known."""
+
+    widths = (32, 48, 64)
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        fine, middle, coarse = self.widths
+        self.down = nn.ModuleList(
+            [convolutions(inputs, fine), convolutions(fine, middle), convolutions(middle, coarse)]
+        )
+        self.up = nn.ModuleList([convolutions(coarse + middle, middle), convolutions(middle + fine, fine)])
+        self.heads = nn.ModuleList(nn.Conv2d(width, outputs, 1) for width in self.widths[::-1])
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Predictions (B, outputs, H / 2^k, W / 2^k) for k = 2, 1, 0. H and W are multiples of 4."""
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(F.max_pool2d(x, 2) if level else x)
+            skips.append(x)
+        predictions = [self.heads[0](x)]
+        for block, head, skip in zip(self.up, list(self.heads)[1:], skips[-2::-1], strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip], dim=1))
+            predictions.append(head(x))
+        return predictions
+
+
+def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None) -> Tensor:
+    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W).
+
+    D counts pixels that show a `surface`, as `halve` does.
+    """
+    return fine + alpha * F.interpolate(coarse - halve(fine, surface), scale_factor=2.0)
+
+
+class MultiResolution(KernelPredictor):
+    """A filter at each of three resolutions, combined from the coarsest on by Eq. 7 (§5.2).
+
+    Eq. 7 is no convex combination: what it makes negative is cut off.
+    """
+
+    maps: ClassVar[int]  # that the filter takes, at each resolution
+
+    def __init__(self, *, signal: Signal | None = None):
+        super().__init__(signal=signal)
+        self.network = MultiResolutionNet(sum(FEATURES.values()), self.maps + 1)
+
+    def first_layers(self) -> Sequence[nn.Conv2d]:
+        return [self.network.down[0][0]]  # type: ignore[index, list-item]
+
+    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
+        return pad_to_multiple(super().features(frame, irradiance, scale), 4)
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        """The image (B, 3, h, w) of one resolution, filtered as its `maps` (B, ·, h, w) say."""
+        raise NotImplementedError
+
+    def mixture(self, maps: Tensor) -> Tensor | None:
+        """The logits between windows among the `maps` of the finest resolution, if any."""
+        return None
+
+    def reconstruct(  # type: ignore[override]
+        self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        height, width = irradiance.shape[-2:]
+        images = [pad_to_multiple(irradiance, 4)]
+        surfaces = [None if surface is None else pad_to_multiple(surface, 4)]
+        for _ in predicted[1:]:
+            images.append(halve(images[-1], surfaces[-1]))
+            surfaces.append(halve_surface(surfaces[-1]))
+        output = images[-1]
+        for level, (image, there, predictions) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
+            maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
+            filtered = self.filter_level(image, maps, there)
+            output = combine_resolutions(filtered, output, torch.sigmoid(alpha), there) if level else filtered
+        mixture = self.mixture(maps[..., :height, :width])
+        return output[..., :height, :width].clamp(min=0), mixture
+
+
+class WSKPMR(MultiResolution):
+    """Windows 3 and 5 at three resolutions (§5.3)."""
+
+    windows = (3, 5)
+    maps = 4
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        return fuse(image, maps[:, :2], maps[:, 2:], self.windows, surface)
+
+    def mixture(self, maps: Tensor) -> Tensor | None:
+        return maps[:, 2:]
+
+
+class MRKP(MultiResolution):
+    """The paper's other baseline (§6.1): the network of wskp-mr, and a free 5 x 5 kernel a pixel at each resolution."""
+
+    maps = 25
+
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
+        return apply_kernels(image, maps, surface)

@@ -1,0 +1,1 @@
+"""Rendering a dataset: which clips it has, and how they get to disk."""

@@ -1,0 +1,127 @@
+"""Rendering clips on a Ray cluster: many machines share one folder, and a lost worker costs one clip."""
+
+import os
+import signal
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from datasets.clip import Dataset
+from errors import BadInput
+from render.backend import LEAST_THREADS, VARIANT, dr
+from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
+from render.job.generate import check_versions
+
+WORKERS_PER_CLIP = 4  # that may die before the clip counts as failed
+SECONDS_TO_CLEAN_UP = 10  # for workers when the job is given up
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Within the context the first Ctrl-C is put off to the end: amid Ray's start it would crash the process."""
+    interrupted = False
+    usual = signal.getsignal(signal.SIGINT)
+
+    def put_off(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        signal.signal(signal.SIGINT, usual)
+
+    signal.signal(signal.SIGINT, put_off)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    if interrupted:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def connected_ray() -> Iterator[Any]:
+    """The ray module, connected to the cluster that RAY_ADDRESS names or that runs here, or else to a new one here.
+
+    Raises BadInput where Ray is not installed, or no cluster answers.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
+    try:
+        import ray
+    except ImportError:
+        raise BadInput("--ray needs Ray: pip install 'onespp[ray]'") from None
+    try:
+        with uninterrupted():
+            connect(ray)
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def connect(ray: Any) -> None:
+    """Join a cluster or start one on this machine. Raises BadInput where RAY_ADDRESS names one that does not answer."""
+    host, _, port = os.environ.get("RAY_ADDRESS", "").rpartition(":")
+    try:
+        if port.isdigit():
+            socket.create_connection((host, int(port)), timeout=5).close()  # Ray itself would try for minutes
+        ray.init(include_dashboard=False, log_to_driver=False, logging_level="error")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise BadInput(
+            f"no Ray cluster answers ({error}): check RAY_ADDRESS and RAY_AUTH_MODE, or end a broken one by `ray stop`"
+        ) from None
+
+
+def reserved_resources() -> dict[str, Any]:
+    """What the task of a clip reserves: a GPU where this machine renders on one, else one core without sight of GPUs.
+
+    All workers render with the variant of this machine, or the bytes of their clips would differ.
+    """
+    if VARIANT.startswith("cuda"):
+        return {"num_cpus": 1, "num_gpus": 1}
+    return {"num_cpus": 1, "runtime_env": {"env_vars": {"CUDA_VISIBLE_DEVICES": ""}}}
+
+
+def render_on_worker(job: RenderJob) -> ClipOutcome:
+    """Render a clip on as few threads as can: clips side by side use cores better than threads do."""
+    dr.set_thread_count(LEAST_THREADS)
+    check_versions(Dataset(job.path.parents[2]))
+    return run_clip_job(job)
+
+
+def render_on_cluster(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
+    """Render clips on a Ray cluster; yields their outcomes in the order in which they end.
+
+    Every clip has a worker process of its own, and a new one where that dies. All machines must reach the clips'
+    folder under the same path.
+
+    Raises BadInput where there is no cluster to use; and at once, giving up the rest, what a worker raises: OSError for
+    a full disk, BadInput for other versions of packages.
+    """
+    with connected_ray() as ray:
+        if VARIANT.startswith("cuda") and not ray.cluster_resources().get("GPU"):
+            raise BadInput("this machine renders on its GPU and the cluster has none: set CUDA_VISIBLE_DEVICES=''")
+        yield from outcomes_of(ray, jobs)
+
+
+def outcomes_of(ray: Any, jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
+    """Run all jobs on the cluster to which `ray` is connected, as `render_on_cluster` does."""
+    task = ray.remote(max_calls=1, max_retries=WORKERS_PER_CLIP - 1, **reserved_resources())(render_on_worker)
+    tasks = {task.remote(job._replace(path=job.path.absolute())): job for job in jobs}
+    waiting = list(tasks)
+    try:
+        while waiting:
+            [done], waiting = ray.wait(waiting)
+            yield outcome_of(ray, done, tasks[done])
+    finally:
+        for unfinished in waiting:
+            ray.cancel(unfinished)  # interrupts the worker, which then removes what it has begun
+        if waiting:
+            ray.wait(waiting, num_returns=len(waiting), timeout=SECONDS_TO_CLEAN_UP)
+
+
+def outcome_of(ray: Any, reference: Any, job: RenderJob) -> ClipOutcome:
+    """The outcome of an ended task. Raises what the worker raised."""
+    try:
+        return ray.get(reference)._replace(path=job.path)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    except ray.exceptions.RayError as error:  # the worker died, or its machine
+        return ClipOutcome(job.path, "failed", f"{WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}")

@@ -1,0 +1,149 @@
+"""The generation job: render the clips of a data set that are not there yet."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from datasets.card import write_card
+from datasets.channels import USUAL_CHANNELS
+from datasets.clip import Dataset, is_clip
+from errors import BadInput
+from files import read_json, write_json
+from provenance import RENDERING, versions
+from render.clip import NO_OPTIONS, Options
+from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
+from render.job.pilots import choose_rooms
+from render.job.profiles import NO_PILOTS, check_seed, plan, profile_of
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Share:
+    """Share `index` (from 1) of `count` disjoint ones of a data set's clips."""
+
+    index: int
+    count: int
+
+    @staticmethod
+    def parse(text: str) -> "Share":
+        """The share written as "K/N". Raises BadInput unless 1 <= K <= N."""
+        match = re.fullmatch(r"(\d+)/(\d+)", text)
+        if match and 1 <= int(match[1]) <= int(match[2]):
+            return Share(int(match[1]), int(match[2]))
+        raise BadInput(f"'{text}' is not a part: write K/N with K from 1 to N, such as 2/8")
+
+    def of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """The items of this share: every `count`-th."""
+        return items[self.index - 1 :: self.count]
+
+
+WHOLE_DATA_SET = Share(1, 1)
+
+
+def render_here(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
+    """Render clips in this process, one after the other."""
+    return map(run_clip_job, jobs)
+
+
+def generate(
+    root: Path,
+    profile: str,
+    seed: int,
+    share: Share = WHOLE_DATA_SET,
+    reads: Sequence[str] = USUAL_CHANNELS,
+    options: Options = NO_OPTIONS,
+    render: Callable[[Sequence[RenderJob]], Iterator[ClipOutcome]] = render_here,
+) -> int:
+    """Render the clips that are missing from the share of a data set at `root`. Returns how many were rendered.
+
+    Clips for training and validation get the channels in `reads` and those that are always needed.
+
+    Several jobs may work on one folder, on machines that share it or not: each clip is rendered by one of them, and
+    the folders of disjoint shares merge into the whole. A clip that fails is left out, and the rest goes on. A data set
+    that is whole gets its card.
+
+    Raises BadInput at the end, naming the first clip that failed, and OSError at once: a full disk is full for all.
+    """
+    check_seed(seed)
+    check_folder(root)
+    facts = root / "dataset.json"
+    if facts.exists():  # its rooms are chosen; whether they are those of this profile is checked below, without a pilot
+        needed_spp = read_json(facts).get("needed_spp", {})
+    else:
+        needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
+    wanted = plan(profile, seed, reads, options, needed_spp)
+    for note in wanted["notes"]:
+        tqdm.write(note)
+    root.mkdir(parents=True, exist_ok=True)
+    write_or_check_plan(root, wanted)
+    dataset = Dataset(root)
+
+    def job(clip: Path) -> RenderJob:
+        channels = tuple(wanted["channels"][clip.parts[-3]])
+        return RenderJob(clip, profile, seed, channels, options, needed_spp.get("/".join(clip.parts[-3:])))
+
+    jobs = [job(clip) for clip in share.of(dataset.planned()) if not is_clip(clip)]
+    rendered = 0
+    if jobs:
+        check_versions(dataset)
+        rendered = count_rendered(tqdm(render(jobs), "clips", len(jobs), unit="clip"))
+    write_card(dataset)
+    return rendered
+
+
+def check_folder(root: Path) -> None:
+    """Raise BadInput unless `root` is a new folder, an empty one or that of a data set."""
+    if root.exists() and not root.is_dir():
+        raise BadInput(f"{root} is a file, not a folder: choose another --data")
+    visible = [path.name for path in root.glob("[!.]*")]
+    if visible and "dataset.json" not in visible:
+        raise BadInput(f"{root} holds something else than a data set: choose an empty or new folder")
+
+
+def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
+    """Write the plan into a new data set's folder. Raises BadInput where another plan is there already."""
+    if not (root / "dataset.json").exists():
+        write_json(root / "dataset.json", wanted)
+        return
+    present = read_json(root / "dataset.json")
+    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options", "source"):
+        if present.get(key, {}) != wanted[key]:
+            raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
+
+
+def check_versions(dataset: Dataset) -> None:
+    """Raise BadInput where other packages are installed than rendered the data set: seeds may render other bytes."""
+    here = versions(RENDERING)
+    changed = [
+        f"{name} {began_with}, here {here.get(name, 'none')}"
+        for name, began_with in dataset.facts["versions"].items()
+        if here.get(name) != began_with
+    ]
+    if changed:
+        raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
+
+
+def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
+    """Wait for all clips, tell of those that were not rendered, and count those that were.
+
+    Raises BadInput at the end, naming the first clip that failed.
+    """
+    ended: dict[str, list[ClipOutcome]] = {"rendered": [], "left": [], "failed": []}
+    for outcome in outcomes:
+        ended[outcome.ending].append(outcome)
+        if outcome.ending == "left":
+            tqdm.write(f"{outcome.path}: {outcome.reason}")
+        elif outcome.ending == "failed":
+            tqdm.write(f"{outcome.path}: failed, the rest goes on: {outcome.reason}")
+    if ended["failed"]:
+        first = ended["failed"][0]
+        clips = sum(map(len, ended.values()))
+        raise BadInput(
+            f"{len(ended['failed'])} of {clips} clips failed and can be tried again, first {first.path}: {first.reason}"
+        )
+    return len(ended["rendered"])
