@@ -408,12 +408,13 @@ def denoise(
     from denoise.run import denoise as denoise_sequence
     from eval.bench.sizes import threads_or_all
     from eval.selection import weights_of
+    from models.registry import parse_name
     from timing import thread_count
 
     colour = (*frames, *hdr)
     if not colour:
         raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
-    weights = weights or weights_of(denoiser, runs)
+    weights = weights or weights_of(parse_name(denoiser), runs)
     passes = {"colour": colour, "half": half, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
     patterns = {name: each for name, each in passes.items() if each}
     selection = (layers, motion, ref, frame_range, reset_at)

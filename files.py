@@ -11,6 +11,11 @@ from typing import Any
 from errors import BadInput
 
 
+def cache_folder() -> Path:
+    """Where what was measured of this machine is kept from process to process; it need not exist."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "onespp"
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path that takes the place of `path` at the end; whatever fails, what stood there still does."""

@@ -29,10 +29,11 @@ def load(name: str, weights: str | Path | None = None, precision: torch.dtype | 
     is by default the fastest on this machine. Raises errors.BadInput where the name is unknown, the file missing,
     damaged or another network's, and for a network that has neither.
     """
-    from models.registry import load as load_denoiser
+    from models.registry import parse_name
     from models.shipped_weights import shipped_weights
+    from models.spec import load as load_denoiser
 
-    return load_denoiser(name, Path(weights) if weights else shipped_weights(name), precision)
+    return load_denoiser(name, Path(weights) if weights else shipped_weights(parse_name(name).base), precision)
 
 
 def open_dataset(path: str | Path) -> Dataset:

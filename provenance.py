@@ -34,11 +34,16 @@ def device_in_words(kind: str = "cpu", threads: int | None = None) -> str:
 
     if kind == "cuda":
         return f"cuda, {torch.cuda.get_device_name()}"
+    return f"cpu, {processor_name()}, {threads or torch.get_num_threads()} threads"
+
+
+def processor_name() -> str:
+    """The model of the processor, or else its architecture."""
     try:
         model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
     except OSError:
         model = None
-    return f"cpu, {model[1] if model else platform.machine()}, {threads or torch.get_num_threads()} threads"
+    return model[1] if model else platform.machine()
 
 
 def file_digest(path: Path) -> str:

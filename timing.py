@@ -28,7 +28,7 @@ def take_turns(
     fewest: int | None = None,
     patience: float = inf,
     clock: Clock = time.perf_counter,
-    label: str = "timing",
+    label: str | None = "timing",
 ) -> dict[str, list[float]]:
     """Seconds of each call of each function, called in turns.
 
@@ -37,11 +37,12 @@ def take_turns(
         before_round: is told the number of each round, from 0, before it begins; its time does not count.
         fewest: rounds that count, at least, where all together take longer than `patience` seconds.
         clock: waits for the device, where the work is done on one.
+        label: of the progress bar; None for no bar.
     """
     seconds: dict[str, list[float]] = {name: [] for name in work}
     rounds = warm_up + measured
     end = time.perf_counter() + patience
-    with tqdm(total=rounds * len(work), desc=label, leave=False) as progress:
+    with tqdm(total=rounds * len(work), desc=label, leave=False, disable=label is None) as progress:
         for index in range(rounds):
             before_round(index)
             for name, function in work.items():

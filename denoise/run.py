@@ -31,10 +31,11 @@ from eval.bench.memory import status_mb
 from files import replacing
 from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN, OIDNQuality
-from models.spec import DenoiserSpec, precision_in_use
+from models.registry import parse_name
+from models.spec import DenoiserSpec, fastest_precision
 from models.wrappers.error_estimate import ErrorEstimate, with_error
 from models.wrappers.shrinkage import Shrunk
-from models.wrappers.wrapper import inner_denoiser
+from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, file_digest, versions
 
 Precision = Literal["half", "float"]
@@ -92,7 +93,8 @@ def denoise(job: Job) -> None:
     check_names(job.out, frames)
     sequence = shots(frames, job.reset_at)
     sources = find_sources(open_passes(frames[0], header_only=True), stated_layers(job.layers))
-    spec = DenoiserSpec(job.denoiser, "total", precision_in_use(job.denoiser), job.weights)
+    name = parse_name(job.denoiser)
+    spec = DenoiserSpec(name, "total", fastest_precision(name), job.weights)
     denoiser = build(spec, job.quality)
     if job.tells_error:
         check_error_can_be_told(job, denoiser, sources, frames[0])
@@ -114,7 +116,7 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
     """The denoiser, ready to use. Raises BadInput for a quality that it does not have."""
     denoiser = spec.build()
     if quality:
-        inner = inner_denoiser(denoiser)
+        inner = unwrapped(denoiser)
         if not isinstance(inner, OIDN):
             raise BadInput(f"--quality is OIDN's, '{spec.name}' has none")
         inner.quality = quality

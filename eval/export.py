@@ -8,7 +8,7 @@ from models.export.package import Export, write_export
 from models.export.program import Format, check_installed
 from models.export.registry import check_exportable
 from models.export.step import Warp
-from models.spec import split_name
+from models.registry import parse_name
 
 GOLDEN_SIZE = (72, 104)  # height and width in pixels, neither a multiple of 16
 GOLDEN_FRAMES = 4
@@ -28,10 +28,11 @@ def export(
     `weights` are by default those shipped, or of NAME@BUDGET those in RUNS. Raises BadInput where the denoiser cannot
     be exported or has no weights, and where packages are missing.
     """
-    denoiser, _ = split_name(name)
+    parsed = parse_name(name)
+    denoiser = str(parsed.with_budget(None))
     check_exportable(denoiser)
     check_installed(to)
-    weights = weights or weights_of(name, runs)
+    weights = weights or weights_of(parsed, runs)
     assert weights is not None
     folder = out or runs / "export" / f"{name}-{to}"
     frames = [synthetic_frame(index, *GOLDEN_SIZE) for index in range(GOLDEN_FRAMES)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, TypeVar
 
 import torch
@@ -43,26 +44,35 @@ def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None
 class Denoiser(torch.nn.Module):
     """One frame in, linear HDR radiance out.
 
-    What a denoiser needs and returns are facts of its class: nothing has to be built to ask for them.
+    What is known of a denoiser is an attribute of its class; wrappers (models/wrappers) take over those of the denoiser
+    that they wrap. `registry.prototype` returns an instance to read them from, without weights.
 
     Attributes:
-        reads: channels it needs; nothing else is loaded, rendered or stored for it. An instance may have its own.
+        reads: channels it needs; nothing else is loaded, rendered or stored for it.
         signal: what it returns; "total" denoises direct + indirect and adds emission back untouched. The class's is the
             default for instances.
         refuses: precisions that it does not compute in, with the reason.
         is_network: whether it needs trained weights.
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
-        dispensable: channels that its network can do without where they do not vary, and what it sees of a value.
-        inputs: what its network sees, in order, and how many inputs each is; channels by their names.
+        convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
+        separates_lights: whether it filters direct and indirect light apart.
+        is_baseline: whether it is compared with denoisers of indirect light alone, on indirect light.
+        evaluated_with: wrappers with which `onespp eval` runs it beside the denoiser itself.
+        dispensable: channels that its network can do without where they do not vary, and its input for a value.
+        inputs: the inputs of its network in order, and how many channels each has; channels by their names.
         constants: channels that it does without, see models.specialise, and the value that each has everywhere.
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
     """
 
     reads: tuple[str, ...]
     signal: Signal = "total"
-    refuses: ClassVar[dict[torch.dtype, str]] = {}
-    is_network: ClassVar[bool] = False
-    offline: ClassVar[bool] = False
+    refuses: Mapping[torch.dtype, str] = MappingProxyType({})
+    is_network: bool = False
+    offline: bool = False
+    convex: bool = False
+    separates_lights: bool = False
+    is_baseline: bool = False
+    evaluated_with: tuple[str, ...] = ()
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     precision: torch.dtype = torch.float32
 
@@ -73,8 +83,7 @@ class Denoiser(torch.nn.Module):
         self.inputs: dict[str, int] = {}
         self.constants: dict[str, list[float]] = {}
 
-    @classmethod
-    def unavailable(cls) -> str | None:
+    def unavailable(self) -> str | None:
         """Why it cannot run on this machine, with what to install; None where it can."""
         return None
 

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from errors import BadInput
-from models.registry import DENOISERS, plain_name
+from models.registry import DENOISERS
 
 FOLDER = Path(__file__).parent / "shipped"
 
 
 def shipped_weights(name: str) -> Path | None:
     """The shipped weights of a denoiser of the registry; None where there are none."""
-    path = FOLDER / f"{plain_name(name)}.safetensors"
+    path = FOLDER / f"{name}.safetensors"
     return path if path.exists() else None
 
 

@@ -1,69 +1,38 @@
 """A denoiser to run, described before anything is built: which, with what weights, and how it computes."""
 
-import re
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from datasets.frame import Signal
 from errors import BadInput
-from models import compiled, registry
+from models import compiled
 from models.denoiser import Denoiser
-from models.extra_denoisers import EXTRA, WINDOW_SETS, windows_label
+from models.fastest import bfloat16_is_faster
+from models.names import DenoiserName
+from models.registry import create, parse_name, prototype
 from models.weights import load_weights
-from models.wrappers.wrapper import inner_denoiser
+from models.wrappers.wrapper import layers_of, unwrapped
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
-# Where the parts of a name are defined.
-AROUND = {
-    registry.ADAPTIVE: "models.wrappers.adaptive",
-    registry.TAA: "models.wrappers.taa",
-    registry.SHRINKING: "models.wrappers.shrinkage",
-}
-OF_BUDGET = re.compile(r"([^@+]+)@([^@+]+)(\+.*)?")  # NAME@BUDGET
+
+def precisions_of(name: str | DenoiserName) -> list[str]:
+    """The precisions that a denoiser computes in, keys of PRECISIONS. Raises BadInput for an unknown name."""
+    refused = prototype(name).refuses
+    return [precision for precision, dtype in PRECISIONS.items() if dtype not in refused]
 
 
-def split_name(name: str) -> tuple[str, str | None]:
-    """A denoiser, and the budget whose weights it is to have: wskp6+taa and quick of "wskp6@quick+taa"."""
-    match = OF_BUDGET.fullmatch(name)
-    return (match[1] + (match[3] or ""), match[2]) if match else (name, None)
+def fastest_precision(name: str | DenoiserName) -> str:
+    """bfloat16 for networks that support it, where this processor is faster in it, else float32.
 
-
-def with_budget(name: str, budget: str) -> str:
-    """The same the other way round."""
-    plain = registry.plain_name(name)
-    return f"{plain}@{budget}{name.removeprefix(plain)}"
-
-
-def class_of(name: str) -> type[Denoiser]:
-    """The class of a denoiser, which knows all that can be asked of it. Raises BadInput for an unknown name."""
-    denoiser, budget = split_name(name)
-    kind = EXTRA[denoiser].kind if denoiser in EXTRA else registry.denoiser_class(denoiser)
-    if budget and (denoiser in EXTRA or not kind.is_network):
-        raise BadInput(f"unknown denoiser '{name}': '{denoiser}' has no weights of a budget")
-    return kind
-
-
-def create_any(name: str, signal: Signal | None = None) -> Denoiser:
-    """A denoiser of the registry or of EXTRA, with fresh weights. Raises BadInput for an unknown name."""
-    denoiser, _ = split_name(name)
-    if denoiser in EXTRA:
-        return EXTRA[denoiser].kind(signal=signal, **EXTRA[denoiser].arguments)
-    return registry.create(denoiser, signal)
-
-
-def precisions_of(name: str) -> list[str]:
-    """The precisions that a denoiser computes in, keys of PRECISIONS."""
-    return [precision for precision, dtype in PRECISIONS.items() if dtype not in class_of(name).refuses]
-
-
-def precision_in_use(name: str) -> str:
-    """The fastest precision here of those that the denoiser computes in, a key of PRECISIONS."""
-    fastest = registry.inference_precision(class_of(name))
-    return next(precision for precision, dtype in PRECISIONS.items() if dtype == fastest)
+    Raises BadInput for an unknown name.
+    """
+    supported = prototype(name).is_network and "bfloat16" in precisions_of(name)
+    return "bfloat16" if supported and bfloat16_is_faster() else "float32"
 
 
 @dataclass(frozen=True)
@@ -71,8 +40,7 @@ class DenoiserSpec:
     """One way to run a denoiser.
 
     Attributes:
-        name: one of the registry or of EXTRA, or NAME@BUDGET: a network as it was trained in a budget, where NAME
-            alone has shipped weights. Suffixes come last: wskp6@quick+adaptive.
+        denoiser: its name, in its parts.
         signal: what it returns; None for what it usually does.
         precision: of its network, a key of PRECISIONS.
         weights: the file of a network's weights; without one they are fresh, and always the same.
@@ -80,27 +48,37 @@ class DenoiserSpec:
         device: "cpu" or "cuda".
     """
 
-    name: str
+    denoiser: DenoiserName
     signal: Signal | None = None
     precision: str = "float32"
     weights: Path | None = None
     compiled: bool = True
     device: str = "cpu"
 
+    @classmethod
+    def named(cls, name: str, **fields: Any) -> "DenoiserSpec":
+        """That of a name such as wskp6@quick+taa. Raises BadInput for one of no denoiser."""
+        return cls(parse_name(name), **fields)
+
     @property
-    def kind(self) -> type[Denoiser]:
-        return class_of(self.name)
+    def name(self) -> str:
+        return str(self.denoiser)
+
+    @property
+    def facts(self) -> Denoiser:
+        """A denoiser of this kind to read attributes from, see registry.prototype."""
+        return prototype(self.denoiser)
 
     @property
     def returns(self) -> Signal:
         """The signal that it returns."""
-        return self.signal or self.kind.signal
+        return self.signal or self.facts.signal
 
     @property
     def way(self) -> str:
-        """Its name in the bench's tables, which tell precisions apart by a column of their own: svgf (PyTorch)."""
-        signal = f" ({self.returns})" if self.returns != self.kind.signal else ""
-        return f"{self.name}{signal}" + ("" if self.compiled else " (PyTorch)")
+        """Its name in the bench's tables, where weights make no difference: svgf (PyTorch)."""
+        signal = f" ({self.returns})" if self.returns != self.facts.signal else ""
+        return f"{self.denoiser.with_budget(None)}{signal}" + ("" if self.compiled else " (PyTorch)")
 
     @property
     def label(self) -> str:
@@ -109,21 +87,40 @@ class DenoiserSpec:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Those of onespp in which the denoiser is defined."""
-        around = [module for suffix, module in AROUND.items() if suffix in self.name]
-        return (class_of(registry.plain_name(self.name)).__module__, *around)
+        """The modules of onespp that define the denoiser and its wrappers."""
+        return tuple(type(layer).__module__ for layer in layers_of(self.facts))
 
     def build(self) -> Denoiser:
         """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
         torch.manual_seed(0)
-        denoiser = create_any(self.name, self.signal)
+        denoiser = create(self.denoiser, self.signal)
         if self.weights:
-            name, _ = split_name(self.name)
-            label = windows_label(WINDOW_SETS[name]) if name in WINDOW_SETS else registry.plain_name(name)
-            load_weights(inner_denoiser(denoiser), label, self.weights)
+            load_weights(unwrapped(denoiser), self.denoiser.base, self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
         return denoiser.to(self.device)
 
     def running(self) -> AbstractContextManager[None]:
         """The context in which it computes as described."""
         return nullcontext() if self.compiled else compiled.disabled()
+
+
+def load(
+    name: str,
+    weights: Path | None,
+    precision: torch.dtype | None = None,
+    signal: Signal | None = None,
+    device: str = "cpu",
+) -> Denoiser:
+    """A denoiser ready to use, by its name, with the weights of a file if it is a network.
+
+    `precision` is by default the fastest here of those that it does not refuse, `signal` that of its class. Raises
+    BadInput where the name is unknown, the file missing, damaged or another network's, and for a precision it refuses.
+    """
+    parsed = parse_name(name)
+    if not prototype(parsed).is_network:
+        weights = None
+    elif weights is None:
+        raise BadInput(f"'{name}' needs trained weights")
+    names = {dtype: key for key, dtype in PRECISIONS.items()}
+    chosen = names[precision] if precision else fastest_precision(parsed)
+    return DenoiserSpec(parsed, signal, chosen, weights, device=device).build()

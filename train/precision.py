@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from models.fastest import WORTHWHILE
+from models.fastest import MIN_SPEEDUP
 from timing import device_clock, take_turns, thread_count
 from train.losses.network_loss import NetworkLoss
 
@@ -26,7 +26,7 @@ def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: 
 
 
 def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
-    """bfloat16 where that makes a step WORTHWHILE times faster, by the best of some turns; else float32.
+    """bfloat16 where that makes a step at least MIN_SPEEDUP times faster, by the best of some turns; else float32.
 
     On processors one thread computes, and only the time that it computes counts: a busy machine, on which each step
     waits as it happens to, tells nothing by the clock on the wall.
@@ -40,4 +40,4 @@ def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
     clock = time.process_time if device == "cpu" else partial(device_clock, device)
     with thread_count(1):
         seconds = take_turns(work, TURNS, clock=clock, label="measuring precisions")
-    return BFLOAT16 if min(seconds[FLOAT32]) > WORTHWHILE * min(seconds[BFLOAT16]) else FLOAT32
+    return BFLOAT16 if min(seconds[FLOAT32]) > MIN_SPEEDUP * min(seconds[BFLOAT16]) else FLOAT32

@@ -18,13 +18,13 @@ from eval.bench.output import bench_folder
 from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
 from eval.bench.sizes import Size, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.selection import BASELINES, cannot_run, choose
+from eval.selection import cannot_run, choose
 from files import read_json, write_json
-from models.extra_denoisers import ALL_WINDOWS, EXTRA, FAST_OIDN
 from models.filters.oidn import OIDN
-from models.registry import DENOISERS
-from models.spec import DenoiserSpec, create_any, precisions_of, split_name
-from models.wrappers.wrapper import inner_denoiser
+from models.names import DenoiserName
+from models.registry import DENOISERS, create, parse_name, prototype
+from models.spec import DenoiserSpec, precisions_of
+from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 
@@ -55,22 +55,19 @@ class DenoiserCost(Timing):
 
 
 def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
-    """All ways to run the named denoisers and OIDN, or all that can run here, with networks of other sizes.
+    """All ways to run the named denoisers and OIDN, or all that can run here.
 
     Raises BadInput where a named one is unknown or cannot run.
     """
-    everyone = (*DENOISERS, *(name for name in EXTRA if name not in (ALL_WINDOWS, FAST_OIDN)))
-    baseline = [] if cannot_run(BASELINE) else [BASELINE]
+    baseline = [] if cannot_run(parse_name(BASELINE)) else [BASELINE]
     found: list[DenoiserSpec] = []
-    named = [split_name(name)[0] for name in names]  # weights make no difference
-    for name in choose([*named, *baseline] if names else [], everyone, cannot_run):
+    named = [str(parse_name(name).with_budget(None)) for name in names]  # weights make no difference
+    for name in choose([*named, *baseline] if names else [], map(DenoiserName, DENOISERS), cannot_run):
         found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
-        if name in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
+        if str(name) in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
             found.append(DenoiserSpec(name, compiled=False))
-        if name in BASELINES:
+        if prototype(name).is_baseline and not name.wrappers:
             found.append(DenoiserSpec(name, signal="indirect", device=device))
-        if name == BASELINE:
-            found.append(DenoiserSpec(FAST_OIDN, device=device))
     return found
 
 
@@ -134,9 +131,7 @@ def cost(contender: Contender, size: Size, peak_mb: float | None) -> DenoiserCos
     return DenoiserCost(
         **asdict(contender.timing(size)),
         peak_mb=peak_mb,
-        parameters=None
-        if isinstance(inner_denoiser(contender.denoiser), OIDN)
-        else contender.denoiser.parameter_count(),
+        parameters=None if isinstance(unwrapped(contender.denoiser), OIDN) else contender.denoiser.parameter_count(),
         macs_per_pixel=macs_per_pixel(spec),
         prediction=contender.share_of_network(),
     )
@@ -237,6 +232,6 @@ def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
             "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": None if share is None else create_any(row.denoiser).parameter_count(),
+            "as trained": None if share is None else create(row.denoiser).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

@@ -87,11 +87,11 @@ def bench_export(
     radiance: dict[str, Tensor] = {}
     with thread_count(count), TemporaryDirectory() as folder:
         ways = {
-            COMPILED: sequence.ours(DenoiserSpec(name)),
-            PYTORCH: sequence.ours(DenoiserSpec(name, compiled=False)),
+            COMPILED: sequence.ours(DenoiserSpec.named(name)),
+            PYTORCH: sequence.ours(DenoiserSpec.named(name, compiled=False)),
         }
         for way, warp in EXPORTED.items():
-            step = step_of(name, DenoiserSpec(name).build(), warp)
+            step = step_of(name, DenoiserSpec.named(name).build(), warp)
             file = Path(folder) / f"{warp}.onnx"
             with torch.inference_mode(False):
                 operators[way] = write_onnx(trace(step, synthetic_frame(0, *EXAMPLE_SIZE)), step, file).total

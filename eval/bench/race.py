@@ -14,7 +14,7 @@ from eval.bench.sizes import Size, size_name
 from eval.bench.synthetic_frames import synthetic_frame
 from models.denoiser import Denoiser, State
 from models.spec import DenoiserSpec
-from models.wrappers.wrapper import inner_denoiser
+from models.wrappers.wrapper import unwrapped
 from timing import device_clock, take_turns
 
 WARM_UP_FRAMES = 2
@@ -96,7 +96,7 @@ class Contender:
 
 
 def network_of(denoiser: Denoiser) -> nn.Module | None:
-    network = getattr(inner_denoiser(denoiser), "network", None)
+    network = getattr(unwrapped(denoiser), "network", None)
     return network if isinstance(network, nn.Module) else None
 
 

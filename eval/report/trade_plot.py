@@ -43,7 +43,7 @@ def trade_plot(times: Times, clips: Sequence[ClipResults], metric: str) -> Trade
     """A point for each denoiser that was timed in the precision in which it was evaluated. Clips are of one signal."""
     offers = {}
     for result in clips[0].results:
-        spec = DenoiserSpec(result.denoiser, result.signal, result.precision)
+        spec = DenoiserSpec.named(result.denoiser, signal=result.signal, precision=result.precision)
         offers[result.denoiser] = Offer(times.of(spec), scores_of(clips, result.denoiser))
     beaten = beaten_by(offers, metric)
     points = [

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from datasets.frame import Frame
 from eval.stress.cases import RECOVERY_LIMIT, SPOILED_FRAME, StressCase
 from eval.stress.changes import FrameChange, PixelChange, unchanged
-from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
+from eval.stress.irradiance_range import ROUNDING, range_violation
 from eval.stress.lit_frames import NOISE_PERIOD
 from eval.stress.logits import largest_logits
 from eval.stress.outcome import StressOutcome
@@ -23,7 +23,7 @@ ORDINARY_VALUES = (0.0, 1.0)  # that a pixel may well have: they tell which othe
 BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
 REQUIREMENTS = {
     "finite": "what comes of finite pixels is finite",
-    "range": f"{', '.join(CONVEX)} stay within the irradiance seen since the last reset; no other goes below 0",
+    "range": "convex filters stay within the range of irradiance since the last reset; no other goes below 0",
     "spread": "a pixel that is not finite changes none that could not see it in that frame",
     "recovery": f"{RECOVERY_LIMIT} frames later it changes none by more than {FORGOTTEN:.1%} of the brightest, or "
     f"{ROUNDINGS} times the rounding of half precision",
@@ -64,14 +64,13 @@ def forgotten_below(precision: str) -> float:
 
 
 class StressCheck:
-    """The way of the denoiser called `name` through a stress case.
+    """A denoiser's run through a stress case.
 
     `build` makes it in a given precision, a key of PRECISIONS, always with the same weights. It must compute in the
     case's.
     """
 
-    def __init__(self, name: str, build: Callable[[str], Denoiser], case: StressCase):
-        self.name = name
+    def __init__(self, build: Callable[[str], Denoiser], case: StressCase):
         self.build = build
         self.case = case
         self.denoiser = build(case.precision)
@@ -113,12 +112,12 @@ class StressCheck:
         errors = self.errors()
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
         good_input = [finite_pixels(frame, self.denoiser.reads) for frame in self.frames]
-        violation = range_violation(self.name, self.frames, self.outputs)
+        violation = range_violation(self.denoiser, self.frames, self.outputs)
         recovery = self.recovery(errors) if self.case.only is not None else None
         poison = self.case.poison
         broken = {
             "finite": any((a & b).any() for a, b in zip(bad, good_input, strict=True)),
-            "range": violation > (ROUNDING if self.name in CONVEX else 0),
+            "range": violation > (ROUNDING if self.denoiser.convex else 0),
             "spread": poison is not None and self.spreads(poison),
             "recovery": poison is not None and recovery is None,
         }

@@ -6,22 +6,21 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
+from models.denoiser import Denoiser
 from models.operators import finite
 
-# Filters whose output is a mean of irradiance that they have seen.
-CONVEX = ("eaw", "svgf", "asvgf", "trmv", "sbf", "aaf", "lbf", "wskp3", "wskp6", "kp", "one")
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
 DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
 
 
 class IrradianceRange:
-    """The irradiance of surfaces that a convex filter has seen since it began: its limits, for each colour.
+    """The range of the irradiance of surfaces since a convex filter began, for each colour.
 
-    Some filter direct and indirect light separately, so its limits are sums of two.
+    Of a filter that `separates_lights` the limits are sums of those of direct and of indirect light.
     """
 
-    def __init__(self, name: str):
-        self.separate = name in ("svgf", "asvgf", "trmv", "aaf")
+    def __init__(self, separates_lights: bool):
+        self.separate = separates_lights
         self.low = torch.tensor(torch.inf)
         self.high = torch.tensor(-torch.inf)
 
@@ -44,15 +43,15 @@ class IrradianceRange:
         return float(torch.maximum(above, below).max())
 
 
-def range_violation(name: str, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
+def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
     """How far a sequence leaves the range at most, 0 where it does not.
 
     Relative to the range's end for a convex filter, absolute below 0 for any other denoiser. What is not finite counts
     as 0, in frames and in `outputs` (3, H, W) alike.
     """
-    if name not in CONVEX:
+    if not denoiser.convex:
         return max(0.0, *(-float(finite(output).min()) for output in outputs))
-    seen = IrradianceRange(name)
+    seen = IrradianceRange(denoiser.separates_lights)
     largest = 0.0
     for frame, output in zip(frames, outputs, strict=True):
         seen.see(frame.finite())

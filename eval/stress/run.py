@@ -17,8 +17,9 @@ from eval.stress.outcome import FRESH, StressRow
 from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
-from models.registry import DENOISERS
-from models.spec import DenoiserSpec, create_any, precisions_of, split_name
+from models.names import DenoiserName
+from models.registry import DENOISERS, create
+from models.spec import DenoiserSpec, precisions_of
 from plotting import save_figure
 from provenance import DENOISING, versions
 from timing import thread_count
@@ -30,11 +31,11 @@ def stressed(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec
     Raises BadInput where a named one is unknown or cannot run, and for NAME@BUDGET without its weights.
     """
 
-    def lacks_its_own(name: str) -> str | None:
-        return untrained(runs, budget, name) if split_name(name)[1] else None
+    def lacks_its_own(name: DenoiserName) -> str | None:
+        return untrained(runs, budget, name) if name.budget else None
 
     specs = []
-    for name in choose(names, DENOISERS, cannot_run, lacks_its_own):
+    for name in choose(names, map(DenoiserName, DENOISERS), cannot_run, lacks_its_own):
         file = weights_file(name, runs, budget)
         specs.append(DenoiserSpec(name, weights=file if file and file.exists() else None))
     return specs
@@ -44,13 +45,13 @@ def weights_label(spec: DenoiserSpec) -> str | None:
     """The file of its weights, or FRESH; None for a denoiser that has none."""
     if spec.weights:
         return str(spec.weights)
-    return FRESH if spec.kind.is_network else None
+    return FRESH if spec.facts.is_network else None
 
 
 def applies(case: StressCase, spec: DenoiserSpec) -> bool:
     """Whether the denoiser computes in the case's precision, and has logits where these are to be scaled."""
-    return case.precision in precisions_of(spec.name) and (
-        case.logits is None or bool(last_layers(create_any(spec.name)))
+    return case.precision in precisions_of(spec.denoiser) and (
+        case.logits is None or bool(last_layers(create(spec.denoiser)))
     )
 
 
@@ -76,7 +77,7 @@ def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> lis
             build = cache(partial(build_in, spec))
             for case in ours:
                 progress.set_postfix_str(f"{spec.name}: {case.name}")
-                outcome = StressCheck(split_name(spec.name)[0], build, case).outcome()
+                outcome = StressCheck(build, case).outcome()
                 rows.append(StressRow(spec.name, weights_label(spec), case.name, outcome))
                 progress.update()
     return rows
@@ -90,7 +91,7 @@ def stress(
     Prints tables and writes RUNS/stress/results.json, table.md and errors.png. Returns whether all requirements are
     kept. Raises BadInput for an unknown denoiser, damaged weights, and where none takes the precision.
     """
-    specs = [spec for spec in stressed(names, runs, budget) if precision in precisions_of(spec.name)]
+    specs = [spec for spec in stressed(names, runs, budget) if precision in precisions_of(spec.denoiser)]
     if not specs:
         raise BadInput(f"none of {', '.join(names)} computes in {precision}; name a network, or leave out --precision")
     cases = cases_in(precision, long)

@@ -24,7 +24,8 @@ from eval.selection import cannot_run, choose, weights_of
 from eval.studies.own_clips import SEED, own_clip
 from files import write_file, write_json
 from models.denoiser import State
-from models.spec import DenoiserSpec, precision_in_use
+from models.registry import parse_name
+from models.spec import DenoiserSpec, fastest_precision
 from models.wrappers.error_estimate import ErrorEstimate, with_error
 from models.wrappers.shrinkage import Shrunk
 from plotting import DPI, plt, save_figure
@@ -195,11 +196,11 @@ def tellers(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
     Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is no NAME+js.
     """
     found = {}
-    for name in choose(names, DENOISERS, cannot_run):
-        denoiser = DenoiserSpec(name, "total", precision_in_use(name), weights_of(name, runs)).build()
+    for name in choose(names, map(parse_name, DENOISERS), cannot_run):
+        denoiser = DenoiserSpec(name, "total", fastest_precision(name), weights_of(name, runs)).build()
         if not isinstance(denoiser, Shrunk):
             raise BadInput(f"{name} does not tell its error, {name}+js does")
-        found[name] = denoiser
+        found[str(name)] = denoiser
     return found
 
 

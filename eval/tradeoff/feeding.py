@@ -19,7 +19,7 @@ from eval.tradeoff.resampled_clips import Source, scene_of, source, with_samples
 from eval.tradeoff.samples import SampleTrade, sample_trades
 from eval.tradeoff.shrinkage import Gain, gains_of
 from eval.tradeoff.times import Times
-from models.spec import DenoiserSpec, precision_in_use
+from models.spec import DenoiserSpec, fastest_precision
 from render.clip import Options
 
 SPP_LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -55,7 +55,7 @@ def sampled(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
     return [
         candidate
         for candidate in chosen
-        if (named or candidate.name in SAMPLED) and candidate.precision == precision_in_use(candidate.name)
+        if (named or candidate.name in SAMPLED) and candidate.precision == fastest_precision(candidate.denoiser)
     ]
 
 
@@ -64,7 +64,7 @@ def results_by_spp(
 ) -> dict[int, list[ClipResults]]:
     """Results on the clips by samples a pixel. What is rendered and judged is kept in `folder`."""
     entrants = [entrant(spec, spec.label) for spec in specs]
-    halves = any(not set(HALVES.values()).isdisjoint(spec.kind.reads) for spec in specs)
+    halves = any(not set(HALVES.values()).isdisjoint(spec.facts.reads) for spec in specs)
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):

@@ -9,8 +9,8 @@ from tabulate import tabulate
 
 from eval.metrics import METRICS, Values, within_floor
 from eval.results import ClipResults
-from models.registry import SHRINKING
 
+SHRINKING = "+js"
 INPUT = "noisy"  # the denoiser that returns what it is given
 
 

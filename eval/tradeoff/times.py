@@ -1,22 +1,12 @@
 """What a frame takes, from what `onespp bench denoisers` left."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from errors import BadInput
 from eval.bench.denoisers import results_file
 from eval.bench.sizes import Size, size_name
 from files import read_json
-from models.extra_denoisers import ALL_WINDOWS
-from models.spec import DenoiserSpec, split_name
-
-TIMED_AS = {ALL_WINDOWS: "wskp6", "ntd-b": "ntd"}  # the same computation: another training of a network
-
-
-def timed_as(spec: DenoiserSpec) -> str:
-    """What the bench calls whatever computes the same."""
-    name, _ = split_name(spec.name)  # weights make no difference
-    return replace(spec, name=TIMED_AS.get(name, name)).way
+from models.spec import DenoiserSpec
 
 
 class Times:
@@ -49,7 +39,7 @@ class Times:
 
     def of(self, spec: DenoiserSpec) -> float | None:
         """Milliseconds a frame; None where that was not measured."""
-        return self.ms.get((timed_as(spec), spec.precision))
+        return self.ms.get((spec.way, spec.precision))
 
 
 def times_of_first_size(runs: Path) -> Times | None:

@@ -19,7 +19,7 @@ from models.export.program import OPSET, Format, Operators, check_installed, tra
 from models.export.registry import load_step
 from models.export.runtime import run_file
 from models.export.step import Port, Step, Tensors, Warp
-from models.registry import load
+from models.spec import load
 from provenance import file_digest, versions
 
 MANIFEST = "manifest.json"

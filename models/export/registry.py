@@ -9,7 +9,7 @@ from models.denoiser import Denoiser
 from models.export.one import OneStep
 from models.export.step import Step, Warp
 from models.export.wskp import WSKPStep
-from models.registry import load
+from models.spec import load
 
 STEPS = {"wskp3": WSKPStep, "wskp6": WSKPStep, "one": OneStep}
 

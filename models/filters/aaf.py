@@ -152,6 +152,8 @@ class AAF(Denoiser):
         *("hit_distance", "light_distance", "light_angle"),
     )
     refuses = CLASSICAL
+    convex = True
+    separates_lights = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         image = irradiances(frame, self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)

@@ -15,6 +15,7 @@ class Noisy(Denoiser):
 
     reads = ("direct", "indirect", "emission")
     refuses = CLASSICAL
+    is_baseline = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return frame.radiance(self.signal), State(frame.moment)
@@ -29,7 +30,7 @@ class AccumulatedState(State):
 
 
 class Accumulating(Denoiser):
-    """A denoiser that begins with temporal accumulation, in whose place models.wrappers.adaptive puts its own."""
+    """A denoiser that begins with temporal accumulation, which models.wrappers.adaptive replaces."""
 
     accumulation: Callable[[Frame, Tensor, Accumulation | None], Accumulation] = staticmethod(accumulate)
 
@@ -43,6 +44,7 @@ class Accumulated(Accumulating):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
+    is_baseline = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))

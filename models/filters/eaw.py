@@ -69,6 +69,7 @@ class EAW(Accumulating):
 
     reads = Accumulated.reads
     refuses = CLASSICAL
+    convex = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         before = matching_state(state, EAWState, frame)

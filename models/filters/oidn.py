@@ -82,20 +82,20 @@ class RayTracingFilter:
 class OIDN(Denoiser):
     """Denoises each noisy frame by itself; reflected radiance only: emission, free of noise, is added afterwards.
 
-    Runs on CPU threads, as many as PyTorch has. The quality is "high" (for final frames; OIDN's default), "balanced" or
+    Runs on CPU threads, as many as PyTorch has. `quality` is "high" (OIDN's default, for final frames), "balanced" or
     "fast" (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
     """
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
 
-    def __init__(self, quality: OIDNQuality = "high", *, signal: Signal | None = None):
+    quality: OIDNQuality = "high"
+
+    def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.quality = quality
         self.key: tuple[int, int, int] | None = None  # (H, W, threads) that the filter was made for
 
-    @classmethod
-    def unavailable(cls) -> str | None:
+    def unavailable(self) -> str | None:
         try:
             open_device(threads=1).release()
         except BadInput as error:
@@ -126,10 +126,23 @@ class OIDN(Denoiser):
         return self.denoise(frame, reflected), State(frame.moment)
 
 
+class OIDNBalanced(OIDN):
+    """OIDN in its quality "balanced"."""
+
+    quality = "balanced"
+
+
+class OIDNFast(OIDN):
+    """OIDN in its quality "fast"."""
+
+    quality = "fast"
+
+
 class OIDNAccumulated(Accumulating, OIDN):
     """Denoises temporally accumulated irradiance, re-modulated. The history is not filtered."""
 
     reads = Accumulated.reads
+    evaluated_with = ("adaptive",)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))

@@ -111,6 +111,7 @@ class SBF(Denoiser):
 
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id")
     refuses = CLASSICAL
+    convex = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         colour = frame.irradiance(self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)

@@ -231,6 +231,9 @@ class SVGF(Denoiser):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
+    convex = True
+    separates_lights = True
+    is_baseline = True
 
     def change(self, frame: Frame) -> Tensor | None:
         """How much of the history to give up, (B, 1, H, W) in [0, 1]; None for nothing anywhere."""

@@ -23,7 +23,6 @@ What is ours, as frames have one sample a pixel and features free of noise:
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -96,12 +95,12 @@ class LBF(Denoiser):
     """Filters each frame by itself, within the range of its irradiance, in seconds."""
 
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id")
-    refuses: ClassVar = {
-        dtype: "its filter's sums need float32, and its network is too small to gain from less"
-        for dtype in (torch.bfloat16, torch.float16)
-    }
+    refuses = dict.fromkeys(
+        (torch.bfloat16, torch.float16), "the sums of its filter need float32, and its network is too small to gain"
+    )
     is_network = True
     offline = True
+    convex = True
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)

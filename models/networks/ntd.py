@@ -189,7 +189,7 @@ class NTD(Denoiser):
     # The traditional vectors tell what is disoccluded, for the loss and for pictures.
     reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
     signal: Signal = "indirect"
-    refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+    refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     dispensable: ClassVar = {"albedo": as_it_is, "normal": as_it_is}
 

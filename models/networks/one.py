@@ -195,8 +195,9 @@ class One(Denoiser):
         "mesh_id",
         "motion",
     )
-    refuses: ClassVar = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}
+    refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
+    convex = True
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
     def __init__(self, *, steps: Sequence[int] = STEPS, signal: Signal | None = None):

@@ -131,6 +131,8 @@ def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
 class WSKP(KernelPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
+    convex = True
+    evaluated_with: tuple[str, ...] = ("adaptive",)
     layers: ClassVar[int] = 6
 
     def __init__(
@@ -151,12 +153,14 @@ class WSKP(KernelPredictor):
 class WSKP3(WSKP):
     """The smaller of the paper's two networks."""
 
+    evaluated_with = ()
     layers = 3
 
 
 class KP(KernelPredictor):
     """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel a pixel."""
 
+    convex = True
     window = 13
 
     def __init__(self, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None):

@@ -14,16 +14,14 @@ The noise is estimated from the differences themselves, t² = (Σ w d)² / Σ w�
 cannot make larger than 1.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from torch import Tensor
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.denoiser import Denoiser
+from models.denoiser import Denoiser, State
 from models.filters.atrous import Tap, WindowSum, strip_taps
 from models.filters.baselines import Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
@@ -33,6 +31,7 @@ from models.history.strata import middles, repeated, sums
 from models.history.surfaces import Surfaces
 from models.operators import image_luminance
 from models.parameters import LARGEST_LUMINANCE, LEAST_DIVISOR, SMALLEST_ALPHA
+from models.wrappers.wrapper import Wrapper
 
 RADIUS = 3  # strata: windows of 7 x 7
 BRIGHTEST = 3.0  # times the mean around it: what a sample may count
@@ -149,13 +148,14 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
     )
 
 
-@cache
-def adaptive(kind: type[Denoiser]) -> type[Denoiser]:
-    """The class of denoisers of `kind` that accumulate adaptively. Raises BadInput for one that does not accumulate."""
-    if not issubclass(kind, Accumulating):
-        raise BadInput(f"{kind.__name__} does not begin with temporal accumulation: leave out +adaptive")
+class Adaptive(Wrapper):
+    """The same denoiser on adaptively accumulated frames. Raises BadInput for one that does not accumulate."""
 
-    class AdaptiveKind(kind):  # type: ignore[misc, valid-type]
-        accumulation: Callable[..., Accumulation] = staticmethod(accumulate_adaptively)
+    def __init__(self, inner: Denoiser):
+        if not isinstance(inner, Accumulating):
+            raise BadInput(f"{type(inner).__name__} does not begin with temporal accumulation: leave out +adaptive")
+        super().__init__(inner)
+        inner.accumulation = accumulate_adaptively
 
-    return AdaptiveKind
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        return self.inner.forward(frame, state)

@@ -19,7 +19,7 @@ What is ours, by measurement (docs/experiments.md, Shrinkage):
 Without halves, as at one sample a pixel, it is the denoiser itself.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -31,7 +31,7 @@ from models.denoiser import State
 from models.filters.neighbours import mesh_sums
 from models.operators import image_luminance
 from models.parameters import LEAST_DIVISOR
-from models.wrappers.wrapper import Around
+from models.wrappers.wrapper import Wrapper
 
 STANDARD_ERRORS = 3.0
 SCARCE = 16.0  # samples a pixel
@@ -125,14 +125,12 @@ def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
     return mixture(frame, denoised, share_let_in(frame, denoised, signal), signal)
 
 
-class Shrunk(Around):
+class Shrunk(Wrapper):
     """Shrinkage to a denoiser's output, where frames have halves. Its state is the inner one's."""
 
-    @classmethod
-    def reads_around(cls, reads: Iterable[str]) -> tuple[str, ...]:
+    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
         """With the halves of those that have any, and what shrinkage compares them by."""
-        named = tuple(reads)
-        return tuple(dict.fromkeys((*named, *(HALVES[name] for name in HALVES if name in named), *COMPARED_BY)))
+        return tuple(dict.fromkeys((*reads, *(HALVES[name] for name in HALVES if name in reads), *COMPARED_BY)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.forward(frame, state)

@@ -1,6 +1,6 @@
 """Temporal antialiasing, for whatever denoiser (Karis 2014)."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,7 @@ from models.denoiser import State, matching_state
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
 from models.history.surfaces import Surfaces
-from models.wrappers.wrapper import Around
+from models.wrappers.wrapper import Wrapper
 
 NEWEST = 0.1  # weight of the current frame
 YCOCG = ((0.25, 0.5, 0.25), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25))  # from RGB
@@ -90,7 +90,7 @@ class AntialiasedState(State):
         return self.inner.pictures()
 
 
-class Antialiased(Around):
+class Antialiased(Wrapper):
     """Temporal antialiasing after a denoiser.
 
     The history follows the motion vectors and is blended across edges, which is what smooths them; it is dropped where
@@ -98,8 +98,7 @@ class Antialiased(Around):
     causal one of the outputs so far.
     """
 
-    @classmethod
-    def reads_around(cls, reads: Iterable[str]) -> tuple[str, ...]:
+    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
         """With those that the history is fetched and tested by."""
         return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
 

@@ -1,60 +1,45 @@
-"""Denoisers with something done to their output: what all of these have in common."""
+"""What all wrappers have in common: a denoiser around another one, whose name gets a suffix."""
 
-from collections.abc import Iterable
-from functools import cache
-from typing import ClassVar, TypeVar
+from collections.abc import Iterator, Sequence
 
 import torch
 
-from datasets.frame import Signal
 from models.denoiser import Denoiser
 
 
-class Around(Denoiser):
-    """A denoiser of `inner_class` with something done to its output; `around` makes the class."""
+class Wrapper(Denoiser):
+    """A denoiser that changes the input or output of another one, with whose facts it begins."""
 
-    inner_class: ClassVar[type[Denoiser]]
+    def __init__(self, inner: Denoiser):
+        super().__init__(signal=inner.signal)
+        self.inner = inner
+        self.reads = self.reads_with(inner.reads)
+        self.refuses = inner.refuses
+        self.is_network = inner.is_network
+        self.offline = inner.offline
+        self.constants = inner.constants
 
-    @classmethod
-    def reads_around(cls, reads: Iterable[str]) -> tuple[str, ...]:
-        """The channels that the inner denoiser `reads`, and those that are read for its output."""
-        raise NotImplementedError
+    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
+        """The channels that the inner denoiser `reads`, and those that the wrapper needs."""
+        return tuple(reads)
 
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.inner = self.inner_class(signal=signal)
-        self.reads = self.reads_around(self.inner.reads)
-        self.constants = self.inner.constants
-
-    @classmethod
-    def unavailable(cls) -> str | None:
-        return cls.inner_class.unavailable()
+    def unavailable(self) -> str | None:
+        return self.inner.unavailable()
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         self.inner.prepare(precision)
         super().prepare(precision)
 
 
-A = TypeVar("A", bound=Around)
-
-
-@cache
-def around(wrapper: type[A], kind: type[Denoiser]) -> type[A]:
-    """The class of denoisers of `kind` with what `wrapper` does to their output."""
-
-    class AroundKind(wrapper):  # type: ignore[misc, valid-type]
-        inner_class = kind
-        reads = wrapper.reads_around(kind.reads)
-        signal = kind.signal
-        refuses = kind.refuses
-        is_network = kind.is_network
-        offline = kind.offline
-
-    return AroundKind
-
-
-def inner_denoiser(denoiser: Denoiser) -> Denoiser:
-    """The denoiser without what is done to its output."""
-    while isinstance(denoiser, Around):
+def layers_of(denoiser: Denoiser) -> Iterator[Denoiser]:
+    """The denoiser, and what it is wrapped around, outermost first."""
+    yield denoiser
+    while isinstance(denoiser, Wrapper):
         denoiser = denoiser.inner
-    return denoiser
+        yield denoiser
+
+
+def unwrapped(denoiser: Denoiser) -> Denoiser:
+    """The denoiser without its wrappers."""
+    *_, innermost = layers_of(denoiser)
+    return innermost

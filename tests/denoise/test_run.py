@@ -24,7 +24,8 @@ from denoise.exr_image import ExrImage
 from denoise.run import Job, denoise
 from errors import BadInput
 from eval.tradeoff.resampled_clips import with_samples
-from models.registry import create, load
+from models.registry import create
+from models.spec import load
 from models.weights import save_weights
 from tests.denoise.conftest import as_foreign
 from tests.helpers import foreign

@@ -7,7 +7,6 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
-from eval.bench.scaling import exponent, in_use
 
 import eval.bench.denoisers
 from command_line import main
@@ -17,10 +16,10 @@ from eval.bench.race import FEWEST_FRAMES, TIMED_FRAMES, race
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.selection import cannot_run
-from models.extra_denoisers import WINDOW_SETS
 from models.networks.one import One
 from models.parameters import ONE_INPUTS, STEPS, outputs_of_one
-from models.spec import DenoiserSpec, create_any, precision_in_use
+from models.registry import create, parse_name
+from models.spec import DenoiserSpec
 from provenance import device_in_words
 
 FIELDS = [
@@ -38,7 +37,7 @@ FIELDS = [
     "macs_per_pixel",
     "prediction",
 ]
-NOISY = DenoiserSpec("noisy")
+NOISY = DenoiserSpec.named("noisy")
 
 
 def test_results_have_the_agreed_form(tmp_path, capsys):
@@ -53,11 +52,11 @@ def test_results_have_the_agreed_form(tmp_path, capsys):
     labels = [(row["denoiser"], row["dtype"]) for row in rows]
     accumulated = ("accumulated", "accumulated (PyTorch)", "accumulated (indirect)")
     rae = [("rae", precision) for precision in ("float32", "bfloat16", "float16")]
-    oidn = [] if cannot_run("oidn") else [("oidn", "float32"), ("oidn (fast)", "float32")]  # it comes by itself
+    oidn = [] if cannot_run(parse_name("oidn")) else [("oidn", "float32")]  # the baseline
     assert labels == [*((way, "float32") for way in accumulated), *rae, *oidn]
     for row in rows:
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]
-        counts = {"rae": 1_951_935, "oidn": None, "oidn (fast)": None}
+        counts = {"rae": 1_951_935, "oidn": None}
         assert row["parameters"] == counts.get(row["denoiser"], 0)
         assert (row["macs_per_pixel"] is None) == (row["prediction"] is None) == (row["denoiser"] != "rae")
         assert row["prediction"] is None or 0 < row["prediction"] < 1
@@ -94,7 +93,7 @@ def test_an_interrupted_bench_goes_on(tmp_path):
     assert again[0] == first  # to the last digit of its times: it was not measured again
     assert list(races(NOISY)) == again
 
-    others = races(NOISY, DenoiserSpec("accumulated"))  # what is there is not theirs
+    others = races(NOISY, DenoiserSpec.named("accumulated"))  # what is there is not theirs
     assert next(others)[0] != first[0]
     assert {row.denoiser for row in chain.from_iterable(races(NOISY))} == {"noisy"}
     assert all(row.frames == 2 for row in chain.from_iterable(races(NOISY, measured=2)))
@@ -111,10 +110,10 @@ def test_a_bench_goes_on_where_the_same_call_was_interrupted(tmp_path):
 
 
 def test_oidn_has_no_parameters_to_count():
-    if cannot_run("oidn"):
+    if cannot_run(parse_name("oidn")):
         pytest.skip("there is no OIDN here")
     for name in ("oidn", "oidn+taa"):
-        (contender,) = race([DenoiserSpec(name)], (8, 8), measured=1)
+        (contender,) = race([DenoiserSpec.named(name)], (8, 8), measured=1)
         row = cost(contender, (8, 8), 1.0)
         assert (row.peak_mb, row.parameters, row.macs_per_pixel, row.prediction) == (1.0, None, None, None)
 
@@ -124,30 +123,8 @@ def test_a_race_that_takes_long_measures_fewer_frames():
     assert contender.timing((4, 8)).frames == FEWEST_FRAMES < TIMED_FRAMES
 
 
-def test_scaling(tmp_path, capsys):
-    main(["bench", "scaling", "noisy", "wskp3", "--size", "32x32", "16x16", "--threads", "1", "--runs", str(tmp_path)])
-    assert "16x16" in capsys.readouterr().out
-    rows = json.loads((tmp_path / "bench" / "scaling.json").read_text())["rows"]
-    names = ["noisy", "wskp3", *([] if cannot_run("oidn") else ["oidn", "oidn (fast)"])]
-    assert [(row["denoiser"], row["width"]) for row in rows] == [(name, w) for w in (16, 32) for name in names]
-    used = precision_in_use("wskp3")
-    assert [row["dtype"] for row in rows if row["denoiser"] == "wskp3"] == [used, used]
-    assert (tmp_path / "report" / "figures" / "scaling.png").exists()
-
-
-def test_exponent_of_known_laws():
-    pixels = [100, 400, 900, 1600]
-    assert exponent(pixels, [3.0 * n for n in pixels]) == pytest.approx(1)
-    assert exponent(pixels, [0.1 * n**1.5 for n in pixels]) == pytest.approx(1.5)
-    assert exponent(pixels[:1], [1.0]) is None
-
-
-def test_networks_of_other_sizes_are_measured_too():
-    names = {spec.name for spec in ways(())}
-    assert {"wskp6-1w", "wskp6-5w"} <= names and "wskp6-6w" not in names  # that is wskp6
-    assert macs_per_pixel(DenoiserSpec("wskp6-1w")) < macs_per_pixel(DenoiserSpec("wskp6"))
-    assert not any(spec.name in WINDOW_SETS for spec in in_use(()))
-    assert ways(["kp@quick", "kp"]) == ways(["kp"])  # weights make no difference
+def test_weights_make_no_difference_to_times():
+    assert ways(["kp@quick", "kp"]) == ways(["kp"])
     assert all(spec.compiled for spec in ways(["svgf"], "cuda"))
 
 
@@ -163,19 +140,19 @@ def test_multiply_accumulates_by_hand():
     for level, (middle, out) in zip(range(4, -1, -1), decoder, strict=True):
         products += ((below + widths[level]) * middle + middle * out) / 4**level
         below = out
-    assert macs_per_pixel(DenoiserSpec("rae")) == pytest.approx(9 * products)
-    assert macs_per_pixel(DenoiserSpec("noisy")) is None
+    assert macs_per_pixel(DenoiserSpec.named("rae")) == pytest.approx(9 * products)
+    assert macs_per_pixel(DenoiserSpec.named("noisy")) is None
 
 
 def test_repvgg_is_counted_as_it_runs():
     """One 5 x 5 convolution a block, not its branches; and parameters of both forms are reported."""
-    denoiser = create_any("wskp6")
+    denoiser = create("wskp6")
     trained = denoiser.parameter_count()
     denoiser.prepare()
     layers = [layer for layer in denoiser.network.modules() if isinstance(layer, torch.nn.Conv2d)]
     assert denoiser.parameter_count() < trained
     expected = sum(layer.in_channels * layer.out_channels * 25 for layer in layers)
-    assert macs_per_pixel(DenoiserSpec("wskp6", precision="bfloat16")) == expected
+    assert macs_per_pixel(DenoiserSpec.named("wskp6", precision="bfloat16")) == expected
 
 
 def test_what_is_measured(monkeypatch, capsys):
@@ -187,8 +164,8 @@ def test_what_is_measured(monkeypatch, capsys):
     with pytest.raises(BadInput, match=gone):
         ways(["oidn"])
     monkeypatch.undo()
-    if not cannot_run("oidn"):
-        assert [spec.way for spec in ways(["oidn"])] == ["oidn", "oidn (fast)"]
+    if not cannot_run(parse_name("oidn")):
+        assert [spec.way for spec in ways(["oidn"])] == ["oidn"]
 
 
 def test_sizes_and_threads_that_cannot_be(tmp_path):
@@ -245,4 +222,4 @@ def test_transposed_convolutions_count_their_inputs():
     half = 4 * inputs * a + (1 + 9) * a * a + 4 * a * outputs
     quarter = 4 * a * b + 2 * 9 * b * b + 4 * b * a
     eighth = 4 * b * c + 2 * 9 * c * c + 4 * c * b
-    assert macs_per_pixel(DenoiserSpec("one")) == half / 4 + quarter / 16 + eighth / 64
+    assert macs_per_pixel(DenoiserSpec.named("one")) == half / 4 + quarter / 16 + eighth / 64

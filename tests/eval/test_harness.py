@@ -122,7 +122,7 @@ def test_strips_show_every_denoiser_and_the_reference(runs):
     ],
 )
 def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expected):
-    entrants = entrants_of([DenoiserSpec(name) for name in names])
+    entrants = entrants_of([DenoiserSpec.named(name) for name in names])
     assert {(entrant.name, entrant.denoiser.signal) for entrant in entrants} == expected
     assert len(entrants) == len(expected)
 

@@ -146,7 +146,7 @@ def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
 def test_errors_that_samples_tell_are_a_view_of_their_own(tiny, page, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
     fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", halves=True)
-    specs = [DenoiserSpec("noisy"), DenoiserSpec("eaw+js")]
+    specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw+js")]
     (results,) = by_clip(evaluate_clip(fed, entrants_of(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
     assert list(shown.told) == ["eaw+js"] and len(shown.told["eaw+js"]) == len(shown.frames)

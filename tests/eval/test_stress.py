@@ -141,7 +141,7 @@ def check(monkeypatch) -> Check:
 
     def run(kind: type[Denoiser], name: str = "broken", cases: Sequence[StressCase] = STRESS_CASES) -> list[StressRow]:
         monkeypatch.setitem(registry.DENOISERS, name, kind)
-        return check_all([DenoiserSpec(name)], cases)
+        return check_all([DenoiserSpec.named(name)], cases)
 
     return run
 
@@ -200,7 +200,7 @@ def test_weights_are_named(tmp_path, shipped):
 
 def test_cases_apply_to_precisions_and_logits_that_a_denoiser_has():
     def taken_by(name: str) -> set[str]:
-        spec = DenoiserSpec(name)
+        spec = DenoiserSpec.named(name)
         return {case for case in ("logits to ±1e4", "bfloat16", "float16") if applies(CASES[case], spec)}
 
     assert taken_by("wskp3") == taken_by("wskp-mr") == taken_by("kp") == {"logits to ±1e4", "bfloat16", "float16"}
@@ -275,7 +275,7 @@ def test_a_state_that_does_not_recover_is_found(check):
 def test_recovery_is_counted_in_frames():
     """The mean's error halves from frame to frame."""
     case = CASES[IN_LIGHT[0]]
-    outcome = StressCheck("halves", lambda _: Halves(), case).outcome()
+    outcome = StressCheck(lambda _: Halves(), case).outcome()
     frames = list(case.frames())
     whole = frames[0].radiance("total")
     lost = float((whole - frames[SPOILED_FRAME].finite().radiance("total")).abs().max() / whole.max())
@@ -366,8 +366,8 @@ def test_the_range_is_of_every_colour_and_of_what_svgf_adds_up():
         "depth": torch.ones(1, 1, 1, 2),
     }
     frame = replace(frame, channels=tensors)
-    for name, low, high in (("eaw", 3.0, 3.0), ("svgf", 1.0, 5.0)):
-        seen = IrradianceRange(name)
+    for separates_lights, low, high in ((False, 3.0, 3.0), (True, 1.0, 5.0)):
+        seen = IrradianceRange(separates_lights)
         seen.see(frame)
         for level, outside in ((low, 0), (high, 0), (high * 1.01, 0.01), (low * 0.99, 0.01)):
             assert max(0, seen.violation(frame, torch.full((3, 1, 2), level))) == pytest.approx(outside, abs=1e-6)

@@ -23,11 +23,10 @@ from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import trade
 from eval.tradeoff.samples import SampleTrade, generalisation, sample_trades
-from eval.tradeoff.times import Times, timed_as
+from eval.tradeoff.times import Times
 from files import read_json, write_json
-from models.extra_denoisers import ALL_WINDOWS, WINDOW_SETS, windows_label
-from models.parameters import WINDOWS
-from models.spec import DenoiserSpec, create_any
+from models.registry import create
+from models.spec import DenoiserSpec
 from models.weights import save_weights
 from render.clip import NO_OPTIONS
 from train.task import WEIGHTS_FILE, run_folder
@@ -117,7 +116,9 @@ def clip_results(**psnr: float) -> ClipResults:
 def test_samples_that_are_not_worth_their_time(tmp_path):
     bench_of(tmp_path, ["noisy", "rae"], ms=lambda index: 0.5 + 4 * index, threads=(1,))
     fed = {1: [clip_results(noisy=20.0, rae=30.0)], 4: [clip_results(noisy=26.0, rae=29.0)]}
-    rows = sample_trades([DenoiserSpec("noisy"), DenoiserSpec("rae")], fed, {1: 0.5, 4: 8.5}, Times(tmp_path, SIZE))
+    rows = sample_trades(
+        [DenoiserSpec.named("noisy"), DenoiserSpec.named("rae")], fed, {1: 0.5, 4: 8.5}, Times(tmp_path, SIZE)
+    )
     assert [(row.name, row.ms) for row in rows] == [
         ("noisy, 1 spp", 1.0),
         ("rae, 1 spp", 5.0),
@@ -233,33 +234,14 @@ def test_cost_of_samples(tiny):
 # --- Candidates -------------------------------------------------------------------------------------------------------
 
 
-def test_sizes_are_the_networks_of_the_ablation():
-    assert [windows_label(windows) for windows in WINDOW_SETS.values()][:2] == ["3", "3+5"]
-    assert WINDOW_SETS[ALL_WINDOWS] == WINDOWS
-    for name, windows in WINDOW_SETS.items():
-        assert create_any(name).windows == windows
-    names = (ALL_WINDOWS, "wskp6-2w", "ntd", "ntd-b")
-    assert [timed_as(DenoiserSpec(name)) for name in names] == ["wskp6", "wskp6-2w", "ntd", "ntd"]
-    assert timed_as(DenoiserSpec("svgf", signal="indirect")) == "svgf (indirect)"
-    assert timed_as(DenoiserSpec("ntd", signal="indirect")) == "ntd"
-    assert timed_as(DenoiserSpec("ntd-b@tiny")) == "ntd" and timed_as(DenoiserSpec("kp@tiny+taa")) == "kp+taa"
-
-
 def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys, shipped):
     with pytest.raises(BadInput, match=r"rae: it has no weights.*`onespp train rae --budget tiny --runs"):
         candidates(["rae"], tmp_path, "tiny")
-    with pytest.raises(BadInput, match="`onespp ablate wskp-windows --budget tiny --runs"):
-        candidates(["wskp6-2w"], tmp_path, "tiny")
     with pytest.raises(BadInput, match="unknown denoiser 'magic'"):
         candidates(["magic"], tmp_path, "tiny")
     labels = {candidate.label for candidate in candidates([], tmp_path, "tiny")}
     assert {"noisy", "svgf"} <= labels and "rae" not in labels
     assert re.search(r"\bwskp3\b.*: skipped, it has no weights", capsys.readouterr().out)
-    (tmp_path / "ablation" / "wskp-windows").mkdir(parents=True)
-    write_json(tmp_path / "ablation" / "wskp-windows" / "results.json", {"profile": "quick"})
-    assert "svgf" in {candidate.label for candidate in candidates([], tmp_path, "tiny")}
-    with pytest.raises(BadInput, match="is of the budget quick"):
-        candidates(["wskp6-2w"], tmp_path, "tiny")
 
 
 def test_only_what_was_named_is_a_candidate(tmp_path):
@@ -270,10 +252,10 @@ def test_times_come_from_the_bench(tmp_path):
     with pytest.raises(BadInput, match=r"no times at .*`onespp bench denoisers --size 48x32 --runs"):
         Times(tmp_path, SIZE)
     bench_of(tmp_path, ["noisy", "rae"])
-    rae = DenoiserSpec("rae", precision="bfloat16")
+    rae = DenoiserSpec.named("rae", precision="bfloat16")
     assert [Times(tmp_path, SIZE, threads=n).of(rae) for n in (None, 1)] == [1.0, 2.0]
-    assert Times(tmp_path, SIZE).of(DenoiserSpec("kp")) is None
-    assert Times(tmp_path, SIZE).of(DenoiserSpec("noisy", signal="indirect")) is None  # of total light alone
+    assert Times(tmp_path, SIZE).of(DenoiserSpec.named("kp")) is None
+    assert Times(tmp_path, SIZE).of(DenoiserSpec.named("noisy", signal="indirect")) is None  # of total light alone
     with pytest.raises(BadInput, match=r"results-cuda.json"):
         Times(tmp_path, SIZE, device="cuda")
     with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
@@ -285,19 +267,13 @@ def test_times_come_from_the_bench(tmp_path):
 
 @pytest.fixture(scope="module")
 def traded(tiny, tmp_path_factory):
-    """A trade of a few filters and an untrained wskp6, alone and with two windows; and what it printed."""
+    """A trade of a few filters and an untrained wskp6; and what it printed."""
     runs = tmp_path_factory.mktemp("runs")
-    for name, folder in (
-        ("wskp6", run_folder(runs, "wskp6", "tiny")),
-        ("wskp6-2w", runs / "ablation" / "wskp-windows" / "3+5-0"),
-    ):
-        folder.mkdir(parents=True)
-        label = "wskp6" if name == "wskp6" else windows_label(WINDOW_SETS[name])
-        save_weights(create_any(name), label, {"epochs": 7}, folder / WEIGHTS_FILE)
-    write_json(runs / "ablation" / "wskp-windows" / "results.json", {"profile": "tiny"})
-    bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "wskp6-2w", "svgf+js"])
-    names = ("noisy", "accumulated", "svgf", "svgf+js", "wskp6@tiny", "wskp6-2w")
-    text = trade(tiny, runs, "tiny", names, "48x32", levels=(1, 4))
+    folder = run_folder(runs, "wskp6", "tiny")
+    folder.mkdir(parents=True)
+    save_weights(create("wskp6"), "wskp6", {"epochs": 7}, folder / WEIGHTS_FILE)
+    bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "svgf+js"])
+    text = trade(tiny, runs, "tiny", ("noisy", "accumulated", "svgf", "svgf+js", "wskp6@tiny"), "48x32", levels=(1, 4))
     return runs, text
 
 
@@ -306,7 +282,7 @@ def test_trade_holds_every_precision_and_size(traded):
     content = read_json(runs / "report" / "trade.json")
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
     rows = {row["label"]: row for row in content["rows"]}
-    assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16", "wskp6-2w-bfloat16"} <= rows.keys()
+    assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16"} <= rows.keys()
     assert rows["wskp6@tiny"]["epochs"] == 7 and rows["noisy"]["epochs"] is None
     assert rows["wskp6@tiny"]["ms"] == rows["wskp6@tiny-float16"]["ms"] == 2.0
     assert (

@@ -17,6 +17,7 @@ from models.wrappers.adaptive import (
     brightest,
     gain,
 )
+from models.wrappers.wrapper import unwrapped
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 48
@@ -206,12 +207,12 @@ def test_brightness_does_not_matter():
 
 def test_whatever_accumulates_can_accumulate_adaptively():
     for name in ("accumulated", "eaw", "bmfr", "oidn-accumulated", "wskp6", "kp", "wskp-mr", "mr-kp", "nbgd"):
-        kind = registry.denoiser_class(f"{name}+adaptive")
-        assert kind.accumulation is accumulate_adaptively
-        assert kind.reads == registry.denoiser_class(name).reads
-        assert registry.denoiser_class(name).accumulation is accumulate
-    assert registry.plain_name("wskp6+adaptive+taa") == "wskp6"
-    assert "motion" in registry.denoiser_class("eaw+adaptive+taa").reads
+        adaptive = registry.prototype(f"{name}+adaptive")
+        assert unwrapped(adaptive).accumulation is accumulate_adaptively
+        assert adaptive.reads == registry.prototype(name).reads
+        assert registry.prototype(name).accumulation is accumulate
+    assert registry.parse_name("wskp6+adaptive+taa").base == "wskp6"
+    assert "motion" in registry.prototype("eaw+adaptive+taa").reads
     for name in ("noisy+adaptive", "svgf+adaptive", "eaw+taa+adaptive"):
         with pytest.raises(BadInput, match="temporal accumulation"):
-            registry.denoiser_class(name)
+            registry.prototype(name)

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.frame import Frame
-from eval.stress.irradiance_range import CONVEX
 from models import compiled, registry
 from models.history.running_scale import running_scale
 from models.networks.fusion import fuse
@@ -19,7 +18,7 @@ from models.operators import halve, halve_surface
 from tests.helpers.frames import chain, flat_frame, play, run
 from tests.helpers.unfold import unfold_kernel
 
-NAMES = [name for name in registry.DENOISERS if not registry.unavailable(name)]
+NAMES = [name for name in registry.DENOISERS if not registry.prototype(name).unavailable()]
 WINDOWS = (3, 5, 13)
 MASKS = st.builds(
     lambda height, width, share, seed: (
@@ -97,7 +96,7 @@ def test_background_is_its_emission_alone(name):
         assert (carried.masked_select(~surface) == 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in CONVEX if name in NAMES])
+@pytest.mark.parametrize("name", [name for name in NAMES if registry.prototype(name).convex])
 @settings(deadline=None)
 @given(surface=MASKS)
 def test_even_light_stays_even_beside_background(name, surface):

@@ -11,6 +11,7 @@ from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
 from models.networks.rae import RAE, RAEState
+from models.spec import fastest_precision, load, precisions_of
 from models.weights import load_weights, save_weights
 from tests.helpers.frames import flat_frame, run
 
@@ -37,21 +38,21 @@ def denoisers():
         "ntd+taa+js",
     ],
 )
-def test_classes_tell_what_their_instances_are(name):
-    kind = registry.denoiser_class(name)
+def test_a_prototype_has_the_attributes_of_the_denoiser(name):
+    prototype = registry.prototype(name)
     denoiser = registry.create(name)
-    assert type(denoiser).__name__ == kind.__name__
-    assert (kind.reads, kind.signal, kind.refuses) == (denoiser.reads, denoiser.signal, denoiser.refuses)
-    assert kind.is_network == (denoiser.parameter_count() > 0)
-    assert registry.inference_precision(name) == registry.inference_precision(kind)
+    assert type(denoiser) is type(prototype)
+    assert (prototype.reads, prototype.signal, prototype.refuses) == (denoiser.reads, denoiser.signal, denoiser.refuses)
+    assert prototype.is_network == (denoiser.parameter_count() > 0)
+    assert fastest_precision(name) in precisions_of(name)
     assert {registry.create(name, signal).signal for signal in ("total", "indirect")} == {"total", "indirect"}
 
 
-def test_facts_are_known_without_building(monkeypatch):
-    monkeypatch.setattr(torch.nn.Module, "__init__", lambda self: pytest.fail("something was built"))
+def test_a_prototype_takes_no_memory_for_weights():
+    assert all(weight.is_meta for weight in registry.prototype("rae+taa").parameters())
     assert "dual_motion" in registry.channels_read(["ntd"]) and "normal" in registry.channels_read(["noisy+taa"])
-    assert registry.unavailable("rae+taa") is None
-    assert registry.inference_precision("svgf+taa") == torch.float32
+    assert registry.prototype("rae+taa").unavailable() is None
+    assert fastest_precision("svgf+taa") == "float32"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -239,7 +240,7 @@ def test_rae_inputs_are_the_seven_of_the_paper(tiny, denoisers, monkeypatch):
 def test_weights_round_trip(tmp_path, denoisers):
     path = tmp_path / "w.safetensors"
     save_weights(denoisers["rae"], "rae", {"epochs": 3}, path)
-    loaded = registry.load("rae", path, torch.float32)
+    loaded = load("rae", path, torch.float32)
     for a, b in zip(loaded.parameters(), denoisers["rae"].parameters(), strict=True):
         assert torch.equal(a, b)
     assert not loaded.training and list(tmp_path.iterdir()) == [path]
@@ -248,15 +249,15 @@ def test_weights_round_trip(tmp_path, denoisers):
 def test_unusable_weights_are_named(tmp_path, denoisers):
     path = tmp_path / "w.safetensors"
     with pytest.raises(BadInput, match="onespp train rae"):
-        registry.load("rae", path)
+        load("rae", path)
     with pytest.raises(BadInput, match="needs trained weights"):
-        registry.load("rae", None)
+        load("rae", None)
     path.write_bytes(b"not weights")
     with pytest.raises(BadInput, match="damaged"):
-        registry.load("rae", path)
+        load("rae", path)
     save_weights(denoisers["rae"], "wskp6", {}, path)
     with pytest.raises(BadInput, match="'wskp6', not of 'rae'"):
-        registry.load("rae", path)
+        load("rae", path)
     small = RAE()
     small.network = torch.nn.Conv2d(7, 3, 1)
     save_weights(small, "rae", {}, path)

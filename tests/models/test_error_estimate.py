@@ -14,7 +14,6 @@ from errors import BadInput
 from models.denoiser import Denoiser, State
 from models.wrappers.error_estimate import ErrorEstimate, estimated, with_error
 from models.wrappers.shrinkage import Shrunk
-from models.wrappers.wrapper import around
 from tests.helpers.frames import flat_frame
 from tests.helpers.halves import noisy_halves, with_halves
 
@@ -40,7 +39,7 @@ def waves(length: float) -> Tensor:
 
 def judged(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
     a, b = noisy_halves(truth, deviation)
-    output, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b), None)
+    output, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b), None)
     return output, estimate
 
 
@@ -93,20 +92,20 @@ def test_samples_are_asked_for_as_errors_of_mixtures_fall():
 def test_equal_halves_have_no_error():
     image = 0.1 + torch.rand(1, 3, 40, 40)
     frame = replace(with_halves(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
-    output, _, estimate = with_error(around(Shrunk, Blur)(), frame, None)
+    output, _, estimate = with_error(Shrunk(Blur()), frame, None)
     torch.testing.assert_close(output, image)
     assert estimate.radiance().max() < 1e-5 and estimate.relative_error() < 1e-5
 
 
 def test_a_frame_without_halves_is_refused():
     with pytest.raises(BadInput, match="no halves"):
-        with_error(around(Shrunk, Blur)(), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
+        with_error(Shrunk(Blur()), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
 
 
 def test_it_gives_what_the_denoiser_gives():
     a, b = noisy_halves(waves(20), 0.3)
     frame = with_halves(a, b)
-    denoiser = around(Shrunk, Blur)()
+    denoiser = Shrunk(Blur())
     torch.testing.assert_close(with_error(denoiser, frame, None)[0], denoiser(frame, None)[0])
 
 
@@ -123,7 +122,7 @@ def test_any_halves_tell_something_finite(seed, height, width, levels, backgroun
     a, b = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
     mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
     depth = mesh if background else mesh + 1
-    output, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b, mesh_id=mesh, depth=depth), None)
+    output, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b, mesh_id=mesh, depth=depth), None)
     error = estimate.radiance()
     assert torch.isfinite(output).all() and torch.isfinite(error).all() and (error >= 0).all()
     assert ((error == 0) | (depth > 0)).all()
@@ -134,7 +133,7 @@ def test_any_halves_tell_something_finite(seed, height, width, levels, backgroun
 def test_a_firefly_in_one_half_is_told_where_it_is():
     a, b = noisy_halves(torch.ones(1, 3, 64, 64), 0.3)
     a[..., 32, 32] = 1e4
-    _, _, estimate = with_error(around(Shrunk, Blur)(), with_halves(a, b), None)
+    _, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b), None)
     error = estimate.radiance()
     assert torch.isfinite(error).all()
     assert error[..., :8, :8].max() < 0.5

@@ -31,7 +31,8 @@ from models.history.reprojection import reproject
 from models.history.surfaces import Surfaces, to_previous_camera
 from models.networks.affinity import plain_level
 from models.parameters import WINDOWS
-from models.registry import create, load
+from models.registry import create
+from models.spec import load
 from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.exports import check_page

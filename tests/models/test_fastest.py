@@ -6,16 +6,18 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from models import registry
-from models.fastest import bfloat16_pays
+from files import read_json
+from models.fastest import bfloat16_is_faster
+from models.spec import fastest_precision
 
 
 @pytest.fixture(autouse=True)
-def forget():
-    """What these tests measure holds for them alone."""
-    bfloat16_pays.cache_clear()
+def own_cache(tmp_path, monkeypatch):
+    """These tests measure anew and keep their measurements to themselves."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    bfloat16_is_faster.cache_clear()
     yield
-    bfloat16_pays.cache_clear()
+    bfloat16_is_faster.cache_clear()
 
 
 @pytest.mark.parametrize("slow, fast", [(torch.float32, torch.bfloat16), (torch.bfloat16, torch.float32)])
@@ -33,13 +35,24 @@ def test_networks_take_the_precision_that_is_faster(monkeypatch, slow, fast):
 
     with monkeypatch.context() as patched:
         patched.setattr(F, "conv2d", conv2d)
-        assert registry.inference_precision("rae") == fast
-    assert registry.inference_precision("wskp6+taa") == fast  # remembered
-    assert registry.inference_precision("svgf") == torch.float32
+        assert fastest_precision("rae") == str(fast).removeprefix("torch.")
+    bfloat16_is_faster.cache_clear()  # another process
+    monkeypatch.setattr(F, "conv2d", lambda *_, **__: pytest.fail("measured twice"))
+    assert fastest_precision("wskp6+taa") == fastest_precision("rae") == str(fast).removeprefix("torch.")
+    assert fastest_precision("svgf") == "float32"
+
+
+def test_a_damaged_cache_is_measured_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    file = tmp_path / "onespp" / "bfloat16.json"
+    file.parent.mkdir()
+    file.write_text("{")
+    first = fastest_precision("rae")
+    assert len(read_json(file)) == 1 and fastest_precision("rae") == first
 
 
 def test_without_instructions_nothing_is_measured(monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     monkeypatch.setattr(F, "conv2d", lambda *_, **__: pytest.fail("measured"))
-    assert registry.inference_precision("rae") == torch.float32
+    assert fastest_precision("rae") == "float32"

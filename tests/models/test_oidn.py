@@ -10,7 +10,8 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
-from models.filters.oidn import OIDN, OIDNAccumulated
+from models.filters.oidn import OIDN, OIDNAccumulated, OIDNFast
+from models.spec import load
 from tests.helpers.frames import flat_frame, run
 
 pytest.importorskip("pyoidn")
@@ -44,15 +45,15 @@ def test_denoises_and_accumulation_helps(tiny):
 
 def test_quality_is_a_setting(tiny):
     (frame,) = frames_of(tiny, 1)
-    high, fast = (OIDN(quality)(frame, None)[0] for quality in ("high", "fast"))
+    high, fast = (denoiser(frame, None)[0] for denoiser in (OIDN(), OIDNFast()))
     assert not torch.equal(high, fast)
     assert error(fast, frame) < 0.3 * error(frame.radiance("total"), frame)
 
 
-@pytest.mark.parametrize("quality", ["high", "fast"])
-def test_any_level_of_light(quality):
+@pytest.mark.parametrize("kind", [OIDN, OIDNFast])
+def test_any_level_of_light(kind):
     """A noisy wall comes out at its mean level, from almost no light to the most that float16 holds."""
-    denoiser = OIDN(quality)
+    denoiser = kind()
     for level in LEVELS:
         frame = noisy_wall(64, 64, level / 4)
         output, _ = denoiser(frame, None)
@@ -91,7 +92,7 @@ def test_unusable_pixels_count_as_black(poison):
 
 def test_the_filter_is_made_once_a_size_and_thread_count(monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    denoiser = OIDN("fast")
+    denoiser = OIDNFast()
     filters = []
     for size in ((20, 30), (20, 30), (30, 20), (30, 20)):
         denoiser(flat_frame(*size), None)
@@ -103,7 +104,7 @@ def test_the_filter_is_made_once_a_size_and_thread_count(monkeypatch):
 
 
 def test_outputs_are_not_overwritten_by_the_next_frame():
-    denoiser = OIDN("fast")
+    denoiser = OIDNFast()
     first, _ = denoiser(noisy_wall(16, 16), None)
     kept = first.clone()
     denoiser(noisy_wall(16, 16, 9.0), None)
@@ -116,21 +117,21 @@ def test_native_objects_are_released(monkeypatch):
     released = []
     for kind in (pyoidn.Device, pyoidn.Filter):
         monkeypatch.setattr(kind, "release", lambda self, kind=kind, r=kind.release: (released.append(kind), r(self)))
-    denoiser = OIDN("fast")
+    denoiser = OIDNFast()
     denoiser(flat_frame(4, 4), None)
     del denoiser
     assert released == [pyoidn.Filter, pyoidn.Device]
 
 
 def test_missing_or_broken_oidn_is_a_clear_error(monkeypatch):
-    assert registry.unavailable("oidn") is None and registry.unavailable("noisy") is None
+    assert registry.prototype("oidn").unavailable() is None and registry.prototype("noisy").unavailable() is None
     monkeypatch.setattr("pyoidn.Device.get_error", lambda self: "unsupported hardware")
-    assert "unsupported hardware" in registry.unavailable("oidn")
+    assert "unsupported hardware" in registry.prototype("oidn").unavailable()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     for name in ("oidn", "oidn-accumulated"):
-        assert "pip install 'onespp[oidn]'" in registry.unavailable(name)
+        assert "pip install 'onespp[oidn]'" in registry.prototype(name).unavailable()
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
-            registry.load(name, None)
+            load(name, None)
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
             registry.create(name)(flat_frame(4, 4), None)
     assert registry.channels_read(["oidn"])  # what it reads is known all the same

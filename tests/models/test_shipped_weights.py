@@ -13,6 +13,7 @@ import torch
 from errors import BadInput
 from models import registry
 from models.shipped_weights import FOLDER, require_shipped, shipped_names, shipped_weights
+from models.spec import load
 from provenance import ROOT
 from tests.helpers.frames import flat_frame, run
 
@@ -44,7 +45,7 @@ def test_an_installed_package_has_them():
 @pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
 def test_they_denoise(path):
     """A grey wall in even light stays finite and about as bright, and history does not spoil it."""
-    denoiser = registry.load(path.stem, path, torch.float32)
+    denoiser = load(path.stem, path, torch.float32)
     frames = [flat_frame(24, 40, irradiance=0.5 * torch.ones(1, 3, 24, 40)) for _ in range(3)]
     for frame in frames:
         frame.channels["indirect"] = frame.channels["direct"]
@@ -59,7 +60,7 @@ def test_one_neither_drifts_nor_burns_in():
     height, width = 48, 64
     light = torch.linspace(0.1, 2.0, width).expand(1, 3, height, width)
     generator = torch.Generator().manual_seed(0)
-    denoiser = registry.load("one", shipped_weights("one"), torch.float32)
+    denoiser = load("one", shipped_weights("one"), torch.float32)
     state = None
     errors = []
     biases = []

@@ -15,7 +15,6 @@ from models.denoiser import Denoiser, State
 from models.filters.neighbours import mesh_sums
 from models.wrappers import shrinkage
 from models.wrappers.shrinkage import RARE, SCARCE, STANDARD_ERRORS, Shrunk, shrunk
-from models.wrappers.wrapper import around
 from tests.helpers.frames import flat_frame, play
 from tests.helpers.halves import noisy_halves, with_halves
 
@@ -35,7 +34,7 @@ class Told(Denoiser):
 
 def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     """What `Told` of that irradiance becomes."""
-    denoiser = around(Shrunk, Told)()
+    denoiser = Shrunk(Told())
     assert isinstance(denoiser.inner, Told)
     denoiser.inner.image = image
     return play(denoiser, [frame])[0][0]
@@ -143,11 +142,11 @@ def test_without_halves_it_is_the_denoiser():
 
 
 def test_its_name_weights_and_channels_are_those_of_the_denoiser():
-    assert registry.plain_name("wskp6+adaptive+taa+js") == "wskp6"
-    kind = registry.denoiser_class("ntd+js")
-    assert kind.signal == "indirect" and kind.is_network
-    assert "indirect_halves" in kind.reads and "direct_halves" not in kind.reads
-    assert registry.denoiser_class("nfor+js").offline
+    assert registry.parse_name("wskp6+adaptive+taa+js").base == "wskp6"
+    prototype = registry.prototype("ntd+js")
+    assert prototype.signal == "indirect" and prototype.is_network
+    assert "indirect_halves" in prototype.reads and "direct_halves" not in prototype.reads
+    assert registry.prototype("nfor+js").offline
 
 
 def test_a_few_black_samples_are_not_taken_for_the_truth():

@@ -15,6 +15,7 @@ from models import compiled, registry
 from models.denoiser import Denoiser
 from models.history.running_scale import running_scale
 from models.networks.features import network_features
+from models.spec import load
 from models.specialise import drop_inputs, specialise
 from models.weights import save_weights
 from tests.helpers.frames import chain, flat_frame, run
@@ -113,7 +114,7 @@ def test_every_network_can_do_without_what_does_not_vary(name, tmp_path):
         assert special.parameter_count() == general.parameter_count() - FEWER[name]
     path = tmp_path / "w.safetensors"
     save_weights(special, name, {}, path)
-    loaded = registry.load(name, path, torch.float32)
+    loaded = load(name, path, torch.float32)
     sequence = frames(40, 37, 3)
     expected = run(general, sequence)
     for output in (run(special, sequence), run(loaded, sequence)):
@@ -143,11 +144,11 @@ def with_channel(frame: Frame, name: str, change: Tensor) -> Frame:
 
 @pytest.mark.parametrize("name, channel", [("rae", "roughness"), ("wskp3", "albedo"), ("wskp3+taa", "normal")])
 def test_a_frame_in_which_such_a_channel_varies_is_refused(name, channel, tmp_path):
-    plain = registry.plain_name(name)
+    plain = registry.parse_name(name).base
     _, special = pair(plain)
     path = tmp_path / "w.safetensors"
     save_weights(special, plain, {}, path)
-    denoiser = registry.load(name, path, torch.float32)
+    denoiser = load(name, path, torch.float32)
     [frame] = frames(8, 8, 1)
     odd = torch.zeros(1, 1, 8, 8)
     odd[..., 3, 4] = 1

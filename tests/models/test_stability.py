@@ -18,14 +18,14 @@ from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.stress.irradiance_range import CONVEX, ROUNDING, range_violation
+from eval.stress.irradiance_range import ROUNDING, range_violation
 from models import registry
 from tests.helpers.frames import chain, flat_frame, play, run
 
 NAMES = [
     name
     for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive", "eaw+js")
-    if not registry.unavailable(name)
+    if not registry.prototype(name).unavailable()
 ]
 THREADS = torch.get_num_threads()
 ALL = tuple(registry.channels_read())
@@ -120,11 +120,11 @@ def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channe
         torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("name", [name for name in CONVEX if name in NAMES])
+@pytest.mark.parametrize("name", [name for name in NAMES if registry.prototype(name).convex])
 @SETTINGS
 @given(frames=frames_strategy())
 def test_convex_filters_stay_in_range(denoisers, name, frames):
-    assert range_violation(name, frames, run(denoisers[name], frames)) <= ROUNDING
+    assert range_violation(denoisers[name], frames, run(denoisers[name], frames)) <= ROUNDING
 
 
 # --- Long sequences ---------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from models import registry
+from models.spec import load
 from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.frames import run
@@ -109,7 +110,7 @@ def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):
     special = training.judged.denoiser
     assert special.constants == {"albedo": GREY["value"]} and training.facts["constants"] == special.constants
     frame = read_frame(Dataset(grey).clips("val")[0], 0, special.reads)
-    before = registry.load("wskp3", general, torch.float32)
+    before = load("wskp3", general, torch.float32)
     inner = (..., slice(12, -12), slice(12, -12))
     torch.testing.assert_close(run(special, [frame])[0][inner], run(before, [frame])[0][inner], rtol=1e-3, atol=1e-4)
 
@@ -117,7 +118,7 @@ def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):
     assert f"wskp3: specialised to {grey}, left out albedo\n" in capsys.readouterr().out
     assert json.loads(metadata(weights)["constants"]) == special.constants
     assert tensors(weights)["network.0.branches.2.weight"].shape == (24, 7, 5, 5)
-    trained = registry.load("wskp3", weights, torch.float32)
+    trained = load("wskp3", weights, torch.float32)
     assert torch.isfinite(run(trained, [frame])[0]).all()
     with pytest.raises(BadInput, match="albedo is not"):  # test clips are as they were
         run(trained, [read_frame(Dataset(grey).clips("test")[0], 0, trained.reads)])
