@@ -8,7 +8,6 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-SOURCES := onespp.py command_line.py allocator.py errors.py files.py plotting.py provenance.py timing.py scenes render datasets models train eval denoise tests
 LLVM := libllvm19
 
 .NOTPARALLEL:
@@ -41,7 +40,6 @@ eval: $(READY)
 
 bench: $(READY)
 	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
-	$(BIN)/onespp bench scaling --runs $(RUNS)
 	$(BIN)/onespp bench rendering --runs $(RUNS)
 
 stress: $(READY)
@@ -61,8 +59,8 @@ test-all: $(READY)
 	$(PYTEST) -m '' --hypothesis-profile thorough
 
 lint: $(READY)
-	$(BIN)/ruff check $(SOURCES)
-	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
 clean:

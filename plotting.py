@@ -1,23 +1,37 @@
-"""Figures on disk, whole or not at all, and the sizes of what is in them."""
+"""Figures on disk, complete or not at all, and the sizes of what is in them. All drawing packages are imported here.
+
+Importing this module raises BadInput where the extra `report` is not installed.
+"""
 
 import math
 from pathlib import Path
 
-import matplotlib
-from matplotlib.figure import Figure
-
+from extras import requires_extra
 from files import replacing
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+with requires_extra("report"):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+    from matplotlib import ticker
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from PIL import Image, ImageDraw, ImageFont
 
 __all__ = [
     "DPI",
     "SMALLEST_PANEL",
     "TWO_LINE_CAPTION",
+    "Axes",
+    "Figure",
+    "Image",
+    "ImageDraw",
+    "ImageFont",
     "enlargement",
     "plt",
     "save_figure",
+    "ticker",
 ]
 
 DPI = 100
@@ -26,7 +40,7 @@ SMALLEST_PANEL = 256  # px, the longer side of an image
 
 
 def enlargement(height: int, width: int, smallest: int = SMALLEST_PANEL) -> int:
-    """The whole factor that makes the longer side of an image at least `smallest` pixels."""
+    """The integer factor that makes the longer side of an image at least `smallest` pixels."""
     return max(1, math.ceil(smallest / max(height, width)))
 
 

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from datasets.difficulty import MEASURES, Difficulty
-from plotting import plt
+from plotting import Figure, plt
 
 BINS = 16
 

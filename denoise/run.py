@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image as Picture
 from tqdm import tqdm
 
 from datasets.frame import Frame
@@ -28,6 +27,7 @@ from denoise.sources import Sources, find_sources, has_halves
 from denoise.understanding import Understanding, report, understand
 from errors import BadInput
 from eval.bench.memory import status_mb
+from extras import requires_extra
 from files import replacing
 from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN, OIDNQuality
@@ -88,6 +88,9 @@ def denoise(job: Job) -> None:
 
     Raises BadInput for what the user can mend.
     """
+    if job.previews:
+        with requires_extra("report"):
+            import PIL.Image  # noqa: F401 - so that a missing package is named before the work
     frames = sequence_of(job.patterns, job.frames)
     references = reference_files(job, frames)
     check_names(job.out, frames)
@@ -305,7 +308,9 @@ class Work:
         """The frame's file with denoised radiance in it, and its preview."""
         image.replace(self.sources.target, radiance, DTYPES[self.job.stored_as])
         if self.job.previews:
+            from PIL import Image
+
             shown = display(np.nan_to_num(radiance).clip(0, None), self.exposure)
             with replacing(self.preview(files)) as temporary:
-                Picture.fromarray((255 * shown + 0.5).astype(np.uint8)).save(temporary, "PNG")
+                Image.fromarray((255 * shown + 0.5).astype(np.uint8)).save(temporary, "PNG")
         image.write(self.job.out / files.name, f"onespp {self.job.denoiser}")

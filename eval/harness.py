@@ -32,8 +32,8 @@ from eval.results import (
     write_results,
 )
 from eval.selection import evaluated, with_indirect_baselines
-from eval.strip import save_strip
 from eval.text_table import results_table
+from extras import can_draw
 from models.spec import DenoiserSpec
 from provenance import device_in_words
 from timing import thread_count, threads_for
@@ -125,6 +125,8 @@ def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs
 
 def save_strips(runs: Path, results: ClipResults) -> None:
     """A PNG of a frame late in the clip as each denoiser shows it."""
+    from eval.strip import save_strip
+
     index = len(results.reference.frames) * 3 // 4
     images = {name: load_picture(folder, index) for name, folder in folders_of(runs, results).items()}
     errors = {result.denoiser: result.frames[index] for result in results.results}
@@ -159,7 +161,10 @@ def evaluate(
     results = [result for clip in clips for result in evaluate_clip(clip, entrants, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(), results, weights)
-    for group in by_clip(results):
-        save_strips(runs, group)
+    if can_draw():
+        for group in by_clip(results):
+            save_strips(runs, group)
+    else:
+        print("no pictures: they need `pip install 'onespp[report]'`")
     print(results_table(list(by_clip(results))))
     return content

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from datasets.clip import Clip
 from datasets.clip_kind import ClipKind
 from datasets.frame import Signal
 from errors import BadInput
 from eval.metrics import METRICS, Values
+from extras import can_draw
 from files import read_json, write_file, write_json
 from provenance import DENOISING, code_digest, versions
 
@@ -59,18 +59,26 @@ def error_path(folder: Path, index: int) -> Path:
 
 
 def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
-    """Keep an image (H, W, 3) in [0, 1], rounded to 8 bits."""
-    Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(picture_path(folder, index), lossless=True, method=2)
+    """Keep an image (H, W, 3) in [0, 1], rounded to 8 bits; nothing without the extra `report`."""
+    save_bytes(picture_path(folder, index), 255 * image + 0.5)
 
 
 def save_error(folder: Path, index: int, error: NDArray[np.floating]) -> None:
     """Keep an error map (H, W) in exposed radiance, white from BRIGHTEST_ERROR on."""
-    shades = 255 * (error / BRIGHTEST_ERROR).clip(0, 1) + 0.5
-    Image.fromarray(shades.astype(np.uint8)).save(error_path(folder, index), lossless=True, method=2)
+    save_bytes(error_path(folder, index), 255 * (error / BRIGHTEST_ERROR).clip(0, 1) + 0.5)
+
+
+def save_bytes(path: Path, values: NDArray[np.floating]) -> None:
+    if can_draw():
+        from plotting import Image
+
+        Image.fromarray(values.astype(np.uint8)).save(path, lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:
     """Raises BadInput where it is missing or damaged."""
+    from plotting import Image
+
     path = picture_path(folder, index)
     try:
         with Image.open(path) as image:
@@ -111,12 +119,13 @@ def load_result(folder: Path) -> Result:
 
 
 def is_finished(folder: Path, wanted: str) -> bool:
-    """Whether the folder's result is whole and follows from the same data, code and weights."""
+    """Whether the folder's result is complete, with pictures if these can be stored, and of the same key."""
     try:
         result = load_result(folder)
     except BadInput:
         return False
-    return result.key == wanted and all(picture_path(folder, index).exists() for index in range(len(result.frames)))
+    has_pictures = all(picture_path(folder, index).exists() for index in range(len(result.frames)))
+    return result.key == wanted and (has_pictures or not can_draw())
 
 
 def write_results(

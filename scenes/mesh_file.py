@@ -17,6 +17,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from errors import BadInput
+from extras import can_draw
 from scenes.animation import Camera, Shape, Track
 from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
 from scenes.camera import Array
@@ -218,7 +219,11 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
         missing = f": {resolver.missing[0]} is missing" if resolver.missing else f" is empty or damaged ({damage})"
         raise BadInput(f"{path}{missing}")
     notes = [f"the file {name} is missing: what it says is left out" for name in dict.fromkeys(resolver.missing)]
-    return scene, notes + list(dict.fromkeys(complaints.heard)) + notes_of_gltf(path)
+    return scene, notes + list(dict.fromkeys(complaints.heard)) + notes_of_gltf(path) + notes_of_textures()
+
+
+def notes_of_textures() -> list[str]:
+    return [] if can_draw() else ["textures are left out: reading them needs `pip install 'onespp[report]'`"]
 
 
 def notes_of_gltf(path: Path) -> list[str]:

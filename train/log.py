@@ -3,14 +3,16 @@
 import csv
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
-import matplotlib.image
 import numpy as np
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
+from extras import can_draw
 from files import replacing
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 METRICS_CSV = "metrics.csv"
 SAMPLE_FILE = "sample.png"
@@ -25,6 +27,15 @@ def read_metrics(path: Path) -> list[LogRow]:
     return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(whole)]
 
 
+def open_board(folder: Path, done: int) -> "SummaryWriter | None":
+    """TensorBoard's log from step `done` on; None where TensorBoard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ModuleNotFoundError:
+        return None
+    return SummaryWriter(str(folder), purge_step=done)
+
+
 class Log:
     """Means of what `step` is given, a row of metrics.csv and points in TensorBoard for every so many steps.
 
@@ -34,7 +45,7 @@ class Log:
     def __init__(self, folder: Path, done: int, total: int):
         self.path = folder / METRICS_CSV
         self.every = max(1, total // MOST_ROWS)
-        self.board = SummaryWriter(str(folder), purge_step=done)
+        self.board = open_board(folder, done)
         self.pending: list[LogRow] = []
         self.forget_after(done)
 
@@ -69,15 +80,21 @@ class Log:
             if new:
                 writer.writeheader()
             writer.writerow(row)
-        for name, value in row.items():
-            self.board.add_scalar(name, value, step)
+        if self.board:
+            for name, value in row.items():
+                self.board.add_scalar(name, value, step)
 
     def picture(self, step: int, image: Tensor) -> None:
         """Show a picture (3, H, W) in [0, 1]: in TensorBoard, and the newest as sample.png."""
-        self.board.add_image("noisy, output, reference, difference", image, step)
-        with replacing(self.path.with_name(SAMPLE_FILE)) as temporary:
-            matplotlib.image.imsave(temporary, image.permute(1, 2, 0).numpy(), format="png")
+        if self.board:
+            self.board.add_image("noisy, output, reference, difference", image, step)
+        if can_draw():
+            from plotting import plt
+
+            with replacing(self.path.with_name(SAMPLE_FILE)) as temporary:
+                plt.imsave(temporary, image.permute(1, 2, 0).numpy(), format="png")
 
     def close(self) -> None:
         """Write what TensorBoard still holds back."""
-        self.board.close()
+        if self.board:
+            self.board.close()

@@ -10,6 +10,7 @@ from lightning_fabric import Fabric
 from tqdm import tqdm
 
 from errors import BadInput
+from extras import can_draw
 from files import locked
 from train.checkpoint import load_checkpoint
 from train.fabric import fabric_here
@@ -80,7 +81,10 @@ def train_to_end(training: Training, save_seconds: float) -> None:
     if not training.finished:
         take_steps(training, save_seconds)
     if (folder / BEST_FILE).exists():  # only a finished training has weights
-        loss_curve(folder, f"{training.task.name}, {training.task.budget}")
+        if can_draw():
+            loss_curve(folder, f"{training.task.name}, {training.task.budget}")
+        else:
+            print(f"{training.task.name}: no loss.png: it needs `pip install 'onespp[report]'`")
         os.replace(folder / BEST_FILE, folder / WEIGHTS_FILE)
 
 

@@ -12,7 +12,6 @@ from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display
 from models.denoiser import Denoiser, State
 from models.operators import finite
-from plotting import DPI, plt, save_figure
 from train.log import METRICS_CSV, read_metrics
 
 CURVE_FILE = "loss.png"
@@ -39,6 +38,8 @@ def sample_picture(denoiser: Denoiser, clip: Clip, device: torch.device) -> Tens
 
 def loss_curve(folder: Path, title: str) -> None:
     """Draw loss.png from metrics.csv: the training loss and its parts, and the loss over the validation clips."""
+    from plotting import DPI, plt, save_figure
+
     rows = read_metrics(folder / METRICS_CSV)
     figure, axis = plt.subplots(figsize=(7, 4.5), dpi=DPI, layout="constrained")
     other = {"step", "learning_rate", "gradient_norm", "step_ms", "loading_ms", "skipped", "val_loss"}

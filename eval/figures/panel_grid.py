@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from plotting import DPI, TWO_LINE_CAPTION, enlargement, plt
+from plotting import DPI, TWO_LINE_CAPTION, Figure, enlargement, plt
 
 # The longer side of an image, in pixels.
 SMALLEST_IMAGE = 192

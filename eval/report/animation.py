@@ -4,11 +4,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from eval.results import ClipResults, folders_of, load_picture, signal_label
 from files import replacing
-from plotting import enlargement
+from plotting import Image, ImageDraw, ImageFont, enlargement
 
 BEST_SHOWN = 2  # denoisers
 MOST_FRAMES = 240

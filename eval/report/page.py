@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 from tqdm import tqdm
 
 from errors import BadInput
@@ -20,8 +18,13 @@ from eval.report.trade_plot import trade_plots
 from eval.results import ClipResults, read_results
 from eval.text_table import LEGEND
 from eval.tradeoff.times import times_of_first_size
+from extras import requires_extra
 from files import write_file
 from plotting import plt
+
+with requires_extra("report"):
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
 
 
 def figures(runs: Path) -> list[dict[str, str]]:

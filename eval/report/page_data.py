@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from tqdm import tqdm
 
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, error_path, folders_of, load_picture, picture_path
+from plotting import Image
 from timing import thread_count, threads_for
 
 WITH_FLIP_MAPS = 1.4  # bytes of images and their FLIP maps over those of images

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 from tabulate import tabulate
 
 from eval.stress.cases import RECOVERY_LIMIT, StressCase
 from eval.stress.check import REQUIREMENTS
 from eval.stress.outcome import FRESH, StressRow
-from plotting import plt
+from plotting import Figure, plt
 
 
 def short(value: float | None) -> str:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from tabulate import tabulate
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -28,7 +26,7 @@ from models.registry import parse_name
 from models.spec import DenoiserSpec, fastest_precision
 from models.wrappers.error_estimate import ErrorEstimate, with_error
 from models.wrappers.shrinkage import Shrunk
-from plotting import DPI, plt, save_figure
+from plotting import DPI, Axes, Figure, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling
 from scenes.registry import build_scene

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -21,7 +20,7 @@ from files import write_file, write_json
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.spec import DenoiserSpec
-from plotting import DPI, plt, save_figure
+from plotting import DPI, Figure, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling
 from scenes.animation import KeyframedTrack, RigidMotion, Scene, Track

@@ -6,7 +6,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
@@ -16,6 +15,7 @@ from errors import BadInput
 from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
 from models.denoiser import Denoiser, State
+from plotting import Image
 from render.clip import Sampling
 from render.job.clip_job import write_clip
 from render.shot import Shot

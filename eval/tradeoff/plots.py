@@ -2,15 +2,11 @@
 
 from collections.abc import Sequence
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-
 from eval.metrics import METRICS
 from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.pareto import Point
 from eval.tradeoff.samples import SampleTrade
-from plotting import DPI, plt
+from plotting import DPI, Axes, Figure, plt, ticker
 
 MARKERS = {"float32": "o", "bfloat16": "s", "float16": "^"}
 
@@ -18,9 +14,9 @@ MARKERS = {"float32": "o", "bfloat16": "s", "float16": "^"}
 def plain_ticks(axis: Axes) -> None:
     """Milliseconds on a logarithmic axis, as 2, 5, 10, 20 instead of powers."""
     axis.set_xscale("log")
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    axis.xaxis.set_minor_formatter(ticker.NullFormatter())
 
 
 def draw_front(rows: Sequence[Trade], metric: str, title: str) -> Figure:
