@@ -27,15 +27,6 @@ BLOCK_SIDE = 32  # px
 REGRESSORS = 10  # 1, normal (3), position (3), its squares (3)
 FLATTEST = 1e-3  # of a block's largest extent: what is smaller along an axis is not stretched to 1
 
-# --- NFOR (Bitterli et al. 2016) --------------------------------------------------------------------------------------
-
-REACH = 9  # R, px: windows of 19 x 19
-WINDOW = 2 * REACH + 1
-LARGEST_DISTANCE = 1e4  # of two pixels; weights are 0 long before
-FARTHEST = 1e30  # the distance to what is no surface
-RIDGE = 1e-5  # of the sum of weights, in squared units of features
-LARGEST_FITTED = 1e13  # irradiance; fits extrapolate it, and squares of that must stay finite
-
 # --- AAF (Mehta et al. 2012, 2013) ------------------------------------------------------------------------------------
 
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that

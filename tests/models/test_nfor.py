@@ -1,6 +1,5 @@
 """NFOR step by step against slow versions in float64 that follow the paper pixel by pixel."""
 
-import contextlib
 import math
 
 import numpy as np
@@ -9,20 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import compiled
-from models.filters.nfor import NFOR, chequered_halves, features_of, nfor, nl_means, patch_distances, regress
+from models.filters.nfor import NFOR, checkerboard_buffers, features_of, nfor, nl_means, patch_distances, regress
 from tests.helpers.frames import flat_frame, run
 
-WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6))
 EXAMPLES = settings(max_examples=8, deadline=None)
-
-
-@pytest.fixture(params=WAYS, autouse=True)
-def way(request):
-    """Every test runs with compiled kernels and the PyTorch way."""
-    with WAYS[request.param]():
-        yield
 
 
 # --- Slow versions ----------------------------------------------------------------------------------------------------
@@ -154,20 +144,20 @@ def test_means_and_fits_are_weighted_by_distance(size, seed, k):
 @given(size=SIZES, seed=st.integers(0, 999))
 def test_the_whole_is_the_paper_s_pseudocode(size, seed):
     a, b, variance, features, surface = random_images(seed, *size)
-    halves = torch.stack([to_torch(a), to_torch(b)], dim=1)
-    found = nfor(halves, to_torch(variance), to_torch(features), to_torch(surface[None]))
+    buffers = torch.stack([to_torch(a), to_torch(b)], dim=1)
+    found = nfor(buffers, to_torch(variance), to_torch(features), to_torch(surface[None]))
     np.testing.assert_allclose(to_numpy(found), naive_nfor(a, b, variance, features, surface), rtol=2e-3, atol=2e-4)
 
 
 def test_images_larger_than_windows():
     """What is linear in features and position comes back as it was, whatever the weights."""
     rng = np.random.default_rng(0)
-    features = rng.uniform(-1, 1, (7, 41, 150))
-    y, x = np.mgrid[:41, :150]
+    features = rng.uniform(-1, 1, (7, 24, 40))
+    y, x = np.mgrid[:24, :40]
     slopes = rng.uniform(-1, 1, (3, 9))
     image = 5 + np.tensordot(slopes, np.concatenate([features, [y / 9, x / 9]]), 1)
     distances = patch_distances(
-        to_torch(rng.random((3, 41, 150))), torch.full((1, 3, 41, 150), 0.1), torch.ones(1, 1, 41, 150), 3
+        to_torch(rng.random((3, 24, 40))), torch.full((1, 3, 24, 40), 0.1), torch.ones(1, 1, 24, 40), 3
     )
     fitted = regress(to_torch(image), to_torch(features), distances, 1.0)
     np.testing.assert_allclose(to_numpy(fitted), image, rtol=1e-3, atol=1e-3)
@@ -182,41 +172,41 @@ def test_features_without_variation_leave_the_weighted_mean():
     assert (fitted - 1).square().mean() < 0.02
 
 
-# --- Halves -----------------------------------------------------------------------------------------------------------
+# --- Buffers A and B --------------------------------------------------------------------------------------------------
 
 
-def test_halves_share_no_sample():
-    """A sample that changes does so in one half alone, at its pixel and beside it."""
+def test_buffers_share_no_sample():
+    """A sample contributes to one buffer alone, at its pixel and beside it."""
     mesh = torch.ones(1, 1, 6, 7)
     colour = torch.rand(1, 3, 6, 7)
-    before = chequered_halves(colour, mesh)
+    before = checkerboard_buffers(colour, mesh)
     for y, x in np.ndindex(6, 7):
         moved = colour.clone()
         moved[..., y, x] += 1
-        off = chequered_halves(moved, mesh) - before
+        off = checkerboard_buffers(moved, mesh) - before
         own = (y + x) % 2
         assert (off[:, 1 - own] == 0).all()
         changed = {tuple(place) for place in off[0, own, 0].nonzero().tolist()}
         assert changed == {(j, i) for j, i in np.ndindex(6, 7) if abs(j - y) + abs(i - x) <= 1}
 
 
-def test_halves_take_from_their_own_mesh():
+def test_buffers_average_within_a_mesh():
     mesh = torch.tensor([[1, 1, 2, 2], [1, 3, 2, 2.0]])[None, None]
     colour = mesh.repeat(1, 3, 1, 1)
-    assert (chequered_halves(colour, mesh) == colour[:, None]).all()  # the only pixel of mesh 3 is in both
-    assert chequered_halves(torch.ones(1, 3, 1, 1), torch.ones(1, 1, 1, 1)).eq(1).all()
+    assert (checkerboard_buffers(colour, mesh) == colour[:, None]).all()  # the only pixel of mesh 3 is in both
+    assert checkerboard_buffers(torch.ones(1, 3, 1, 1), torch.ones(1, 1, 1, 1)).eq(1).all()
 
 
-def test_true_halves_are_filtered_well():
-    """Noise on a picture of features and of a shadow that they do not know."""
+def test_noise_is_reduced_tenfold():
+    """Noise on an image of features and of a shadow that no feature shows."""
     generator = torch.Generator().manual_seed(0)
     features = torch.zeros(1, 7, 40, 48)
     features[:, 0] = torch.rand(40, 48, generator=generator)
     truth = 1 + features[:, :1].repeat(1, 3, 1, 1)
     truth[..., 20:, :] *= 0.3
-    halves = truth[:, None] + 0.4 * torch.randn(1, 2, 3, 40, 48, generator=generator)
-    found = nfor(halves, torch.full_like(truth, 0.08), features, torch.ones(1, 1, 40, 48))
-    noise = (halves.mean(dim=1) - truth).square().mean()
+    buffers = truth[:, None] + 0.4 * torch.randn(1, 2, 3, 40, 48, generator=generator)
+    found = nfor(buffers, torch.full_like(truth, 0.08), features, torch.ones(1, 1, 40, 48))
+    noise = (buffers.mean(dim=1) - truth).square().mean()
     assert (found - truth).square().mean() < 0.1 * noise
 
 
