@@ -17,6 +17,7 @@ from tqdm import tqdm
 from allocator import keep_freed_memory
 from datasets.clip import Clip, Dataset
 from errors import BadInput
+from eval.bench.synthetic_frames import synthetic_frame
 from eval.clip_run import ClipRun, Entrant, ReferenceRun, Run, play
 from eval.results import (
     SIGNALS,
@@ -38,6 +39,7 @@ from models.spec import DenoiserSpec
 from provenance import device_in_words
 from timing import thread_count, threads_for
 
+COMPILED_SIZE = (32, 48)  # px: a frame on which denoisers are run to compile their kernels
 SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
 
 
@@ -114,11 +116,22 @@ def start_worker() -> None:
     tqdm.set_lock(threading.RLock())
 
 
+@torch.inference_mode()
+def compile_kernels(spec: DenoiserSpec) -> None:
+    """Run a denoiser on small frames, so that its kernels are compiled and on disk for every process."""
+    denoiser = spec.build()
+    state = None
+    for index in range(2):
+        _, state = denoiser(synthetic_frame(index, *COMPILED_SIZE), state)
+
+
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
-    """Evaluate clips side by side."""
+    """Evaluate clips side by side. First the processes share out the kernels: else each would compile all of them."""
     threads = max(1, torch.get_num_threads() // processes)
     jobs = [ClipJob(clip.path, specs, runs, threads) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
+        for _ in tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"):
+            pass
         for _ in tqdm(pool.imap_unordered(ClipJob.work, jobs, chunksize=1), "clips", len(jobs), unit="clip"):
             pass
 
