@@ -17,6 +17,7 @@ from errors import BadInput
 
 Data = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/PROFILE")]
 DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/BUDGET")]
+Device = Annotated[Literal["cpu", "cuda"], arg(help="what computes")]
 Runs = Annotated[Path, arg(metavar="DIR", help="where trainings and results are kept")]
 Profile = Annotated[
     str,
@@ -142,6 +143,7 @@ def evaluate(
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
     processes: Annotated[int, arg(metavar="N", help="at most so many clips side by side")] = os.cpu_count() or 1,
+    device: Device = "cpu",
 ) -> None:
     """Judge all denoisers that can run, or those named, on the test clips: table, pictures, results.json.
 
@@ -150,7 +152,7 @@ def evaluate(
     """
     from eval.harness import evaluate as evaluate_on
 
-    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes)
+    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes, device)
 
 
 def report(

@@ -7,7 +7,7 @@ from __future__ import annotations  # what is only named in signatures is not lo
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 __all__ = ["camera", "denoise", "frames", "load", "open_dataset", "read_frames"]
 
 
-def load(name: str, weights: str | Path | None = None, precision: torch.dtype | None = None) -> Denoiser:
+def load(
+    name: str,
+    weights: str | Path | None = None,
+    precision: torch.dtype | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+) -> Denoiser:
     """A denoiser ready to use, by its name: svgf, wskp6+adaptive, oidn+taa, ...
 
     The file of a network's `weights` is by default the one that is shipped (`onespp weights` lists them). `precision`
@@ -33,7 +38,8 @@ def load(name: str, weights: str | Path | None = None, precision: torch.dtype | 
     from models.shipped_weights import shipped_weights
     from models.spec import load as load_denoiser
 
-    return load_denoiser(name, Path(weights) if weights else shipped_weights(parse_name(name).base), precision)
+    file = Path(weights) if weights else shipped_weights(parse_name(name).base)
+    return load_denoiser(name, file, precision, device=device)
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -95,8 +101,8 @@ def denoise(denoiser: Denoiser, sequence: Iterable[Frame]) -> Iterator[NDArray[n
     state = None
     for frame in sequence:
         with torch.inference_mode():
-            radiance, state = denoiser(frame, state)
-        yield radiance[0].permute(1, 2, 0).numpy()
+            radiance, state = denoiser(frame.to(denoiser.device), state)
+        yield radiance[0].permute(1, 2, 0).cpu().numpy()
 
 
 if __name__ == "__main__":

@@ -265,6 +265,8 @@ class Frame:
 
     def to(self, device: torch.device | str) -> "Frame":
         """The frame with all tensors on `device`."""
+        if self.gain.device == torch.device(device):
+            return self
 
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device)

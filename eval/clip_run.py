@@ -39,6 +39,7 @@ class Entrant:
         modules: of onespp, in which it is defined.
         build: makes it, ready to use; called once, and only if results are missing.
         tells_error: whether to keep maps of the error that it tells, where it is a NAME+js and frames have halves.
+        device: where it computes: "cpu" or "cuda".
     """
 
     name: str
@@ -48,6 +49,7 @@ class Entrant:
     modules: tuple[str, ...]
     build: Callable[[], Denoiser]
     tells_error: bool = False
+    device: str = "cpu"
 
     @cached_property
     def denoiser(self) -> Denoiser:
@@ -64,6 +66,7 @@ class Entrant:
             "signal": self.signal,
             "precision": self.precision,
             "weights": self.weights_digest,
+            "device": self.device,
         }
         return result_key(clip, [__name__, *self.modules], facts)
 
@@ -97,11 +100,13 @@ class ClipRun:
     def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
         denoiser = self.entrant.denoiser
+        moved = frame.to(denoiser.device)
         if self.entrant.tells_error and isinstance(denoiser, Shrunk) and frame.has_halves:
-            output, self.state, estimate = with_error(denoiser, frame, self.state)
-            self.error = exposure * estimate.radiance().square().mean(dim=1).sqrt()
+            output, self.state, estimate = with_error(denoiser, moved, self.state)
+            self.error = exposure * estimate.radiance().cpu().square().mean(dim=1).sqrt()
         else:
-            output, self.state = denoiser(frame, self.state)
+            output, self.state = denoiser(moved, self.state)
+        output = output.cpu()
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
         comparison = Comparison(output, halves, exposure, hidden(frame), self.before, still)
         self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})

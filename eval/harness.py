@@ -54,7 +54,7 @@ def clips_of_one_spp(dataset: Dataset) -> list[Clip]:
 def entrant(spec: DenoiserSpec, name: str | None = None, tells_error: bool = False) -> Entrant:
     """The denoiser of a spec, under the name that results are to give it."""
     name = name or spec.name
-    return Entrant(name, spec.returns, spec.precision, spec.weights, spec.modules, spec.build, tells_error)
+    return Entrant(name, spec.returns, spec.precision, spec.weights, spec.modules, spec.build, tells_error, spec.device)
 
 
 def entrants_of(specs: Sequence[DenoiserSpec]) -> list[Entrant]:
@@ -153,6 +153,7 @@ def evaluate(
     budget: str,
     names: Sequence[str] = (),
     processes: int = 1,
+    device: str = "cpu",
     smallest_share: int = SMALLEST_SHARE,
 ) -> dict[str, Any]:
     """Evaluate over the test clips of data sets; writes RUNS/eval: results.json, frames.csv, a PNG a clip and signal.
@@ -163,7 +164,7 @@ def evaluate(
     clips = [clip for path in data for clip in Dataset(path).clips("test")]
     if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
         raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
-    specs = evaluated(names, runs, budget)
+    specs = evaluated(names, runs, budget, device)
     entrants = entrants_of(specs)
     (runs / "eval").mkdir(parents=True, exist_ok=True)
     waiting = [clip for clip in clips if not all(one.finished for one in passes(clip, entrants, runs))]
@@ -173,7 +174,7 @@ def evaluate(
         evaluate_in_processes(waiting, specs, runs, processes)
     results = [result for clip in clips for result in evaluate_clip(clip, entrants, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
-    content = write_results(runs, data, device_in_words(), results, weights)
+    content = write_results(runs, data, device_in_words(device), results, weights)
     if can_draw():
         for group in by_clip(results):
             save_strips(runs, group)

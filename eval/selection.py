@@ -89,14 +89,14 @@ def everyone(runs: Path, budget: str) -> Iterator[DenoiserName]:
             yield trained
 
 
-def evaluated(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
+def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu") -> list[DenoiserSpec]:
     """The named denoisers, or everyone who can run and is trained, as `onespp eval` runs them.
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
     chosen = choose(names, everyone(runs, budget), cannot_run, partial(untrained, runs, budget))
     return [
-        DenoiserSpec(name, precision=fastest_precision(name), weights=weights_file(name, runs, budget))
+        DenoiserSpec(name, None, fastest_precision(name, device), weights_file(name, runs, budget), device=device)
         for name in chosen
     ]
 

@@ -62,6 +62,7 @@ class Denoiser(torch.nn.Module):
         inputs: the inputs of its network in order, and how many channels each has; channels by their names.
         constants: channels that it does without, see models.specialise, and the value that each has everywhere.
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
+        device: "cpu" or "cuda", where it was moved to: frames have to be there, and its output is.
     """
 
     reads: tuple[str, ...]
@@ -75,6 +76,7 @@ class Denoiser(torch.nn.Module):
     evaluated_with: tuple[str, ...] = ()
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     precision: torch.dtype = torch.float32
+    device: str = "cpu"
 
     def __init__(self, *, signal: Signal | None = None):
         """`signal` is the class's unless another one is named."""

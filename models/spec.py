@@ -26,13 +26,22 @@ def precisions_of(name: str | DenoiserName) -> list[str]:
     return [precision for precision, dtype in PRECISIONS.items() if dtype not in refused]
 
 
-def fastest_precision(name: str | DenoiserName) -> str:
-    """bfloat16 for networks that support it, where this processor is faster in it, else float32.
+def fastest_precision(name: str | DenoiserName, device: str = "cpu") -> str:
+    """bfloat16 for networks that support it, where the device is faster in it, else float32.
 
-    Raises BadInput for an unknown name.
+    Raises BadInput for an unknown name, or where there is no such device.
     """
-    supported = prototype(name).is_network and "bfloat16" in precisions_of(name)
-    return "bfloat16" if supported and bfloat16_is_faster() else "float32"
+    check_device(device)
+    if not prototype(name).is_network or "bfloat16" not in precisions_of(name):
+        return "float32"
+    is_faster = bfloat16_is_faster() if device == "cpu" else torch.cuda.is_bf16_supported(including_emulation=False)
+    return "bfloat16" if is_faster else "float32"
+
+
+def check_device(device: str) -> None:
+    """Raise BadInput for "cuda" where PyTorch finds no CUDA device."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BadInput("PyTorch finds no CUDA device here: use the device cpu")
 
 
 @dataclass(frozen=True)
@@ -92,11 +101,13 @@ class DenoiserSpec:
 
     def build(self) -> Denoiser:
         """Ready to use. Raises BadInput where it cannot run here, or its weights are damaged or another network's."""
+        check_device(self.device)
         torch.manual_seed(0)
         denoiser = create(self.denoiser, self.signal)
         if self.weights:
             load_weights(unwrapped(denoiser), self.denoiser.base, self.weights)
         denoiser.prepare(PRECISIONS[self.precision])
+        denoiser.device = self.device
         return denoiser.to(self.device)
 
     def running(self) -> AbstractContextManager[None]:
@@ -122,5 +133,5 @@ def load(
     elif weights is None:
         raise BadInput(f"'{name}' needs trained weights")
     names = {dtype: key for key, dtype in PRECISIONS.items()}
-    chosen = names[precision] if precision else fastest_precision(parsed)
+    chosen = names[precision] if precision else fastest_precision(parsed, device)
     return DenoiserSpec(parsed, signal, chosen, weights, device=device).build()
