@@ -434,12 +434,12 @@ def weights(
         card: write the facts of its card anew, or of all cards: those of its weights, and what `onespp eval` has left
             in RUNS.
     """
-    from eval.shipped import card_file, table, write_card
+    from eval.shipped import card_file, measure_card, table
     from models.shipped_weights import shipped_names
 
     if card:
         for each in [name] if name else shipped_names():
-            print(write_card(each, card))
+            print(measure_card(each, card))
     else:
         print(card_file(name).read_text().strip() if name else table())
 

@@ -13,16 +13,16 @@ from eval.metrics import METRICS
 from eval.report.table_rows import mean_rows
 from eval.results import FLOOR, RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
 from eval.text_table import LEGEND, PRINTED, floor_cell, value_cell
-from files import write_file
+from files import read_json, write_file, write_json
 from models.shipped_weights import require_shipped, shipped_names
 from models.weights import read_metadata
 from provenance import file_digest
 
 LICENCE = "Apache-2.0"  # that of onespp
-COMPARED = ("noisy", "accumulated", "svgf", "oidn")  # whom cards show beside the network
+BESIDE = ("noisy", "accumulated", "svgf", "oidn")  # denoisers that cards show beside the network
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
-TOLD_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # by cards, from the recipe
+LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # by cards, from the recipe
 
 FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
 - Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
@@ -70,11 +70,24 @@ def card_file(name: str) -> Path:
     return require_shipped(name).with_suffix(".md")
 
 
-def write_card(name: str, runs: Path) -> Path:
-    """Write the facts of a card anew: those of its weights, and what `onespp eval` has left in RUNS. Returns its path.
+def measured_file(name: str) -> Path:
+    """The measurements that a card shows, as JSON beside it. Raises BadInput where its weights are not shipped."""
+    return require_shipped(name).with_suffix(".json")
 
-    What a person wrote around them stays. Raises BadInput where there is no card yet, and where the network has not
-    been judged since its weights are there.
+
+def measure_card(name: str, runs: Path) -> Path:
+    """Write the card of a network anew from its weights and from RUNS/eval. Returns the card's path.
+
+    Raises BadInput where there is no card yet, and where the network was not evaluated with these weights.
+    """
+    write_json(measured_file(name), measurements(name, runs))
+    return write_card(name)
+
+
+def write_card(name: str) -> Path:
+    """Write the facts of a card anew from its weights and measurements; the text around them stays. Returns its path.
+
+    Raises BadInput where there is no card yet.
     """
     path = card_file(name)
     text = path.read_text() if path.exists() else ""
@@ -85,18 +98,33 @@ def write_card(name: str, runs: Path) -> Path:
             f"{path}: write what the network is for and where it is weak, with the lines '{BEGIN}' and '{END}' where "
             "its facts are to stand"
         )
-    write_file(path, f"{before}{begin}\n{facts(name, runs)}\n{end}{after}".encode())
+    write_file(path, f"{before}{begin}\n{facts(name)}\n{end}{after}".encode())
     return path
 
 
-def facts(name: str, runs: Path) -> str:
+def measurements(name: str, runs: Path) -> dict[str, Any]:
+    """What a card shows of RUNS/eval, see `evaluated_clips`: tables as lists of rows of text."""
+    results, clips = evaluated_clips(name, runs)
+    alike = of_one_spp(clips)
+    return {
+        "clips": len(alike),
+        "datasets": [Path(each).name for each in results["dataset"].split(", ")],
+        "signal": clips[0].signal,
+        "precision": results_of(clips, name)[0].precision,
+        "device": results["device"],
+        "versions": in_words(results["versions"]),
+        "means": means_rows(alike),
+        "psnr": psnr_rows(clips),
+    }
+
+
+def facts(name: str) -> str:
     """The part of a card that follows from files, as Markdown."""
     weights = require_shipped(name)
+    measured = read_json(measured_file(name))
     metadata = read_metadata(weights)
     recipe = metadata["recipe"]
     data = recipe["data"]
-    results, clips = judged(name, runs)
-    alike = of_one_spp(clips)
     return FACTS.format(
         name=name,
         parameters=recipe["parameters"],
@@ -112,17 +140,17 @@ def facts(name: str, runs: Path) -> str:
         start=f", begun with weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
         step=recipe["step"],
         validation=recipe["validation"],
-        recipe=json.dumps({key: value for key, value in recipe.items() if key not in TOLD_APART}),
+        recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
         makers=" and ".join(f"{in_words(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]),
-        count=len(alike),
-        dataset="`, `".join(Path(each).name for each in results["dataset"].split(", ")),
-        signal=clips[0].signal,
-        precision=results_of(clips, name)[0].precision,
-        device=results["device"],
-        versions=in_words(results["versions"]),
-        means=means_table(alike),
+        count=measured["clips"],
+        dataset="`, `".join(measured["datasets"]),
+        signal=measured["signal"],
+        precision=measured["precision"],
+        device=measured["device"],
+        versions=measured["versions"],
+        means=tabulate(measured["means"], "keys", "github", disable_numparse=True),
         metric=METRICS["psnr"].title,
-        clips=psnr_table(clips),
+        clips=tabulate(measured["psnr"], "keys", "github", disable_numparse=True),
         legend=LEGEND,
     )
 
@@ -131,8 +159,8 @@ def in_words(versions: dict[str, str]) -> str:
     return ", ".join(f"{package} {version}" for package, version in versions.items())
 
 
-def judged(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """The content of RUNS/eval/results.json, and the results of the network beside those of COMPARED.
+def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
+    """The content of RUNS/eval/results.json, and the results of the network beside those of BESIDE.
 
     Raises BadInput where the shipped weights, as they are, have not been judged.
     """
@@ -142,24 +170,26 @@ def judged(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     found = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
     if not of_one_spp(found) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
-        command = f"onespp eval {' '.join((*COMPARED, name))} --runs {runs}"
+        command = f"onespp eval {' '.join((*BESIDE, name))} --runs {runs}"
         raise BadInput(f"{path} has nothing of {weights} as it is now, on clips of 1 spp: run `{command}`")
-    wanted = (*COMPARED, name)
+    wanted = (*BESIDE, name)
     return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in found]
 
 
-def means_table(clips: Sequence[ClipResults]) -> str:
-    """Means of all denoisers over the clips, with those of their noise floors, as Markdown."""
-    lines = [[row.denoiser, *(row.text(metric) for metric in PRINTED)] for row in mean_rows(clips)]
-    head = ["denoiser", *(METRICS[metric].title for metric in PRINTED)]
-    return tabulate(lines, head, "github", disable_numparse=True)
+def means_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
+    """Means of all denoisers over the clips, and of the noise floors."""
+    titles = {metric: METRICS[metric].title for metric in PRINTED}
+    return [
+        {"denoiser": row.denoiser} | {title: row.text(metric) for metric, title in titles.items()}
+        for row in mean_rows(clips)
+    ]
 
 
-def psnr_table(clips: Sequence[ClipResults]) -> str:
-    """PSNR of all denoisers, a row a clip, as Markdown."""
+def psnr_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
+    """PSNR of all denoisers, a row a clip."""
     lines = []
     for clip in clips:
         floor = clip.reference.metrics["psnr"]
         cells = {result.denoiser: value_cell("psnr", result.metrics["psnr"], floor) for result in clip.results}
         lines.append({"clip": f"{clip.scene}/{clip.clip}", **cells, FLOOR: floor_cell("psnr", floor)})
-    return tabulate(lines, "keys", "github", disable_numparse=True)
+    return lines

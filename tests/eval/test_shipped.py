@@ -10,7 +10,7 @@ from command_line import main
 from errors import BadInput
 from eval.harness import evaluate
 from eval.results import read_results
-from eval.shipped import BEGIN, END, table, write_card
+from eval.shipped import BEGIN, END, measure_card, table
 from files import read_json, write_json
 from models.registry import create
 from models.weights import save_weights
@@ -57,9 +57,9 @@ def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
     evaluate([tiny], tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
     card = wskp3.with_suffix(".md")
     with pytest.raises(BadInput, match=r"wskp3.md: write what the network is for.*the lines"):
-        write_card("wskp3", tmp_path)
+        measure_card("wskp3", tmp_path)
     card.write_text(HAND)
-    assert write_card("wskp3", tmp_path) == card
+    assert measure_card("wskp3", tmp_path) == card
     text = card.read_text()
     before, _, after = HAND.partition("old\n")
     assert text.startswith(before) and text.endswith(after) and "old" not in text
@@ -105,18 +105,18 @@ def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
     content = read_json(results)
     os.utime(wskp3, (results.stat().st_mtime + 5,) * 2)
     with pytest.raises(BadInput, match=r"nothing of .*wskp3.safetensors as it is now.*`onespp eval noisy"):
-        write_card("wskp3", tmp_path)
+        measure_card("wskp3", tmp_path)
     os.utime(wskp3, (0, 0))
-    write_card("wskp3", tmp_path)
+    measure_card("wskp3", tmp_path)
     for row in content["rows"]:
         row["weights"] = row["weights"] and "runs/train/wskp3-quick/weights.safetensors"
     write_json(results, content)
     with pytest.raises(BadInput, match="nothing of"):
-        write_card("wskp3", tmp_path)
+        measure_card("wskp3", tmp_path)
     write_json(results, content | {"rows": [row for row in content["rows"] if row["denoiser"] == "noisy"]})
     with pytest.raises(BadInput, match="nothing of"):
-        write_card("wskp3", tmp_path)
+        measure_card("wskp3", tmp_path)
     shutil.rmtree(tmp_path / "eval")
     with pytest.raises(BadInput, match="there are no results"):
-        write_card("wskp3", tmp_path)
+        measure_card("wskp3", tmp_path)
     assert "old" not in wskp3.with_suffix(".md").read_text()
