@@ -1,80 +1,144 @@
-"""The channel table: what a clip holds, in which shape, precision and unit; and constants of its light."""
+"""The channel table: every fact about a channel of a clip is in its row; and constants of a clip's light."""
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Kind = Literal[
+    "noisy",  # radiance of the noisy samples
+    "buffers",  # the same radiance as two independent sample buffers, A and B; stored on request
+    "reference",  # the same radiance with many samples, also as two buffers
+    "emission",  # radiance without noise
+    "surface",  # what a primary ray hits
+    "mirrored",  # a surface channel, of what mirrors show; stored where a mirror is in view
+    "motion",  # vectors to the frame before
+    "gradient",  # how light has changed since the frame before
+    "hit",  # means over those of the noisy samples that hit something; 0 where none did
+    "camera",  # matrices
+]
 
 
-class Channel(NamedTuple):
+@dataclass(frozen=True)
+class Channel:
     """One row of the table.
 
-    Axes are F frames, S noise realisations, H rows, W columns and M meshes; a number stands for its own length.
+    Attributes:
+        axes: F frames, S noise realisations, H rows, W columns and M meshes; a number is the length of its own axis.
+        dtype: as stored.
+        unit: of its numbers.
+        letters: of its components in EXR layers.
+        of: the channel that this is another form of, for buffers, references and mirrored channels.
+        widens: whether it is stored as float32 where float16 would lose precision.
+        essential: whether it is rendered whatever denoisers read.
+        step: the optional step of rendering that makes it.
+        renderer_only: whether no other renderer writes it, and nothing else can take its place.
+        is_camera_motion: whether it follows from depth and cameras in a scene in which nothing else moves.
     """
 
+    kind: Kind
     axes: tuple[str | int, ...]
-    dtype: str  # as stored, unless it widens
+    dtype: str
     unit: str
-    widens: bool = False  # to float32 where float16 would lose precision
+    letters: str = ""
+    of: str | None = None
+    widens: bool = False
+    essential: bool = False
+    step: str | None = None
+    renderer_only: bool = False
+    is_camera_motion: bool = False
 
     @property
     def components(self) -> int:
         """Numbers per pixel of a channel that is an image."""
-        return int(self.axes[-1])
+        return len(self.letters)
 
     @property
     def is_image(self) -> bool:
-        """Whether the channel has pixels."""
-        return "H" in self.axes
+        return self.kind != "camera"
 
     @property
-    def has_halves(self) -> bool:
+    def has_buffers(self) -> bool:
         """Whether a frame has two images of it, of independent samples."""
-        return self.axes[-4:-3] == (2,)
+        return self.kind in ("buffers", "reference")
+
+    @property
+    def is_reflected(self) -> bool:
+        """Whether it is radiance that surfaces reflect."""
+        return self.kind in ("noisy", "buffers", "reference")
+
+    @property
+    def is_temporal(self) -> bool:
+        """Whether it relates a frame to the one before."""
+        return self.kind in ("motion", "gradient")
 
     def shape(self, **sizes: int) -> list[int]:
         """The stored shape, for the lengths of the axes given by name: F, S, H, W and M."""
         return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
 
 
-RADIANCE_UNIT = "W sr^-1 m^-2"
+RADIANCE = "W sr^-1 m^-2"
+LENGTH = "world units"
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (ITU-R BT.709)
 ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
+REALISATIONS = ("F", "S", "H", "W")
+IMAGES = ("F", "H", "W")
+
+NOISY_ROW = Channel("noisy", (*REALISATIONS, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True)
+BUFFERS_ROW = replace(NOISY_ROW, kind="buffers", axes=("F", "S", 2, "H", "W", 3), essential=False)
+REFERENCE_ROW = replace(NOISY_ROW, kind="reference", axes=("F", 2, "H", "W", 3))
+MOTION_ROW = Channel("motion", (*IMAGES, 2), "<f4", "px", "XY")
+TRACKED_ROW = replace(MOTION_ROW, step="shadow_motion", renderer_only=True)  # of what causes a pixel's light
+HIT_ROW = Channel("hit", (*REALISATIONS, 1), "<f2", LENGTH, "Z", widens=True, step="hit_distance", renderer_only=True)
+
 CHANNELS: dict[str, Channel] = {
-    "direct": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "indirect": Channel(("F", "S", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "direct_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "indirect_halves": Channel(("F", "S", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "direct_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "indirect_reference": Channel(("F", 2, "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "emission": Channel(("F", "H", "W", 3), "<f2", RADIANCE_UNIT, widens=True),
-    "albedo": Channel(("F", "H", "W", 3), "<f2", "1"),
-    "normal": Channel(("F", "H", "W", 3), "<f2", "1"),
-    "depth": Channel(("F", "H", "W", 1), "<f4", "world units"),
-    "roughness": Channel(("F", "H", "W", 1), "<f2", "GGX alpha"),
-    "mesh_id": Channel(("F", "H", "W", 1), "<u2", "index"),
-    "motion": Channel(("F", "H", "W", 2), "<f4", "px"),
-    "dual_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
-    "shadow_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
-    "reflection_motion": Channel(("F", "H", "W", 2), "<f4", "px"),
-    "gradient": Channel(("F", "H", "W", 2), "<f2", RADIANCE_UNIT, widens=True),
-    "hit_distance": Channel(("F", "S", "H", "W", 2), "<f2", "world units", widens=True),
-    "light_distance": Channel(("F", "S", "H", "W", 1), "<f2", "world units", widens=True),
-    "light_angle": Channel(("F", "S", "H", "W", 1), "<f2", "rad", widens=True),
-    "K": Channel(("F", 3, 3), "<f8", "px"),
-    "camera_to_world": Channel(("F", 4, 4), "<f8", "world units"),
-    "object_to_world": Channel(("F", "M", 4, 4), "<f8", "world units"),
+    "direct": NOISY_ROW,
+    "indirect": NOISY_ROW,
+    "direct_halves": replace(BUFFERS_ROW, of="direct"),
+    "indirect_halves": replace(BUFFERS_ROW, of="indirect"),
+    "direct_reference": replace(REFERENCE_ROW, of="direct"),
+    "indirect_reference": replace(REFERENCE_ROW, of="indirect"),
+    "emission": Channel("emission", (*IMAGES, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True),
+    "albedo": Channel("surface", (*IMAGES, 3), "<f2", "1", "RGB", essential=True),
+    "normal": Channel("surface", (*IMAGES, 3), "<f2", "1", "XYZ"),
+    "depth": Channel("surface", (*IMAGES, 1), "<f4", LENGTH, "Z", essential=True),
+    "roughness": Channel("surface", (*IMAGES, 1), "<f2", "GGX alpha", "Y"),
+    "mesh_id": Channel("surface", (*IMAGES, 1), "<u2", "index", "I", essential=True),
+    "motion": replace(MOTION_ROW, is_camera_motion=True),
+    "dual_motion": replace(MOTION_ROW, step="dual_motion"),
+    "shadow_motion": replace(TRACKED_ROW, is_camera_motion=True),
+    "reflection_motion": TRACKED_ROW,
+    "gradient": Channel(
+        "gradient", (*IMAGES, 2), "<f2", RADIANCE, "XY", widens=True, step="gradient", renderer_only=True
+    ),
+    "hit_distance": replace(HIT_ROW, axes=(*REALISATIONS, 2), letters="XY"),
+    "light_distance": HIT_ROW,
+    "light_angle": replace(HIT_ROW, unit="rad", letters="Y"),
+    "K": Channel("camera", ("F", 3, 3), "<f8", "px", essential=True),
+    "camera_to_world": Channel("camera", ("F", 4, 4), "<f8", LENGTH, essential=True),
+    "object_to_world": Channel("camera", ("F", "M", 4, 4), "<f8", LENGTH, essential=True),
 }
 
-SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", "motion")  # of what a pixel shows
-MIRRORED = {name: f"mirrored_{name}" for name in SURFACE_CHANNELS}  # of what mirrors show, where any is in view
-CHANNELS |= {mirrored: CHANNELS[name] for name, mirrored in MIRRORED.items()}
-TRACKED_CHANNELS = ("shadow_motion", "reflection_motion")  # of what causes a pixel's light
-MOTION_CHANNELS = ("motion", "dual_motion", *TRACKED_CHANNELS)
-TEMPORAL_CHANNELS = (*MOTION_CHANNELS, "gradient")  # which relate a frame to the one before
-CAMERA_CHANNELS = ("K", "camera_to_world", "object_to_world")
-NOISY = ("direct", "indirect")
-HIT_CHANNELS = ("hit_distance", "light_distance", "light_angle")  # of the samples in NOISY; 0 where none met anything
-SAMPLED = (*NOISY, *HIT_CHANNELS)  # which each noise realisation has of its own
-HALVES = {"direct": "direct_halves", "indirect": "indirect_halves"}  # the samples of noisy channels, in two halves
-# Halves are stored where asked for.
-USUAL_CHANNELS = tuple(name for name in CHANNELS if name not in {*HALVES.values(), *MIRRORED.values()})
-REFERENCES = ("direct_reference", "indirect_reference")
+
+def channels_of(*kinds: Kind) -> tuple[str, ...]:
+    """The names of all channels of some kinds, in the order of the table."""
+    return tuple(name for name, channel in CHANNELS.items() if channel.kind in kinds)
+
+
+def forms_of(kind: Kind) -> dict[str, str]:
+    """The channels of one kind by the channel that each is another form of."""
+    return {str(CHANNELS[name].of): name for name in channels_of(kind)}
+
+
+MIRRORABLE = (*channels_of("surface"), "motion")
+CHANNELS |= {
+    f"mirrored_{name}": replace(CHANNELS[name], kind="mirrored", of=name, essential=False, is_camera_motion=False)
+    for name in MIRRORABLE
+}
+MIRRORED = forms_of("mirrored")
+SAMPLE_BUFFERS = forms_of("buffers")
+NOISY_CHANNELS = channels_of("noisy")
+REFERENCE_CHANNELS = channels_of("reference")
+HIT_CHANNELS = channels_of("hit")
+MOTION_CHANNELS = channels_of("motion")
+CAMERA_CHANNELS = channels_of("camera")
+USUAL_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].kind not in ("buffers", "mirrored"))

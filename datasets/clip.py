@@ -107,7 +107,7 @@ class Clip:
         spec = CHANNELS[channel]
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
-            leading = (2,) if spec.has_halves else ()
+            leading = (2,) if spec.has_buffers else ()
             value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
             return np.broadcast_to(value, (*leading, *area, spec.components))
         if "derived" in entry:

@@ -10,40 +10,31 @@ import OpenEXR
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, MIRRORED
+from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
 from scenes.camera import View, inverse_pose
 
-# Components of layers that are not colours (RGB).
-COMPONENTS = {
-    "normal": "XYZ",
-    "depth": "Z",
-    "roughness": "Y",
-    "mesh_id": "I",
-    "motion": "XY",
-    "dual_motion": "XY",
-    "shadow_motion": "XY",
-    "reflection_motion": "XY",
-    "gradient": "XY",
-    "hit_distance": "XY",
-    "light_distance": "Z",
-    "light_angle": "Y",
-}
-COMPONENTS |= {mirrored: COMPONENTS[name] for name, mirrored in MIRRORED.items() if name in COMPONENTS}
-HALF_ENDINGS = ("_a", "_b")  # of the two layers of a channel that has halves
+BUFFER_SUFFIXES = ("_a", "_b")  # of the two layers of a channel that has two sample buffers
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 
 
 def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """EXR channels (H, W), named LAYER.COMPONENT, of a clip's channel (H, W, C), or (2, H, W, C) if it has halves."""
-    if array.ndim == 4:
-        halves = zip(HALF_ENDINGS, array, strict=True)
-        return {key: plane for half, image in halves for key, plane in layers_of(name + half, image).items()}
+    """EXR channels (H, W), named LAYER.LETTER, of a clip's channel: (H, W, C), or (2, H, W, C) of two buffers."""
+    channel = CHANNELS[name]
     exact = array.astype(np.uint32) if array.dtype == np.uint16 else array  # EXR has no 16-bit integers
-    components = COMPONENTS.get(name, "RGB")
-    return {f"{name}.{c}": np.ascontiguousarray(exact[..., i]) for i, c in enumerate(components)}
+    images = zip(layer_names(name), exact if channel.has_buffers else [exact], strict=True)
+    return {
+        f"{layer}.{letter}": np.ascontiguousarray(image[..., i])
+        for layer, image in images
+        for i, letter in enumerate(channel.letters)
+    }
+
+
+def layer_names(name: str) -> list[str]:
+    """The layers of a channel: its own, or one for each of its two buffers."""
+    return [name + suffix for suffix in BUFFER_SUFFIXES] if CHANNELS[name].has_buffers else [name]
 
 
 def write_planes(path: Path, planes: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:
@@ -112,10 +103,9 @@ def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Those of our channels, as `Clip.read` returns them, that EXR channels (H, W) hold: the inverse of layers_of."""
     channels: dict[str, NDArray[Any]] = {}
     for name, channel in CHANNELS.items():
-        components = COMPONENTS.get(name, "RGB")
-        layers = [name + half for half in HALF_ENDINGS] if channel.has_halves else [name]
-        if channel.is_image and all(f"{layer}.{c}" in planes for layer in layers for c in components):
-            images = [np.stack([planes[f"{layer}.{c}"] for c in components], axis=-1) for layer in layers]
+        layers = layer_names(name)
+        if channel.is_image and all(f"{layer}.{c}" in planes for layer in layers for c in channel.letters):
+            images = [np.stack([planes[f"{layer}.{c}"] for c in channel.letters], axis=-1) for layer in layers]
             array = images[0] if len(images) == 1 else np.stack(images)
             channels[name] = array.astype(np.uint16) if channel.dtype == "<u2" else array
     return channels

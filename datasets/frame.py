@@ -13,12 +13,10 @@ from datasets.channels import (
     ALBEDO_FLOOR,
     CAMERA_CHANNELS,
     CHANNELS,
-    HALVES,
     HIT_CHANNELS,
     MOTION_CHANNELS,
-    NOISY,
-    REFERENCES,
-    TEMPORAL_CHANNELS,
+    NOISY_CHANNELS,
+    SAMPLE_BUFFERS,
 )
 from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow
 from errors import BadInput
@@ -189,27 +187,25 @@ class Frame:
         def stacked(name: str) -> Tensor:
             return torch.stack([frame.channels[name] for frame in frames])
 
-        means = {name: stacked(name).mean(dim=0) for name in self.channels.keys() & set(NOISY)}
+        means = {name: stacked(name).mean(dim=0) for name in self.channels.keys() & set(NOISY_CHANNELS)}
         means |= {name: mean_where_met(stacked(name)) for name in self.channels.keys() & set(HIT_CHANNELS)}
         return replace(self, channels=self.channels | means, spp=len(frames) * self.samples)
 
     @property
-    def has_halves(self) -> bool:
+    def has_buffers(self) -> bool:
         """Whether the samples of the noisy channels are known in two independent halves."""
-        return self.channels.keys() & set(HALVES.values()) != set()
+        return self.channels.keys() & set(SAMPLE_BUFFERS.values()) != set()
 
-    def half(self, which: int) -> "Frame":
+    def buffer(self, which: int) -> "Frame":
         """The frame with half of its samples alone: those of half 0 or 1."""
-        known = {name: halves for name, halves in HALVES.items() if {name, halves} <= self.channels.keys()}
+        known = {name: halves for name, halves in SAMPLE_BUFFERS.items() if {name, halves} <= self.channels.keys()}
         noisy = {name: self.channels[halves][:, which] for name, halves in known.items()}
-        others = {name: tensor for name, tensor in self.channels.items() if name not in HALVES.values()}
+        others = {name: tensor for name, tensor in self.channels.items() if name not in SAMPLE_BUFFERS.values()}
         return replace(self, channels=others | noisy, spp=self.samples / 2)
 
     def lit(self, light: Tensor) -> "Frame":
         """The frame with all light but emission, noisy and in references, times `light` (H, W)."""
-        lit = {
-            name: self.channels[name] * light for name in self.channels.keys() & {*NOISY, *HALVES.values(), *REFERENCES}
-        }
+        lit = {name: tensor * light for name, tensor in self.channels.items() if CHANNELS[name].is_reflected}
         return replace(self, channels=self.channels | lit)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
@@ -225,13 +221,13 @@ class Frame:
         reflected = self.indirect if signal == "indirect" else self.direct + self.indirect
         return reflected / self.divisor
 
-    def reference_halves(self, signal: Signal) -> Tensor:
+    def reference_buffers(self, signal: Signal) -> Tensor:
         """Radiance without emission (B, 2, 3, H, W) of both halves of the reference, whose noise is independent."""
         return self.indirect_reference if signal == "indirect" else self.direct_reference + self.indirect_reference
 
     def reference_irradiance(self, signal: Signal) -> Tensor:
         """Irradiance (B, 3, H, W) of the reference, the mean of its halves."""
-        return self.reference_halves(signal).mean(dim=1) / self.divisor
+        return self.reference_buffers(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
         """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, see `complete`."""
@@ -315,13 +311,13 @@ def read_frame(
         previous = stored_previous
     tensors = {}
     for name in channels:
-        if name in CAMERA_CHANNELS or (name in HALVES.values() and name not in clip.channels):
+        if name in CAMERA_CHANNELS or (name in SAMPLE_BUFFERS.values() and name not in clip.channels):
             continue
-        if name in TEMPORAL_CHANNELS and previous != stored_previous:
+        if CHANNELS[name].is_temporal and previous != stored_previous:
             array = for_playback(clip, name, index, previous, window)
         else:
             array = clip.seen(name, index, window, realisation)
-        tensors[name] = to_tensor(array, has_halves=CHANNELS[name].has_halves)
+        tensors[name] = to_tensor(array, has_buffers=CHANNELS[name].has_buffers)
     return Frame(
         tensors,
         now=Cameras.of(clip.view(index), window),
@@ -333,7 +329,7 @@ def read_frame(
 
 
 def for_playback(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> np.ndarray:
-    """A channel of TEMPORAL_CHANNELS (h, w, 2), to a frame that is not the one before in the clip.
+    """A temporal channel (h, w, 2), to a frame that is not the one before in the clip.
 
     Dual motion vectors depend on what hid a surface and gradients on how light changes, which only the renderer sees:
     they cannot be computed afterwards. But while time stands still nothing is hidden and nothing changes: dual motion
@@ -344,8 +340,8 @@ def for_playback(clip: Clip, name: str, index: int, previous: int, window: Image
     return clip.motion_to(index, previous, window)
 
 
-def to_tensor(array: np.ndarray, has_halves: bool = False) -> Tensor:
+def to_tensor(array: np.ndarray, has_buffers: bool = False) -> Tensor:
     """(H, W, C) as (1, C, H, W), or with halves (2, H, W, C) as (1, 2, C, H, W); float32."""
     tensor = torch.from_numpy(np.ascontiguousarray(np.moveaxis(array.astype(np.float32), -1, -3)))
-    assert tensor.ndim == (4 if has_halves else 3)
+    assert tensor.ndim == (4 if has_buffers else 3)
     return tensor[None]

@@ -7,7 +7,7 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, NOISY, REFERENCES, USUAL_CHANNELS
+from datasets.channels import CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
@@ -16,10 +16,9 @@ from files import read_json
 
 # Whatever helps to denoise the noisy channels.
 AUXILIARY_CHANNELS = tuple(
-    name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in (*NOISY, *REFERENCES)
+    name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in (*NOISY_CHANNELS, *REFERENCE_CHANNELS)
 )
-# Steps of rendering, each of which makes the channel of its name.
-OPTIONAL_STEPS = ("dual_motion", "shadow_motion", "gradient", "hit_distance")
+OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))
 CLIP_HEAD = (
     "clip",
     "frames",

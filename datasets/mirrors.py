@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import MIRRORED, TEMPORAL_CHANNELS
+from datasets.channels import CHANNELS, MIRRORED
 
 
 def seen(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
@@ -18,7 +18,7 @@ def seen(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]])
     if MIRRORED.get(name) in stored:
         return read(MIRRORED[name])
     own = read(name)
-    if name not in TEMPORAL_CHANNELS or MIRRORED["motion"] not in stored:
+    if not CHANNELS[name].is_temporal or MIRRORED["motion"] not in stored:
         return own
     in_mirror = read(MIRRORED["depth"]) != read("depth")
     return np.where(in_mirror, 0 if name == "gradient" else read(MIRRORED["motion"]), own)

@@ -40,7 +40,7 @@ def display(radiance: ArrayOrTensor, exposure: float) -> ArrayOrTensor:
     return exposed.clip(0, 1) ** (1 / 2.2)
 
 
-def noise_of_halves(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+def noise_of_mean(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     """Expected squared error of the mean of two independent images, as displayed: mean((a - b)^2) / 4."""
     return float(((a - b) ** 2).mean() / 4)
 

@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, REFERENCES, Channel
-from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
+from datasets.channels import CHANNELS, MIRRORED, REFERENCE_CHANNELS, Channel
+from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean
 from files import write_json
 
 HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in its normal range
@@ -154,7 +154,7 @@ class ClipWriter:
         if not self.channels:
             self.channels = {name: RawChannel(self.folder, name) for name in channels}
         added = {name: raw.add(channels[name]) for name, raw in self.channels.items()}
-        reference = sum(added[name].mean(axis=0) for name in REFERENCES)
+        reference = sum(added[name].mean(axis=0) for name in REFERENCE_CHANNELS)
         self.luminances.append(luminance(np.asarray(reference)).astype(np.float32))
         for step, spent in seconds.items():
             self.timing[step] = self.timing.get(step, 0.0) + spent
@@ -164,9 +164,9 @@ class ClipWriter:
         floors = []
         for frame in range(len(self.luminances)):
             emission = self.channels["emission"].read(frame)
-            halves = sum(self.channels[name].read(frame) for name in REFERENCES) + emission
+            halves = sum(self.channels[name].read(frame) for name in REFERENCE_CHANNELS) + emission
             a, b = display(halves.astype(np.float64), exposure)
-            floors.append(noise_of_halves(a, b))
+            floors.append(noise_of_mean(a, b))
         return float(np.mean(floors))
 
     def leave_out_unseen_mirrors(self) -> None:

@@ -144,7 +144,7 @@ class Shot:
         self.view = view
         self.depth = depth
         return Frame(
-            {name: to_tensor(channels[name], CHANNELS[name].has_halves) for name in self.reads if name in channels},
+            {name: to_tensor(channels[name], CHANNELS[name].has_buffers) for name in self.reads if name in channels},
             now=Cameras.of(view),
             previous=Cameras.of(before if self.reading.has_history else NOWHERE),
             gain=torch.ones(1, 3, 1, 1),
@@ -323,7 +323,7 @@ class OwnShot:
         self.view = view
         return Frame(
             {
-                name: to_tensor(mirrors.seen(name, arrays, arrays.__getitem__), CHANNELS[name].has_halves)
+                name: to_tensor(mirrors.seen(name, arrays, arrays.__getitem__), CHANNELS[name].has_buffers)
                 for name in self.reads
                 if name in arrays
             },

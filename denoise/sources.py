@@ -4,8 +4,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from datasets.channels import HALVES
-from datasets.exr import COMPONENTS, FACTS_ATTRIBUTE, HALF_ENDINGS
+from datasets.channels import CHANNELS, SAMPLE_BUFFERS
+from datasets.exr import FACTS_ATTRIBUTE, layer_names
 from denoise.exr_image import ExrImage
 from denoise.layers import KNOWN, Layer, candidates, grouped, in_words, layer_of, plain, stated_layer
 from denoise.sequence import COLOUR
@@ -50,13 +50,13 @@ def is_ours(image: ExrImage) -> bool:
         facts = json.loads(image.header.get(FACTS_ATTRIBUTE, "null"))
     except (TypeError, ValueError):
         return False
-    needed = [f"{layer}.{c}" for layer in ("direct", "indirect", "emission") for c in COMPONENTS.get(layer, "RGB")]
+    needed = [f"{layer}.{c}" for layer in ("direct", "indirect", "emission") for c in CHANNELS[layer].letters]
     return isinstance(facts, dict) and all(name in image.channels for name in [*needed, *"RGB"])
 
 
 def has_halves(image: ExrImage) -> bool:
     """Whether a file that `onespp exr` wrote holds the halves of its samples."""
-    return all(f"{channel}{ending}.R" in image.channels for channel in HALVES.values() for ending in HALF_ENDINGS)
+    return all(f"{layer}.R" in image.channels for name in SAMPLE_BUFFERS.values() for layer in layer_names(name))
 
 
 def find_sources(images: Mapping[str, ExrImage], stated: Mapping[str, str]) -> Sources:

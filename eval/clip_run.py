@@ -101,7 +101,7 @@ class ClipRun:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
         denoiser = self.entrant.denoiser
         moved = frame.to(denoiser.device)
-        if self.entrant.tells_error and isinstance(denoiser, Shrunk) and frame.has_halves:
+        if self.entrant.tells_error and isinstance(denoiser, Shrunk) and frame.has_buffers:
             output, self.state, estimate = with_error(denoiser, moved, self.state)
             self.error = exposure * estimate.radiance().cpu().square().mean(dim=1).sqrt()
         else:
@@ -179,7 +179,7 @@ def play(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool =
     still = is_still(clip)
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
-        halves = {signal: to_tensor(clip.reference(index, signal), has_halves=True)[0] for signal in signals}
+        halves = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
         for run, folder in zip(runs, folders, strict=True):
             output = run.step(frame, halves[run.signal], clip.exposure, still)
             image = display(finite(output), clip.exposure)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 from tqdm import tqdm
 
-from datasets.channels import REFERENCES
+from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from models.history.running_scale import RunningMean, RunningScale
@@ -65,7 +65,7 @@ class AccumulatedCrops(TorchDataset[Crops]):
         self.crop = crop
         self.seed = seed
         self.epoch = 0
-        self.channels = (*denoiser.filter_reads, *REFERENCES)
+        self.channels = (*denoiser.filter_reads, *REFERENCE_CHANNELS)
         frames = np.array([clip.frames for clip in clips])
         self.share = frames / frames.sum()
         self.count = int(count * frames.sum())

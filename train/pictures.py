@@ -30,7 +30,7 @@ def sample_picture(denoiser: Denoiser, clip: Clip, device: torch.device) -> Tens
     for index in range(last + 1):
         frame = read_frame(clip, index, denoiser.reads)
         output, state = denoiser(frame.to(device), state)
-    reference = to_tensor(clip.reference(last, denoiser.signal), has_halves=True)[0].mean(dim=0, keepdim=True)
+    reference = to_tensor(clip.reference(last, denoiser.signal), has_buffers=True)[0].mean(dim=0, keepdim=True)
     images = (frame.radiance(denoiser.signal), finite(output).float().cpu(), reference)
     noisy, shown, truth = (display(image, clip.exposure)[0] for image in images)
     return torch.cat([noisy, shown, truth, (AMPLIFIED * (shown - truth).abs()).clamp(max=1)], dim=-1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
-from datasets.channels import REFERENCES, SAMPLED
+from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, read_frame
 from errors import BadInput
@@ -70,7 +70,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
     ):
         check_fits(clips, length, crop)
         self.clips = clips
-        self.channels = tuple(dict.fromkeys([*reads, *REFERENCES]))
+        self.channels = tuple(dict.fromkeys([*reads, *REFERENCE_CHANNELS]))
         self.length = length
         self.crop = crop
         self.augmentation = augmentation
@@ -114,7 +114,7 @@ class TrainingSequences(TorchDataset[list[Frame]]):
             previous = playback[max(t - 1, 0)]
             frame = read_frame(clip, position, self.channels, realisation, previous, window)
             if together > 1:
-                sampled = [name for name in self.channels if name in SAMPLED]
+                sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
                 frame = frame.with_more_samples(
                     [read_frame(clip, position, sampled, i, window=window) for i in chosen[1:]]
                 )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves, psnr
+from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean, psnr
 from eval.bench.output import bench_folder
 from eval.bench.stock import Render, stock_render
 from files import write_json
@@ -59,7 +59,7 @@ class TimeToFloor:
 def displayed_noise(render: Render, exposure: float, spp: int) -> float:
     """Mean squared error of the mean of two halves of so many samples, as displayed."""
     a, b = (display(render(1 + half, spp // 2), exposure) for half in (0, 1))
-    return noise_of_halves(a, b)
+    return noise_of_mean(a, b)
 
 
 def samples_needed(render: Render, exposure: float, target: float) -> tuple[int, float]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, HALVES
+from datasets.channels import CHANNELS, SAMPLE_BUFFERS
 from datasets.frame import Cameras, Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
@@ -112,7 +112,7 @@ def halves_of(light: Mapping[str, Array], seed: tuple[int, ...]) -> dict[str, Ar
     halves = {}
     for name, mean in light.items():
         in_first = rng.random((*mean.shape[:2], 1)) < 0.5
-        halves[HALVES[name]] = 2 * mean * np.stack([in_first, ~in_first])
+        halves[SAMPLE_BUFFERS[name]] = 2 * mean * np.stack([in_first, ~in_first])
     return halves
 
 
@@ -161,5 +161,5 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "light_angle": np.where(hit, 0.05, 0),
     }
     gain = to_tensor(np.ones((1, 1, 3)))
-    tensors = {name: to_tensor(array, CHANNELS[name].has_halves) for name, array in channels.items()}
+    tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
     return Frame(tensors, Cameras.of(now), Cameras.of(before), gain, "synthetic sequence")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from datasets.channels import REFERENCES
+from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, Signal, read_frame
 from datasets.tonemap import display, psnr
@@ -64,7 +64,7 @@ class DenoiserView:
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
-        if frame.channels.keys() >= set(REFERENCES):
+        if frame.channels.keys() >= set(REFERENCE_CHANNELS):
             difference = image - as_displayed(reference_of(frame, signal), exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
@@ -110,10 +110,10 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
     """
     views = [DenoiserView(name, denoiser) for name, denoiser in denoisers.items()]
     channels = {channel for denoiser in denoisers.values() for channel in denoiser.reads}
-    has_reference = all(channel in clip.channels for channel in REFERENCES)
+    has_reference = all(channel in clip.channels for channel in REFERENCE_CHANNELS)
     references: Column = []
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
-        wanted = channels | {*REFERENCES, "albedo", "depth"} if has_reference and index in shown else channels
+        wanted = channels | {*REFERENCE_CHANNELS, "albedo", "depth"} if has_reference and index in shown else channels
         frame = read_frame(clip, index, sorted(wanted))
         for view in views:
             output = view.step(frame)

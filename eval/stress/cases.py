@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from datasets.channels import HALVES, MOTION_CHANNELS, NOISY
+from datasets.channels import MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
 from datasets.frame import Frame
 from eval.bench.sizes import Size
 from eval.stress.changes import (
@@ -91,7 +91,7 @@ def bad_pixel(name: str, value: float, channels: tuple[str, ...]) -> StressCase:
 STRESS_CASES = (
     StressCase("even light, then noise"),
     StressCase("all black", change=light_times(0)),
-    bad_pixel("a firefly of 65504", 65504, (*NOISY, *HALVES.values())),
+    bad_pixel("a firefly of 65504", 65504, (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values())),
     StressCase("radiance 1e-7", change=light_times(1e-7), compare_with="own", gain=1e-7),
     StressCase("radiance 6e4", change=light_times(6e4), compare_with="own", gain=6e4),
     StressCase("radiance 1e-7 to 6e4", change=dim_to_bright),

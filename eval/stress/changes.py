@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from datasets.channels import HALVES, HIT_CHANNELS, MOTION_CHANNELS, NOISY
+from datasets.channels import CHANNELS, LENGTH, channels_of
 from datasets.frame import Cameras, Frame
 
 FrameChange = Callable[[Frame], Frame]
 
-LIGHT_CHANNELS = (*NOISY, *HALVES.values(), "emission")
-SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness", "mesh_id", *MOTION_CHANNELS, *HIT_CHANNELS)
+LIGHT_CHANNELS = channels_of("noisy", "buffers", "emission")
+SURFACE_CHANNELS = channels_of("surface", "motion", "hit")
+LENGTHS = tuple(name for name in SURFACE_CHANNELS if CHANNELS[name].unit == LENGTH)
 
 
 def unchanged(frame: Frame) -> Frame:
@@ -65,7 +66,7 @@ def lengths_times(factor: float) -> FrameChange:
         return Cameras(at.K, at.camera_to_world * factors, at.object_to_world * factors)
 
     def change(frame: Frame) -> Frame:
-        lengths = {name: factor * frame.channels[name] for name in ("depth", "hit_distance", "light_distance")}
+        lengths = {name: factor * frame.channels[name] for name in LENGTHS}
         return replace(
             frame, channels=frame.channels | lengths, now=cameras(frame.now), previous=cameras(frame.previous)
         )

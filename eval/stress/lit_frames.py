@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from datasets.channels import CHANNELS, HALVES
+from datasets.channels import CHANNELS, SAMPLE_BUFFERS
 from datasets.frame import Frame, to_tensor
 from eval.bench.sizes import Size
 from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, halves_of, noisy, synthetic_frame
@@ -25,9 +25,9 @@ def lit(frame: Frame, seed: int | None) -> Frame:
         light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
         halves = halves_of(light, (seed, 1))
     else:
-        halves = {HALVES[name]: np.stack([mean, mean]) for name, mean in light.items()}
+        halves = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
     channels = light | halves
-    tensors = {name: to_tensor(array, CHANNELS[name].has_halves) for name, array in channels.items()}
+    tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
     return replace(frame, channels=frame.channels | tensors)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
-from datasets.channels import CAMERA_CHANNELS, HALVES, NOISY, REFERENCES
+from datasets.channels import CAMERA_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from datasets.tonemap import display
@@ -36,7 +36,7 @@ SCENES = ("cornell_box", "cornell_box_moving", "room-2002", "room-2004")
 SIZE = (12, 128, 128)  # frames, height, width
 SAMPLING = Sampling(realisations=64, noisy_spp=2, reference_spp=1024)
 SURFACES = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
-CHANNELS = (*NOISY, *REFERENCES, *SURFACES, *CAMERA_CHANNELS)
+CHANNELS = (*NOISY_CHANNELS, *REFERENCE_CHANNELS, *SURFACES, *CAMERA_CHANNELS)
 LEVELS = (128, 64, 16, 4)  # samples a pixel; the first one's error is what samples are asked for
 BLOCK = 64  # px: squared errors are compared in means over such blocks and all frames
 BAND = (0.8, 1.25)  # of told over true
@@ -72,13 +72,13 @@ def clip_of(scene: str, folder: Path) -> Clip:
 
 def fed(clip: Clip, index: int, spp: int, reads: Sequence[str]) -> Frame:
     """A frame with `spp` samples a pixel in two halves, of realisations whose noise is independent."""
-    frame = read_frame(clip, index, [name for name in reads if name not in NOISY])
+    frame = read_frame(clip, index, [name for name in reads if name not in NOISY_CHANNELS])
     realisations = range(spp // clip.facts["noisy_spp"])
     channels = dict(frame.channels)
-    for name in NOISY:
+    for name in NOISY_CHANNELS:
         drawn = np.stack([clip.read(name, index, realisation=i).astype(np.float32) for i in realisations])
         halves = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
-        channels |= {name: to_tensor(halves.mean(axis=0)), HALVES[name]: to_tensor(halves, has_halves=True)}
+        channels |= {name: to_tensor(halves.mean(axis=0)), SAMPLE_BUFFERS[name]: to_tensor(halves, has_buffers=True)}
     return replace(frame, channels=channels, spp=torch.full((1, 1, 1, 1), float(spp)))
 
 
@@ -87,7 +87,7 @@ def played(denoiser: Shrunk, clip: Clip, spp: int) -> Iterator[tuple[Tensor, Err
     state: State | None = None
     for index in range(clip.frames):
         output, state, estimate = with_error(denoiser, fed(clip, index, spp, denoiser.reads), state)
-        yield output, estimate, to_tensor(clip.reference(index, denoiser.signal), has_halves=True)[0]
+        yield output, estimate, to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
 
 
 def told(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None) -> Told:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from datasets.channels import HALVES
+from datasets.channels import SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.bench.sample_cost import Cost, sample_cost
@@ -64,7 +64,7 @@ def results_by_spp(
 ) -> dict[int, list[ClipResults]]:
     """Results on the clips by samples a pixel. What is rendered and judged is kept in `folder`."""
     entrants = [entrant(spec, spec.label) for spec in specs]
-    halves = any(not set(HALVES.values()).isdisjoint(spec.facts.reads) for spec in specs)
+    halves = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, HALVES, NOISY
+from datasets.channels import CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from datasets.writer import to_storage
 from errors import BadInput
@@ -22,7 +22,7 @@ from render.sampler import CYCLE
 from scenes.animation import Scene
 
 Source = Literal["averaged", "rendered"]
-NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY (H, W, 3), of HALVES (2, H, W, 3)
+NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS (H, W, 3), of SAMPLE_BUFFERS (2, H, W, 3)
 
 
 def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
@@ -43,11 +43,11 @@ def averaged(clip: Clip, count: int, halves: bool) -> Iterator[NoisyFrame]:
     """Frame by frame the mean of the clip's first `count` noise realisations, which are independent."""
     for frame in range(clip.frames):
         noisy = {}
-        for name in NOISY:
+        for name in NOISY_CHANNELS:
             drawn = np.stack([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)])
             noisy[name] = drawn.mean(axis=0)
             if halves:
-                noisy[HALVES[name]] = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
+                noisy[SAMPLE_BUFFERS[name]] = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
         yield noisy
 
 
@@ -58,7 +58,7 @@ def rendered(clip: Clip, dataset: Dataset, spp: int, halves: bool) -> Iterator[N
     """
     scene, seed = scene_of(clip, dataset)
     sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # nothing is kept of the reference
-    channels = (*NOISY, *HALVES.values()) if halves else NOISY
+    channels = (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values()) if halves else NOISY_CHANNELS
     for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, channels):
         yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in channels}
 

@@ -146,14 +146,14 @@ class ErrorEstimate:
 
 def with_error(denoiser: Shrunk, frame: Frame, state: State | None) -> tuple[Tensor, State, ErrorEstimate]:
     """What NAME+js makes of a frame, its state, and the estimate of its error. Raises BadInput without halves."""
-    if not frame.has_halves:
+    if not frame.has_buffers:
         raise BadInput(f"{frame.source} has no halves of its samples: how far it is from the truth cannot be told")
     frame = frame.finite()
     inner, signal = denoiser.inner, denoiser.signal
     output, after = inner(frame, state)
     filtered = denoised_irradiance(output, frame, signal)
     share = share_let_in(frame, filtered, signal)
-    halves = [frame.half(which) for which in (0, 1)]
+    halves = [frame.buffer(which) for which in (0, 1)]
     passes = [denoised_irradiance(inner(half, state)[0], half, signal) for half in halves]
     estimate = estimated(frame, filtered, passes, [half.irradiance(signal) for half in halves], share)
     return frame.remodulate(mixture(frame, filtered, share, signal), signal), after, estimate

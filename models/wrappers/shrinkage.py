@@ -25,7 +25,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from datasets.channels import HALVES
+from datasets.channels import SAMPLE_BUFFERS
 from datasets.frame import Frame, Signal
 from models.denoiser import State
 from models.filters.neighbours import mesh_sums
@@ -97,7 +97,7 @@ def denoised_irradiance(output: Tensor, frame: Frame, signal: Signal) -> Tensor:
 
 def share_let_in(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
     """ρ (B, 3, H, W) of a frame that has halves, for denoised irradiance (B, 3, H, W)."""
-    a, b = (frame.half(which).irradiance(signal) for which in (0, 1))
+    a, b = (frame.buffer(which).irradiance(signal) for which in (0, 1))
     luminance = mesh_means_of(image_luminance(denoised), frame.mesh_id)
     unit = unit_of(luminance)
     off_a, off_b = (relative(half - denoised, unit) for half in (a, b))
@@ -130,11 +130,12 @@ class Shrunk(Wrapper):
 
     def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
         """With the halves of those that have any, and what shrinkage compares them by."""
-        return tuple(dict.fromkeys((*reads, *(HALVES[name] for name in HALVES if name in reads), *COMPARED_BY)))
+        buffers = (SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)
+        return tuple(dict.fromkeys((*reads, *buffers, *COMPARED_BY)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.forward(frame, state)
-        if not frame.has_halves:
+        if not frame.has_buffers:
             return output, after
         denoised = denoised_irradiance(output, frame, self.signal)
         return frame.remodulate(shrunk(frame, denoised, self.signal), self.signal), after

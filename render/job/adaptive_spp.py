@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from datasets.tonemap import clip_exposure, display, luminance, noise_of_halves
+from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean
 from render.clip import NO_OPTIONS, Options
 from render.job.profiles import SamplingQuality
 from render.shot import Shot
@@ -22,7 +22,7 @@ def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: 
         emissions.append(shot.emission)
     exposure = clip_exposure(luminance(np.mean(halves, axis=1)))
     shown = [display(pair + emission, exposure) for pair, emission in zip(np.array(halves), emissions, strict=True)]
-    return float(np.mean([noise_of_halves(a, b) for a, b in shown]))
+    return float(np.mean([noise_of_mean(a, b) for a, b in shown]))
 
 
 def samples_needed(

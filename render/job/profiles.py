@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from datasets.channels import CAMERA_CHANNELS, CHANNELS, HALVES, REFERENCES, USUAL_CHANNELS
+from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS
 from errors import BadInput
 from provenance import RENDERING, versions
@@ -21,7 +21,7 @@ from scenes.description import Split, read_description
 GENERATOR = 8  # raise it when the same seed renders different bytes
 
 # Without these a clip has no picture, no reference or no geometry that other channels could be derived from.
-ESSENTIAL_CHANNELS = {"direct", "indirect", *REFERENCES, "emission", "albedo", "depth", "mesh_id", *CAMERA_CHANNELS}
+ESSENTIAL_CHANNELS = {name for name, channel in CHANNELS.items() if channel.essential}
 
 
 class SamplingQuality(NamedTuple):
@@ -250,8 +250,8 @@ def plan(
     check_seed(seed)
     described = profile_of(profile)
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
-    if not set(HALVES.values()).isdisjoint(reads):  # direct and indirect light are drawn together
-        reads = (*reads, *HALVES.values())
+    if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are drawn together
+        reads = (*reads, *SAMPLE_BUFFERS.values())
     train = rendered_channels(reads)
     test = [name for name in CHANNELS if name in USUAL_CHANNELS or name in reads]
     return {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.channels import CHANNELS, HALVES, HIT_CHANNELS, MOTION_CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, HIT_CHANNELS, MOTION_CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.clip_kind import ClipKind
 from datasets.frame import read_frame
@@ -111,7 +111,7 @@ def test_halves_tell_the_noise_of_their_mean(moving_boxes):
     """(A - B)² / 4 is the variance of the mean: the same that its realisations show."""
     assert "direct_halves" not in moving_boxes["000"].channels  # of one sample
     many = moving_boxes["000-16spp"]
-    for name, halves in HALVES.items():
+    for name, halves in SAMPLE_BUFFERS.items():
         drawn = np.array([[many.read(halves, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
         noisy = np.array([[many.read(name, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
         np.testing.assert_allclose(noisy, drawn.mean(axis=2), rtol=2e-3, atol=1e-5)  # of float16
@@ -122,18 +122,18 @@ def test_halves_tell_the_noise_of_their_mean(moving_boxes):
 def test_halves_are_stored_together_and_where_asked_for():
     """A clip for denoisers of indirect light alone may be shown to others too."""
     asked = plan("release", 0, channels_read(["ntd+js"]))["channels"]["test"]
-    assert set(HALVES.values()) < set(asked)
+    assert set(SAMPLE_BUFFERS.values()) < set(asked)
     assert set(plan("release", 0, channels_read(["ntd"]))["channels"]["test"]) == set(USUAL_CHANNELS)
 
 
 def test_a_frame_gives_its_halves_as_frames(moving_boxes):
-    frame = read_frame(moving_boxes["000-16spp"], 2, ("direct", "albedo", *HALVES.values()))
-    a, b = frame.half(0), frame.half(1)
-    assert frame.has_halves and not a.has_halves
+    frame = read_frame(moving_boxes["000-16spp"], 2, ("direct", "albedo", *SAMPLE_BUFFERS.values()))
+    a, b = frame.buffer(0), frame.buffer(1)
+    assert frame.has_buffers and not a.has_buffers
     assert a.channels.keys() == {"direct", "albedo"} and float(a.samples) == float(b.samples) == 8
     torch.testing.assert_close((a.direct + b.direct) / 2, frame.direct, rtol=2e-3, atol=1e-5)
-    one = read_frame(moving_boxes["000"], 2, ("direct", "albedo", *HALVES.values()))
-    assert not one.has_halves and one.channels.keys() == {"direct", "albedo"}
+    one = read_frame(moving_boxes["000"], 2, ("direct", "albedo", *SAMPLE_BUFFERS.values()))
+    assert not one.has_buffers and one.channels.keys() == {"direct", "albedo"}
 
 
 @pytest.mark.parametrize("floor", [34.0, 40.0])

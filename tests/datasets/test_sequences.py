@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.channels import CHANNELS, HIT_CHANNELS, TEMPORAL_CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, HIT_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from errors import BadInput
 from train.data import loader
 from train.sequences import Augmentation, TrainingSequences, collate
 
-FORWARD_ALONE = tuple(name for name in TEMPORAL_CHANNELS if name != "motion")
+FORWARD_ALONE = tuple(name for name, channel in CHANNELS.items() if channel.is_temporal and name != "motion")
 IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
 AUGMENTATIONS = {
     "none": Augmentation(),

@@ -121,7 +121,7 @@ def main(source: str, out: Path) -> None:
             write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
     else:
         for which, folder in enumerate(("frames", "half")):
-            halves = (synthetic_frame(index, *parse_size(source)).half(which) for index in range(3))
+            halves = (synthetic_frame(index, *parse_size(source)).buffer(which) for index in range(3))
             write_sequence(out / folder, halves, blender)
 
 

@@ -13,7 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from datasets.channels import REFERENCES
+from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Dataset
 from datasets.frame import Cameras, Frame, read_frame
 from datasets.tonemap import display, psnr
@@ -182,7 +182,7 @@ def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, n
     full.prepare()
     half.prepare(precision)
     clip = Dataset(tiny).clips("test")[1]
-    frames = [read_frame(clip, index, (*full.reads, *REFERENCES)) for index in range(clip.frames)]
+    frames = [read_frame(clip, index, (*full.reads, *REFERENCE_CHANNELS)) for index in range(clip.frames)]
     truth = [frame.remodulate(frame.reference_irradiance(full.signal), full.signal) for frame in frames]
     exact = run(full, frames)
     rounded = run(half, frames)

@@ -78,7 +78,7 @@ class DisplayedLoss(NetworkLoss):
         temporal: list[Tensor] = []
         before: Sequence[Tensor] = ()  # the last frame's errors
         for frame, output, exposure in exposed_outputs(self.denoiser, batch):
-            target = exposure * frame.reference_halves(self.denoiser.signal).mean(dim=1)
+            target = exposure * frame.reference_buffers(self.denoiser.signal).mean(dim=1)
             errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
             spatial.append(sum_of_scales(errors, shares))
             if before:

@@ -39,7 +39,7 @@ class LBFLoss(NetworkLoss):
         signal = self.denoiser.signal
         losses = []
         for frame, output, exposure in exposed_outputs(self.denoiser, batch):
-            reference = exposure * frame.reference_halves(signal).mean(dim=1)
+            reference = exposure * frame.reference_buffers(signal).mean(dim=1)
             shown = reference + exposure * frame.emission if signal == "total" else reference
             error = (output - reference).square() / (shown.square() + self.terms.epsilon)
             losses.append(surface_mean(frame.samples / 2 * error, frame.depth))

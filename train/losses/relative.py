@@ -56,7 +56,7 @@ class RelativeLoss(NetworkLoss):
         before: Tensor | None = None  # the errors of the frame before
         signal = self.denoiser.signal
         for frame, reflected, exposure in exposed_outputs(self.denoiser, batch):
-            errors = reflected[:, None] - exposure[:, None] * frame.reference_halves(signal)
+            errors = reflected[:, None] - exposure[:, None] * frame.reference_buffers(signal)
             errors = torch.where(frame.depth[:, None] > 0, errors, 0)
             shown = reflected.detach().clamp(min=0)
             if signal == "total":
