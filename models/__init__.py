@@ -6,6 +6,6 @@
   of `convolution.py` and `pixel_kernels.py`.
 - `taa.py` puts temporal antialiasing after any of them.
 - What they share: `reprojection.py` fetches the history of `surfaces.py`, `accumulation.py` averages along it,
-  `running_scale.py` estimates exposure and depth; `operators.py` and `parameters.py` hold small functions and numbers.
+  `running_scale.py` estimates exposure and depth; `operators.py` has small functions.
 - `compiled/` has kernels for the functions that take most time.
 """

@@ -56,7 +56,7 @@ def test_results_of_one_denoiser_do_not_follow_from_another():
 def test_kernels_on_disk_follow_from_all_that_they_take():
     modules = [f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))]
     assert code_digest(*modules) == KERNELS
-    assert {"models.parameters", "models.compiled.exponential", "datasets.channels"} <= set(sources(*modules))
+    assert {"models.operators", "models.compiled.exponential", "datasets.channels"} <= set(sources(*modules))
 
 
 def test_imports_are_found_in_both_forms(tmp_path):

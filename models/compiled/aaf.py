@@ -7,16 +7,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models import parameters
 from models.compiled.eaw import columns_with_tap, divide
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 from models.compiled.lines import add_line, add_product, copy_line
 
-LEAST_COSINE = np.float32(parameters.AAF_LEAST_COSINE)
-LARGEST_EXPONENT = np.float32(parameters.AAF_TRUNCATION**2 / 2)
-NEAR = np.float32(2 * parameters.DIFFUSE_BAND)
-REACH = parameters.AAF_REACH
+DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
+MAX_REACH = 50  # px
+TRUNCATION = 8**0.5  # standard deviations at which Gaussians end
+COSINE_OF_5_DEGREES = 0.99619  # largest angle between the normals of pixels that are filtered together
+MAX_GAUSSIAN_EXPONENT = np.float32(TRUNCATION**2 / 2)
+NEAR = np.float32(2 * DIFFUSE_BAND)
 HALF = np.float32(0.5)
 ZERO = np.float32(0)
 INFINITY = np.float32(np.inf)
@@ -42,7 +43,7 @@ def measure(distance: Any, along: Any, geometry: Any, row: Any, left: Any, dx: A
         c = to_z[i] - z[i]
         squared = a * a + b * b + c * c
         off = a * n_x[i] + b * n_y[i] + c * n_z[i]
-        same = n_x[i] * m_x[i] + n_y[i] * m_y[i] + n_z[i] * m_z[i] > LEAST_COSINE
+        same = n_x[i] * m_x[i] + n_y[i] * m_y[i] + n_z[i] * m_z[i] > np.float32(COSINE_OF_5_DEGREES)
         distance[i] = squared if same else INFINITY
         along[i] = max(squared - off * off, ZERO)
 
@@ -53,8 +54,8 @@ def weigh(weight: Any, distance: Any, along: Any, width: Any, widest: Any) -> No
     for i in range(weight.size):
         narrower = min(width[i], widest[i])
         exponent = HALF * along[i] / (narrower * narrower)
-        reached = distance[i] < NEAR * NEAR * narrower * narrower and exponent <= LARGEST_EXPONENT
-        weight[i] = exp(-min(exponent, LARGEST_EXPONENT)) if reached else ZERO
+        reached = distance[i] < NEAR * NEAR * narrower * narrower and exponent <= MAX_GAUSSIAN_EXPONENT
+        weight[i] = exp(-min(exponent, MAX_GAUSSIAN_EXPONENT)) if reached else ZERO
 
 
 @jit_with_memory
@@ -66,7 +67,7 @@ def filter_row(out: Any, row: Any, image: Any, width: Any, widest: Any, geometry
     for s in range(signals):
         for c in range(3):
             copy_line(out[s, c, row], image[s, c, row])
-    for step in range(-REACH, REACH + 1):
+    for step in range(-MAX_REACH, MAX_REACH + 1):
         dx, dy = (0, step) if down else (step, 0)
         left, right = columns_with_tap(row, dx, dy, height, columns)
         if step == 0 or left >= right:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
-from models import parameters
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
 from models.compiled.reprojection import (
     BLOCK_ROWS,
@@ -23,7 +22,7 @@ from models.compiled.reprojection import (
 )
 from models.history.surfaces import Surfaces
 
-SMALLEST_ALPHA = np.float32(parameters.SMALLEST_ALPHA)
+MIN_ALPHA = 0.2  # SVGF §4.1: weight of the newest frame in a long history
 
 
 @jit_with_reciprocals
@@ -31,7 +30,7 @@ def weigh(alpha: Any, length: Any, past_length: Any, found: Any) -> None:
     """The weight of the newest frame and the new history length, (W), from those fetched and whether any was."""
     for x in range(alpha.size):
         longer = past_length[x] + ONE
-        alpha[x] = max(ONE / longer, SMALLEST_ALPHA) if found[x] > 0 else ONE
+        alpha[x] = max(ONE / longer, np.float32(MIN_ALPHA)) if found[x] > 0 else ONE
         length[x] = longer if found[x] > 0 else ONE
 
 

@@ -8,15 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models import parameters
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory, match_threads
 from models.compiled.lines import add_line, add_product, scale_line
 
+MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
 ZERO = np.float32(0)
 TWO = np.float32(2)
-LEAST_LOGIT = np.float32(parameters.LEAST_LOGIT)
-BLOCK = 2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
+BLOCK_PIXELS = 2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
 STRIDE = 4  # features that are compared in one pass
 
 
@@ -52,7 +51,7 @@ def measure(distance: Any, features: Any, low: Any, high: Any, offset: Any) -> N
 def weigh(weight: Any, distance: Any, sharpness: Any, importance: Any, surface: Any) -> None:
     for x in range(weight.size):
         exponent = importance[x] - sharpness[x] * distance[x]
-        weight[x] = exp(min(max(exponent, LEAST_LOGIT), -LEAST_LOGIT)) * surface[x]
+        weight[x] = exp(min(max(exponent, np.float32(MIN_LOGIT)), -np.float32(MIN_LOGIT))) * surface[x]
 
 
 @jit_in_any_order
@@ -131,7 +130,7 @@ def filter_image(
 ) -> None:
     """out (3, N) and the sums of weights, total (N), from image (3, N), features (F, N), others (N), row after row."""
     pixels = total.size
-    block = max(1, BLOCK // width) * width
+    block = max(1, BLOCK_PIXELS // width) * width
     inside = columns_inside(block, width, step)
     for number in numba.prange((pixels + block - 1) // block):
         distances = np.empty(block, np.float32)
@@ -221,7 +220,7 @@ def pull_weights(
 def pull_exponent(to_sharpness: Any, pull: Any, distance: Any, sharpness: Any, importance: Any) -> None:
     """pull (n) becomes the gradient of the exponent; -2 sharpness times that, for features, is left in distance."""
     for x in range(pull.size):
-        inside = importance[x] - sharpness[x] * distance[x] >= LEAST_LOGIT
+        inside = importance[x] - sharpness[x] * distance[x] >= np.float32(MIN_LOGIT)
         pull[x] = pull[x] if inside else ZERO
         to_sharpness[x] -= pull[x] * distance[x]
         distance[x] = -TWO * sharpness[x] * pull[x]
@@ -263,7 +262,7 @@ def pull_images(
 ) -> None:
     """The gradients of what affinity_level takes, added to `to_...`: (B, ., N), items in parallel."""
     batch, colours, pixels = image.shape
-    block = max(1, BLOCK // width) * width
+    block = max(1, BLOCK_PIXELS // width) * width
     inside = columns_inside(block, width, step)
     for item in numba.prange(batch):
         distances = np.empty(block, np.float32)

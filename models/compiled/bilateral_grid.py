@@ -9,13 +9,12 @@ from torch import Tensor
 
 from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory, plane_or_empty
 from models.compiled.lines import fill_line
-from models.parameters import GUIDES
 
-LARGEST_GUIDE = np.float32(GUIDES - 1)
+GUIDES = 256  # values of a guide (Meng et al. 2020), which cells of a grid divide as they divide pixels
 HALF = np.float32(0.5)
 ONE = np.float32(1)
 ZERO = np.float32(0)
-STRIP_ROWS = 64  # of pixels that a thread filters at once; a multiple of all spacings
+GRID_STRIP_ROWS = 64  # of pixels that a thread filters at once; a multiple of all spacings
 
 # A row of cells is a line of columns * levels * 4 numbers: red, green, blue and weight. It has a column and a level
 # more at either end, which are emptied before they are read: so no pixel has to ask whether its cells are inside.
@@ -32,7 +31,7 @@ def cells_around(x: Any, guide: Any, levels: Any, per_cell: Any) -> Any:
     """Where the first cell around a pixel of a line begins, and how far it lies to the right of it and behind it."""
     inside = guide if ZERO <= guide <= ONE else ZERO  # NaN would be outside of memory
     across = in_cells(np.float32(x), per_cell)
-    deep = in_cells(LARGEST_GUIDE * inside, per_cell)
+    deep = in_cells(np.float32(GUIDES - 1) * inside, per_cell)
     column = np.int64(across)
     level = np.int64(deep)
     return (column * levels + level) * 4, across - np.float32(column), deep - np.float32(level)
@@ -140,14 +139,14 @@ def filter_image(out: Any, image: Any, guide: Any, surface: Any, spacing: int) -
     levels = GUIDES // spacing + 2
     columns = (width + spacing - 1) // spacing + 2
     per_cell = ONE / np.float32(spacing)
-    strips = (height + spacing // 2 + STRIP_ROWS - 1) // STRIP_ROWS
+    strips = (height + spacing // 2 + GRID_STRIP_ROWS - 1) // GRID_STRIP_ROWS
     for strip in numba.prange(strips):
         above = np.empty(columns * levels * 4, np.float32)
         below = np.empty(columns * levels * 4, np.float32)
         # Pixels from the middle of a row of cells to the middle of the next one read the same two rows.
-        first = np.int64(strip) * STRIP_ROWS // spacing
+        first = np.int64(strip) * GRID_STRIP_ROWS // spacing
         fill_cells(below, first - 1, image, guide, surface, levels, spacing)
-        for row in range(first, first + STRIP_ROWS // spacing):
+        for row in range(first, first + GRID_STRIP_ROWS // spacing):
             above, below = below, above
             fill_cells(below, row, image, guide, surface, levels, spacing)
             top = row * spacing - spacing // 2

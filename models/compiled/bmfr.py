@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
-from models.parameters import BLOCK_SIDE, FLATTEST, REGRESSORS
 
+BLOCK_SIDE = 32  # px
+REGRESSORS = 10  # 1, normal (3), position (3), its squares (3)
+MIN_RELATIVE_EXTENT = 1e-3  # of a block's largest: positions along an axis of less are not stretched to [0, 1]
 PIXELS = BLOCK_SIDE**2
 COLUMNS = REGRESSORS + 3  # of the augmented matrix: features and colours
 POSITION = 4  # the first column of positions
@@ -86,7 +88,7 @@ def scale_positions(columns: Any) -> None:
     extents = np.empty(3)
     for i in range(3):
         extents[i] = begin_at_0(columns[POSITION + i], columns[0])
-    least = FLATTEST * extents.max()
+    least = MIN_RELATIVE_EXTENT * extents.max()
     for i in range(3):
         extent = max(extents[i], least)
         scale(columns[POSITION + i], columns[SQUARE + i], 1 / extent if extent > 0 else 0.0)

@@ -7,30 +7,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models import parameters
 from models.compiled.affinity import add_weighted, normalise, pull_weights, scale_gradient
 from models.compiled.eaw import columns_with_tap
-from models.compiled.exponential import exp
+from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 from models.compiled.lines import add_product, fill_line, scale_line
+from models.operators import MIN_DIVISOR
 
+FILTER_RADIUS = 27  # px: windows of 55 x 55
+FEATURE_GROUPS = (3, 3, 3, 1, 1)  # channels of each feature: position, normal, albedo, roughness, visibility
+COLOUR_SHARPNESS = 1 / (2 * 7**2)  # 1 / 2 β²
+MAX_EXPONENT = -MIN_EXPONENT
+GROUP_COUNT = len(FEATURE_GROUPS)
 if TYPE_CHECKING:
     from models.networks.cross_bilateral import Pixels
 
 ZERO = np.float32(0)
-COLOUR_SHARPNESS = np.float32(parameters.COLOUR_SHARPNESS)
-LEAST_VARIANCE = np.float32(parameters.LEAST_VARIANCE)
-LARGEST_EXPONENT = np.float32(parameters.LARGEST_EXPONENT)
-RADIUS = parameters.FILTER_RADIUS
-GROUPS = len(parameters.GROUPS)
-FIRST = tuple(np.cumsum((0, *parameters.GROUPS)).tolist())  # channel of each group, and beyond the last
+FIRST = tuple(np.cumsum((0, *FEATURE_GROUPS)).tolist())  # channel of each group, and beyond the last
 
 
 @jit_in_any_order
 def add_apart(exponent: Any, here: Any, there: Any, variance: Any, variance_there: Any) -> None:
     for x in range(exponent.size):
         off = there[x] - here[x]
-        exponent[x] += COLOUR_SHARPNESS * (off * off / (LEAST_VARIANCE + variance[x] + variance_there[x]))
+        exponent[x] += np.float32(COLOUR_SHARPNESS) * (
+            off * off / (np.float32(MIN_DIVISOR) + variance[x] + variance_there[x])
+        )
 
 
 @jit_in_any_order
@@ -42,7 +44,7 @@ def add_square(distance: Any, here: Any, there: Any) -> None:
 @jit_in_any_order
 def decay_where(weight: Any, exponent: Any, surface: Any) -> None:
     for x in range(weight.size):
-        weight[x] = exp(-min(exponent[x], LARGEST_EXPONENT)) * surface[x]
+        weight[x] = exp(-min(exponent[x], np.float32(MAX_EXPONENT))) * surface[x]
 
 
 class Planes(NamedTuple):
@@ -57,7 +59,7 @@ class Planes(NamedTuple):
 
 @jit_in_any_order
 def weigh_tap(weight: Any, exponent: Any, distances: Any, given: Any, row: Any, left: Any, dy: Any, dx: Any) -> None:
-    """weight, exponent (n) and distances (1 + GROUPS, n) of n pixels of a row, from `left` on, to their taps."""
+    """weight, exponent (n) and distances (1 + GROUP_COUNT, n) of n pixels of a row, from `left` on, to their taps."""
     here = slice(left, left + weight.size)
     there = slice(left + dx, left + dx + weight.size)
     image, variance, features, surface, sharpness = given
@@ -71,11 +73,11 @@ def weigh_tap(weight: Any, exponent: Any, distances: Any, given: Any, row: Any, 
             variance[c, row + dy, there],
         )
     fill_line(distances[0], np.float32(dy * dy + dx * dx))
-    for group in range(GROUPS):
+    for group in range(GROUP_COUNT):
         fill_line(distances[1 + group], ZERO)
         for f in range(FIRST[group], FIRST[group + 1]):
             add_square(distances[1 + group], features[f, row, here], features[f, row + dy, there])
-    for s in range(1 + GROUPS):
+    for s in range(1 + GROUP_COUNT):
         add_product(exponent, sharpness[s, row, here], distances[s])
     decay_where(weight, exponent, surface[0, row + dy, there])
 
@@ -84,11 +86,11 @@ def weigh_tap(weight: Any, exponent: Any, distances: Any, given: Any, row: Any, 
 def filter_row(out: Any, total: Any, given: Any, row: Any) -> None:
     """A row of out (3, H, W) and total (1, H, W)."""
     height, width = given.surface.shape[1:]
-    scratch = np.empty((3 + GROUPS, width), np.float32)
+    scratch = np.empty((3 + GROUP_COUNT, width), np.float32)
     out[:, row] = ZERO
     total[:, row] = ZERO
-    for dy in range(-RADIUS, RADIUS + 1):
-        for dx in range(-RADIUS, RADIUS + 1):
+    for dy in range(-FILTER_RADIUS, FILTER_RADIUS + 1):
+        for dx in range(-FILTER_RADIUS, FILTER_RADIUS + 1):
             left, right = columns_with_tap(row, dx, dy, height, width)
             if left >= right:
                 continue
@@ -127,7 +129,7 @@ def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
 def drop_beyond(pull: Any, exponent: Any) -> None:
     """Where the weight is the least there is, it does not change."""
     for x in range(pull.size):
-        pull[x] = pull[x] if exponent[x] < LARGEST_EXPONENT else ZERO
+        pull[x] = pull[x] if exponent[x] < np.float32(MAX_EXPONENT) else ZERO
 
 
 @jit_in_any_order
@@ -138,16 +140,16 @@ def subtract_product(line: Any, one: Any, other: Any) -> None:
 
 @jit_with_memory
 def pull_row(pulled: Any, gradient: Any, out: Any, total: Any, given: Any, row: Any) -> None:
-    """A row of pulled (1 + GROUPS, H, W)."""
+    """A row of pulled (1 + GROUP_COUNT, H, W)."""
     height, width = given.surface.shape[1:]
-    scratch = np.empty((4 + GROUPS, width), np.float32)
+    scratch = np.empty((4 + GROUP_COUNT, width), np.float32)
     scaled = np.empty((3, width), np.float32)
     dots = np.zeros(width, np.float32)
     pulled[:, row] = ZERO
     for c in range(3):
         scale_gradient(scaled[c], dots, gradient[c, row], out[c, row], total[0, row])
-    for dy in range(-RADIUS, RADIUS + 1):
-        for dx in range(-RADIUS, RADIUS + 1):
+    for dy in range(-FILTER_RADIUS, FILTER_RADIUS + 1):
+        for dx in range(-FILTER_RADIUS, FILTER_RADIUS + 1):
             left, right = columns_with_tap(row, dx, dy, height, width)
             if left >= right:
                 continue
@@ -158,7 +160,7 @@ def pull_row(pulled: Any, gradient: Any, out: Any, total: Any, given: Any, row: 
             here = scaled[:, left:right]
             pull_weights(pull, weight, here[0], here[1], here[2], dots[left:right], there[0], there[1], there[2])
             drop_beyond(pull, exponent)
-            for s in range(1 + GROUPS):
+            for s in range(1 + GROUP_COUNT):
                 subtract_product(pulled[s, row, left:right], pull, distances[s])
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from models.compiled.jit import jit_inlined
 
+MIN_EXPONENT = -80.0  # exp of less is denormal in float32, which is slow; what it leaves is 1e-35
 LOG2E = np.float32(1.4426950408889634)
 # 2^f on [-1/2, 1/2] as 1 + f * a polynomial: with these coefficients its largest relative error is the least, 9.2e-8
 EXP_1, EXP_2, EXP_3, EXP_4, EXP_5 = (

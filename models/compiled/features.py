@@ -14,8 +14,9 @@ from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
 from models.compiled.lines import interleave, scale_depth
 from models.history.running_scale import RunningScale
-from models.parameters import FEATURES, GAMMA
 
+FEATURES = {"colour": 3, "albedo": 3, "normal": 3, "depth": 1}  # inputs' channels (Fan et al. 2021, §5.1)
+GAMMA = 2.2  # of the display transform before the network (§5.1)
 ONE = np.float32(1)
 HALF = np.float32(0.5)
 BLOCK_ROWS = 8  # that share one piece of scratch memory

@@ -14,18 +14,16 @@ import torch
 from numba.np.ufunc.parallel import get_thread_id
 from torch import Tensor
 
-from models import parameters
-from models.compiled.exponential import exp
+from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
 from models.compiled.lines import copy_line
-from models.parameters import WINDOWS
+from models.operators import MIN_DIVISOR
 
+WINDOWS = (3, 5, 7, 9, 11, 13)  # Fan et al. 2021, §5.3
+SAFE_RANGE = 80.0  # of logits: exp(±40) times any radiance, summed, neither overflows nor vanishes in float32
+OUTSIDE_LOGIT = -1e30  # logit of a tap outside the image, or without a surface
 THREAD_ROWS = 32  # rows that a thread fuses at once
 CHUNK = 256  # px; of all maps, they fit into the fastest cache
-SAFE_RANGE = np.float32(parameters.SAFE_RANGE)
-LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
-OUTSIDE = np.float32(parameters.OUTSIDE)
-LEAST_WEIGHT = np.float32(parameters.LEAST_WEIGHT)
 
 
 # --- Lines of W pixels ------------------------------------------------------------------------------------------------
@@ -51,25 +49,29 @@ def add_four(line: Any, a: Any, b: Any, c: Any, d: Any) -> None:
 
 @jit_in_any_order
 def leave_out(logits: Any, surface: Any) -> None:
-    """logits become OUTSIDE where surface is 0."""
+    """logits become OUTSIDE_LOGIT where surface is 0."""
     for x in range(logits.size):
-        logits[x] = logits[x] if surface[x] > 0 else OUTSIDE
+        logits[x] = logits[x] if surface[x] > 0 else np.float32(OUTSIDE_LOGIT)
 
 
 @jit_in_any_order
 def widen(low: Any, high: Any, logits: Any) -> None:
-    """low and high come to include the logits that are not OUTSIDE."""
+    """low and high come to include the logits that are not OUTSIDE_LOGIT."""
     for x in range(logits.size):
         entry = logits[x]
         high[x] = entry if entry > high[x] else high[x]
-        low[x] = entry if entry < low[x] and entry > OUTSIDE else low[x]
+        low[x] = entry if entry < low[x] and entry > np.float32(OUTSIDE_LOGIT) else low[x]
 
 
 @jit_in_any_order
 def weigh(weight: Any, r: Any, g: Any, b: Any, logits: Any, shift: Any, red: Any, green: Any, blue: Any) -> None:
-    """weight = exp(logits - shift), 0 for logits OUTSIDE, and r, g, b = weight times red, green, blue."""
+    """weight = exp(logits - shift), 0 for logits OUTSIDE_LOGIT, and r, g, b = weight times red, green, blue."""
     for x in range(weight.size):
-        w = exp(max(logits[x] - shift, LEAST_EXPONENT)) if logits[x] > OUTSIDE else np.float32(0)
+        w = (
+            exp(max(logits[x] - shift, np.float32(MIN_EXPONENT)))
+            if logits[x] > np.float32(OUTSIDE_LOGIT)
+            else np.float32(0)
+        )
         weight[x] = w
         r[x] = w * red[x]
         g[x] = w * green[x]
@@ -80,7 +82,7 @@ def weigh(weight: Any, r: Any, g: Any, b: Any, logits: Any, shift: Any, red: Any
 def add_share(red: Any, green: Any, blue: Any, share: Any, r: Any, g: Any, b: Any, weight: Any) -> None:
     """red, green, blue += share times the sums r, g, b over that of weights."""
     for x in range(share.size):
-        factor = share[x] / max(weight[x], LEAST_WEIGHT)
+        factor = share[x] / max(weight[x], np.float32(MIN_DIVISOR))
         red[x] += factor * r[x]
         green[x] += factor * g[x]
         blue[x] += factor * b[x]
@@ -146,9 +148,9 @@ def mix(fused: Any, y: Any, total: Any, share: Any) -> None:
 
 @jit_with_memory
 def logit_range(logits: Any) -> Any:
-    """The lowest and highest of logits (n, W) that are not OUTSIDE, or OUTSIDE twice."""
+    """The lowest and highest of logits (n, W) that are not OUTSIDE_LOGIT, or OUTSIDE_LOGIT twice."""
     low = np.full(logits.shape[1], np.float32(np.inf))
-    high = np.full(logits.shape[1], OUTSIDE)
+    high = np.full(logits.shape[1], np.float32(OUTSIDE_LOGIT))
     for y in range(logits.shape[0]):
         widen(low, high, logits[y])
     top = high.max()
@@ -170,7 +172,7 @@ def softmax(shares: Any, y: Any, top: Any, total: Any) -> None:
         share = shares[i, y]
         for x in range(width):
             exponent = share[x] - top[x]
-            share[x] = exp(exponent if exponent > LEAST_EXPONENT else LEAST_EXPONENT)
+            share[x] = exp(exponent if exponent > np.float32(MIN_EXPONENT) else np.float32(MIN_EXPONENT))
             total[x] += share[x]
     for i in range(count):
         share = shares[i, y]
@@ -185,7 +187,8 @@ def filter_strip(
     """Add a window's share to a strip of rows from `start` on.
 
     `fused` and `image` (3, H, W) are whole; `logits` (rows, W), from row `low` on, cover the windows of the strip and
-    lie within SAFE_RANGE around `shift`, or OUTSIDE; `shares` (strip, W); `weighted` (4, rows or more, W) is scratch.
+    lie within SAFE_RANGE around `shift`, or are OUTSIDE_LOGIT; `shares` (strip, W); `weighted` (4, rows or more, W) is
+    scratch.
     """
     height, width = image.shape[1:]
     stop = start + len(shares)
@@ -221,8 +224,8 @@ def gather_in_steps(tops: Any, totals: Any, margin: int, entries: Any, values: A
         entry = entries[tap]
         for x in range(width):
             exponent = entry[x] - top[x]
-            exponent = exponent if exponent > LEAST_EXPONENT else LEAST_EXPONENT
-            weight[x] = exp(exponent) if entry[x] > OUTSIDE else np.float32(0)
+            exponent = exponent if exponent > np.float32(MIN_EXPONENT) else np.float32(MIN_EXPONENT)
+            weight[x] = exp(exponent) if entry[x] > np.float32(OUTSIDE_LOGIT) else np.float32(0)
         for c in range(4):
             total = totals[c][margin : margin + width]
             value = values[c, tap]
@@ -238,7 +241,7 @@ def filter_strip_in_steps(fused: Any, image: Any, logits: Any, shares: Any, radi
     entries = np.empty((taps, width), np.float32)
     values = np.zeros((4, taps, width), np.float32)
     top = np.empty(width, np.float32)
-    tops = np.full(width + 2 * radius, OUTSIDE)
+    tops = np.full(width + 2 * radius, np.float32(OUTSIDE_LOGIT))
     total = np.empty((4, width), np.float32)
     totals = np.zeros((4, width + 2 * radius), np.float32)
     for y in range(start, start + len(shares)):
@@ -300,7 +303,7 @@ def fuse_strips(
             entries = my_logits[i, low - first : high - first]
             bottom, top = logit_range(entries)
             my_share = my_shares[i, : stop - start]
-            if top - bottom <= SAFE_RANGE:
+            if top - bottom <= np.float32(SAFE_RANGE):
                 shift = (bottom + top) / np.float32(2)
                 filter_strip(fused, image, entries, shift, my_share, radius, start, low, my_weighted)
             else:

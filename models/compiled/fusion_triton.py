@@ -9,9 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from models import parameters
+from models.compiled.fusion import OUTSIDE_LOGIT
 
-OUTSIDE = tl.constexpr(parameters.OUTSIDE)
+OUTSIDE = tl.constexpr(OUTSIDE_LOGIT)
 PROGRAM_WIDTH = 128  # pixels of a row that one program filters
 
 

@@ -8,16 +8,15 @@ import torch
 from torch import Tensor
 
 from datasets.channels import LUMINANCE_WEIGHTS
-from models import parameters
 from models.compiled.eaw import columns_with_tap
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
 from models.compiled.lines import add_line, add_product
+from models.operators import MAX_LUMINANCE
 
+MIN_MEAN = 1e-20  # smallest luminance that deviations are divided by
 ONE = np.float32(1)
 ZERO = np.float32(0)
-LEAST_MEAN = np.float32(parameters.LEAST_MEAN)
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
-LARGEST_LUMINANCE = np.float32(parameters.LARGEST_LUMINANCE)
 SUMS = 6  # red, green, blue, luminance, its square, pixels
 
 
@@ -30,7 +29,7 @@ def compare(same: Any, mesh: Any, other: Any) -> None:
 @jit_in_any_order
 def add_luminances(first: Any, second: Any, same: Any, red: Any, green: Any, blue: Any) -> None:
     for x in range(same.size):
-        y = min(RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x], LARGEST_LUMINANCE)
+        y = min(RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x], np.float32(MAX_LUMINANCE))
         first[x] += same[x] * y
         second[x] += same[x] * y * y
 
@@ -57,7 +56,7 @@ def spread(line: Any, first: Any, second: Any, count: Any) -> None:
     for x in range(line.size):
         mean = first[x] / count[x]
         variance = max(second[x] / count[x] - mean * mean, ZERO)
-        line[x] = np.sqrt(variance) / max(mean, LEAST_MEAN)
+        line[x] = np.sqrt(variance) / max(mean, np.float32(MIN_MEAN))
 
 
 @jit_parallel

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from datasets.frame import Frame
 from models import parameters
-from models.compiled.exponential import exp, log
+from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
 from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line
 from models.history.running_scale import RunningScale
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ONE = np.float32(1)
 ZERO = np.float32(0)
 TWO = np.float32(2)
-LEAST_EXPONENT = np.float32(parameters.LEAST_EXPONENT)
+LEAST_EXPONENT = np.float32(MIN_EXPONENT)
 LARGEST_LOGIT = np.float32(parameters.LARGEST_LOGIT)
 FEWEST_SAMPLES = np.float32(parameters.FEWEST_SAMPLES)
 BRIGHTEST = np.float32(parameters.BRIGHTEST)

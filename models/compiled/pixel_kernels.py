@@ -11,7 +11,7 @@ from torch import Tensor
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory, plane_or_empty
 
-LEAST_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
+MIN_RELATIVE_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
 NEVER = np.float32(-np.inf)  # logit of a tap that shows no surface
 ONE_LINE = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
 
@@ -45,7 +45,7 @@ def raise_top(top: Any, logits: Any) -> None:
 def to_weights(logits: Any, top: Any, total: Any) -> None:
     """In place, weights relative to the largest logit; total += weights."""
     for x in range(top.size):
-        weight = exp(max(logits[x] - top[x], LEAST_LOGIT))
+        weight = exp(max(logits[x] - top[x], MIN_RELATIVE_LOGIT))
         logits[x] = weight if logits[x] > NEVER else np.float32(0)
         total[x] += logits[x]
 

@@ -1,4 +1,4 @@
-"""models.history.reprojection for the CPU: rows in parallel, each split into runs of pixels whose taps lie side by side.
+"""models.history.reprojection for the CPU: rows in parallel, split into runs of pixels whose taps lie side by side.
 
 Where neighbours show one mesh and move by the same whole pixels, their taps are contiguous lines of memory, and every
 loop over them is vectorised; the few pixels of short runs and at borders are looked at one by one. Points and
@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datasets.frame import Frame
-from models import parameters
 from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_reciprocals
 from models.compiled.lines import add_product
 from models.history.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
 
+PLANE_TOLERANCE = 0.01  # of the depth: largest distance of a tap's surface from the point's plane
+NORMAL_TOLERANCE = 0.9  # smallest cosine of the angle between a tap's normal and the point's
 HALF = np.float32(0.5)
 ONE = np.float32(1)
 ZERO = np.float32(0)
-PLANE_TOLERANCE = np.float32(parameters.PLANE_TOLERANCE)
-NORMAL_TOLERANCE = np.float32(parameters.NORMAL_TOLERANCE)
 SHORTEST_RUN = 8  # px; loops over less are not worth their beginning
 BLOCK_ROWS = 8  # that share one piece of scratch memory
 
@@ -219,7 +218,7 @@ def is_consistent(x: Any, y: Any, pixel: Any, mesh: float, search: Search, then:
         seen = depth * (views.axes[0, i] * px + views.axes[1, i] * py + views.axes[2, i])
         off_plane += (search.point[i, pixel] - seen) * n
         cosine += n * search.normal[i, pixel]
-    return abs(off_plane) <= PLANE_TOLERANCE * depth and cosine >= NORMAL_TOLERANCE
+    return abs(off_plane) <= np.float32(PLANE_TOLERANCE) * depth and cosine >= np.float32(NORMAL_TOLERANCE)
 
 
 @jit_with_reciprocals
@@ -233,7 +232,7 @@ def compare_normals(good: Any, nx: Any, ny: Any, nz: Any, x: Any, y: Any, z: Any
     """good (n) becomes 0 where the normals (x, y, z) of taps are not those expected."""
     for i in range(good.size):
         cosine = x[i] * nx[i] + y[i] * ny[i] + z[i] * nz[i]
-        good[i] = good[i] if cosine >= NORMAL_TOLERANCE else ZERO
+        good[i] = good[i] if cosine >= np.float32(NORMAL_TOLERANCE) else ZERO
 
 
 @jit_with_reciprocals
@@ -251,7 +250,7 @@ def compare_planes(
         off_plane = (px[i] - d * (ax * column + bx)) * x[i]
         off_plane += (py[i] - d * (ay * column + by)) * y[i]
         off_plane += (pz[i] - d * (az * column + bz)) * z[i]
-        good[i] = good[i] if abs(off_plane) <= PLANE_TOLERANCE * d else ZERO
+        good[i] = good[i] if abs(off_plane) <= np.float32(PLANE_TOLERANCE) * d else ZERO
 
 
 @jit_with_reciprocals

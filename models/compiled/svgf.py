@@ -16,7 +16,6 @@ from torch import Tensor
 
 from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.frame import Frame
-from models import parameters
 from models.compiled.exponential import exp
 from models.compiled.jit import (
     array,
@@ -31,24 +30,25 @@ from models.compiled.lines import copy_line
 from models.compiled.reprojection import BLOCK_ROWS, ONE, Buffers, Past, Views, fetch, find_row, new_search
 from models.filters.atrous import B3_SPLINE, RADIUS
 from models.history.surfaces import Surfaces
-from models.parameters import SPATIAL_RADIUS, SQUARINGS
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR
+
+ALPHA = 0.2  # §4.1: weight of the newest sample
+SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
+SIGMA_Z = 1.0  # §4.4
+SIGMA_L = 4.0
+SQUARINGS = 7  # σ_n = 128 = 2^7
+EPSILON_Z = 1e-3  # of the depth
+EPSILON_L = 1e-20  # luminance²
 
 RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
-ALPHA = np.float32(parameters.ALPHA)
-LARGEST_LUMINANCE = np.float32(parameters.LARGEST_LUMINANCE)
-SIGMA_Z = np.float32(parameters.SIGMA_Z)
-SIGMA_L = np.float32(parameters.SIGMA_L)
-EPSILON_Z = np.float32(parameters.EPSILON_Z)
-EPSILON_L = np.float32(parameters.EPSILON_L)
-LEAST_DIVISOR = np.float32(parameters.LEAST_DIVISOR)
 unsigned = np.uint64  # an index that cannot count from the end: one that can, keeps loops scalar
-LEAST_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
-LEAST_WEIGHT = np.float32(1e-15)
-LARGEST_EXPONENT = np.float32(40)  # e^-40 is below LEAST_WEIGHT
-LEAST_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
+NEGLIGIBLE_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
+NEGLIGIBLE_WEIGHT = np.float32(1e-15)
+NEGLIGIBLE_EXPONENT = np.float32(40)  # e^-40 is below NEGLIGIBLE_WEIGHT
+MIN_GAUSSIAN_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
 SPLINE = np.array(B3_SPLINE, np.float32)
 TAPS = 2 * RADIUS + 1  # of a row
-BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
+LEVEL_BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
 GEOMETRY = 7  # lines of pack_geometry
 SIGNAL = 6
 SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where one needs it
@@ -61,7 +61,7 @@ SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where 
 def clamp_luminance(y: Any, red: Any, green: Any, blue: Any) -> None:
     for x in range(y.size):
         luminance = RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x]
-        y[x] = min(max(luminance, -LARGEST_LUMINANCE), LARGEST_LUMINANCE)
+        y[x] = min(max(luminance, -np.float32(MAX_LUMINANCE)), np.float32(MAX_LUMINANCE))
 
 
 @jit_with_reciprocals
@@ -75,7 +75,7 @@ def weigh(alpha: Any, length: Any, past_length: Any, change: Any, found: Any) ->
     """The weight of the newest frame and the new history length, (W), where `change` of the history is given up."""
     for x in range(alpha.size):
         kept = ONE - change[x]
-        alpha[x] = kept * ALPHA + change[x]
+        alpha[x] = kept * np.float32(ALPHA) + change[x]
         length[x] = past_length[x] * kept + ONE if found[x] > 0 else ONE
 
 
@@ -198,14 +198,14 @@ def pack_geometry_row(packed: Any, row: Any, depth: Any, normal: Any, mesh: Any)
     tolerance = packed[6, row]
     for i in range(width):
         length = np.sqrt(x[i] * x[i] + y[i] * y[i] + n_z[i] * n_z[i])
-        normalise = np.float32(1) / max(length, LEAST_DIVISOR) if z[i] > 0 else np.float32(0)
+        normalise = np.float32(1) / max(length, np.float32(MIN_DIVISOR)) if z[i] > 0 else np.float32(0)
         out_x[i] = x[i] * normalise
         out_y[i] = y[i] * normalise
         out_z[i] = n_z[i] * normalise
         out_depth[i] = z[i]
-        along_x[i] = SIGMA_Z * nearer_to_zero(across[i + 1], across[i])
-        along_y[i] = SIGMA_Z * nearer_to_zero(ahead[i], behind[i])
-        tolerance[i] = EPSILON_Z * abs(z[i]) + LEAST_DIVISOR
+        along_x[i] = np.float32(SIGMA_Z) * nearer_to_zero(across[i + 1], across[i])
+        along_y[i] = np.float32(SIGMA_Z) * nearer_to_zero(ahead[i], behind[i])
+        tolerance[i] = np.float32(EPSILON_Z) * abs(z[i]) + np.float32(MIN_DIVISOR)
 
 
 @jit_parallel
@@ -242,7 +242,7 @@ def geometry_terms(
 ) -> tuple[Any, Any]:
     """models.filters.svgf.geometry_weight of one pixel as w times e to the power of -exponent."""
     w_n = x * to_x + y * to_y + z * to_z
-    w_n = w_n if w_n > LEAST_COSINE else np.float32(0)
+    w_n = w_n if w_n > NEGLIGIBLE_COSINE else np.float32(0)
     for _ in range(SQUARINGS):
         w_n *= w_n
     return w_n, abs(depth - to_depth) / (abs(along_x * dx + along_y * dy) + tolerance)
@@ -251,8 +251,8 @@ def geometry_terms(
 @jit_inlined_in_any_order
 def weight(w: Any, exponent: Any) -> Any:
     """w times e to the power of -exponent, 0 where that is negligible: denormal numbers are slow."""
-    w *= exp(-min(exponent, LARGEST_EXPONENT))
-    return w if w > LEAST_WEIGHT else np.float32(0)
+    w *= exp(-min(exponent, NEGLIGIBLE_EXPONENT))
+    return w if w > NEGLIGIBLE_WEIGHT else np.float32(0)
 
 
 @jit_in_any_order
@@ -292,7 +292,7 @@ def geometry_weights(weights: Any, geometry: Any, row: Any, left: int, dx: int, 
 def weigh_taps(weights: Any, h: Any, surfaces: Any, row: Any, to: Any, step: int, first: int, count: int) -> None:
     """Geometrical weights of all taps in the row `to`, for `count` pixels of a row from `first` on.
 
-    As weights (2 * TAPS * BLOCK): for each tap the two that geometry_terms returns, the first times h (TAPS).
+    As weights (2 * TAPS * LEVEL_BLOCK): for each tap the two that geometry_terms returns, the first times h (TAPS).
     """
     x = surfaces[row, 0]
     y = surfaces[row, 1]
@@ -313,15 +313,15 @@ def weigh_taps(weights: Any, h: Any, surfaces: Any, row: Any, to: Any, step: int
             dx = (tap - RADIUS) * step
             q = unsigned(first + i + dx)
             w_n, exponent = geometry_terms(*here, to_x[q], to_y[q], to_z[q], to_depth[q], np.float32(dx), dy)
-            weights[unsigned(2 * tap * BLOCK + i)] = h[tap] * w_n
-            weights[unsigned((2 * tap + 1) * BLOCK + i)] = exponent
+            weights[unsigned(2 * tap * LEVEL_BLOCK + i)] = h[tap] * w_n
+            weights[unsigned((2 * tap + 1) * LEVEL_BLOCK + i)] = exponent
 
 
 @jit_in_any_order
 def add_taps(
     sums: Any, weights: Any, signals: Any, s: int, row: Any, to: Any, step: int, first: int, count: int
 ) -> None:
-    """Add all taps in the row `to`, with the weights of weigh_taps, to sums (5 * BLOCK).
+    """Add all taps in the row `to`, with the weights of weigh_taps, to sums (5 * LEVEL_BLOCK).
 
     Of colours, of variances, of weights.
     """
@@ -341,36 +341,36 @@ def add_taps(
         total = np.float32(0)
         for tap in range(TAPS):
             q = unsigned(first + i + (tap - RADIUS) * step)
-            exponent = weights[unsigned((2 * tap + 1) * BLOCK + i)]
-            w = weight(weights[unsigned(2 * tap * BLOCK + i)], abs(y[p] - to_y[q]) * scale[p] + exponent)
+            exponent = weights[unsigned((2 * tap + 1) * LEVEL_BLOCK + i)]
+            w = weight(weights[unsigned(2 * tap * LEVEL_BLOCK + i)], abs(y[p] - to_y[q]) * scale[p] + exponent)
             red += w * r[q]
             green += w * g[q]
             blue += w * b[q]
             spread += w * w * v[q]
             total += w
         sums[unsigned(i)] += red
-        sums[unsigned(i + BLOCK)] += green
-        sums[unsigned(i + 2 * BLOCK)] += blue
-        sums[unsigned(i + 3 * BLOCK)] += spread
-        sums[unsigned(i + 4 * BLOCK)] += total
+        sums[unsigned(i + LEVEL_BLOCK)] += green
+        sums[unsigned(i + 2 * LEVEL_BLOCK)] += blue
+        sums[unsigned(i + 3 * LEVEL_BLOCK)] += spread
+        sums[unsigned(i + 4 * LEVEL_BLOCK)] += total
 
 
 @jit_in_any_order
 def divide_sums(filtered: Any, signals: Any, row: Any, s: int, first: int, count: int, sums: Any) -> None:
-    """Colour and variance of `count` pixels of `filtered` from `first` on, from sums (5 * BLOCK) and the centre's."""
+    """Colour and variance of `count` pixels of `filtered` from `first` on, from sums (5 * LEVEL_BLOCK)."""
     h = SPLINE[RADIUS] * SPLINE[RADIUS]
     for c in range(3):
         line = filtered[row, s, c]
         centre = signals[row, s, c]
         for i in range(count):
             p = unsigned(first + i)
-            line[p] = (sums[unsigned(i + c * BLOCK)] + h * centre[p]) / (sums[unsigned(i + 4 * BLOCK)] + h)
+            line[p] = (sums[unsigned(i + c * LEVEL_BLOCK)] + h * centre[p]) / (sums[unsigned(i + 4 * LEVEL_BLOCK)] + h)
     line = filtered[row, s, 3]
     centre = signals[row, s, 3]
     for i in range(count):
         p = unsigned(first + i)
-        normalise = np.float32(1) / (sums[unsigned(i + 4 * BLOCK)] + h)
-        line[p] = (sums[unsigned(i + 3 * BLOCK)] + h * h * centre[p]) * normalise * normalise
+        normalise = np.float32(1) / (sums[unsigned(i + 4 * LEVEL_BLOCK)] + h)
+        line[p] = (sums[unsigned(i + 3 * LEVEL_BLOCK)] + h * h * centre[p]) * normalise * normalise
 
 
 @jit_parallel
@@ -379,11 +379,11 @@ def filter_image(filtered: Any, signals: Any, surfaces: Any, margin: int, step: 
     height, count_signals, _, width = signals.shape
     for line in numba.prange(height):
         row = np.int64(line)
-        sums = np.empty((count_signals, 5 * BLOCK), np.float32)
-        weights = np.empty(2 * TAPS * BLOCK, np.float32)
+        sums = np.empty((count_signals, 5 * LEVEL_BLOCK), np.float32)
+        weights = np.empty(2 * TAPS * LEVEL_BLOCK, np.float32)
         h = np.empty(TAPS, np.float32)
-        for first in range(margin, width - margin, BLOCK):
-            count = min(BLOCK, width - margin - first)
+        for first in range(margin, width - margin, LEVEL_BLOCK):
+            count = min(LEVEL_BLOCK, width - margin - first)
             sums[:] = 0
             for j in range(-RADIUS, RADIUS + 1):
                 to = row + j * step
@@ -416,7 +416,9 @@ def finish_edge(luminance: Any, scale: Any, r: Any, g: Any, b: Any, columns: Any
         luminance[x] = RED_WEIGHT * r[x] + GREEN_WEIGHT * g[x] + BLUE_WEIGHT * b[x]
         mean = quarter * columns[x] + half * columns[x + 1] + quarter * columns[x + 2]
         share = quarter * inside[x] + half * inside[x + 1] + quarter * inside[x + 2]
-        scale[x] = np.float32(1) / (SIGMA_L * np.sqrt(mean / max(share, LEAST_SHARE) + EPSILON_L))
+        scale[x] = np.float32(1) / (
+            np.float32(SIGMA_L) * np.sqrt(mean / max(share, MIN_GAUSSIAN_SHARE) + np.float32(EPSILON_L))
+        )
 
 
 @jit_with_memory

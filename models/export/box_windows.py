@@ -6,7 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.parameters import LEAST_EXPONENT, LEAST_WEIGHT, OUTSIDE, SAFE_RANGE
+from models.compiled.exponential import MIN_EXPONENT
+from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE
+from models.operators import MIN_DIVISOR
 
 SUMMED = 4  # channels of each window's sums: weighted red, green and blue, and the weights
 
@@ -26,17 +28,17 @@ def box_kernels(windows: Sequence[int]) -> Tensor:
 def careful_sums(logits: Tensor, values: Sequence[Tensor], windows: Sequence[int]) -> Tensor:
     """Box sums (M, C, H, W) relative to the largest of the logits (M, 1, H, W) in every window.
 
-    `values` are C images (1, 1, H, W), 0 where the logits are OUTSIDE. Columns are summed, then rows of these.
+    `values` are C images (1, 1, H, W), 0 where the logits are OUTSIDE_LOGIT. Columns are summed, then rows of these.
     """
     inside = within(windows)[..., None, None]
     largest = max(windows)
     margin = largest // 2
     column = torch.eye(largest)[:, None, :, None]  # the neighbours of a pixel become its channels
     for kernel, (y, x) in ((column, (margin, 0)), (column.transpose(2, 3), (0, margin))):
-        entries = F.conv2d(F.pad(logits, (x, x, y, y), value=OUTSIDE), kernel)
-        entries = torch.where(inside, entries, OUTSIDE)
+        entries = F.conv2d(F.pad(logits, (x, x, y, y), value=OUTSIDE_LOGIT), kernel)
+        entries = torch.where(inside, entries, OUTSIDE_LOGIT)
         logits = entries.amax(dim=1, keepdim=True)
-        weights = torch.exp((entries - logits).clamp(min=LEAST_EXPONENT)) * (entries > OUTSIDE)
+        weights = torch.exp((entries - logits).clamp(min=MIN_EXPONENT)) * (entries > OUTSIDE_LOGIT)
         values = [(weights * F.conv2d(each, kernel, padding=(y, x))).sum(dim=1, keepdim=True) for each in values]
     return torch.cat(list(values), dim=1)
 
@@ -69,12 +71,12 @@ class BoxWindows(nn.Module):
             return F.conv2d(sums, columns.transpose(2, 3), padding=(0, margin), groups=groups)
 
         def careful(importance: Tensor, values: Tensor, surface: Tensor, high: Tensor, low: Tensor) -> Tensor:
-            logits = torch.where(surface > 0, importance, OUTSIDE).transpose(0, 1)
+            logits = torch.where(surface > 0, importance, OUTSIDE_LOGIT).transpose(0, 1)
             return careful_sums(logits, values.split(1, dim=1), self.windows).flatten(0, 1)[None]
 
         within_range = (high - low).max() <= SAFE_RANGE
         sums = torch.cond(within_range, shifted, careful, (importance, values, surface, high, low))
         sums = sums.view(1, len(self.windows), SUMMED, height, width)
         shares = torch.exp(mixture - mixture.amax(dim=1, keepdim=True))  # engines take softmax along channels slowly
-        factors = shares[:, :, None] / sums[:, :, 3:].clamp(min=LEAST_WEIGHT)
+        factors = shares[:, :, None] / sums[:, :, 3:].clamp(min=MIN_DIVISOR)
         return (factors * sums[:, :, :3]).sum(dim=1) / shares.sum(dim=1, keepdim=True)

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.parameters import LEAST_LOGIT, LEAST_WEIGHT
+from models.compiled.affinity import MIN_LOGIT
+from models.operators import MIN_DIVISOR
 
 
 def around(x: Tensor, step: int) -> Tensor:
@@ -33,7 +34,7 @@ def affinity_level(
     difference = around(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
     importances, near = around(torch.cat([importance, values], dim=1), step).split([1, 4], dim=1)
-    weight = torch.exp((importances - sharpness * distance).clamp(min=LEAST_LOGIT))
+    weight = torch.exp((importances - sharpness * distance).clamp(min=MIN_LOGIT))
     total = (weight * near).sum(dim=0, keepdim=True) + torch.exp(own) * values
     weighted, weights = total.split([3, 1], dim=1)
-    return torch.where(surface > 0, weighted / weights.clamp(min=LEAST_WEIGHT), 0)
+    return torch.where(surface > 0, weighted / weights.clamp(min=MIN_DIVISOR), 0)

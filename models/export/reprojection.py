@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.compiled.reprojection import NORMAL_TOLERANCE, PLANE_TOLERANCE
 from models.history.surfaces import BACKGROUND_ID
-from models.parameters import NORMAL_TOLERANCE, PLANE_TOLERANCE
 
 NOWHERE = -1.0  # mesh id around the image
 

@@ -3,13 +3,14 @@
 import torch
 from torch import Tensor, nn
 
+from models.compiled.accumulation import MIN_ALPHA
+from models.compiled.features import GAMMA
 from models.export.box_windows import BoxWindows
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
 from models.networks.repvgg import RepVGGBlock
 from models.networks.wskp import WSKP
-from models.parameters import GAMMA, SMALLEST_ALPHA
 
 READS = ("noisy", "emission", "albedo", "normal", "depth")
 HISTORY = image("history", 4, "accumulated irradiance, linear RGB, and its length in frames")
@@ -52,7 +53,7 @@ class WSKPStep(RecurrentStep):
         past, frames = self.past(x).split([3, 1], dim=1)
         length = frames + 1
         # Without a history its length is 0: the weight of the newest frame is 1.
-        irradiance = past + (1 / length).clamp(min=SMALLEST_ALPHA) * (noisy - past)
+        irradiance = past + (1 / length).clamp(min=MIN_ALPHA) * (noisy - past)
         radiance = irradiance * divisor
         state, scale = updated_scale(x["scale"], radiance, x["depth"])
         predicted = self.network(self.features(x, radiance, scale).to(self.precision)).to(radiance)

@@ -37,19 +37,13 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import aaf as kernels
+from models.compiled.aaf import COSINE_OF_5_DEGREES, DIFFUSE_BAND, MAX_REACH, TRUNCATION
 from models.denoiser import CLASSICAL, Denoiser, State
 from models.filters.atrous import Tap, WindowSum
 from models.filters.neighbours import mesh_least
 from models.filters.svgf import irradiances
 from models.history.surfaces import rays
-from models.parameters import (
-    AAF_LEAST_COSINE,
-    AAF_REACH,
-    AAF_TRUNCATION,
-    DIFFUSE_BAND,
-    LARGEST_LUMINANCE,
-    LEAST_DIVISOR,
-)
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 SHADOW_SHARPNESS = 3.0  # k
 GLOSSY_BAND = 3.5
@@ -86,7 +80,7 @@ def widths(frame: Frame) -> Tensor:
     nearest = mesh_least(torch.where(met > 0, met, torch.inf), frame.mesh_id)
     of_lamp, indirect = (nearest / (2 * band_limit(frame.roughness))).split(1, dim=1)
     both = torch.stack([torch.minimum(of_shadow, of_lamp), indirect], dim=1)
-    return torch.minimum(both, (AAF_REACH / AAF_TRUNCATION * size)[:, None])
+    return torch.minimum(both, (MAX_REACH / TRUNCATION * size)[:, None])
 
 
 def positions(frame: Frame) -> Tensor:
@@ -100,7 +94,7 @@ def positions(frame: Frame) -> Tensor:
 
 def pack_geometry(frame: Frame) -> Tensor:
     """What measures and stops the filters, (B, 1, 6, H, W): positions, unit normals (0 for background)."""
-    unit = torch.where(frame.depth > 0, F.normalize(frame.normal, dim=1, eps=LEAST_DIVISOR), 0)
+    unit = torch.where(frame.depth > 0, F.normalize(frame.normal, dim=1, eps=MIN_DIVISOR), 0)
     return torch.cat([positions(frame), unit], dim=1)[:, None]
 
 
@@ -123,9 +117,9 @@ def gaussian_weight(width: Tensor, p: Tensor, q: Tensor) -> Tensor:
     distance = apart.square().sum(dim=-3, keepdim=True)
     along = distance - (apart * normal).sum(dim=-3, keepdim=True).square()
     exponent = along.clamp(min=0) / (2 * width.square())
-    same = (normal * q[..., 3:, :, :]).sum(dim=-3, keepdim=True) > AAF_LEAST_COSINE
+    same = (normal * q[..., 3:, :, :]).sum(dim=-3, keepdim=True) > COSINE_OF_5_DEGREES
     near = distance < (2 * DIFFUSE_BAND * width).square()
-    return torch.where(same & near & (exponent <= AAF_TRUNCATION**2 / 2), (-exponent).exp(), 0)
+    return torch.where(same & near & (exponent <= TRUNCATION**2 / 2), (-exponent).exp(), 0)
 
 
 @compiled.by(kernels.filter_lines)
@@ -136,7 +130,7 @@ def filter_lines(image: Tensor, width: Tensor, widest: Tensor, geometry: Tensor,
     """
     total = WindowSum(torch.ones_like(width), 1)
     mean = WindowSum(image, 1)
-    for tap in line_taps(image.shape[-2:], AAF_REACH, down):
+    for tap in line_taps(image.shape[-2:], MAX_REACH, down):
         narrower = torch.minimum(width[tap.p], widest[tap.q])
         weight = gaussian_weight(narrower, geometry[tap.p], geometry[tap.q])
         total.add(tap, weight)
@@ -156,7 +150,7 @@ class AAF(Denoiser):
     separates_lights = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        image = irradiances(frame, self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+        image = irradiances(frame, self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
         width = widths(frame)[:, -image.shape[1] :]
         widest = width.clone()
         widest[:, -1] = torch.inf  # of indirect light

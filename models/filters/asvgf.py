@@ -17,7 +17,7 @@ from datasets.frame import Frame
 from models.filters.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
 from models.filters.svgf import SVGF, geometry_weight, pack_geometry
 from models.history.strata import STRATUM, repeated, sums
-from models.parameters import LEAST_DIVISOR
+from models.operators import MIN_DIVISOR
 
 
 def geometry_of_samples(frame: Frame) -> Tensor:
@@ -49,7 +49,7 @@ def change_of_light(frame: Frame) -> Tensor:
     for level in range(ATROUS_LEVELS):
         gradient = gradient_level(gradient, geometry, 2**level)
     difference, largest = gradient.split(1, dim=1)
-    return repeated((difference.abs() / largest.clamp(min=LEAST_DIVISOR)).clamp(max=1), frame.size)
+    return repeated((difference.abs() / largest.clamp(min=MIN_DIVISOR)).clamp(max=1), frame.size)
 
 
 class ASVGF(SVGF):

@@ -31,11 +31,11 @@ from torch import Tensor
 from datasets.frame import LARGEST, Frame
 from models import compiled
 from models.compiled import bmfr as kernels
+from models.compiled.bmfr import BLOCK_SIDE, MIN_RELATIVE_EXTENT, REGRESSORS
 from models.denoiser import CLASSICAL, State, matching_state
 from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.history.reprojection import reproject
 from models.history.surfaces import positions_around_eye, ray_axes
-from models.parameters import BLOCK_SIDE, FLATTEST, REGRESSORS
 
 NOISE = 0.01  # largest, of what is added to features against rank deficiency
 SMALLEST_SECOND_ALPHA = 0.1  # weight of the newest fit in a long history
@@ -95,7 +95,7 @@ def features(normal: Tensor, position: Tensor, surface: Tensor) -> Tensor:
     """The features (N, 1024, 10) of blocks, from normals and positions (N, 1024, 3), 0 off surfaces (N, 1024, 1)."""
     low = torch.where(surface, position, torch.inf).amin(dim=1, keepdim=True)
     extent = torch.where(surface, position, -torch.inf).amax(dim=1, keepdim=True) - low
-    extent = torch.maximum(extent, FLATTEST * extent.amax(dim=2, keepdim=True))
+    extent = torch.maximum(extent, MIN_RELATIVE_EXTENT * extent.amax(dim=2, keepdim=True))
     scaled = (position - low) / torch.where(extent > 0, extent, 1)
     return torch.where(surface, torch.cat([torch.ones_like(surface), normal, scaled, scaled.square()], dim=2), 0)
 

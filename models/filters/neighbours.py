@@ -6,8 +6,8 @@ from torch.nn import functional as F
 
 from models import compiled
 from models.compiled import neighbours as kernels
-from models.operators import image_luminance
-from models.parameters import LARGEST_LUMINANCE, LEAST_MEAN
+from models.compiled.neighbours import MIN_MEAN
+from models.operators import MAX_LUMINANCE, image_luminance
 
 
 def shifted(x: Tensor, step: int) -> Tensor:
@@ -26,14 +26,14 @@ def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
 
 def summands(image: Tensor) -> Tensor:
     """What mesh_means sums: the image (B, 3, H, W), its luminance, the square of that, and 1; (B, 6, H, W)."""
-    luminance = image_luminance(image).clamp(max=LARGEST_LUMINANCE)
+    luminance = image_luminance(image).clamp(max=MAX_LUMINANCE)
     return torch.cat([image, luminance, luminance.square(), torch.ones_like(luminance)], dim=1)
 
 
 def means_of(close: Tensor, wide: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """What mesh_means returns, of sums of summands over 3 x 3 pixels and over 9 x 9."""
     around, mean, square = (wide[:, :5] / wide[:, 5:]).split([3, 1, 1], dim=1)
-    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=LEAST_MEAN)
+    deviation = (square - mean.square()).clamp(min=0).sqrt() / mean.clamp(min=MIN_MEAN)
     return close[:, :3] / close[:, 5:], around, deviation
 
 

@@ -31,27 +31,27 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from models.denoiser import CLASSICAL, Denoiser, State
 from models.filters.neighbours import mesh_means, shifted
-from models.parameters import LEAST_DIVISOR
+from models.operators import MIN_DIVISOR
 
 REACH = 9  # R, px: windows of 19 x 19
-WINDOW = 2 * REACH + 1
+WINDOW_SIDE = 2 * REACH + 1
 MAX_PIXEL_DISTANCE = 1e4  # of two pixels; weights are 0 long before
 MAX_DISTANCE = 1e30  # of patches: from what is no surface
-EPSILON = 1e-20  # of squared differences of colours, where there is no noise
+MIN_SQUARED_NOISE = 1e-20  # of squared differences of colours, where there is no noise
 RIDGE = 1e-5  # of the sum of weights, in squared units of features
 MAX_FITTED = 1e13  # irradiance; fits extrapolate it, and squares of that must stay finite
 BANDWIDTHS = (0.5, 1.0)  # k, of the first pass
-PATCH = 3  # F, px: patches of 7 x 7
-SMALL_PATCH = 1  # where errors and choices are smoothed
-STRIP_PIXELS = 256  # fitted at once, as whole rows: all taps of all features are gathered
+PATCH_RADIUS = 3  # F, px: patches of 7 x 7
+SMALL_PATCH_RADIUS = 1  # where errors and choices are smoothed
+FITTED_PIXELS = 256  # fitted at once, as whole rows: all taps of all features are gathered
 
 
 def window_rows(image: Tensor) -> Iterator[Tensor]:
-    """The taps of all pixels' windows on an image (B, C, H, W), row by row: (B, WINDOW, C, H, W); 0 outside of it."""
+    """The taps of all pixels' windows, row by row: (B, WINDOW_SIDE, C, H, W); 0 outside the image (B, C, H, W)."""
     height = image.shape[-2]
     padded = F.pad(image, (REACH,) * 4)
-    for dy in range(WINDOW):
-        yield padded[..., dy : dy + height, :].unfold(-1, WINDOW, 1).movedim(-1, 1)
+    for dy in range(WINDOW_SIDE):
+        yield padded[..., dy : dy + height, :].unfold(-1, WINDOW_SIDE, 1).movedim(-1, 1)
 
 
 def box_means(image: Tensor, side: int) -> Tensor:
@@ -71,7 +71,7 @@ def patch_distances(guide: Tensor, variance: Tensor, surface: Tensor, radius: in
     for taps in window_rows(torch.cat([guide, variance, surface], dim=1)):
         there, noise, surface_there = taps.split([3, 3, 1], dim=2)
         off = (guide[:, None] - there).square() - (variance[:, None] + torch.minimum(variance[:, None], noise))
-        apart = (off / (EPSILON + variance[:, None] + noise)).clamp(max=MAX_PIXEL_DISTANCE).mean(dim=2)
+        apart = (off / (MIN_SQUARED_NOISE + variance[:, None] + noise)).clamp(max=MAX_PIXEL_DISTANCE).mean(dim=2)
         both = surface * surface_there[:, :, 0]
         total, count = box_means(apart * both, side), box_means(both, side)
         rows.append(torch.where(both > 0, (total / count.clamp(min=side**-2)).clamp(min=0), MAX_DISTANCE))
@@ -82,7 +82,7 @@ def nl_means(image: Tensor, distances: Tensor, bandwidth: float) -> Tensor:
     """Means of the image (B, C, H, W) with weights exp(-distance / bandwidth²); 0 off surfaces."""
     weights = torch.exp(-distances / bandwidth**2)
     sums = torch.zeros_like(image)
-    for weight, taps in zip(weights.split(WINDOW, dim=1), window_rows(image), strict=True):
+    for weight, taps in zip(weights.split(WINDOW_SIDE, dim=1), window_rows(image), strict=True):
         sums += (weight[:, :, None] * taps).sum(dim=1)
     return sums / weights.sum(dim=1, keepdim=True).clamp(min=1)  # a pixel's weight for itself is 1
 
@@ -94,14 +94,14 @@ def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float
     """
     height, width = image.shape[-2:]
     count = features.shape[1]
-    steps = torch.linspace(-1, 1, WINDOW).to(image)
+    steps = torch.linspace(-1, 1, WINDOW_SIDE).to(image)
     position = torch.cartesian_prod(steps, steps).T
     padded = F.pad(torch.cat([features, image], dim=1), (REACH,) * 4)
     sums = torch.zeros_like(padded[:, :4])
-    for rows in torch.arange(height).split(max(1, STRIP_PIXELS // width)):
+    for rows in torch.arange(height).split(max(1, FITTED_PIXELS // width)):
         strip = slice(int(rows[0]), int(rows[-1]) + 1)
         wide = slice(strip.start, strip.stop + 2 * REACH)
-        taps = F.unfold(padded[:, :, wide], WINDOW).mT.unflatten(2, (-1, WINDOW**2))  # (B, pixels, F + 3, taps)
+        taps = F.unfold(padded[:, :, wide], WINDOW_SIDE).mT.unflatten(2, (-1, WINDOW_SIDE**2))  # (B, N, F + 3, taps)
         apart = taps[:, :, :count] - features[:, :, strip].flatten(2).mT[..., None]
         coordinates = position.expand(*apart.shape[:2], -1, -1)
         x = torch.cat([torch.ones_like(apart[:, :, :1]), coordinates, apart], dim=2).double()
@@ -112,7 +112,7 @@ def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float
         moments.diagonal(dim1=-2, dim2=-1)[..., 1:] += RIDGE * total
         fit = torch.cholesky_solve(weighted @ taps[:, :, count:].double().mT, torch.linalg.cholesky(moments))
         predicted = torch.cat([weight * (fit.mT @ x), weight], dim=2).flatten(2).mT
-        sums[:, :, wide] += F.fold(predicted.to(image), (wide.stop - wide.start, sums.shape[-1]), WINDOW)
+        sums[:, :, wide] += F.fold(predicted.to(image), (wide.stop - wide.start, sums.shape[-1]), WINDOW_SIDE)
     inside = sums[..., REACH:-REACH, REACH:-REACH]
     return inside[:, :3] / inside[:, 3:].clamp(min=1)
 
@@ -136,8 +136,8 @@ def variance_of_mean(buffers: Tensor) -> Tensor:
 def first_pass(buffers: Tensor, variance: Tensor, features: Tensor, surface: Tensor) -> Tensor:
     """The filtered buffers (B, 2, 3, H, W), at each pixel by the better bandwidth (§5.2, §5.3)."""
     a, b = buffers.unbind(dim=1)
-    to_a, to_b = (patch_distances(buffer, 2 * variance, surface, PATCH) for buffer in (a, b))
-    smoothing = patch_distances(buffers.mean(dim=1), variance, surface, SMALL_PATCH)
+    to_a, to_b = (patch_distances(buffer, 2 * variance, surface, PATCH_RADIUS) for buffer in (a, b))
+    smoothing = patch_distances(buffers.mean(dim=1), variance, surface, SMALL_PATCH_RADIUS)
     filtered = []
     errors = []
     for bandwidth in BANDWIDTHS:
@@ -157,12 +157,12 @@ def nfor(buffers: Tensor, variance: Tensor, features: Tensor, surface: Tensor) -
     """
     filtered = first_pass(buffers, variance, features, surface)
     mean = filtered.mean(dim=1)
-    return regress(mean, features, patch_distances(mean, variance_of_mean(filtered), surface, PATCH), 1.0)
+    return regress(mean, features, patch_distances(mean, variance_of_mean(filtered), surface, PATCH_RADIUS), 1.0)
 
 
 def features_of(frame: Frame) -> Tensor:
     """Normal, albedo and relative depth, which fits are linear in: (B, 7, H, W) in [-1, 1]."""
-    max_depth = frame.depth.amax((2, 3), keepdim=True).clamp(min=LEAST_DIVISOR)
+    max_depth = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
     return torch.cat(
         [frame.normal.clamp(-1, 1), frame.albedo.clamp(0, 1), (frame.depth / max_depth).clamp(0, 1)], dim=1
     )

@@ -31,7 +31,7 @@ from models import compiled
 from models.compiled import sbf as kernels
 from models.denoiser import CLASSICAL, Denoiser, State
 from models.filters.neighbours import mesh_variance
-from models.parameters import LARGEST_LUMINANCE, LEAST_DIVISOR
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 BANK = tuple(2 ** (i / 2) for i in range(7))  # px; σ_s from 1 to 8
 RISK_SIGMA = 8.0  # px
@@ -39,7 +39,7 @@ SIGMA_NORMAL = 0.8
 SIGMA_ALBEDO = 0.25
 SIGMA_DEPTH = 0.6  # of the frame's largest
 FAR_AWAY = 1e3  # what background has in place of a depth; what is outside the image lies as far on the other side
-STRIP_ROWS = 16  # that are worked on at once: all taps along a row are gathered
+GATHERED_ROWS = 16  # that are worked on at once: all taps along a row are gathered
 
 
 def gaussians(sigmas: Sequence[float]) -> Tensor:
@@ -53,7 +53,7 @@ def gaussians(sigmas: Sequence[float]) -> Tensor:
 
 def guides(frame: Frame) -> Tensor:
     """Features f (B, 7, H, W), so scaled that exp(-|f(p) - f(q)|²) is the product of their Gaussians."""
-    furthest = frame.depth.amax((2, 3), keepdim=True).clamp(min=LEAST_DIVISOR)
+    furthest = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
     depth = torch.where(frame.depth > 0, frame.depth / furthest / SIGMA_DEPTH, FAR_AWAY)
     return torch.cat([frame.normal / SIGMA_NORMAL, frame.albedo / SIGMA_ALBEDO, depth], dim=1) / math.sqrt(2)
 
@@ -71,8 +71,8 @@ def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
     padded_guides = F.pad(guides, around, value=-FAR_AWAY)
     batch, channels, height, width = image.shape
     strips = []
-    for top in range(0, height, STRIP_ROWS):
-        bottom = min(top + STRIP_ROWS, height)
+    for top in range(0, height, GATHERED_ROWS):
+        bottom = min(top + GATHERED_ROWS, height)
         here = guides[:, :, top:bottom, :, None]
         sums = image.new_zeros(batch, channels, bottom - top, width, gaussians.shape[1])
         for dy in range(taps):
@@ -114,6 +114,6 @@ class SBF(Denoiser):
     convex = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        colour = frame.irradiance(self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+        colour = frame.irradiance(self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
         filtered = best_filtered(colour, mesh_variance(colour, frame.mesh_id), guides(frame))
         return frame.remodulate(filtered, self.signal), State(frame.moment)

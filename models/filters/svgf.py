@@ -22,24 +22,14 @@ from torch.nn import functional as F
 from datasets.frame import Frame, Signal
 from models import compiled
 from models.compiled import svgf as kernels
+from models.compiled.svgf import ALPHA, EPSILON_L, EPSILON_Z, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.filters.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
 from models.history.reprojection import reproject
 from models.history.surfaces import Surfaces
-from models.operators import image_luminance
-from models.parameters import (
-    ALPHA,
-    EPSILON_L,
-    EPSILON_Z,
-    LARGEST_LUMINANCE,
-    LEAST_DIVISOR,
-    SIGMA_L,
-    SIGMA_Z,
-    SPATIAL_RADIUS,
-    SQUARINGS,
-)
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 
-STEPS = tuple(2**level for level in range(ATROUS_LEVELS))  # px from tap to tap
+ATROUS_STEPS = tuple(2**level for level in range(ATROUS_LEVELS))  # px from tap to tap
 RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
 
 
@@ -58,7 +48,7 @@ class Integrated:
 
 def luminance_moments(colour: Tensor) -> Tensor:
     """Raw moments (B, S, 2, H, W) of the luminance of single samples (B, S, 3, H, W)."""
-    y = image_luminance(colour.flatten(0, 1)).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE)
+    y = image_luminance(colour.flatten(0, 1)).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
     return torch.cat([y, y.square()], dim=1).unflatten(0, colour.shape[:2])
 
 
@@ -113,9 +103,9 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
 
     Unit normal (3; 0 for background), depth, σ_z ∇z (2: along x and y, per pixel), ε of Eq. 3.
     """
-    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=LEAST_DIVISOR), 0)
+    unit = torch.where(depth > 0, F.normalize(normal, dim=1, eps=MIN_DIVISOR), 0)
     gradient = [SIGMA_Z * slope(depth, mesh_id, dim) for dim in (-1, -2)]
-    epsilon = EPSILON_Z * depth.abs() + LEAST_DIVISOR
+    epsilon = EPSILON_Z * depth.abs() + MIN_DIVISOR
     return torch.cat([unit, depth, *gradient, epsilon], dim=1)[:, None]
 
 
@@ -245,6 +235,6 @@ class SVGF(Denoiser):
         integrated = integrate(frame, irradiances(frame, self.signal), history, self.change(frame))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         estimated = estimate_variance(integrated, geometry)
-        first, colour, _ = svgf_levels(integrated.colour, estimated, geometry, STEPS)
+        first, colour, _ = svgf_levels(integrated.colour, estimated, geometry, ATROUS_STEPS)
         history = replace(integrated, colour=first)  # §4.3: the first level's output
         return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)

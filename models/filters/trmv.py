@@ -26,7 +26,7 @@ from datasets.frame import Frame
 from models.denoiser import State, matching_state
 from models.filters.neighbours import mesh_sums
 from models.filters.svgf import (
-    STEPS,
+    ATROUS_STEPS,
     SVGF,
     Integrated,
     estimate_variance,
@@ -93,6 +93,6 @@ class TRMV(SVGF):
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         variance = torch.cat([estimate_variance(part, geometry) for part in integrated], dim=1)
         colour = torch.cat([part.colour for part in integrated], dim=1)
-        first, colour, _ = svgf_levels(colour, variance, geometry, STEPS)
+        first, colour, _ = svgf_levels(colour, variance, geometry, ATROUS_STEPS)
         kept = [replace(part, colour=own) for part, own in zip(integrated, first.split(1, dim=1), strict=True)]
         return frame.remodulate(colour.sum(dim=1), self.signal), TRMVState(frame.moment, kept)

@@ -8,9 +8,9 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import accumulation as kernels
+from models.compiled.accumulation import MIN_ALPHA
 from models.history.reprojection import reproject
 from models.history.surfaces import Surfaces
-from models.parameters import SMALLEST_ALPHA
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def accumulate_samples(
     """`accumulate` with a history: irradiance (B, 3, H, W) and length (B, 1, H, W); `surfaces` are the history's."""
     past, found = reproject(frame, torch.cat([past_irradiance, past_length], dim=1), surfaces)
     length = past[:, 3:] + 1
-    alpha = (1 / length).clamp(min=SMALLEST_ALPHA)
+    alpha = (1 / length).clamp(min=MIN_ALPHA)
     return torch.lerp(past[:, :3], noisy, torch.where(found, alpha, 1)), torch.where(found, length, 1)
 
 

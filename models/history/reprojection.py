@@ -8,8 +8,8 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import reprojection as kernels
+from models.compiled.reprojection import NORMAL_TOLERANCE, PLANE_TOLERANCE
 from models.history.surfaces import BACKGROUND_ID, Surfaces, rays, to_previous_camera
-from models.parameters import NORMAL_TOLERANCE, PLANE_TOLERANCE
 
 
 class Reprojection:

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from models import compiled
 from models.compiled import affinity as kernels
+from models.compiled.affinity import MIN_LOGIT
 from models.filters.neighbours import shifted
-from models.parameters import LEAST_LOGIT, LEAST_WEIGHT
+from models.operators import MIN_DIVISOR
 
 
 def plain_level(
@@ -18,10 +19,10 @@ def plain_level(
     count = features.shape[1]
     taps = shifted(torch.cat([features, importance, surface, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
-    exponent = (taps[:, count] - sharpness * distance).clamp(min=LEAST_LOGIT)
+    exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
     weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
     total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
-    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=LEAST_WEIGHT), 0)
+    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=MIN_DIVISOR), 0)
 
 
 class AffinityLevel(torch.autograd.Function):

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from models import compiled
 from models.compiled import bilateral_grid as kernels
-from models.parameters import GUIDES, LEAST_WEIGHT
+from models.compiled.bilateral_grid import GUIDES
+from models.operators import MIN_DIVISOR
 
 
 def cells_around(place: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
@@ -64,7 +65,7 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     for cell, weight in around:
         cells.index_add_(0, cell, values * weight)
     # A pixel that counts is in all the cells that it reads: none of them is empty.
-    means = cells[:, :3] / cells[:, 3:].clamp(min=LEAST_WEIGHT)
+    means = cells[:, :3] / cells[:, 3:].clamp(min=MIN_DIVISOR)
     total = torch.stack([weight * means[cell] for cell, weight in around]).sum(dim=0)
     share = torch.stack([weight for _, weight in around]).sum(dim=0)
     filtered = (total / share).reshape(len(image), *image.shape[-2:], 3).permute(0, 3, 1, 2)

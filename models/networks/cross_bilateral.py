@@ -15,15 +15,9 @@ from torch import Tensor
 
 from models import compiled
 from models.compiled import cross_bilateral as kernels
+from models.compiled.cross_bilateral import COLOUR_SHARPNESS, FEATURE_GROUPS, FILTER_RADIUS, MAX_EXPONENT
 from models.networks.pixel_kernels import window_taps
-from models.parameters import (
-    COLOUR_SHARPNESS,
-    FILTER_RADIUS,
-    GROUPS,
-    LARGEST_EXPONENT,
-    LEAST_VARIANCE,
-    LEAST_WEIGHT,
-)
+from models.operators import MIN_DIVISOR
 
 SIDE = 2 * FILTER_RADIUS + 1
 
@@ -33,7 +27,7 @@ class Pixels(NamedTuple):
 
     image: Tensor  # 3 channels
     variance: Tensor  # of the noise in each of these
-    features: Tensor  # sum(GROUPS) channels
+    features: Tensor  # sum(FEATURE_GROUPS) channels
     surface: Tensor  # 1 for pixels that count, 0 for those that are left out like what is outside the image
 
 
@@ -45,14 +39,14 @@ def tap_weights(pixels: Pixels, sharpness: Tensor) -> Iterator[tuple[Any, Any, T
     image, variance, features, surface = pixels
     for index, here, there in window_taps(SIDE, *image.shape[-2:]):
         dy, dx = (offset - FILTER_RADIUS for offset in divmod(index, SIDE))
-        noise = LEAST_VARIANCE + variance[here] + variance[there]
+        noise = MIN_DIVISOR + variance[here] + variance[there]
         apart = ((image[there] - image[here]).square() / noise).sum(dim=1, keepdim=True)
-        squares = (features[there] - features[here]).square().split(GROUPS, dim=1)
+        squares = (features[there] - features[here]).square().split(FEATURE_GROUPS, dim=1)
         in_image = torch.full_like(apart, dy * dy + dx * dx)
         distances = torch.cat([in_image, *(square.sum(dim=1, keepdim=True) for square in squares)], dim=1)
         exponent = COLOUR_SHARPNESS * apart + (sharpness[here] * distances).sum(dim=1, keepdim=True)
-        weight = torch.exp(-exponent.clamp(max=LARGEST_EXPONENT)) * surface[there]
-        yield here, there, weight, distances * (exponent < LARGEST_EXPONENT)
+        weight = torch.exp(-exponent.clamp(max=MAX_EXPONENT)) * surface[there]
+        yield here, there, weight, distances * (exponent < MAX_EXPONENT)
 
 
 @compiled.by(kernels.weighted_mean)
@@ -63,14 +57,14 @@ def weighted_mean(pixels: Pixels, sharpness: Tensor) -> tuple[Tensor, Tensor]:
     for here, there, weight, _ in tap_weights(pixels, sharpness):
         out[here].addcmul_(weight, pixels.image[there])
         total[here] += weight
-    return out * pixels.surface / total.clamp(min=LEAST_WEIGHT), total * pixels.surface
+    return out * pixels.surface / total.clamp(min=MIN_DIVISOR), total * pixels.surface
 
 
 @compiled.by(kernels.pull_sharpness)
 def pull_sharpness(gradient: Tensor, pixels: Pixels, sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:
     """The gradient of the sharpness (B, 1 + groups, H, W), from that of what weighted_mean returned."""
     pulled = torch.zeros_like(sharpness)
-    scaled = gradient * pixels.surface / total.clamp(min=LEAST_WEIGHT)
+    scaled = gradient * pixels.surface / total.clamp(min=MIN_DIVISOR)
     dot = (scaled * out).sum(dim=1, keepdim=True)
     for here, there, weight, distances in tap_weights(pixels, sharpness):
         pull = weight * ((scaled[here] * pixels.image[there]).sum(dim=1, keepdim=True) - dot[here])

@@ -8,8 +8,8 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import features as kernels
+from models.compiled.features import FEATURES, GAMMA
 from models.history.running_scale import RunningScale
-from models.parameters import FEATURES, GAMMA
 
 
 @compiled.by(kernels.network_features)

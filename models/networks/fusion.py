@@ -14,8 +14,9 @@ from torch.nn import functional as F
 
 from models import compiled
 from models.compiled import fusion as kernels
-from models.operators import STRIP_ROWS
-from models.parameters import LEAST_EXPONENT, LEAST_WEIGHT, OUTSIDE, SAFE_RANGE, WINDOWS
+from models.compiled.exponential import MIN_EXPONENT
+from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE, WINDOWS
+from models.operators import MIN_DIVISOR, STRIP_ROWS
 
 
 def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
@@ -58,13 +59,13 @@ def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, 
     total = values
     for dim in (-2, -1):
         size = top.shape[dim]
-        entries = F.pad(top, along(dim, margin), value=OUTSIDE)
+        entries = F.pad(top, along(dim, margin), value=OUTSIDE_LOGIT)
         parts = F.pad(total, along(dim, margin))
         top = windowed_max(entries, window, dim)
         total = torch.zeros_like(total)
         for tap in range(window):
             entry = entries.narrow(dim, tap, size)
-            weight = torch.exp((entry - top).clamp(min=LEAST_EXPONENT)) * (entry > OUTSIDE)
+            weight = torch.exp((entry - top).clamp(min=MIN_EXPONENT)) * (entry > OUTSIDE_LOGIT)
             total = total + weight * parts.narrow(dim, tap, size)
     return top, total
 
@@ -77,7 +78,7 @@ def windowed_sums(logits: Tensor, values: Tensor, window: int, counted: Tensor |
     """
     low, high = torch.aminmax(logits)
     if counted is not None:
-        logits = torch.where(counted, logits, OUTSIDE)
+        logits = torch.where(counted, logits, OUTSIDE_LOGIT)
         values = torch.where(counted, values, 0)
         high = logits.amax()
         low = torch.where(counted, logits, high).amin()
@@ -104,7 +105,7 @@ class SharedKernel(torch.autograd.Function):
         counted = None if surface is None else surface > 0
         top, total = windowed_sums(logits, with_ones(image), window, counted)
         weight = total[:, -1:]
-        filtered = total[:, :-1] / weight.clamp(min=LEAST_WEIGHT)
+        filtered = total[:, :-1] / weight.clamp(min=MIN_DIVISOR)
         ctx.window = window
         ctx.save_for_backward(image, logits, counted, filtered, top + torch.log(weight))
         return filtered

@@ -28,13 +28,14 @@ import torch
 from torch import Tensor, nn
 
 from datasets.frame import Frame, Signal
+from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, mesh_variance, shifted
 from models.history.running_scale import RunningScale, running_scale
 from models.history.surfaces import positions_around_eye, ray_axes
 from models.networks.cross_bilateral import Pixels, cross_bilateral
 from models.networks.secondary_features import SECONDARY, secondary_features
-from models.parameters import GROUPS, LARGEST_LUMINANCE
+from models.operators import MAX_LUMINANCE
 
 HIDDEN = 10
 FARTHEST = 1e3  # running median depths; positions further off look alike
@@ -52,12 +53,12 @@ def visibility(frame: Frame) -> tuple[Tensor, Tensor]:
 
 
 def features_of(frame: Frame, scale: RunningScale) -> tuple[Tensor, Tensor]:
-    """The features (B, sum(GROUPS), H, W) and the variance of their noise, (B, groups, H, W)."""
+    """The features (B, sum(FEATURE_GROUPS), H, W) and the variance of their noise, (B, groups, H, W)."""
     unit = torch.exp(scale.log_depth.value)[:, None, None, None]
     position = (positions_around_eye(frame.depth, ray_axes(frame.now)) / unit).clamp(-FARTHEST, FARTHEST)
     visible, variance = visibility(frame)
     features = torch.cat([position.to(frame.depth), frame.normal, frame.albedo, frame.roughness, visible], dim=1)
-    return features, torch.cat([torch.zeros_like(variance)] * (len(GROUPS) - 1) + [variance], dim=1)
+    return features, torch.cat([torch.zeros_like(variance)] * (len(FEATURE_GROUPS) - 1) + [variance], dim=1)
 
 
 def remove_spikes(image: Tensor, surface: Tensor) -> Tensor:
@@ -105,7 +106,7 @@ class LBF(Denoiser):
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         self.inputs = {"secondary features": SECONDARY}
-        last = nn.Linear(HIDDEN, 1 + len(GROUPS))
+        last = nn.Linear(HIDDEN, 1 + len(FEATURE_GROUPS))
         nn.init.constant_(last.bias, FIRST_BIAS)
         self.network = nn.Sequential(nn.Linear(SECONDARY, HIDDEN), nn.Sigmoid(), last, nn.Softplus())
 
@@ -119,7 +120,7 @@ class LBF(Denoiser):
         """Filtered irradiance (B, 3, H, W), before spikes are removed, and the state for the next frame."""
         before = matching_state(state, LBFState, frame)
         surface = (frame.depth > 0).to(frame.depth)
-        colour = frame.irradiance(self.signal).clamp(-LARGEST_LUMINANCE, LARGEST_LUMINANCE) * surface
+        colour = frame.irradiance(self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE) * surface
         scale = running_scale(colour * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         features, variance = features_of(frame, scale)
         sharpness = self.sharpness(features, variance, surface, frame.samples)

@@ -26,9 +26,9 @@ import torch
 from torch import Tensor, nn
 
 from datasets.frame import Signal
+from models.compiled.features import FEATURES
 from models.networks.bilateral_grid import grid_mean
 from models.networks.wskp import KernelPredictor
-from models.parameters import FEATURES
 
 WIDTH = 20  # channels between the two layers
 KERNEL = 5  # px

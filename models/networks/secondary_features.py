@@ -1,23 +1,23 @@
 """What LBF's network sees: statistics of the features around each pixel (Kalantari et al. 2015, §3.3).
 
-All take features (B, sum(GROUPS), H, W) and `surface` (B, 1, H, W), 1 for pixels that count: background and what is
-outside the image is in none of them. Channels are looked at apart; in the end the channels of a group are averaged.
+All take features (B, sum(FEATURE_GROUPS), H, W) and `surface` (B, 1, H, W), 1 for pixels that count: background and
+what is outside the image is in none of them. Statistics are taken channel by channel, then averaged over those of a group.
 """
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.networks.pixel_kernels import window_taps
 from models.operators import pad_to_multiple
-from models.parameters import GROUPS
 
 BLOCK = 7  # px: what statistics are taken of
 SMALL_BLOCK = 3
 GAUSSIAN_MEDIAN = 0.6745  # of the absolute value of normal noise of deviation 1
 SPREAD = 0.01  # spreads that differ far below this look alike to the network
 KINDS = 7  # of statistics, one for each group
-SECONDARY = KINDS * len(GROUPS) + 1
+SECONDARY = KINDS * len(FEATURE_GROUPS) + 1
 
 
 def box_sum(image: Tensor, side: int) -> Tensor:
@@ -81,7 +81,7 @@ def noise(features: Tensor, surface: Tensor) -> Tensor:
 
 def group_means(features: Tensor) -> Tensor:
     """Means over the channels of each group, (B, groups, H, W)."""
-    return torch.cat([group.mean(dim=1, keepdim=True) for group in features.split(GROUPS, dim=1)], dim=1)
+    return torch.cat([group.mean(dim=1, keepdim=True) for group in features.split(FEATURE_GROUPS, dim=1)], dim=1)
 
 
 def secondary_features(features: Tensor, variance: Tensor, surface: Tensor, samples: Tensor) -> Tensor:

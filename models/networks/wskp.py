@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.compiled.fusion import THREAD_ROWS
+from models.compiled.features import FEATURES
+from models.compiled.fusion import THREAD_ROWS, WINDOWS
 from models.denoiser import State, as_it_is, matching_state
 from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.history.running_scale import RunningScale, running_scale
@@ -18,7 +19,6 @@ from models.networks.fusion import fuse
 from models.networks.pixel_kernels import apply_kernels
 from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.operators import halve, halve_surface, pad_to_multiple
-from models.parameters import FEATURES, WINDOWS
 
 WIDTH = 24  # ours: the widths drawn in the paper are not known
 LARGEST_WHOLE = 1920 * 1080  # px; the network's images of larger frames would take gigabytes: they are cut into strips

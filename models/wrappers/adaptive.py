@@ -21,6 +21,7 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from errors import BadInput
+from models.compiled.accumulation import MIN_ALPHA
 from models.denoiser import Denoiser, State
 from models.filters.atrous import Tap, WindowSum, strip_taps
 from models.filters.baselines import Accumulating
@@ -29,8 +30,7 @@ from models.history.accumulation import Accumulation
 from models.history.reprojection import reproject
 from models.history.strata import middles, repeated, sums
 from models.history.surfaces import Surfaces
-from models.operators import image_luminance
-from models.parameters import LARGEST_LUMINANCE, LEAST_DIVISOR, SMALLEST_ALPHA
+from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
 
 RADIUS = 3  # strata: windows of 7 x 7
@@ -80,14 +80,14 @@ def brightest(expected: Tensor, around: Neighbourhoods) -> Tensor:
 def bounded(irradiance: Tensor, limit: Tensor, around: Neighbourhoods) -> Tensor:
     """Irradiance (B, 3, H, W) of which what exceeds the luminance `limit` (B, 1, H, W) is shared out around it."""
     luminance = image_luminance(irradiance)
-    kept = torch.where(luminance > limit, limit / luminance.clamp(min=LEAST_DIVISOR), 1)
+    kept = torch.where(luminance > limit, limit / luminance.clamp(min=MIN_DIVISOR), 1)
     return irradiance * kept + around.means(irradiance * (1 - kept))
 
 
 def trust(difference: Tensor, around: Neighbourhoods) -> Tensor:
     """How far to believe that the sum of differences (B, 1, H, W) around each stratum is no noise, (B, 1, h, w)."""
     variance = around.sums(difference.square(), power=2)
-    t_squared = around.sums(difference).square() / variance.clamp(min=LEAST_DIVISOR)
+    t_squared = around.sums(difference).square() / variance.clamp(min=MIN_DIVISOR)
     return ((t_squared - INSIGNIFICANT) / (SIGNIFICANT - INSIGNIFICANT)).clamp(0, 1)
 
 
@@ -100,18 +100,18 @@ def gain(newest: Tensor, past: Tensor, cut: Tensor, limit: Tensor, around: Neigh
     may be too large: the gain is at most that of the whole.
     """
     believed = trust(torch.minimum(newest, limit) - cut, around)
-    now, then, then_cut = (around.sums(torch.cat([newest, past, cut], dim=1)) + LEAST_DIVISOR).split(1, dim=1)
+    now, then, then_cut = (around.sums(torch.cat([newest, past, cut], dim=1)) + MIN_DIVISOR).split(1, dim=1)
     whole = (now / then).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
     factor = torch.ones_like(past)
     for _ in range(GAIN_STEPS):
-        ratio = (around.sums(torch.minimum(newest, limit * factor)) + LEAST_DIVISOR) / then_cut
+        ratio = (around.sums(torch.minimum(newest, limit * factor)) + MIN_DIVISOR) / then_cut
         factor = repeated(ratio.clamp(whole.clamp(max=1), whole.clamp(min=1)) ** believed, around.size)
     return factor
 
 
 def luminance_of(irradiance: Tensor) -> Tensor:
     """Luminance (B, 1, H, W) whose squares can be summed."""
-    return image_luminance(irradiance).clamp(0, LARGEST_LUMINANCE)
+    return image_luminance(irradiance).clamp(0, MAX_LUMINANCE)
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
     comparable = found & around.members
     factor = gain(luminance * comparable, past_luminance * comparable, past_cut * comparable, limit, around)
     limit = limit * factor
-    alpha = torch.where(found, (1 / (n + 1)).clamp(min=SMALLEST_ALPHA), 1)
+    alpha = torch.where(found, (1 / (n + 1)).clamp(min=MIN_ALPHA), 1)
     return AdaptiveAccumulation(
         torch.lerp(past * factor, bounded(irradiance, limit, around), alpha),
         torch.where(found, n + 1, 1),

@@ -25,8 +25,7 @@ from datasets.frame import Frame
 from errors import BadInput
 from models.denoiser import State
 from models.filters.neighbours import mesh_sums
-from models.operators import image_luminance
-from models.parameters import LEAST_DIVISOR
+from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers.shrinkage import Shrunk, believed, denoised_irradiance, mixture, relative, share_let_in, unit_of
 
 MOST_SAMPLES = 2.0**20  # a pixel; nobody is told to take more
@@ -123,14 +122,14 @@ class ErrorEstimate:
         best mixture has e² v / (k e² + v). By as much as the mean of that falls, the error is taken to fall, and chance
         by k. Infinite beyond MOST_SAMPLES.
         """
-        error = self.smoothed(self.filter_error, self.spread, torch.ones_like(self.variance)).clamp(min=LEAST_DIVISOR)
+        error = self.smoothed(self.filter_error, self.spread, torch.ones_like(self.variance)).clamp(min=MIN_DIVISOR)
         now, chance = self.relative_error() ** 2, self.chance()
 
         def mixture(k: float) -> float:
-            return self.over_surfaces(error * self.variance / (k * error + self.variance).clamp(min=LEAST_DIVISOR))
+            return self.over_surfaces(error * self.variance / (k * error + self.variance).clamp(min=MIN_DIVISOR))
 
         def left(k: float) -> float:
-            return now * mixture(k) / max(mixture(1.0), LEAST_DIVISOR) + chance / k
+            return now * mixture(k) / max(mixture(1.0), MIN_DIVISOR) + chance / k
 
         own = float(self.frame.samples.mean())
         if self.most_relative_error() <= target:

@@ -29,8 +29,7 @@ from datasets.channels import SAMPLE_BUFFERS
 from datasets.frame import Frame, Signal
 from models.denoiser import State
 from models.filters.neighbours import mesh_sums
-from models.operators import image_luminance
-from models.parameters import LEAST_DIVISOR
+from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
 
 STANDARD_ERRORS = 3.0
@@ -65,7 +64,7 @@ def window_of(sums: Tensor, rare: Tensor, samples: Tensor) -> Window:
     pixels = sums[:, 12:]
     excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
     error = (squares / pixels).sqrt() + (SCARCE / samples * distance + rare) / pixels
-    return Window(excess, distance.clamp(min=LEAST_DIVISOR), error)
+    return Window(excess, distance.clamp(min=MIN_DIVISOR), error)
 
 
 def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
@@ -80,7 +79,7 @@ def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, sample
 def believed(difference: Tensor, error: Tensor) -> Tensor:
     """How much of a difference is no chance, in [0, 1], from its standard error."""
     doubt = STANDARD_ERRORS * error
-    return 1 - (doubt / difference.abs().clamp(min=LEAST_DIVISOR)).square().clamp(max=1)
+    return 1 - (doubt / difference.abs().clamp(min=MIN_DIVISOR)).square().clamp(max=1)
 
 
 def mesh_means_of(image: Tensor, mesh_id: Tensor) -> Tensor:
@@ -107,7 +106,7 @@ def share_let_in(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
 def unit_of(luminance: Tensor) -> Tensor:
     """What irradiance is compared by, from the luminance around each pixel, (B, 1, H, W): it is never 0."""
     darkest = DARKEST * luminance.mean(dim=(1, 2, 3), keepdim=True)
-    return (luminance + darkest).clamp(min=LEAST_DIVISOR)
+    return (luminance + darkest).clamp(min=MIN_DIVISOR)
 
 
 def relative(difference: Tensor, unit: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.parameters import WINDOWS
+from models.compiled.fusion import WINDOWS
 
 
 def unfold_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:

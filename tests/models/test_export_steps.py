@@ -16,6 +16,7 @@ from datasets.frame import Cameras, read_frame
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
+from models.compiled.fusion import WINDOWS
 from models.denoiser import Denoiser
 from models.export import program as programs
 from models.export.box_windows import BoxWindows
@@ -30,7 +31,6 @@ from models.filters import neighbours
 from models.history.reprojection import reproject
 from models.history.surfaces import Surfaces, to_previous_camera
 from models.networks.affinity import plain_level
-from models.parameters import WINDOWS
 from models.registry import create
 from models.spec import load
 from models.weights import save_weights

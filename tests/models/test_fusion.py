@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from torch.nn import functional as F
 
 from models import compiled
+from models.compiled.fusion import WINDOWS
 from models.networks.fusion import box_sum, fuse, shared_kernel, windowed_sums
-from models.parameters import WINDOWS
 from tests.helpers.unfold import unfold_fuse
 
 

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from models import compiled, registry
+from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.history.running_scale import running_scale
 from models.networks.cross_bilateral import Pixels, cross_bilateral
 from models.networks.lbf import features_of, remove_spikes
 from models.networks.secondary_features import secondary_features
-from models.parameters import GROUPS
 from tests.helpers.frames import flat_frame, run
 
 WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
 SIZES = st.tuples(st.integers(1, 7), st.integers(1, 7))
-CHANNELS = sum(GROUPS)
+CHANNELS = sum(FEATURE_GROUPS)
 
 
 def random_pixels(seed: int, height: int, width: int, batch: int = 1) -> tuple[Pixels, Tensor]:
@@ -30,7 +30,7 @@ def random_pixels(seed: int, height: int, width: int, batch: int = 1) -> tuple[P
         return torch.rand(batch, channels, height, width, generator=generator)
 
     pixels = Pixels(10 * image(3) ** 4, image(3), image(CHANNELS), (image(1) < 0.8).float())
-    return pixels, 10 ** (3 * image(1 + len(GROUPS)) - 2)
+    return pixels, 10 ** (3 * image(1 + len(FEATURE_GROUPS)) - 2)
 
 
 # --- The filter -------------------------------------------------------------------------------------------------------
@@ -89,7 +89,7 @@ def all_at_once(pixels: Pixels, sharpness: Tensor) -> Tensor:
     image, variance, features, surface, s = (tensor[0].double().flatten(1) for tensor in (*pixels, sharpness))
     height, width = pixels.surface.shape[-2:]
     place = torch.cartesian_prod(torch.arange(height), torch.arange(width)).double().T
-    parts = [place, *features.split(GROUPS)]
+    parts = [place, *features.split(FEATURE_GROUPS)]
     squares = torch.stack([(part[:, :, None] - part[:, None]).square().sum(dim=0) for part in parts])
     noise = variance[:, :, None] + variance[:, None]
     apart = ((image[:, :, None] - image[:, None]).square() / noise).sum(dim=0) / 98
@@ -178,7 +178,7 @@ def naive_statistics(f, shown, p):
 @example(size=(2, 2), seed=560)  # a pixel by itself, which has no spread
 def test_the_network_sees_the_statistics_of_the_paper(size, seed):
     pixels, _ = random_pixels(seed, *size)
-    variance = torch.rand(1, len(GROUPS), *size, generator=torch.Generator().manual_seed(seed))
+    variance = torch.rand(1, len(FEATURE_GROUPS), *size, generator=torch.Generator().manual_seed(seed))
     features = pixels.features * pixels.surface
     seen = secondary_features(features, variance, pixels.surface, torch.full((1, 1, 1, 1), 4.0))[0].numpy()
     shown = pixels.surface[0, 0].numpy() > 0
@@ -186,8 +186,8 @@ def test_the_network_sees_the_statistics_of_the_paper(size, seed):
     assert len(seen) == 36
     for p in zip(*np.nonzero(shown), strict=True):
         by_channel = np.array([naive_statistics(channel, shown, p) for channel in f])
-        by_group = np.array([part.mean(axis=0) for part in np.split(by_channel, np.cumsum(GROUPS)[:-1])])
-        own = np.array([part[:, *p].mean() for part in np.split(f, np.cumsum(GROUPS)[:-1])])
+        by_group = np.array([part.mean(axis=0) for part in np.split(by_channel, np.cumsum(FEATURE_GROUPS)[:-1])])
+        own = np.array([part[:, *p].mean() for part in np.split(f, np.cumsum(FEATURE_GROUPS)[:-1])])
         noise, apart, gradient, deviation, mean = by_group.T
         spreads = [noise, apart, gradient, np.sqrt(variance[0, :, *p].numpy()), deviation]
         expected = np.concatenate([np.log1p(np.concatenate(spreads) / 0.01), own, mean, [0.25]])

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.compiled.features import GAMMA
 from models.denoiser import Denoiser
-from models.parameters import GAMMA
 from train.crops import Crops
 from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
 from train.losses.outputs import exposed_outputs
