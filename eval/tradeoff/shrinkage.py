@@ -61,8 +61,8 @@ def clip_gains(clips: Sequence[ClipResults], metric: str, name: str) -> Iterator
             yield clip.name, found[name] - max(found[other] for other in others)
 
 
-def gains_table(gains: Sequence[Gain]) -> str:
-    """Means over the clips, and the worst clip, by samples a pixel."""
+def gains_rows(gains: Sequence[Gain]) -> list[dict[str, str]]:
+    """Means over the clips, and the worst clip, by samples a pixel: a row a denoiser and metric."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for gain in gains:
         line = lines.setdefault(
@@ -70,4 +70,8 @@ def gains_table(gains: Sequence[Gain]) -> str:
         )
         values = gain.clips.values()
         line[f"{gain.spp} spp"] = f"{sum(values) / len(values):+.2f} ({min(values):+.2f})"
-    return tabulate([*lines.values()], "keys", disable_numparse=True)
+    return [*lines.values()]
+
+
+def gains_table(gains: Sequence[Gain]) -> str:
+    return tabulate(gains_rows(gains), "keys", disable_numparse=True)

@@ -1,0 +1,308 @@
+"""Tables and numbers of the documentation, generated from the measurements in docs/measured.
+
+In a page, what stands between `<!-- measured: NAME ARGUMENT... -->` and `<!-- end -->` is the text that
+GENERATORS[NAME] returns. `python -m eval.pages RUNS` extracts the measurements that commands left in RUNS and writes
+the pages anew;
+without RUNS it only writes the pages.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from tabulate import tabulate
+
+from errors import BadInput
+from eval.bench.denoisers import BASELINE
+from eval.metrics import METRICS, Values
+from eval.report.table_rows import TableRow, clip_rows, mean_rows
+from eval.results import REFERENCE, ClipResults, Result, of_one_spp, read_results
+from eval.shipped import measured_file
+from eval.text_table import PRINTED
+from eval.tradeoff.samples import SampleTrade
+from eval.tradeoff.shrinkage import Gain, gains_rows
+from files import read_json, write_file, write_json
+from provenance import ROOT
+
+MEASURED = ROOT / "docs" / "measured"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
+SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
+SOURCES = {
+    "eval": "onespp eval",
+    "bench": "onespp bench denoisers",
+    "trade": "onespp trade",
+    "stress": "onespp stress --long",
+    "times": "make",
+}
+
+
+# --- Extracts ---------------------------------------------------------------------------------------------------------
+
+
+def rounded(values: Any) -> Any:
+    """JSON content with numbers of six digits."""
+    if isinstance(values, dict):
+        return {key: rounded(value) for key, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [rounded(value) for value in values]
+    return float(f"{values:.6g}") if isinstance(values, float) else values
+
+
+def extract_eval(runs: Path) -> dict[str, Any]:
+    """Clips with the metrics of all denoisers."""
+    content, clips = read_results(runs)
+    rows = [
+        {
+            **{"scene": clip.scene, "clip": clip.clip, "signal": clip.signal, "floors": kept(clip.reference.metrics)},
+            "results": {result.denoiser: kept(result.metrics) for result in clip.results},
+        }
+        for clip in of_one_spp(clips)
+    ]
+    return {key: content[key] for key in ("device", "versions", "dataset")} | {"clips": rows}
+
+
+def kept(values: Values) -> Values:
+    return {metric: values.get(metric) for metric in PRINTED}
+
+
+def extract_bench(runs: Path) -> dict[str, Any]:
+    content = read_json(runs / "bench" / "results.json")
+    return {"device": content["device"], "threads": content["threads"], "rows": content["rows"]}
+
+
+def extract_trade(runs: Path) -> dict[str, Any]:
+    content = read_json(runs / "report" / "trade.json")
+    samples = content["samples"]
+    kept = {key: content[key] for key in ("device", "size", "threads", "clips")}
+    return kept | {"samples": samples["rows"], "gains": samples["shrinkage"]}
+
+
+def extract_stress(runs: Path) -> dict[str, Any]:
+    """The worst of all cases for each denoiser, and the requirements that it breaks."""
+    content = read_json(runs / "stress" / "results.json")
+    rows: dict[str, dict[str, Any]] = {}
+    for row in content["rows"]:
+        worst = rows.setdefault(row["denoiser"], {"cases": 0, "violation": 0.0, "nonfinite": 0, "broken": []})
+        worst["cases"] += 1
+        worst["violation"] = max(worst["violation"], row["violation"])
+        worst["nonfinite"] += row["nonfinite"]
+        worst["broken"] += [f"{name} in {row['extreme']}" for name in row["broken"]]
+    return {"device": content["device"], "rows": rows}
+
+
+def extract_times(runs: Path) -> dict[str, Any]:
+    """Seconds that `make` and `make test` took, which they leave in RUNS."""
+    return read_json(runs / "times.json")
+
+
+EXTRACTS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "eval": extract_eval,
+    "bench": extract_bench,
+    "trade": extract_trade,
+    "stress": extract_stress,
+    "times": extract_times,
+}
+
+
+def collect(runs: Path) -> Iterator[Path]:
+    """Extract what RUNS holds of EXTRACTS into docs/measured; yields the files."""
+    for name, extract in EXTRACTS.items():
+        try:
+            content = extract(runs)
+        except BadInput as missing:
+            print(f"{name}: not collected, {missing}")
+            continue
+        write_json(MEASURED / f"{name}.json", rounded(content))
+        yield MEASURED / f"{name}.json"
+
+
+# --- Tables and numbers -----------------------------------------------------------------------------------------------
+
+
+def measured(name: str) -> dict[str, Any]:
+    """An extract. Raises BadInput, naming the command that measures it, where there is none."""
+    path = MEASURED / f"{name}.json"
+    if not path.exists():
+        raise BadInput(f"not measured: `{SOURCES[name]}`, then `python -m eval.pages RUNS`")
+    return read_json(path)
+
+
+def evaluated_clips(signal: str = "total") -> list[ClipResults]:
+    """The clips of `onespp eval` with the denoisers that return a signal."""
+    clips = []
+    for row in measured("eval")["clips"]:
+        if row["signal"] == signal:
+            place = {"key": "", "signal": signal, "scene": row["scene"], "clip": row["clip"], "frames": []}
+            results = [Result(denoiser=name, metrics=values, **place) for name, values in row["results"].items()]
+            reference = Result(denoiser=REFERENCE, metrics=row["floors"], **place)
+            clips.append(ClipResults(row["scene"], row["clip"], row["signal"], results, reference))
+    return clips
+
+
+def rows_of(clip: str, signal: str = "total") -> list[TableRow]:
+    """The denoisers on a scene's clip, or the means over all clips for "mean"."""
+    clips = evaluated_clips(signal)
+    return mean_rows(clips) if clip == "mean" else next(clip_rows(each) for each in clips if each.scene == clip)
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    return f"\n{tabulate(lines, 'keys', 'github', disable_numparse=True)}\n"
+
+
+def clip(scene: str, *names: str) -> str:
+    """Metrics of the named denoisers, or of all, on a scene's clip or in the mean; and the noise floor."""
+    rows = {row.denoiser: row for row in rows_of(scene)}
+    floor = list(rows)[-1]
+    chosen = [rows[name] for name in (*(names or list(rows)[:-1]), floor)]
+    titles = {metric: METRICS[metric].title for metric in PRINTED}
+    lines = [{"denoiser": cell(row)} | {title: row.text(metric) for metric, title in titles.items()} for row in chosen]
+    return table(lines)
+
+
+def cell(row: TableRow) -> str:
+    return row.denoiser if row.is_floor else f"`{row.denoiser}`"
+
+
+def quality(metric: str, signal: str = "total") -> str:
+    """A metric of all denoisers: its mean, and clip by clip."""
+    columns = {"mean": "mean"} | {each.scene: each.scene for each in evaluated_clips(signal)}
+    rows = {title: rows_of(clip, signal) for clip, title in columns.items()}
+    lines = []
+    for index, row in enumerate(rows["mean"]):
+        lines.append({"denoiser": cell(row)} | {title: rows[title][index].text(metric) for title in columns})
+    return table(lines)
+
+
+def value(metric: str, denoiser: str, scene: str = "mean") -> str:
+    """One number."""
+    return next(row.text(metric) for row in rows_of(scene) if row.denoiser == denoiser)
+
+
+def shipped(metric: str, denoiser: str, network: str = "one") -> str:
+    """A mean from the card of a network."""
+    rows = read_json(measured_file(network))["means"]
+    return str(next(row[METRICS[metric].title] for row in rows if row["denoiser"] == denoiser))
+
+
+def timed_rows() -> list[dict[str, Any]]:
+    """Rows of the bench with all threads, at the first of its sizes."""
+    bench = measured("bench")
+    first = bench["rows"][0]
+    return [row for row in bench["rows"] if row["threads"] == bench["threads"] and row["height"] == first["height"]]
+
+
+def times() -> str:
+    """Milliseconds and memory of a frame, fastest first."""
+    rows = sorted(timed_rows(), key=lambda row: row["ms_median"])
+    baseline = next(row["ms_median"] for row in rows if row["denoiser"] == BASELINE)
+    lines = [
+        {
+            "denoiser": f"`{row['denoiser']}`",
+            "precision": row["dtype"],
+            "ms": f"{row['ms_median']:.3g}",
+            f"times `{BASELINE}`": f"{row['ms_median'] / baseline:.2f}",
+            "peak MB": f"{row['peak_mb']:.0f}" if row["peak_mb"] is not None else "-",
+            "parameters": row["parameters"] or "-",
+            "MACs/pixel": f"{row['macs_per_pixel']:.3g}" if row["macs_per_pixel"] else "-",
+        }
+        for row in rows
+    ]
+    return table(lines)
+
+
+def ratio(denoiser: str) -> str:
+    """The time of a denoiser as a multiple of the baseline's."""
+    ms = {row["denoiser"]: row["ms_median"] for row in timed_rows()}
+    return f"{ms[denoiser] / ms[BASELINE]:.2f}"
+
+
+def samples() -> str:
+    """PSNR of denoisers fed more samples a pixel."""
+    lines: dict[str, dict[str, str]] = {}
+    for row in (SampleTrade(**row) for row in measured("trade")["samples"]):
+        if row.signal == "total":
+            lines.setdefault(row.label, {"denoiser": f"`{row.label}`"})[f"{row.spp} spp"] = row.cell("psnr")
+    return table([*lines.values()])
+
+
+def front() -> str:
+    """Where milliseconds of rendering and filtering are best spent."""
+    rows = [SampleTrade(**row) for row in measured("trade")["samples"]]
+    best = sorted((row.ms, row) for row in rows if row.signal == "total" and row.dominated_by is None and row.ms)
+    lines = [
+        {"ms": f"{ms:.0f}", "spent on": f"`{row.label}`, {row.spp} spp", "PSNR": row.cell("psnr")} for ms, row in best
+    ]
+    return table(lines)
+
+
+def gains() -> str:
+    """What +js gains on the better of noise and denoiser."""
+    return table(gains_rows([Gain(**row) for row in measured("trade")["gains"]]))
+
+
+def stress() -> str:
+    """Whether each denoiser keeps the requirements of the stress bench."""
+    lines = [
+        {
+            "denoiser": f"`{name}`",
+            "cases": row["cases"],
+            "non-finite pixels": row["nonfinite"],
+            "largest range violation": f"{row['violation']:.1g}",
+            "broken": "; ".join(row["broken"]) or "none",
+        }
+        for name, row in measured("stress")["rows"].items()
+    ]
+    return table(lines)
+
+
+def device(name: str) -> str:
+    """What a source was measured on."""
+    return str(measured(name)["device"])
+
+
+def minutes(what: str) -> str:
+    """How long a target of make took."""
+    seconds = measured("times")[what]
+    return f"{seconds // 60} min {seconds % 60} s"
+
+
+GENERATORS: dict[str, Callable[..., str]] = {
+    each.__name__: each
+    for each in (clip, quality, value, shipped, times, ratio, samples, front, gains, stress, device, minutes)
+}
+
+
+# --- Pages ------------------------------------------------------------------------------------------------------------
+
+
+def generate(match: re.Match[str]) -> str:
+    """What is to stand at a mark."""
+    name, *arguments = match[1].split()
+    try:
+        text = GENERATORS[name](*arguments)
+    except BadInput as missing:
+        text = f"({missing})"
+    return f"<!-- measured: {match[1]} -->{text}<!-- end -->"
+
+
+def generated(page: str) -> str:
+    """A page with all that is marked generated anew."""
+    return MARKED.sub(generate, page)
+
+
+def main(arguments: list[str]) -> None:
+    for runs in arguments:
+        for path in collect(Path(runs)):
+            print(path)
+    for page in PAGES:
+        text = page.read_text()
+        if (new := generated(text)) != text:
+            write_file(page, new.encode())
+            print(page)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
