@@ -1,4 +1,4 @@
-"""The command line: one subcommand a step, each a thin function."""
+"""The command line: one thin function per subcommand."""
 
 import errno
 import os
@@ -15,33 +15,33 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from allocator import keep_freed_memory
 from errors import BadInput
 
-Data = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/PROFILE")]
-DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the data set; by default data/BUDGET")]
-Device = Annotated[Literal["cpu", "cuda"], arg(help="what computes")]
-Runs = Annotated[Path, arg(metavar="DIR", help="where trainings and results are kept")]
+Data = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/PROFILE")]
+DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/BUDGET")]
+Device = Annotated[Literal["cpu", "cuda"], arg(help="where to compute")]
+Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results")]
 Profile = Annotated[
     str,
     arg(
         metavar="{tiny,quick,sketch,release,rooms-NxS}",
-        help="which clips, how well sampled: seconds, minutes, small rooms, the release (days), "
-        "or N small rooms with references of S samples a pixel",
+        help="which clips, and how well sampled: seconds, minutes, small rooms, the release (days), "
+        "or N small rooms with references of S spp",
     ),
 ]
 Budget = Annotated[
     str,
     arg(
         metavar="{tiny,quick,release,paper}",
-        help="how long networks are trained, as long as their paper at most; names the weights, RUNS/train/NAME-BUDGET",
+        help="how long networks are trained; the weights are in RUNS/train/NAME-BUDGET",
     ),
 ]
-Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default those named above")]
+Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default those listed above")]
 Scenes = Annotated[
     tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box, room-3 or my-scene.toml")
 ]
-ClipFolder = Annotated[Path, Positional, arg(metavar="CLIP", help="its folder")]
-Size = Annotated[str, arg(metavar="WxH", help="of the images")]
-Sizes = Annotated[tuple[str, ...], arg(metavar="WxH...", help="of the images")]
-Png = Annotated[Path, arg(metavar="PNG", help="the picture to write")]
+ClipFolder = Annotated[Path, Positional, arg(metavar="CLIP", help="the clip's folder")]
+Size = Annotated[str, arg(metavar="WxH", help="size of the images")]
+Sizes = Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")]
+Png = Annotated[Path, arg(metavar="PNG", help="the image to write")]
 SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
@@ -50,7 +50,7 @@ def data_folder(data: Path | None, name: str) -> Path:
 
 
 def preview(names: Scenes = (), out: Png = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
-    """Draw a contact sheet of scenes: the middle frame of each, of 16 rooms unless some are named."""
+    """Draw a contact sheet of scenes, by default of 16 rooms: the middle frame of each."""
     from eval.figures.contact_sheet import contact_sheet
 
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -69,17 +69,16 @@ def dataset(
     halton: Annotated[bool, FlagCreatePairsOff] = False,
     regularise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
-    """Render the clips of a profile that are not there yet, or of a scene of your own.
+    """Render the missing clips of a profile, or of your own scene.
 
     Args:
-        scene: instead of a profile, a scene of your own, as docs/scenes.md describes it. What of its file is not
-            honoured is listed first.
-        reads: render for training only what these denoisers read, or else all networks that can be trained.
-        part: render only the K-th of N disjoint shares, to spread the work over machines.
-        ray: render on the Ray cluster of RAY_ADDRESS, or else on all cores of this machine; every machine must reach
-            the data set's folder under the same path.
-        halton: draw noisy frames from a cycle of 16 Halton points with a shift of each pixel (SVGF, RAE).
-        regularise: blur glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
+        scene: your own scene instead of a profile (docs/scenes.md). Unsupported features of its file are listed first.
+        reads: store in training clips only what these denoisers read; by default all networks that can be trained.
+        part: render only the K-th of N disjoint shares, to distribute the work.
+        ray: render on the Ray cluster at RAY_ADDRESS, or on all cores of this machine; every machine must see the
+            dataset's folder under the same path.
+        halton: sample noisy frames from 16 Halton points with a per-pixel shift (SVGF, RAE).
+        regularise: roughen glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
     """
     from models.registry import channels_read
     from render.clip import Options
@@ -115,17 +114,16 @@ def train(
     from_: Annotated[str | None, arg(name="from", metavar="weights|FILE")] = None,
     specialise: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
-    """Train wskp6, in other budgets than quick rae and ntd-mean too, or the networks named; or go on with that.
+    """Train networks, or resume: by default wskp6, and in budgets other than quick also rae and ntd-mean.
 
-    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. A batch is shared by all processes,
-    so the steps stay the same.
+    On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. Every batch is shared by all
+    processes, so the steps are the same.
 
     Args:
         precision: by default the fastest on this machine.
-        micro_batch: sequences or crops of a batch in memory together, to train in less: their gradients accumulate.
-        from_: weights of the same network to begin with, "weights" for the shipped ones, to fit them to the scenes of
-            this data set; what comes out takes another --runs.
-        specialise: leave out of the network's inputs what does not vary in this data set, such as a white albedo.
+        micro_batch: process this many sequences or crops of a batch at a time, to save memory (gradient accumulation).
+        from_: fine-tune these weights of the same network, "weights" meaning the shipped ones; use another --runs.
+        specialise: remove network inputs that are constant in this dataset, such as a white albedo.
     """
     from train.loop import train_network
     from train.recipes import trained_by_default
@@ -139,16 +137,17 @@ def train(
 
 def evaluate(
     names: Denoisers = (),
-    data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="data sets; by default data/BUDGET")] = (),
+    data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="datasets; by default data/BUDGET")] = (),
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
-    processes: Annotated[int, arg(metavar="N", help="at most so many clips side by side")] = os.cpu_count() or 1,
+    processes: Annotated[int, arg(metavar="N", help="evaluate at most this many clips in parallel")] = os.cpu_count()
+    or 1,
     device: Device = "cpu",
 ) -> None:
-    """Judge all denoisers that can run, or those named, on the test clips: table, pictures, results.json.
+    """Evaluate denoisers on the test clips, by default all that can run: table, images, results.json.
 
-    Networks have the weights that are shipped (`onespp weights`), and beside them, as NETWORK@BUDGET, those trained in
-    this budget; or else those alone. What has been judged before, of the same clips, weights and code, is kept.
+    Networks use their shipped weights (`onespp weights`) and, as NETWORK@BUDGET, those trained in this budget. Earlier
+    results of the same clips, weights and code are kept.
     """
     from eval.harness import evaluate as evaluate_on
 
@@ -157,9 +156,9 @@ def evaluate(
 
 def report(
     runs: Runs = Path("runs"),
-    megabytes: Annotated[float, arg(help="of pictures; where not all frames fit, every n-th is shown")] = 24,
+    megabytes: Annotated[float, arg(help="size of all images; where not all frames fit, every n-th is shown")] = 24,
 ) -> None:
-    """Make one page of all results, RUNS/report/index.html, which needs no network; and an animation of each clip."""
+    """Write a self-contained page of all results, RUNS/report/index.html, and an animation of each clip."""
     from eval.report.page import report as make_report
 
     page, *animations = make_report(runs, megabytes)
@@ -169,11 +168,11 @@ def report(
 
 
 def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metavar="PNG")] = None) -> None:
-    """Print what is in a data set: clips, how hard they are, channels, sizes, noise floors, times.
+    """Print the contents of a dataset: clips, their difficulty, channels, sizes, noise floors, render times.
 
     Args:
-        data: the data set.
-        plot: draw a histogram of how hard the clips are as well.
+        data: the dataset.
+        plot: also draw a histogram of the clips' difficulty.
     """
     from datasets.info import summarise
 
@@ -181,10 +180,10 @@ def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metav
 
 
 def verify(data: Path = Path("data/quick")) -> None:
-    """Check every file of a data set against its checksum and shape, and name what is damaged.
+    """Check every file of a dataset against its checksum and shape.
 
     Args:
-        data: the data set.
+        data: the dataset.
     """
     from datasets.verify import find_problems
 
@@ -197,15 +196,17 @@ def verify(data: Path = Path("data/quick")) -> None:
 
 
 def exr(
-    source: Annotated[Path, Positional, arg(metavar="CLIP|DATA", help="the folder of a clip; for oidn of a data set")],
+    source: Annotated[
+        Path, Positional, arg(metavar="CLIP|DATA", help="the folder of a clip, or for oidn of a dataset")
+    ],
     out: Annotated[Path, Positional, arg(metavar="OUT", help="the folder to write")],
     layout: Literal["frames", "oidn"] = "frames",
 ) -> None:
-    """Write OpenEXR files: a multi-layer file a frame of a clip, or a data set for OIDN's training; or go on with that.
+    """Write OpenEXR files, or resume: a multi-layer file per frame of a clip, or a dataset for OIDN's training toolkit.
 
     Args:
-        layout: "frames" takes a clip, such as data/quick/test/cornell_box/000; "oidn" takes a data set, whose splits
-            become OUT/train, OUT/valid and OUT/test for the preprocess.py of Intel Open Image Denoise.
+        layout: "frames" takes a clip, such as data/quick/test/cornell_box/000; "oidn" takes a dataset and
+            writes OUT/train, OUT/valid and OUT/test for the preprocess.py of Intel Open Image Denoise.
     """
     from datasets.exr import export_clip
     from datasets.oidn_layout import export_dataset
@@ -223,9 +224,9 @@ def show(
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
 ) -> None:
-    """Draw a clip as all denoisers that can run show it, or those named.
+    """Draw a clip as denoised by those named, or by all that can run.
 
-    A contact sheet with errors, difference maps, and what each denoiser carries from frame to frame.
+    A contact sheet with errors, difference maps, and each denoiser's state.
     """
     from eval.figures.show import show as draw
 
@@ -233,15 +234,15 @@ def show(
         print(path)
 
 
-def figure_triptych(
+def study_triptych(
     scene: Annotated[str, Positional, arg(metavar="SCENE", help="a built-in one")] = "room-2014",
     denoiser: Annotated[str, arg(metavar="NAME")] = "one",
     out: Png = Path("runs/triptych.png"),
     runs: Runs = Path("runs"),
-    frame: Annotated[int, arg(metavar="N", help="of the flight, which history leads to")] = 12,
-    spp: Annotated[int, arg(metavar="N", help="samples a pixel of the reference")] = 512,
+    frame: Annotated[int, arg(metavar="N", help="frame number; history begins at 0")] = 12,
+    spp: Annotated[int, arg(metavar="N", help="samples per pixel of the reference")] = 512,
 ) -> None:
-    """Draw a frame of 1280 x 720 in three strips: one sample a pixel, denoised, and the reference. Minutes."""
+    """Draw a 1280 x 720 frame in three strips: noisy, denoised, reference. Takes minutes."""
     from eval.studies.triptych import triptych
 
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -250,17 +251,19 @@ def figure_triptych(
 
 
 def export(
-    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6; trained here: wskp6@BUDGET")],
+    name: Annotated[
+        str, Positional, arg(metavar="DENOISER", help="wskp3, wskp6 or one; NAME@BUDGET for weights in RUNS")
+    ],
     to: Literal["onnx", "pt2"] = "onnx",
     out: Annotated[Path | None, arg(metavar="DIR", help="by default RUNS/export/DENOISER-TO")] = None,
     runs: Runs = Path("runs"),
-    weights: Annotated[Path | None, arg(metavar="FILE", help="by default those shipped")] = None,
+    weights: Annotated[Path | None, arg(metavar="FILE", help="by default the shipped ones")] = None,
     precision: Annotated[Literal["float32", "float16"], arg(help="of the network")] = "float32",
     warp: Annotated[
-        Literal["inside", "outside"], arg(help="whether the file moves its history along with the surfaces itself")
+        Literal["inside", "outside"], arg(help="whether the file reprojects its history itself")
     ] = "inside",
 ) -> None:
-    """Write a trained denoiser as one file for engines, with a manifest, golden frames and a page on how to call it."""
+    """Write a trained denoiser as one ONNX or pt2 file, with a manifest, golden frames and calling instructions."""
     from eval.export import export as write
 
     print(write(name, to, runs, weights, precision, warp, out))
@@ -270,9 +273,9 @@ def bench_export(
     name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")] = "wskp6",
     runs: Runs = Path("runs"),
     size: Size = "1280x720",
-    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+    threads: Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")] = None,
 ) -> None:
-    """An exported denoiser under onnxruntime, next to ours."""
+    """Time an exported denoiser under onnxruntime beside ours."""
     from eval.bench.export import bench_export as bench
 
     print(bench(runs, name, size, threads))
@@ -282,45 +285,46 @@ def bench_denoisers(
     names: Denoisers = (),
     runs: Runs = Path("runs"),
     size: Sizes = ("1280x720",),
-    threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default 1, and all of PyTorch's")] = (),
+    threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default 1, and as many as PyTorch uses")] = (),
 ) -> None:
-    """Milliseconds and memory of a frame, next to OIDN, of all denoisers or those named."""
+    """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers."""
     from eval.bench.denoisers import bench_denoisers as bench
 
     print(bench(runs, names, size, threads))
 
 
 def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
-    """Samples a second and seconds to a noise floor of 40 dB, next to stock Mitsuba, of eight scenes or those named."""
+    """Measure samples per second and seconds to 40 dB beside stock Mitsuba, by default in eight scenes."""
     from eval.bench.rendering import bench_rendering as bench
 
     print(bench(runs, names))
 
 
-def bench_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
-    """How soon a change of light shows: quality frame by frame after a lamp is switched or moved, next to still light.
+def study_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
+    """How many frames the output lags after a light changes, by its quality under steady light.
 
-    Renders four clips of the Cornell box, a minute or a few; table, plot, results.json.
+    Renders four clips of the Cornell box in a few minutes; table, plot and results.json in RUNS/study/light.
     """
-    from eval.studies.light import bench_light as bench
+    from eval.studies.light import study_light as study
 
-    print(bench(runs, names, budget))
+    print(study(runs, names, budget))
 
 
-def bench_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
-    """Whether the error that halves of the samples tell is the true one, and whether more are asked for than needed.
+def study_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
+    """How close estimated errors and predicted sample counts are to the true ones.
 
-    Renders four clips, ten minutes or so, and filters them at 4 to 128 samples a pixel; table, plots, results.json.
+    Renders four clips in about ten minutes and filters them at 4 to 128 spp; table, plots and results.json in
+    RUNS/study/error.
     """
-    from eval.studies.error import bench_error as bench
+    from eval.studies.error import study_error as study
 
-    print(bench(runs, names))
+    print(study(runs, names))
 
 
 def bench_training(
     names: Denoisers = (), data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick"
 ) -> None:
-    """Milliseconds of a training step and where they go, of rae, wskp6 and ntd or the networks named."""
+    """Measure where the time of a training step goes, by default of rae, wskp6 and ntd."""
     from eval.bench.training import bench_training as bench
 
     print(bench(data_folder(data, budget), runs, budget, names))
@@ -330,17 +334,17 @@ def stress(
     names: Denoisers = (),
     runs: Runs = Path("runs"),
     budget: Budget = "quick",
-    long: Annotated[bool, FlagCreatePairsOff, arg(help="play sequences of 10 000 frames as well (minutes)")] = False,
-    precision: Annotated[Literal["float32", "bfloat16", "float16"], arg(help="of networks, in all cases")] = "float32",
+    long: Annotated[bool, FlagCreatePairsOff, arg(help="also run sequences of 10 000 frames (minutes)")] = False,
+    precision: Annotated[Literal["float32", "bfloat16", "float16"], arg(help="of networks")] = "float32",
 ) -> None:
-    """Put all denoisers that can run, or those named, to the extremes: tables, results.json, a picture.
+    """Run denoisers on extreme input, by default all that can run: tables, results.json, a heat map.
 
-    Networks have their shipped weights, or else those trained in this budget, or else fresh ones. Exits with 1 if a
+    Networks use their shipped weights, else those trained in this budget, else random ones. Exits with 1 if a
     requirement is broken.
     """
-    from eval.stress.run import stress as put_to_the_extremes
+    from eval.stress.run import stress as run_stress
 
-    if not put_to_the_extremes(runs, names, budget, long, precision):
+    if not run_stress(runs, names, budget, long, precision):
         sys.exit(1)
 
 
@@ -351,16 +355,15 @@ def trade(
     budget: Budget = "quick",
     size: Annotated[str, arg(metavar="WxH", help="of the images that were timed")] = "1280x720",
     threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
-    spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples a pixel to feed, rising")] = SAMPLES,
+    spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = SAMPLES,
 ) -> None:
-    """Weigh quality against milliseconds: denoisers, precisions, sizes of networks, samples a pixel.
+    """Compare quality with milliseconds, by denoiser, precision and samples per pixel: tables, plots, trade.json.
 
-    Judges all denoisers that can run, or those named, on the test clips: tables, plots, RUNS/report/trade.json. Times
-    are those that `onespp bench denoisers` has measured.
+    Evaluates denoisers on the test clips, by default all that can run. Run `onespp bench denoisers` first for times.
     """
-    from eval.tradeoff.run import trade as weigh
+    from eval.tradeoff.run import trade as compare
 
-    print(weigh(data_folder(data, budget), runs, budget, names, size, threads, spp))
+    print(compare(data_folder(data, budget), runs, budget, names, size, threads, spp))
 
 
 Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
@@ -368,43 +371,41 @@ Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
 
 def denoise(
     frames: Annotated[
-        Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, often with all layers")
+        Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, usually with all layers")
     ] = (),
-    denoiser: Annotated[str, arg(metavar="DENOISER", help="of networks trained here NETWORK@BUDGET")] = "one",
-    out: Annotated[Path, arg(metavar="DIR", help="where denoised frames go, under their own names")] = Path("denoised"),
-    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default those shipped")] = None,
+    denoiser: Annotated[str, arg(metavar="DENOISER", help="NETWORK@BUDGET for weights in RUNS")] = "one",
+    out: Annotated[Path, arg(metavar="DIR", help="output folder; frames keep their names")] = Path("denoised"),
+    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default the shipped ones")] = None,
     runs: Runs = Path("runs"),
-    hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="the same as the colour's files")] = (),
-    half: Annotated[Patterns, arg(metavar="PATTERN...", help="the frames by as many other samples, for NAME+js")] = (),
-    alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in files of its own")] = (),
-    nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in files of their own")] = (),
-    mv: Annotated[Patterns, arg(metavar="PATTERN...", help="motion vectors in files of their own")] = (),
-    depth: Annotated[Patterns, arg(metavar="PATTERN...", help="depth in files of its own")] = (),
+    hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="another name for the colour's files")] = (),
+    half: Annotated[Patterns, arg(metavar="PATTERN...", help="sample buffer B of the same frames, for NAME+js")] = (),
+    alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in separate files")] = (),
+    nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in separate files")] = (),
+    mv: Annotated[Patterns, arg(metavar="PATTERN...", help="motion vectors in separate files")] = (),
+    depth: Annotated[Patterns, arg(metavar="PATTERN...", help="depth in separate files")] = (),
     layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...")] = (),
     motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT")] = None,
-    ref: Annotated[Patterns, arg(metavar="PATTERN...", aliases=["-r"], help="references to measure against")] = (),
-    frame_range: Annotated[
-        str | None, arg(name="frames", metavar="A-B", help="the numbers of those to denoise")
-    ] = None,
-    reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frames after a cut: no history leads there")] = (),
-    quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="OIDN's")] = None,
-    stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as they were")] = None,
+    ref: Annotated[Patterns, arg(metavar="PATTERN...", aliases=["-r"], help="references to compare with")] = (),
+    frame_range: Annotated[str | None, arg(name="frames", metavar="A-B", help="frame numbers to denoise")] = None,
+    reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frame numbers at which history is reset")] = (),
+    quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="of OIDN")] = None,
+    stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as in the input")] = None,
     png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
-    spp: Annotated[float, arg(metavar="N", help="samples a pixel of the frames, of each --half")] = 1.0,
+    spp: Annotated[float, arg(metavar="N", help="samples per pixel of the frames, of each buffer")] = 1.0,
     error: Annotated[bool, FlagCreatePairsOff] = False,
     until: Annotated[float | None, arg(metavar="E")] = None,
-    threads: Annotated[int | None, arg(metavar="N", help="by default all of PyTorch's")] = None,
+    threads: Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")] = None,
 ) -> None:
-    """Denoise a sequence of OpenEXR files from any renderer, or go on with it.
+    """Denoise OpenEXR sequences of any renderer, or resume.
 
-    Layers are found by the names in use; what motion vectors mean is found out. All of it is printed at the start.
+    Layers are recognised by common names, the motion vectors' convention by trial; both are printed first.
 
     Args:
-        layers: say yourself what is where, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
-        motion: say yourself what motion vectors mean, such as XY,+x,-y,pixels, in the words that are printed.
-        error: add the layer `error` to each frame: how far pixels are from the truth, by NAME+js and halves, which take
+        layers: name layers yourself, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
+        motion: the motion vectors' convention, such as XY,+x,-y,pixels, in the notation that is printed.
+        error: add the layer `error`, an estimate of each pixel's error; needs NAME+js and two sample buffers, and takes
             three passes instead of one.
-        until: tell which frames have a relative error of at most E, such as 0.02, and how many samples the others take.
+        until: print which frames have a relative error of at most E, such as 0.02, and how many samples others need.
     """
     from denoise.run import Job
     from denoise.run import denoise as denoise_sequence
@@ -425,14 +426,13 @@ def denoise(
 
 
 def weights(
-    name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="whose card to show")] = None,
+    name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="show the card of this network")] = None,
     card: Annotated[Path | None, arg(metavar="RUNS")] = None,
 ) -> None:
-    """List the networks whose trained weights are shipped, which is all that they need; or show the card of one.
+    """List the networks with shipped weights, or show the card of one.
 
     Args:
-        card: write the facts of its card anew, or of all cards: those of its weights, and what `onespp eval` has left
-            in RUNS.
+        card: rewrite the measurements and facts of the card, or of all cards, from the weights and RUNS/eval.
     """
     from eval.shipped import card_file, measure_card, table
     from models.shipped_weights import shipped_names
@@ -448,14 +448,14 @@ Command = Callable[..., None]
 Commands = dict[str, "Command | Commands"]
 
 GROUPS: dict[str, Commands] = {
-    "A first day": {
+    "Pipeline": {
         "preview": preview,
         "dataset": dataset,
         "train": train,
         "eval": evaluate,
         "report": report,
     },
-    "Data sets": {
+    "Datasets": {
         "info": info,
         "verify": verify,
         "exr": exr,
@@ -463,34 +463,26 @@ GROUPS: dict[str, Commands] = {
     "Your own frames": {
         "denoise": denoise,
         "weights": weights,
-    },
-    "A closer look": {
-        "show": show,
-        "figure": {
-            "triptych": figure_triptych,
-        },
-    },
-    "Elsewhere": {
         "export": export,
     },
-    "What it costs, what it stands": {
-        "bench": {
-            "denoisers": bench_denoisers,
-            "export": bench_export,
-            "rendering": bench_rendering,
-            "light": bench_light,
-            "error": bench_error,
-            "training": bench_training,
-        },
+    "Comparisons": {
+        "show": show,
         "trade": trade,
         "stress": stress,
+        "bench": {
+            "denoisers": bench_denoisers,
+            "rendering": bench_rendering,
+            "training": bench_training,
+            "export": bench_export,
+        },
     },
 }
+STUDIES: Commands = {"light": study_light, "error": study_error, "triptych": study_triptych}
 TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
-    "figure": "Draw a figure of the papers or of the docs: variance, unbiased, triptych.",
-    "bench": "Measure this machine: denoisers, scaling, fusion, export, rendering, light, error, loading, training.",
+    "bench": "Measure this machine: denoisers, rendering, training, export.",
+    "study": "Repeat a study that the documentation cites: light, error, triptych.",
 }
 
 
@@ -518,6 +510,8 @@ def run(words: list[str]) -> None:
     groups = GROUPS
     while True:
         commands = {name: command for group in groups.values() for name, command in group.items()}
+        if path == "onespp":
+            commands["study"] = STUDIES
         if not words or words[0] in ("-h", "--help"):
             print("\n".join(overview(path, groups)))
             return
@@ -546,6 +540,8 @@ def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
             yield from (f"{'':<{MARGIN}}{line}" for line in rest)
         yield ""
     yield f"`{path} COMMAND --help` shows the options of each."
+    if path == "onespp":
+        yield "`onespp study --help` lists the studies that the documentation cites."
 
 
 def complain(message: str) -> int:

@@ -40,10 +40,10 @@ def test_every_command_has_help_under_its_own_name(capsys, words):
     assert shown.startswith(f"usage: onespp {' '.join(words)}")
 
 
-def test_help_begins_with_a_first_day(capsys):
+def test_help_begins_with_the_pipeline(capsys):
     shown = help_of(capsys)
     places = [shown.index(f"\n  {name} ") for name in ("preview", "dataset", "train", "eval", "report")]
-    assert places == sorted(places) and places[-1] < shown.index("Data sets")
+    assert places == sorted(places) and places[-1] < shown.index("Datasets")
     assert all(f"\n  {name} " in shown for group in GROUPS.values() for name in group)
     assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "rendering", "training"))
 
@@ -61,7 +61,7 @@ def test_a_bench_refuses_what_it_does_not_honour(capsys):
 
 def test_unknown_commands(capsys):
     assert "unknown command 'onespp fly'" in fails(capsys, "fly")
-    assert "denoisers, scaling" in fails(capsys, "bench", "everything")
+    assert "denoisers, rendering" in fails(capsys, "bench", "everything")
 
 
 def test_unknown_names(capsys, tiny, tmp_path):

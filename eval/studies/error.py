@@ -1,4 +1,4 @@
-"""`onespp bench error`: whether the error that halves of the samples tell is the true one."""
+"""`onespp study error`: how close estimated errors are to true ones."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +17,6 @@ from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from datasets.tonemap import display
 from errors import BadInput
-from eval.bench.output import bench_folder
 from eval.selection import cannot_run, choose, weights_of
 from eval.studies.own_clips import SEED, own_clip
 from files import write_file, write_json
@@ -203,12 +202,12 @@ def tellers(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
 
 
 @torch.inference_mode()
-def bench_error(runs: Path, names: Sequence[str]) -> str:
-    """Judge the named denoisers' errors: RUNS/bench/error gets clips, table.md, calibration.png, map.png, results.json.
+def study_error(runs: Path, names: Sequence[str]) -> str:
+    """Judge the named denoisers' errors: RUNS/study/error gets clips, table.md, calibration.png, map.png, results.json.
 
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
-    folder = bench_folder(runs) / "error"
+    folder = runs / "study" / "error"
     denoisers = tellers(names, runs)
     clips = [clip_of(scene, folder) for scene in tqdm(SCENES, "clips", unit="clip")]
     rows: list[Told] = []

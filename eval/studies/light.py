@@ -1,4 +1,4 @@
-"""`onespp bench light`: how soon a denoiser shows a change of light, by its quality in light that never changed."""
+"""`onespp study light`: how many frames a denoiser lags after a light changes."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,7 +13,6 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display, psnr
-from eval.bench.output import bench_folder
 from eval.selection import evaluated
 from eval.studies.own_clips import SEED, own_clip
 from files import write_file, write_json
@@ -126,13 +125,13 @@ def lag_figure(lags: Sequence[Lag]) -> Figure:
     return figure
 
 
-def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
-    """Judge the named denoisers, or all that can run: RUNS/bench/light gets clips, table.md, plot.png, results.json.
+def study_light(runs: Path, names: Sequence[str], budget: str) -> str:
+    """Judge the named denoisers, or all that can run: RUNS/study/light gets clips, table.md, plot.png, results.json.
 
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     specs = evaluated(names, runs, budget)
-    folder = bench_folder(runs) / "light"
+    folder = runs / "study" / "light"
     clips = {change: clip_of(change, folder) for change in BEFORE}
     lags = [lag_of(spec, clips) for spec in tqdm(specs, "denoisers", unit="denoiser")]
     save_figure(folder / "plot.png", lag_figure(lags))

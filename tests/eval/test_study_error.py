@@ -5,7 +5,7 @@ import pytest
 
 from errors import BadInput
 from eval.studies import error
-from eval.studies.error import Told, bench_error, in_band, table_of
+from eval.studies.error import Told, in_band, study_error, table_of
 from files import read_json
 from render.clip import Sampling
 
@@ -25,7 +25,7 @@ def test_blocks_in_the_band_are_counted():
 
 def test_who_does_not_tell_its_error_is_refused(tmp_path):
     with pytest.raises(BadInput, match=r"svgf\+js does"):
-        bench_error(tmp_path, ("svgf",))
+        study_error(tmp_path, ("svgf",))
 
 
 def test_of_many_samples_the_error_is_told_truly(tmp_path, monkeypatch):
@@ -35,8 +35,8 @@ def test_of_many_samples_the_error_is_told_truly(tmp_path, monkeypatch):
     monkeypatch.setattr(error, "SIZE", (2, 32, 32))
     monkeypatch.setattr(error, "BLOCK", 16)
     monkeypatch.setattr(error, "SAMPLING", Sampling(realisations=16, noisy_spp=8, reference_spp=512))
-    bench_error(tmp_path, ("svgf+js",))
-    folder = tmp_path / "bench" / "error"
+    study_error(tmp_path, ("svgf+js",))
+    folder = tmp_path / "study" / "error"
     assert (folder / "calibration.png").exists() and (folder / "map.png").exists()
     rows = read_json(folder / "results.json")["rows"]
     assert [told["spp"] for told in rows] == [128, 64, 16]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval.studies import light
-from eval.studies.light import AFTER, BEFORE, CHANGE, STILL, bench_light, changed
+from eval.studies.light import AFTER, BEFORE, CHANGE, STILL, changed, study_light
 from files import read_json
 from render.clip import Sampling
 
@@ -27,9 +27,9 @@ def test_all_scenes_end_in_the_same_light(change):
 def test_what_has_no_memory_is_never_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(light, "SIZE", (light.SIZE[0], 24, 32))
     monkeypatch.setattr(light, "SAMPLING", Sampling(realisations=1, noisy_spp=1, reference_spp=8))
-    table = bench_light(tmp_path, ("noisy", "accumulated"), "quick")
-    assert "behind, 8 after" in table and (tmp_path / "bench" / "light" / "plot.png").exists()
-    rows = {row["denoiser"]: row["psnr"] for row in read_json(tmp_path / "bench" / "light" / "results.json")["rows"]}
+    table = study_light(tmp_path, ("noisy", "accumulated"), "quick")
+    assert "behind, 8 after" in table and (tmp_path / "study" / "light" / "plot.png").exists()
+    rows = {row["denoiser"]: row["psnr"] for row in read_json(tmp_path / "study" / "light" / "results.json")["rows"]}
     for change in BEFORE:
         assert rows["noisy"][change][CHANGE:] == rows["noisy"][STILL][CHANGE:]
         if change != STILL:
