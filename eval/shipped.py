@@ -1,4 +1,4 @@
-"""`onespp weights`: which networks have their weights shipped, and a card of each, whose facts follow from files."""
+"""`onespp weights`: the networks whose weights are shipped, and a model card of each, generated from its files."""
 
 import json
 from collections.abc import Sequence
@@ -19,23 +19,23 @@ from models.weights import read_metadata
 from provenance import file_digest
 
 LICENCE = "Apache-2.0"  # that of onespp
-BESIDE = ("noisy", "accumulated", "svgf", "oidn")  # denoisers that cards show beside the network
+BASELINES = ("noisy", "accumulated", "svgf", "oidn")  # on every card, beside its network
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
-LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # by cards, from the recipe
+LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
 
 FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
 - Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
   version {generator}, {scenes} scenes){start}.
-  Kept from step {step}, where the loss on the validation clips was least: {validation:.4g}.
+  Weights of step {step}, which had the lowest validation loss: {validation:.4g}.
 - Recipe: `{recipe}`.
-- Made by {makers}.
+- Trained with {makers}.
 
-Means over the {count} test clips of 1 spp of `{dataset}`, {signal} light, in {precision} ({device}; {versions}):
+Means over the {count} test clips at 1 spp of `{dataset}`, {signal} radiance, in {precision} ({device}; {versions}):
 
 {means}
 
-{metric} clip by clip:
+{metric} per clip:
 
 {clips}
 
@@ -43,12 +43,12 @@ Means over the {count} test clips of 1 spp of `{dataset}`, {signal} light, in {p
 
 
 def table() -> str:
-    """A line for each of the networks."""
+    """All networks with shipped weights as a text table."""
     return tabulate([line(name) for name in shipped_names()], "keys", disable_numparse=True)
 
 
 def line(name: str) -> dict[str, Any]:
-    """What the table says of a network."""
+    """The table's row of a network, by column title."""
     path = require_shipped(name)
     recipe = read_metadata(path)["recipe"]
     data = recipe["data"]
@@ -66,44 +66,41 @@ def line(name: str) -> dict[str, Any]:
 
 
 def card_file(name: str) -> Path:
-    """Where the card of a network is. Raises BadInput where its weights are not shipped."""
+    """The path of a network's card. Raises BadInput where its weights are not shipped."""
     return require_shipped(name).with_suffix(".md")
 
 
 def measured_file(name: str) -> Path:
-    """The measurements that a card shows, as JSON beside it. Raises BadInput where its weights are not shipped."""
+    """The path of the measurements that its card shows. Raises BadInput where its weights are not shipped."""
     return require_shipped(name).with_suffix(".json")
 
 
 def measure_card(name: str, runs: Path) -> Path:
-    """Write the card of a network anew from its weights and from RUNS/eval. Returns the card's path.
+    """Extract a network's measurements from RUNS/eval to JSON and regenerate its card. Returns the card's path.
 
-    Raises BadInput where there is no card yet, and where the network was not evaluated with these weights.
+    Raises BadInput if there is no card yet, or if RUNS/eval has no results of these weights.
     """
     write_json(measured_file(name), measurements(name, runs))
     return write_card(name)
 
 
 def write_card(name: str) -> Path:
-    """Write the facts of a card anew from its weights and measurements; the text around them stays. Returns its path.
-
-    Raises BadInput where there is no card yet.
-    """
+    """Regenerate what stands between a card's markers. Returns its path. Raises BadInput if there is no card yet."""
     path = card_file(name)
     text = path.read_text() if path.exists() else ""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise BadInput(
-            f"{path}: write what the network is for and where it is weak, with the lines '{BEGIN}' and '{END}' where "
-            "its facts are to stand"
+            f"{path}: write the network's intended use and limitations, with the lines '{BEGIN}' and '{END}' where "
+            "its facts belong"
         )
     write_file(path, f"{before}{begin}\n{facts(name)}\n{end}{after}".encode())
     return path
 
 
 def measurements(name: str, runs: Path) -> dict[str, Any]:
-    """What a card shows of RUNS/eval, see `evaluated_clips`: tables as lists of rows of text."""
+    """The measurements of RUNS/eval that a card shows, see `evaluated_clips`: tables are lists of rows of text."""
     results, clips = evaluated_clips(name, runs)
     alike = of_one_spp(clips)
     return {
@@ -112,14 +109,14 @@ def measurements(name: str, runs: Path) -> dict[str, Any]:
         "signal": clips[0].signal,
         "precision": results_of(clips, name)[0].precision,
         "device": results["device"],
-        "versions": in_words(results["versions"]),
+        "versions": version_list(results["versions"]),
         "means": means_rows(alike),
         "psnr": psnr_rows(clips),
     }
 
 
 def facts(name: str) -> str:
-    """The part of a card that follows from files, as Markdown."""
+    """The generated part of a card as Markdown."""
     weights = require_shipped(name)
     measured = read_json(measured_file(name))
     metadata = read_metadata(weights)
@@ -137,11 +134,13 @@ def facts(name: str) -> str:
         data_seed=data["seed"],
         generator=data["generator"],
         scenes=len(data["scenes"]),
-        start=f", begun with weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
+        start=f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
         step=recipe["step"],
         validation=recipe["validation"],
         recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
-        makers=" and ".join(f"{in_words(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]),
+        makers=" and ".join(
+            f"{version_list(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]
+        ),
         count=measured["clips"],
         dataset="`, `".join(measured["datasets"]),
         signal=measured["signal"],
@@ -155,14 +154,14 @@ def facts(name: str) -> str:
     )
 
 
-def in_words(versions: dict[str, str]) -> str:
+def version_list(versions: dict[str, str]) -> str:
     return ", ".join(f"{package} {version}" for package, version in versions.items())
 
 
 def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """The content of RUNS/eval/results.json, and the results of the network beside those of BESIDE.
+    """The content of RUNS/eval/results.json, and of it the clips of the network, with its results and the BASELINES'.
 
-    Raises BadInput where the shipped weights, as they are, have not been judged.
+    Raises BadInput unless the network was evaluated with the shipped weights as they are now.
     """
     weights = require_shipped(name)
     path = runs / "eval" / RESULTS_FILE
@@ -170,14 +169,14 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     found = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
     if not of_one_spp(found) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
-        command = f"onespp eval {' '.join((*BESIDE, name))} --runs {runs}"
-        raise BadInput(f"{path} has nothing of {weights} as it is now, on clips of 1 spp: run `{command}`")
-    wanted = (*BESIDE, name)
+        command = f"onespp eval {' '.join((*BASELINES, name))} --runs {runs}"
+        raise BadInput(f"{path} has no results of {weights} as it is now, on clips at 1 spp: run `{command}`")
+    wanted = (*BASELINES, name)
     return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in found]
 
 
 def means_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
-    """Means of all denoisers over the clips, and of the noise floors."""
+    """Means over the clips, a row per denoiser, and one of the noise floors."""
     titles = {metric: METRICS[metric].title for metric in PRINTED}
     return [
         {"denoiser": row.denoiser} | {title: row.text(metric) for metric, title in titles.items()}
@@ -186,7 +185,7 @@ def means_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
 
 
 def psnr_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
-    """PSNR of all denoisers, a row a clip."""
+    """PSNR of all denoisers, a row per clip."""
     lines = []
     for clip in clips:
         floor = clip.reference.metrics["psnr"]

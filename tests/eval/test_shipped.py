@@ -1,4 +1,4 @@
-"""`onespp weights`: the table, and cards whose facts are written anew around what a person wrote."""
+"""`onespp weights`: the table, and cards, regenerated between their markers."""
 
 import os
 import shutil
@@ -10,9 +10,10 @@ from command_line import main
 from errors import BadInput
 from eval.harness import evaluate
 from eval.results import read_results
-from eval.shipped import BEGIN, END, measure_card, table
+from eval.shipped import BEGIN, END, card_file, facts, measure_card, table
 from files import read_json, write_json
 from models.registry import create
+from models.shipped_weights import shipped_names
 from models.weights import save_weights
 from provenance import file_digest
 from tests.test_cli import fails
@@ -28,7 +29,7 @@ RECIPE = {
     "validation": 0.123456,
 }
 MADE_BY = [{"versions": {"torch": "1.2.3"}, "code": "c0de"}, {"versions": {"torch": "1.2.4"}, "code": "c0d3"}]
-HAND = f"# wskp3\n\nBy hand.\n\n{BEGIN}\nold\n{END}\n\n## Where it is weak\n\nBy hand, too.\n"
+HAND = f"# wskp3\n\nBy hand.\n\n{BEGIN}\nold\n{END}\n\n## Limitations\n\nBy hand, too.\n"
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def test_no_card_of_what_is_not_shipped(shipped, capsys):
 def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
     evaluate([tiny], tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
     card = wskp3.with_suffix(".md")
-    with pytest.raises(BadInput, match=r"wskp3.md: write what the network is for.*the lines"):
+    with pytest.raises(BadInput, match=r"wskp3.md: write the network's intended use.*the lines"):
         measure_card("wskp3", tmp_path)
     card.write_text(HAND)
     assert measure_card("wskp3", tmp_path) == card
@@ -68,11 +69,11 @@ def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
         "1234 parameters",
         file_digest(wskp3),
         "`onespp train wskp3 --budget tiny --seed 3` on the data set `my.toml` (seed 4, ",
-        "generator version 5, 2 scenes). Kept",
-        "from step 78, where the loss on the validation clips was least: 0.1235",
+        "generator version 5, 2 scenes). Weights",
+        "of step 78, which had the lowest validation loss: 0.1235",
         '`{"loss": {"epsilon": 0.01}, "epochs": 6}`',
         "torch 1.2.3, code c0de and torch 1.2.4, code c0d3",
-        "2 test clips of 1 spp of `tiny`, total light",
+        "2 test clips at 1 spp of `tiny`, total radiance",
     ):
         assert fact in words, fact
     rows = {
@@ -97,6 +98,12 @@ def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
     assert capsys.readouterr().out == text
 
 
+@pytest.mark.parametrize("name", shipped_names())
+def test_cards_are_generated_from_weights_and_measurements(name):
+    card = card_file(name).read_text()
+    assert card.partition(BEGIN)[2].partition(END)[0].strip() == facts(name)
+
+
 def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
     """Not those of a training, and not those that were shipped before."""
     wskp3.with_suffix(".md").write_text(HAND)
@@ -104,17 +111,17 @@ def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
     results = tmp_path / "eval" / "results.json"
     content = read_json(results)
     os.utime(wskp3, (results.stat().st_mtime + 5,) * 2)
-    with pytest.raises(BadInput, match=r"nothing of .*wskp3.safetensors as it is now.*`onespp eval noisy"):
+    with pytest.raises(BadInput, match=r"no results of .*wskp3.safetensors as it is now.*`onespp eval noisy"):
         measure_card("wskp3", tmp_path)
     os.utime(wskp3, (0, 0))
     measure_card("wskp3", tmp_path)
     for row in content["rows"]:
         row["weights"] = row["weights"] and "runs/train/wskp3-quick/weights.safetensors"
     write_json(results, content)
-    with pytest.raises(BadInput, match="nothing of"):
+    with pytest.raises(BadInput, match="no results of"):
         measure_card("wskp3", tmp_path)
     write_json(results, content | {"rows": [row for row in content["rows"] if row["denoiser"] == "noisy"]})
-    with pytest.raises(BadInput, match="nothing of"):
+    with pytest.raises(BadInput, match="no results of"):
         measure_card("wskp3", tmp_path)
     shutil.rmtree(tmp_path / "eval")
     with pytest.raises(BadInput, match="there are no results"):

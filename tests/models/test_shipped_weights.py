@@ -31,7 +31,9 @@ def header(path: Path) -> dict:
 
 def test_they_are_small_and_each_has_a_card():
     assert WEIGHTS and sum(path.stat().st_size for path in FILES) <= TOGETHER
-    assert {path.name for path in FILES} == {path.stem + end for path in WEIGHTS for end in (".safetensors", ".md")}
+    assert {path.name for path in FILES} == {
+        path.stem + end for path in WEIGHTS for end in (".safetensors", ".md", ".json")
+    }
     assert shipped_names() == [name for name in registry.DENOISERS if FOLDER / f"{name}.safetensors" in WEIGHTS]
     assert len(shipped_names()) == len(WEIGHTS)
 
@@ -78,21 +80,21 @@ def test_one_neither_drifts_nor_burns_in():
 
 @pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
 def test_cards_agree_with_the_files(path):
-    found = header(path)
-    facts = found.pop("__metadata__")
-    recipe = json.loads(facts["recipe"])
-    parameters = sum(torch.Size(tensor["shape"]).numel() for tensor in found.values())
+    tensors = header(path)
+    metadata = tensors.pop("__metadata__")
+    recipe = json.loads(metadata["recipe"])
+    parameters = sum(torch.Size(tensor["shape"]).numel() for tensor in tensors.values())
     card = path.with_suffix(".md").read_text()
     words = " ".join(card.split())
-    assert facts["denoiser"] == path.stem and "constants" not in facts
-    assert card.startswith(f"# {path.stem}\n") and "## Where it is weak" in card
+    assert metadata["denoiser"] == path.stem and "constants" not in metadata
+    assert card.startswith(f"# {path.stem}\n") and "## Limitations" in card
     assert f"{parameters} parameters, {path.stat().st_size} bytes" in words
     assert hashlib.sha256(path.read_bytes()).hexdigest() in words
     assert f"`onespp train {path.stem} --budget {recipe['profile']} --seed {recipe['seed']}`" in words
     assert f"generator version {recipe['data']['generator']}, {len(recipe['data']['scenes'])} scenes" in words
-    assert f"from step {recipe['step']}," in words and f"{recipe['validation']:.4g}" in words
-    told = json.loads(card.partition("- Recipe: `")[2].partition("`.\n")[0])
-    assert told.items() <= recipe.items() and {"loss", "rate", "batch", "epochs"} <= told.keys()
+    assert f"of step {recipe['step']}," in words and f"{recipe['validation']:.4g}" in words
+    stated = json.loads(card.partition("- Recipe: `")[2].partition("`.\n")[0])
+    assert stated.items() <= recipe.items() and {"loss", "rate", "batch", "epochs"} <= stated.keys()
     licence = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license"]
     assert f"Licence: {licence}." in words
     for name in ("noisy", "accumulated", path.stem, "(noise floor)"):
