@@ -9,9 +9,7 @@ from eval.results import FLOOR, ClipResults
 
 PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
 NEAR = "≈"
-LEGEND = (
-    f"{NEAR} within the noise floor: as close to the truth as the reference itself, so differences are not significant"
-)
+LEGEND = f"{NEAR} within the noise floor: as close to the truth as the reference; differences are not significant"
 
 
 def value_cell(metric: str, value: float | None, floor: float | None = None) -> str:

@@ -104,7 +104,7 @@ def test_cards_agree_with_the_files(path):
 def test_names_stand_for_their_files(shipped):
     (shipped / "kp.safetensors").write_bytes(b"")
     assert shipped_names() == ["kp"]
-    assert shipped_weights("kp+adaptive+taa") == require_shipped("kp") == shipped / "kp.safetensors"
+    assert shipped_weights("kp") == require_shipped("kp") == shipped / "kp.safetensors"
     assert shipped_weights("svgf") is None and shipped_weights("wskp6-2w") is None
     with pytest.raises(BadInput, match="no weights of 'rae' are shipped; those are kp"):
         require_shipped("rae")
