@@ -1,9 +1,9 @@
-"""What `one` does around its network, for the processor: its inputs and what it says, each in one pass over memory.
+"""The layout of `one`'s network, and its kernels: inputs and head outputs, each in one pass over memory.
 
-Networks take and give pixels with their channels side by side; all other loops here run along lines of one channel.
+Networks take and give pixels with their channels side by side; all other loops here run along rows of one channel.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numba
 import numpy as np
@@ -11,35 +11,104 @@ import torch
 from torch import Tensor, nn
 
 from datasets.frame import Frame
-from models import parameters
+from models.compiled.arrays import Image, Index, Matrix, Plane, Row, Rows, Scalar
 from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
 from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line
 from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
-    from models.networks.one import Evidence
+    from models.networks.one import PixelInputs
 
+LATENT = 6  # channels carried beside images, in [-1, 1]
+FEATURES = 8  # that pixels are compared by
+STEPS = (32, 16, 8, 4, 2, 1)  # px between taps of each filter level: the last ones smooth the first ones' pattern
+MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
+MAX_IRRADIANCE = 1e30  # sums with weights of exp(10) must stay finite
+MAX_LOGIT = 10.0  # of the weights of taps
+SIDE_MULTIPLE = 8  # of the sides of the network's images
+MIN_LENGTH = 1e-3  # samples of a history, to divide by
+
+
+class NetworkInput(NamedTuple):
+    """A row of INPUTS.
+
+    Attributes:
+        transform: "log exposed": log(1 + exposure · irradiance); "per pixel": models.networks.one.per_pixel_inputs;
+            "surface": of the G-buffer.
+        without_history: the input whose irradiance stands in where there is no history.
+    """
+
+    name: str
+    channels: int
+    transform: Literal["log exposed", "per pixel", "surface"]
+    without_history: str | None = None
+
+
+# The inputs of the network, in order. PyTorch, kernel and export all take their order from here.
+INPUTS = (
+    NetworkInput("noisy", 3, "log exposed"),
+    NetworkInput("mean_3x3", 3, "log exposed"),
+    NetworkInput("mean_9x9", 3, "log exposed"),
+    NetworkInput("output", 3, "log exposed", without_history="mean_9x9"),
+    NetworkInput("accumulated", 3, "log exposed", without_history="noisy"),
+    NetworkInput("deviation", 1, "per pixel"),
+    NetworkInput("1/samples", 1, "per pixel"),
+    NetworkInput("1/(length + samples)", 1, "per pixel"),
+    NetworkInput("has_history", 1, "per pixel"),
+    NetworkInput("latent", LATENT, "per pixel"),
+    NetworkInput("albedo", 3, "surface"),
+    NetworkInput("view_normal", 3, "surface"),
+    NetworkInput("depth", 1, "surface"),
+    NetworkInput("roughness", 1, "surface"),
+)
+INPUT_CHANNELS = {row.name: row.channels for row in INPUTS}
+
+
+def first_channels(channels: dict[str, int]) -> dict[str, int]:
+    """Where each of consecutive groups of channels begins."""
+    ends = np.cumsum([*channels.values()])
+    return {name: int(end) - count for end, (name, count) in zip(ends, channels.items(), strict=True)}
+
+
+def head_channels(levels: int) -> dict[str, int]:
+    """The outputs of the network in order, and how many channels each has, for a filter of so many levels."""
+    per_level = {"sharpness": levels, "centre": levels, "importance": levels}
+    return {"features": FEATURES, **per_level, "alpha": 2, "latent": LATENT}
+
+
+def filter_levels(outputs: int) -> int:
+    """How many levels of the filter a network of so many outputs sets."""
+    return (outputs - sum(head_channels(0).values())) // 3
+
+
+# Constants of the kernels, where Numba finds them.
+FIRST = first_channels(INPUT_CHANNELS)
+NOISY, MEAN_3X3, MEAN_9X9 = FIRST["noisy"], FIRST["mean_3x3"], FIRST["mean_9x9"]
+OUTPUT, ACCUMULATED = FIRST["output"], FIRST["accumulated"]
+DEVIATION, NEWEST, OLDEST = FIRST["deviation"], FIRST["1/samples"], FIRST["1/(length + samples)"]
+HAS_HISTORY, LATENT_INPUT = FIRST["has_history"], FIRST["latent"]
+ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = FIRST["albedo"], FIRST["view_normal"], FIRST["depth"], FIRST["roughness"]
 ONE = np.float32(1)
 ZERO = np.float32(0)
 TWO = np.float32(2)
 LEAST_EXPONENT = np.float32(MIN_EXPONENT)
-LARGEST_LOGIT = np.float32(parameters.LARGEST_LOGIT)
-FEWEST_SAMPLES = np.float32(parameters.FEWEST_SAMPLES)
-BRIGHTEST = np.float32(parameters.BRIGHTEST)
+MAX_LOGIT32 = np.float32(MAX_LOGIT)
+MIN_LENGTH32 = np.float32(MIN_LENGTH)
+MAX_EXPOSED32 = np.float32(MAX_EXPOSED)
 CHUNK = 512
 ROOM = CHUNK + 16  # for a line: lines that begin a power of two apart would fall on the same set of the cache
 AT_ONCE = 4  # inputs of a layer that two outputs are summed from in one pass
 
 
-class Layer(NamedTuple):
-    """A linear layer as kernels take it: rows for an even number of outputs, columns for AT_ONCE inputs each."""
+class LinearLayer(NamedTuple):
+    """A linear layer, padded to an even number of outputs and a multiple of AT_ONCE inputs."""
 
-    weight: Any  # (outputs, inputs)
-    bias: Any  # (outputs)
+    weight: Matrix  # (outputs, inputs)
+    bias: Row  # (outputs)
 
     @staticmethod
-    def of(layer: nn.Linear) -> "Layer":
+    def of(layer: nn.Linear) -> "LinearLayer":
         weight = array(layer.weight)
         outputs, inputs = weight.shape
         rows, columns = outputs + outputs % 2, -(-inputs // AT_ONCE) * AT_ONCE
@@ -47,21 +116,22 @@ class Layer(NamedTuple):
         padded[:outputs, :inputs] = weight
         bias = np.zeros(rows, np.float32)
         bias[:outputs] = 0 if layer.bias is None else array(layer.bias)
-        return Layer(padded, bias)
+        return LinearLayer(padded, bias)
 
 
 @jit_inlined_in_any_order
-def add_products(one: Any, other: Any, a: Any, b: Any, c: Any, d: Any, to_one: Any, to_other: Any) -> None:
-    one_a, one_b, one_c, one_d = to_one[0], to_one[1], to_one[2], to_one[3]
-    other_a, other_b, other_c, other_d = to_other[0], to_other[1], to_other[2], to_other[3]
-    for x in range(one.size):
-        one[x] += one_a * a[x] + one_b * b[x] + one_c * c[x] + one_d * d[x]
-        other[x] += other_a * a[x] + other_b * b[x] + other_c * c[x] + other_d * d[x]
+def add_products(first: Row, second: Row, a: Row, b: Row, c: Row, d: Row, w: Row, v: Row) -> None:
+    """Add w · (a, b, c, d) to the first row and v · (a, b, c, d) to the second."""
+    wa, wb, wc, wd = w[0], w[1], w[2], w[3]
+    va, vb, vc, vd = v[0], v[1], v[2], v[3]
+    for x in range(first.size):
+        first[x] += wa * a[x] + wb * b[x] + wc * c[x] + wd * d[x]
+        second[x] += va * a[x] + vb * b[x] + vc * c[x] + vd * d[x]
 
 
 @jit_in_any_order
-def add_layer(lines: Any, inputs: Any, weight: Any, n: int) -> None:
-    """Add to the first n of each of lines (outputs, ·) what a layer makes of inputs (inputs, ·)."""
+def add_layer(lines: Rows, inputs: Rows, weight: Matrix, n: int) -> None:
+    """lines (outputs, n) += weight (outputs, inputs) · inputs (inputs, n), for the first n pixels."""
     for o in range(0, weight.shape[0], 2):
         for i in range(0, weight.shape[1], AT_ONCE):
             add_products(
@@ -77,97 +147,92 @@ def add_layer(lines: Any, inputs: Any, weight: Any, n: int) -> None:
 
 
 @jit_in_any_order
-def compress(line: Any, image: Any, gain: Any) -> None:
+def log_exposed(line: Row, image: Row, gain: Scalar) -> None:
     for x in range(line.size):
-        line[x] = log(ONE + min(max(image[x], ZERO) * gain, BRIGHTEST))
+        line[x] = log(ONE + min(max(image[x], ZERO) * gain, MAX_EXPOSED32))
 
 
 @jit_in_any_order
-def log_of_one_more(line: Any, image: Any) -> None:
+def log1p_row(line: Row, image: Row) -> None:
     for x in range(line.size):
         line[x] = log(ONE + image[x])
 
 
 @jit_in_any_order
-def one_over(line: Any, length: Any, found: Any, samples: Any) -> None:
+def reciprocal_length(line: Row, length: Row, has_history: Row, samples: Scalar) -> None:
     for x in range(line.size):
-        line[x] = ONE / (length[x] * found[x] + samples)
+        line[x] = ONE / (length[x] * has_history[x] + samples)
 
 
 @jit_in_any_order
-def turn(line: Any, nx: Any, ny: Any, nz: Any, axis: Any) -> None:
+def dot(line: Row, nx: Row, ny: Row, nz: Row, axis: Row) -> None:
     ax, ay, az = axis[0], axis[1], axis[2]
     for x in range(line.size):
         line[x] = ax * nx[x] + ay * ny[x] + az * nz[x]
 
 
 @jit_in_any_order
-def compress_past(line: Any, found: Any, past: Any, other: Any, gain: Any) -> None:
+def log_exposed_history(line: Row, has_history: Row, past: Row, other: Row, gain: Scalar) -> None:
     for x in range(line.size):
-        known = past[x] if found[x] > ZERO else other[x]
-        line[x] = log(ONE + min(max(known, ZERO) * gain, BRIGHTEST))
+        value = past[x] if has_history[x] > ZERO else other[x]
+        line[x] = log(ONE + min(max(value, ZERO) * gain, MAX_EXPOSED32))
 
 
 @jit_in_any_order
-def activate(line: Any, sums: Any) -> None:
+def relu(line: Row, sums: Row) -> None:
     for x in range(line.size):
         line[x] = max(sums[x], ZERO)
 
 
-class Seen(NamedTuple):
-    """What the network's inputs are made of: images (c, H, W) and (H, W), and numbers."""
+class InputImages(NamedTuple):
+    """What the network's inputs are computed from."""
 
-    noisy: Any
-    near: Any
-    around: Any
-    deviation: Any
-    past: Any
-    found: Any
-    albedo: Any
-    normal: Any
-    depth: Any
-    roughness: Any
-    gain: Any  # (3)
-    samples: Any
-    to_view: Any  # (3, 3)
-    depth_scale: Any
-
-
-@jit_in_any_order
-def fill_lines(lines: Any, seen: Seen, y: Any, x: Any, n: int) -> None:
-    """The network's inputs (C, ·) of n pixels of a row from x on."""
-    found = seen.found[y, x : x + n]
-    k = 0
-    for image in (seen.noisy, seen.near, seen.around):
-        for c in range(3):
-            compress(lines[k, :n], image[c, y, x : x + n], seen.gain[c])
-            k += 1
-    for c in range(3):
-        past, other = seen.past[c, y, x : x + n], seen.around[c, y, x : x + n]
-        compress_past(lines[k, :n], found, past, other, seen.gain[c])
-        past, other = seen.past[3 + c, y, x : x + n], seen.noisy[c, y, x : x + n]
-        compress_past(lines[k + 3, :n], found, past, other, seen.gain[c])
-        k += 1
-    k += 3
-    log_of_one_more(lines[k, :n], seen.deviation[y, x : x + n])
-    lines[k + 1, :n] = ONE / seen.samples
-    one_over(lines[k + 2, :n], seen.past[6, y, x : x + n], found, seen.samples)
-    copy_line(lines[k + 3, :n], found)
-    k += 4
-    for channel in range(7, seen.past.shape[0]):
-        copy_line(lines[k, :n], seen.past[channel, y, x : x + n])
-        scale_line(lines[k, :n], found)
-        k += 1
-    nx, ny, nz = seen.normal[0, y, x : x + n], seen.normal[1, y, x : x + n], seen.normal[2, y, x : x + n]
-    for c in range(3):
-        copy_line(lines[k + c, :n], seen.albedo[c, y, x : x + n])
-        turn(lines[k + 3 + c, :n], nx, ny, nz, seen.to_view[c])
-    scale_depth(lines[k + 6, :n], seen.depth[y, x : x + n], seen.depth_scale)
-    copy_line(lines[k + 7, :n], seen.roughness[y, x : x + n])
+    noisy: Image
+    mean_3x3: Image
+    mean_9x9: Image
+    deviation: Plane
+    history: Image  # see models.networks.one.PixelInputs
+    has_history: Plane
+    albedo: Image
+    normal: Image
+    depth: Plane
+    roughness: Plane
+    gain: Row  # (3): exposure times the frame's gain
+    samples: Scalar
+    to_view: Matrix  # (3, 3)
+    depth_scale: Scalar
 
 
 @jit_in_any_order
-def put(patches: Any, y: Any, x: Any, lines: Any, n: int) -> None:
+def fill_lines(lines: Rows, images: InputImages, y: Index, x: Index, n: int) -> None:
+    """The network's inputs (C, ·) of n pixels of a row from x on, in the order of INPUTS."""
+    row = slice(x, x + n)
+    valid = images.has_history[y, row]
+    history = images.history
+    for c in range(3):
+        gain = images.gain[c]
+        log_exposed(lines[NOISY + c, :n], images.noisy[c, y, row], gain)
+        log_exposed(lines[MEAN_3X3 + c, :n], images.mean_3x3[c, y, row], gain)
+        log_exposed(lines[MEAN_9X9 + c, :n], images.mean_9x9[c, y, row], gain)
+        log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], images.mean_9x9[c, y, row], gain)
+        log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], images.noisy[c, y, row], gain)
+    log1p_row(lines[DEVIATION, :n], images.deviation[y, row])
+    lines[NEWEST, :n] = ONE / images.samples
+    reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, images.samples)
+    copy_line(lines[HAS_HISTORY, :n], valid)
+    for c in range(LATENT):
+        copy_line(lines[LATENT_INPUT + c, :n], history[7 + c, y, row])
+        scale_line(lines[LATENT_INPUT + c, :n], valid)
+    nx, ny, nz = images.normal[0, y, row], images.normal[1, y, row], images.normal[2, y, row]
+    for c in range(3):
+        copy_line(lines[ALBEDO + c, :n], images.albedo[c, y, row])
+        dot(lines[VIEW_NORMAL + c, :n], nx, ny, nz, images.to_view[c])
+    scale_depth(lines[DEPTH, :n], images.depth[y, row], images.depth_scale)
+    copy_line(lines[ROUGHNESS, :n], images.roughness[y, row])
+
+
+@jit_in_any_order
+def write_patches(patches: Matrix, y: Index, x: Index, lines: Rows, n: int) -> None:
     """Pixels x to x + n of row y of patches (H / 2, W / 2, 2, 2, C) from lines (C, ·)."""
     for i in range(n):
         for c in range(patches.shape[4]):
@@ -175,9 +240,9 @@ def put(patches: Any, y: Any, x: Any, lines: Any, n: int) -> None:
 
 
 @jit_parallel
-def write_inputs(patches: Any, hidden: Any, seen: Seen, layer: Layer) -> None:
-    """Patches (H / 2, W / 2, 2, 2, C), borders repeated, and what the layer makes of pixels, hidden (c, h, w)."""
-    height, width = seen.depth.shape
+def write_inputs(patches: Matrix, hidden: Image, images: InputImages, layer: LinearLayer) -> None:
+    """Patches (H / 2, W / 2, 2, 2, C), borders repeated, and hidden (c, h, w): ReLU of the layer of each pixel."""
+    height, width = images.depth.shape
     for row in numba.prange(2 * patches.shape[0]):
         bottom = np.int64(row)
         y = min(bottom, height - 1)
@@ -185,37 +250,39 @@ def write_inputs(patches: Any, hidden: Any, seen: Seen, layer: Layer) -> None:
         sums = np.empty((layer.weight.shape[0], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
-            fill_lines(lines, seen, y, x, n)
-            put(patches, bottom, x, lines, n)
+            fill_lines(lines, images, y, x, n)
+            write_patches(patches, bottom, x, lines, n)
             if bottom > y:
                 continue
             for c in range(sums.shape[0]):
                 fill_line(sums[c, :n], layer.bias[c])
             add_layer(sums, lines, layer.weight, n)
             for c in range(hidden.shape[0]):
-                activate(hidden[c, y, x : x + n], sums[c, :n])
+                relu(hidden[c, y, x : x + n], sums[c, :n])
         last = lines[:, (width - 1) % CHUNK :]
         for x in range(width, 2 * patches.shape[1]):
-            put(patches, bottom, x, last, 1)
+            write_patches(patches, bottom, x, last, 1)
 
 
-def network_inputs(frame: Frame, scale: RunningScale, known: "Evidence", hidden: nn.Linear) -> tuple[Tensor, Tensor]:
+def network_inputs(
+    frame: Frame, scale: RunningScale, inputs: "PixelInputs", hidden: nn.Linear
+) -> tuple[Tensor, Tensor]:
     """See models.networks.one.network_inputs; the channels of patches come last in memory."""
     batch, height, width = frame.shape
-    rows, columns = (parameters.MULTIPLE * -(-size // parameters.MULTIPLE) // 2 for size in (height, width))
+    rows, columns = (SIDE_MULTIPLE * -(-size // SIDE_MULTIPLE) // 2 for size in (height, width))
     out = torch.empty(batch, rows, columns, 2, 2, hidden.in_features)
     sums = torch.empty(batch, hidden.out_features, height, width)
     gains = array((scale.exposure() * frame.gain).flatten(1))
     depth_scales = array(scale.log_depth.value.exp())
     to_view = array(frame.to_view)
     for item in range(batch):
-        seen = Seen(
-            array(known.noisy[item]),
-            array(known.near[item]),
-            array(known.around[item]),
-            array(known.deviation[item, 0]),
-            array(known.past[item]),
-            array(known.found[item, 0]),
+        images = InputImages(
+            array(inputs.noisy[item]),
+            array(inputs.mean_3x3[item]),
+            array(inputs.mean_9x9[item]),
+            array(inputs.deviation[item, 0]),
+            array(inputs.history[item]),
+            array(inputs.has_history[item, 0]),
             array(frame.albedo[item]),
             array(frame.normal[item]),
             array(frame.depth[item, 0]),
@@ -225,15 +292,15 @@ def network_inputs(frame: Frame, scale: RunningScale, known: "Evidence", hidden:
             to_view[item],
             depth_scales[item],
         )
-        write_inputs(out[item].numpy(), sums[item].numpy(), seen, Layer.of(hidden))
+        write_inputs(out[item].numpy(), sums[item].numpy(), images, LinearLayer.of(hidden))
     return out.flatten(3).permute(0, 3, 1, 2), sums
 
 
-# --- What the network says --------------------------------------------------------------------------------------------
+# --- Head outputs -----------------------------------------------------------------------------------------------------
 
 
 @jit_in_any_order
-def separate(lines: Any, pixels: Any) -> None:
+def transpose(lines: Rows, pixels: Matrix) -> None:
     """lines (C, n) = pixels (n, C), transposed."""
     for c in range(pixels.shape[1]):
         for x in range(pixels.shape[0]):
@@ -241,127 +308,145 @@ def separate(lines: Any, pixels: Any) -> None:
 
 
 @jit_in_any_order
-def softplus(line: Any, said: Any) -> None:
+def softplus(line: Row, head: Row) -> None:
     for x in range(line.size):
-        line[x] = max(said[x], ZERO) + log(ONE + exp(max(-abs(said[x]), LEAST_EXPONENT)))
+        line[x] = max(head[x], ZERO) + log(ONE + exp(max(-abs(head[x]), LEAST_EXPONENT)))
 
 
 @jit_in_any_order
-def clamp(line: Any, said: Any) -> None:
+def clamp_logit(line: Row, head: Row) -> None:
     for x in range(line.size):
-        line[x] = min(max(said[x], -LARGEST_LOGIT), LARGEST_LOGIT)
+        line[x] = min(max(head[x], -MAX_LOGIT32), MAX_LOGIT32)
 
 
 @jit_in_any_order
-def tanh(line: Any, said: Any) -> None:
+def tanh(line: Row, head: Row) -> None:
     for x in range(line.size):
-        shrunk = exp(max(-TWO * abs(said[x]), LEAST_EXPONENT))
+        shrunk = exp(max(-TWO * abs(head[x]), LEAST_EXPONENT))
         size = (ONE - shrunk) / (ONE + shrunk)
-        line[x] = size if said[x] > ZERO else -size
+        line[x] = size if head[x] > ZERO else -size
 
 
 @jit_in_any_order
-def odds(line: Any, said: Any, found: Any) -> None:
+def sigmoid(line: Row, head: Row, has_history: Row) -> None:
+    """1 / (1 + exp(-head)), or 1 without history."""
     for x in range(line.size):
-        line[x] = ONE / (ONE + exp(min(max(-said[x], LEAST_EXPONENT), -LEAST_EXPONENT))) if found[x] > ZERO else ONE
+        line[x] = (
+            ONE / (ONE + exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))) if has_history[x] > ZERO else ONE
+        )
 
 
 @jit_in_any_order
-def odds_against(line: Any, said: Any, found: Any, length: Any, samples: Any) -> None:
-    """The prior is the even mean of a history of so many samples."""
+def accumulation_alpha(line: Row, head: Row, has_history: Row, length: Row, samples: Scalar) -> None:
+    """σ(head - ln(length / samples)), or 1 without history: for head = 0 the plain mean of all samples."""
     for x in range(line.size):
-        past = max(length[x], FEWEST_SAMPLES) / samples
-        against = past * exp(min(max(-said[x], LEAST_EXPONENT), -LEAST_EXPONENT))
-        line[x] = ONE / (ONE + against) if found[x] > ZERO else ONE
+        past = max(length[x], MIN_LENGTH32) / samples
+        against = past * exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))
+        line[x] = ONE / (ONE + against) if has_history[x] > ZERO else ONE
 
 
 @jit_in_any_order
-def count_samples(length: Any, past: Any, alpha: Any, samples: Any) -> None:
+def effective_length(length: Row, past: Row, alpha: Row, samples: Scalar) -> None:
+    """1 / (α² / samples + (1 - α)² / past)."""
     for x in range(length.size):
         kept = ONE - alpha[x]
-        length[x] = ONE / (alpha[x] * alpha[x] / samples + kept * kept / max(past[x], FEWEST_SAMPLES))
+        length[x] = ONE / (alpha[x] * alpha[x] / samples + kept * kept / max(past[x], MIN_LENGTH32))
 
 
 @jit_in_any_order
-def mix(line: Any, past: Any, new: Any, alpha: Any) -> None:
+def lerp(line: Row, past: Row, new: Row, alpha: Row) -> None:
     for x in range(line.size):
         line[x] = alpha[x] * new[x] + (ONE - alpha[x]) * past[x]
 
 
-class Told(NamedTuple):
-    """What models.networks.one.Said holds of one image, (c, H, W) and length (H, W)."""
+class DecodedImages(NamedTuple):
+    """models.networks.one.Decoded of one image."""
 
-    features: Any
-    sharpness: Any
-    logits: Any  # own and importance
-    alpha: Any
-    latent: Any
-    accumulated: Any
-    length: Any
+    features: Image
+    sharpness: Image
+    logits: Image  # centre and importance
+    alpha: Image
+    latent: Image
+    accumulated: Image
+    length: Plane
+
+
+class AccumulationInputs(NamedTuple):
+    """What the new accumulation is blended from."""
+
+    noisy: Image
+    history: Image
+    has_history: Plane
+    samples: Scalar
 
 
 @jit_in_any_order
-def tell(told: Told, lines: Any, noisy: Any, past: Any, found: Any, samples: Any, y: Any, x: Any, n: int) -> None:
-    """Write n pixels of a row from x on, for which the network's outputs are lines (C, ·)."""
+def decode_lines(decoded: DecodedImages, lines: Rows, inputs: AccumulationInputs, y: Index, x: Index, n: int) -> None:
+    """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of head_channels."""
     k = 0
-    for c in range(told.features.shape[0]):
-        copy_line(told.features[c, y, x : x + n], lines[k, :n])
+    for c in range(decoded.features.shape[0]):
+        copy_line(decoded.features[c, y, x : x + n], lines[k, :n])
         k += 1
-    for c in range(told.sharpness.shape[0]):
-        softplus(told.sharpness[c, y, x : x + n], lines[k, :n])
+    for c in range(decoded.sharpness.shape[0]):
+        softplus(decoded.sharpness[c, y, x : x + n], lines[k, :n])
         k += 1
-    for c in range(told.logits.shape[0]):
-        clamp(told.logits[c, y, x : x + n], lines[k, :n])
+    for c in range(decoded.logits.shape[0]):
+        clamp_logit(decoded.logits[c, y, x : x + n], lines[k, :n])
         k += 1
-    there = found[y, x : x + n]
-    length = past[6, y, x : x + n]
-    alpha = told.alpha[0, y, x : x + n]
-    odds_against(alpha, lines[k, :n], there, length, samples)
-    odds(told.alpha[1, y, x : x + n], lines[k + 1, :n], there)
+    valid = inputs.has_history[y, x : x + n]
+    length = inputs.history[6, y, x : x + n]
+    alpha = decoded.alpha[0, y, x : x + n]
+    accumulation_alpha(alpha, lines[k, :n], valid, length, inputs.samples)
+    sigmoid(decoded.alpha[1, y, x : x + n], lines[k + 1, :n], valid)
     k += 2
-    for c in range(told.latent.shape[0]):
-        tanh(told.latent[c, y, x : x + n], lines[k, :n])
+    for c in range(decoded.latent.shape[0]):
+        tanh(decoded.latent[c, y, x : x + n], lines[k, :n])
         k += 1
-    count_samples(told.length[y, x : x + n], length, alpha, samples)
+    effective_length(decoded.length[y, x : x + n], length, alpha, inputs.samples)
     for c in range(3):
-        mix(told.accumulated[c, y, x : x + n], past[3 + c, y, x : x + n], noisy[c, y, x : x + n], alpha)
+        past, noisy = inputs.history[3 + c, y, x : x + n], inputs.noisy[c, y, x : x + n]
+        lerp(decoded.accumulated[c, y, x : x + n], past, noisy, alpha)
 
 
 @jit_parallel
-def read_outputs(
-    told: Told, pixels: Any, hidden: Any, layer: Layer, noisy: Any, past: Any, found: Any, samples: Any
+def decode_images(
+    decoded: DecodedImages, pixels: Matrix, hidden: Image, layer: LinearLayer, inputs: AccumulationInputs
 ) -> None:
-    """`told` from what the U-Net says, pixels (H, W, C), with what the layer adds to it, and others (c, H, W)."""
+    """Decode the U-Net's outputs, pixels (H, W, C), plus the layer of hidden (c, H, W)."""
     height, width, _ = pixels.shape
     for row in numba.prange(height):
         y = np.int64(row)
         lines = np.empty((layer.weight.shape[0], ROOM), np.float32)
-        inputs = np.empty((layer.weight.shape[1], ROOM), np.float32)
+        columns = np.empty((layer.weight.shape[1], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
-            separate(lines, pixels[y, x : x + n])
+            transpose(lines, pixels[y, x : x + n])
             for c in range(hidden.shape[0]):
-                copy_line(inputs[c, :n], hidden[c, y, x : x + n])
-            add_layer(lines, inputs, layer.weight, n)
-            tell(told, lines, noisy, past, found, samples, y, x, n)
+                copy_line(columns[c, :n], hidden[c, y, x : x + n])
+            add_layer(lines, columns, layer.weight, n)
+            decode_lines(decoded, lines, inputs, y, x, n)
 
 
-def interpret(said: Tensor, hidden: Tensor, last: nn.Linear, known: "Evidence", samples: Tensor) -> tuple[Tensor, ...]:
-    """See models.networks.one.interpret."""
-    batch, _, height, width = said.shape
-    levels = (said.shape[1] - sum(parameters.outputs_of_one(0))) // 3
-    counts = (parameters.COMPARED, levels, 2 * levels, 2, parameters.LATENT, 3, 1)
+def decode_head(
+    head: Tensor, hidden: Tensor, last: nn.Linear, inputs: "PixelInputs", samples: Tensor
+) -> tuple[Tensor, ...]:
+    """See models.networks.one.decode_head."""
+    batch, _, height, width = head.shape
+    levels = filter_levels(head.shape[1])
+    counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     for item in range(batch):
         features, sharpness, logits, alpha, latent, accumulated, length = (each[item].numpy() for each in out)
-        read_outputs(
-            Told(features, sharpness, logits, alpha, latent, accumulated, length[0]),
-            said[item].movedim(0, -1).numpy(),
+        decode_images(
+            DecodedImages(features, sharpness, logits, alpha, latent, accumulated, length[0]),
+            head[item].movedim(0, -1).numpy(),
             array(hidden[item]),
-            Layer.of(last),
-            array(known.noisy[item]),
-            array(known.past[item]),
-            array(known.found[item, 0]),
-            np.float32(samples[item].item()),
+            LinearLayer.of(last),
+            AccumulationInputs(
+                array(inputs.noisy[item]),
+                array(inputs.history[item]),
+                array(inputs.has_history[item, 0]),
+                np.float32(samples[item].item()),
+            ),
         )
     return out[0], out[1], *out[2].split(levels, dim=1), *out[3:]

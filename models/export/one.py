@@ -1,16 +1,26 @@
-"""`one` (models/networks/one.py) as a step: evidence, network and affinity filter in one graph."""
+"""`one` (models/networks/one.py) as a step: inputs, network and affinity filter in one graph."""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models.compiled.one import MAX_EXPOSED, MAX_IRRADIANCE, SIDE_MULTIPLE
 from models.export.neighbours import affinity_level, mesh_sums
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
 from models.export.step import Warp, image
 from models.filters.neighbours import means_of, summands
-from models.networks.one import PATCH, Evidence, One, Said, meaning
-from models.parameters import BRIGHTEST, LARGEST_IRRADIANCE, LATENT, MULTIPLE
+from models.networks.one import (
+    HISTORY,
+    PATCH,
+    Decoded,
+    One,
+    PixelInputs,
+    decode,
+    exposed_images,
+    per_pixel_inputs,
+    surface_inputs,
+)
 
 READS = (
     "noisy",
@@ -23,10 +33,10 @@ READS = (
     "camera_to_world",
     "samples",
 )
-HISTORY = image(
+ONE_HISTORY = image(
     "history",
-    7 + LATENT,
-    "irradiance denoised and accumulated, linear RGB each; the accumulation's length in samples; latent channels",
+    sum(HISTORY),
+    "denoised and accumulated irradiance, linear RGB each; the accumulation's length in samples; latent channels",
 )
 TO_VIEW = (-1.0, 1.0, -1.0)  # see Frame.to_view
 MARGIN = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
@@ -86,7 +96,7 @@ class OneStep(RecurrentStep):
     """`one`, prepared for inference, which must not be used any more."""
 
     def __init__(self, denoiser: One, warp: Warp):
-        super().__init__(READS, HISTORY, warp)
+        super().__init__(READS, ONE_HISTORY, warp)
         self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(of_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
@@ -95,51 +105,45 @@ class OneStep(RecurrentStep):
         self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
         self.requires_grad_(False)
 
-    def evidence(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> Evidence:
-        """What is known before the network speaks."""
+    def pixel_inputs(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> PixelInputs:
+        """As One.pixel_inputs."""
         mesh = x["mesh_id"].to(noisy) + 1
         close = mesh_sums(summands(noisy), mesh, 1)
         means = means_of(close, mesh_sums(close, mesh, 3))
-        past = self.past(x)
-        found = (past[:, 6:7] > 0).to(noisy) * surface  # no length is 0 once a frame has been seen
-        return Evidence(noisy, *means, past, found)
+        history = self.past(x)
+        has_history = (history[:, 6:7] > 0).to(noisy) * surface  # after the first frame, no length is 0
+        return PixelInputs(noisy, *means, history, has_history)
 
-    def features(self, x: dict[str, Tensor], known: Evidence, scale: Scale) -> Tensor:
-        """models.networks.one.network_inputs."""
-        past, accumulated, length, latent = known.past.split([3, 3, 1, LATENT], dim=1)
-        past = torch.where(known.found > 0, past, known.around)
-        accumulated = torch.where(known.found > 0, accumulated, known.noisy)
-        images = torch.cat([known.noisy, known.near, known.around, past, accumulated], dim=1)
-        colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=BRIGHTEST))
-        newest = (1 / x["samples"]).expand_as(length)
-        oldest = 1 / (length * known.found + x["samples"])
-        numbers = (torch.log1p(known.deviation), newest, oldest, known.found, latent * known.found)
+    def network_inputs(self, x: dict[str, Tensor], inputs: PixelInputs, scale: Scale) -> Tensor:
+        """As models.networks.one.network_inputs, for pixels."""
+        images = torch.cat(exposed_images(inputs), dim=1)
+        colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=MAX_EXPOSED))
         to_view = torch.tensor(TO_VIEW)[:, None] * x["camera_to_world"][:3, :3].T
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])
-        surfaces = (x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
-        return torch.cat([colours, *numbers, *surfaces], dim=1)
+        surfaces = surface_inputs(x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
+        return torch.cat([colours, *per_pixel_inputs(inputs, x["samples"]), *surfaces], dim=1)
 
-    def network(self, seen: Tensor) -> Tensor:
-        """The network's outputs (1, ·, H, W)."""
-        height, width = seen.shape[-2:]
-        whole = (MULTIPLE * ((size + MULTIPLE - 1) // MULTIPLE) for size in (height, width))
-        return resized(self.trunk(resized(seen, *whole)), height, width) + self.trunk.detail(seen)
+    def network(self, channels: Tensor) -> Tensor:
+        """The head outputs (1, ·, H, W)."""
+        height, width = channels.shape[-2:]
+        whole = (SIDE_MULTIPLE * ((size + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for size in (height, width))
+        return resized(self.trunk(resized(channels, *whole)), height, width) + self.trunk.detail(channels)
 
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         x = tensors
         noisy, divisor, surface = demodulation(x)
-        noisy = noisy.clamp(0.0, LARGEST_IRRADIANCE) * surface
+        noisy = noisy.clamp(0.0, MAX_IRRADIANCE) * surface
         state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
-        known = self.evidence(x, noisy, surface)
-        outputs = self.network(self.features(x, known, scale))
-        said = Said(*meaning(outputs, known, x["samples"]))
-        filtered = said.accumulated
-        planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
-        for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
-            filtered = affinity_level(filtered, said.features, sharpness, own, importance, surface, step)
-        output = torch.lerp(known.past[:, :3], filtered, said.alpha[:, 1:]) * surface
+        inputs = self.pixel_inputs(x, noisy, surface)
+        head = self.network(self.network_inputs(x, inputs, scale))
+        decoded = Decoded(*decode(head, inputs, x["samples"]))
+        filtered = decoded.accumulated
+        planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
+        for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):
+            filtered = affinity_level(filtered, decoded.features, sharpness, centre, importance, surface, step)
+        output = torch.lerp(inputs.history[:, :3], filtered, decoded.alpha[:, 1:]) * surface
         return {
             "radiance": output * divisor + x["emission"],
-            "new_history": torch.cat([output, said.accumulated, said.length, said.latent], dim=1),
+            "new_history": torch.cat([output, decoded.accumulated, decoded.length, decoded.latent], dim=1),
             "new_scale": state,
         }

@@ -1,4 +1,4 @@
-"""`one`: our own recurrent denoiser, made of convex kernels on irradiance and of history that surfaces vouch for."""
+"""`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,20 @@ from torch.nn import functional as F
 from datasets.frame import Frame, Signal
 from models import compiled
 from models.compiled import one as kernels
+from models.compiled.one import (
+    INPUT_CHANNELS,
+    INPUTS,
+    LATENT,
+    MAX_EXPOSED,
+    MAX_IRRADIANCE,
+    MAX_LOGIT,
+    MIN_LENGTH,
+    SIDE_MULTIPLE,
+    STEPS,
+    NetworkInput,
+    filter_levels,
+    head_channels,
+)
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means
 from models.history.reprojection import reproject
@@ -19,24 +33,14 @@ from models.history.surfaces import Surfaces
 from models.networks.affinity import affinity_level
 from models.networks.convolution import ConvReLU
 from models.operators import pad_to_multiple
-from models.parameters import (
-    BRIGHTEST,
-    FEWEST_SAMPLES,
-    LARGEST_IRRADIANCE,
-    LARGEST_LOGIT,
-    LATENT,
-    MULTIPLE,
-    ONE_INPUTS,
-    STEPS,
-    outputs_of_one,
-)
 
-DETAIL = 24  # hidden channels of what looks at every pixel alone
+DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
+HISTORY = (3, 3, 1, LATENT)  # channels: output, accumulated irradiance, its effective length, latent
 
 
 class Trunk(nn.Module):
-    """A small U-Net at 1/2, 1/4 and 1/8 of the resolution, and what is added to it of every pixel by itself."""
+    """A small U-Net at 1/2, 1/4 and 1/8 of the resolution, and per-pixel layers that are added to it."""
 
     def __init__(self, inputs: int, outputs: int, widths: tuple[int, int, int]):
         super().__init__()
@@ -49,7 +53,7 @@ class Trunk(nn.Module):
         self.up_a = nn.ConvTranspose2d(b, a, 2, stride=2)
         self.join_a = ConvReLU(a, a)
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
-        # Applied where the inputs are made and the outputs read: see network_inputs and interpret.
+        # Per pixel; applied where inputs are computed and outputs decoded: see network_inputs and decode_head.
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
     @property
@@ -67,19 +71,19 @@ class Trunk(nn.Module):
         return layer
 
     def forward(self, patches: Tensor) -> Tensor:
-        """What the U-Net says, (B, outputs, H, W), of patches_of (B, inputs, H, W)."""
+        """The U-Net's outputs (B, outputs, H, W) from patches_of (B, inputs, H, W)."""
         a = self.enter(patches)
         b = self.down_b(a)
         c = self.down_c(b)
         b = self.join_b(self.up_b(c).add_(b))
         a = self.join_a(self.up_a(b).add_(a))
-        said: Tensor = self.leave(a)
-        return said
+        outputs: Tensor = self.leave(a)
+        return outputs
 
 
 @dataclass(frozen=True)
 class OneState(State):
-    """What is carried: irradiance denoised and merely accumulated, that one's effective length, latent channels."""
+    """Denoised and accumulated irradiance, the latter's effective length, and latent channels."""
 
     output: Tensor  # (B, 3, H, W)
     accumulated: Tensor  # (B, 3, H, W)
@@ -87,7 +91,7 @@ class OneState(State):
     latent: Tensor  # (B, LATENT, H, W)
     surfaces: Surfaces
     scale: RunningScale
-    alpha: Tensor  # (B, 2, H, W), of accumulation and output; to look at
+    alpha: Tensor  # (B, 2, H, W), of accumulation and output; for debugging
 
     def pictures(self) -> dict[str, Tensor]:
         return {
@@ -98,53 +102,54 @@ class OneState(State):
         }
 
 
-class Evidence(NamedTuple):
-    """What is known of each pixel before the network speaks; irradiance, all (B, ·, H, W)."""
+class PixelInputs(NamedTuple):
+    """What is known of each pixel before the network runs; irradiance, all (B, ·, H, W)."""
 
     noisy: Tensor
-    near: Tensor  # mean over 3 x 3 pixels of the same mesh
-    around: Tensor  # over 9 x 9
-    deviation: Tensor  # relative one of luminance over 9 x 9
-    past: Tensor  # output of the frame before, accumulation, its length, latent channels; 7 + LATENT channels
-    found: Tensor  # whether the past was found, 1 or 0; else it means nothing
+    mean_3x3: Tensor  # over pixels of the same mesh
+    mean_9x9: Tensor
+    deviation: Tensor  # of luminance over 9 x 9, relative
+    history: Tensor  # reprojected channels HISTORY of the previous frame
+    has_history: Tensor  # 1 where reprojection was validated, else 0: there history is undefined
 
 
-class Said(NamedTuple):
-    """What the network says of every pixel, in the form that the filter takes, and the accumulation that follows."""
+class Decoded(NamedTuple):
+    """Head outputs in the form that the filter takes, and the new accumulation."""
 
-    features: Tensor  # (B, COMPARED, H, W)
-    sharpness: Tensor  # (B, levels, H, W), as the others of affinity_level
-    own: Tensor
+    features: Tensor  # (B, FEATURES, H, W)
+    sharpness: Tensor  # (B, levels, H, W), as the next two: see affinity_level
+    centre: Tensor
     importance: Tensor
-    alpha: Tensor  # (B, 2, H, W), the weights of this frame in the accumulation and in the output
+    alpha: Tensor  # (B, 2, H, W), weights of this frame in the accumulation and in the output
     latent: Tensor  # (B, LATENT, H, W)
     accumulated: Tensor  # (B, 3, H, W)
     length: Tensor  # (B, 1, H, W)
 
 
-def meaning(said: Tensor, known: Evidence, samples: Tensor) -> tuple[Tensor, ...]:
-    """What the outputs (B, ·, H, W) of the network mean, in the order of Said; samples are (B, 1, 1, 1).
+def decode(head: Tensor, inputs: PixelInputs, samples: Tensor) -> tuple[Tensor, ...]:
+    """Decoded, in order, from head outputs (B, ·, H, W) and the frame's samples (B, 1, 1, 1).
 
-    The prior of the accumulation is the even mean of all samples: the network says how far to leave it. Where nothing
-    was found there is nothing to mix with.
+    The prior of the accumulation is the plain mean of all samples: α = σ(a - ln(length / samples)).
     """
-    levels = (said.shape[1] - sum(outputs_of_one(0))) // 3
-    features, sharpness, own, importance, alphas, latent = said.split(outputs_of_one(levels), dim=1)
-    past = known.past[:, 6:7].clamp(min=FEWEST_SAMPLES)
-    prior = torch.cat([torch.log(past / samples), torch.zeros_like(past)], dim=1)
-    alpha = torch.where(known.found > 0, torch.sigmoid(alphas - prior), 1)
+    channels = head_channels(filter_levels(head.shape[1]))
+    features, sharpness, centre, importance, alphas, latent = head.split([*channels.values()], dim=1)
+    length = inputs.history[:, 6:7].clamp(min=MIN_LENGTH)
+    prior = torch.cat([torch.log(length / samples), torch.zeros_like(length)], dim=1)
+    alpha = torch.where(inputs.has_history > 0, torch.sigmoid(alphas - prior), 1)
     newest, kept = alpha[:, :1], 1 - alpha[:, :1]
-    variance = newest.square() / samples + kept.square() / past
-    logits = (each.clamp(-LARGEST_LOGIT, LARGEST_LOGIT) for each in (own, importance))
-    accumulated = torch.lerp(known.past[:, 3:6], known.noisy, newest)
-    # Every level of the filter reads the features: let none have to bring them together.
+    variance = newest.square() / samples + kept.square() / length
+    logits = (each.clamp(-MAX_LOGIT, MAX_LOGIT) for each in (centre, importance))
+    accumulated = torch.lerp(inputs.history[:, 3:6], inputs.noisy, newest)
+    # Every level of the filter reads the features: make them contiguous once.
     return features.contiguous(), F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
 
 
-@compiled.by(kernels.interpret)
-def interpret(said: Tensor, hidden: Tensor, last: nn.Linear, known: Evidence, samples: Tensor) -> tuple[Tensor, ...]:
-    """The meaning of what the U-Net said and what `last` makes of `hidden` (B, ·, H, W)."""
-    return meaning(said + last(hidden.movedim(1, -1)).movedim(-1, 1), known, samples)
+@compiled.by(kernels.decode_head)
+def decode_head(
+    head: Tensor, hidden: Tensor, last: nn.Linear, inputs: PixelInputs, samples: Tensor
+) -> tuple[Tensor, ...]:
+    """`decode` of the U-Net's outputs plus the layer `last` of `hidden` (B, ·, H, W)."""
+    return decode(head + last(hidden.movedim(1, -1)).movedim(-1, 1), inputs, samples)
 
 
 def patches_of(x: Tensor) -> Tensor:
@@ -152,100 +157,111 @@ def patches_of(x: Tensor) -> Tensor:
 
     The channels of a pixel lie side by side: in the order of rows, columns, channels.
     """
-    x = pad_to_multiple(x, MULTIPLE)
+    x = pad_to_multiple(x, SIDE_MULTIPLE)
     batch, channels, height, width = x.shape
     pixels = x.view(batch, channels, height // 2, 2, width // 2, 2).permute(0, 3, 5, 1, 2, 4)
     return pixels.reshape(batch, PATCH * channels, height // 2, width // 2)
 
 
-@compiled.by(kernels.network_inputs)
-def network_inputs(frame: Frame, scale: RunningScale, known: Evidence, hidden: nn.Linear) -> tuple[Tensor, Tensor]:
-    """What the network sees of pixels: logarithms of exposed irradiance, numbers of the history, surfaces.
+def exposed_images(inputs: PixelInputs) -> list[Tensor]:
+    """The irradiance (B, 3, H, W) of the inputs that are "log exposed", in order; another one where history lacks."""
+    output, accumulated, _, _ = inputs.history.split(HISTORY, dim=1)
+    images = {"output": output, "accumulated": accumulated, **inputs._asdict()}
 
-    As patches_of images (B, ·, H, W); and what looks at every pixel alone makes of those, the outputs of the layer
-    `hidden`, (B, ·, H, W).
-    """
-    output, accumulated, length, latent = known.past.split([3, 3, 1, LATENT], dim=1)
-    found = known.found > 0
-    output = torch.where(found, output, known.around)
-    accumulated = torch.where(found, accumulated, known.noisy)
-    exposed = torch.stack([known.noisy, known.near, known.around, output, accumulated], dim=1).clamp(min=0)
-    exposed = exposed * (scale.exposure() * frame.gain)[:, None]
-    colours = torch.log1p(exposed.clamp(max=BRIGHTEST)).flatten(1, 2)
-    newest = (1 / frame.samples).expand_as(length)
-    oldest = 1 / (length * known.found + frame.samples)
-    numbers = (torch.log1p(known.deviation), newest, oldest, known.found, latent * known.found)
-    surfaces = (frame.albedo, frame.view_normal(), scale.normalised_depth(frame.depth), frame.roughness)
-    seen = torch.cat([colours, *numbers, *surfaces], dim=1)
-    alone = torch.relu(hidden(seen.movedim(1, -1).to(hidden.weight.dtype))).movedim(-1, 1)
-    return patches_of(seen), alone
+    def image(row: NetworkInput) -> Tensor:
+        other = row.without_history
+        return torch.where(inputs.has_history > 0, images[row.name], images[other]) if other else images[row.name]
+
+    return [image(row) for row in INPUTS if row.transform == "log exposed"]
+
+
+def per_pixel_inputs(inputs: PixelInputs, samples: Tensor) -> list[Tensor]:
+    """The inputs (B, ·, H, W) that are "per pixel", in order, for `samples` (B, 1, 1, 1) a pixel."""
+    _, _, length, latent = inputs.history.split(HISTORY, dim=1)
+    values = {
+        "deviation": torch.log1p(inputs.deviation),
+        "1/samples": (1 / samples).expand_as(length),
+        "1/(length + samples)": 1 / (length * inputs.has_history + samples),
+        "has_history": inputs.has_history,
+        "latent": latent * inputs.has_history,
+    }
+    return [values[row.name] for row in INPUTS if row.transform == "per pixel"]
+
+
+def surface_inputs(albedo: Tensor, view_normal: Tensor, depth: Tensor, roughness: Tensor) -> list[Tensor]:
+    """The inputs (B, ·, H, W) of the G-buffer, in order; normals in view space, depth normalised."""
+    values = {"albedo": albedo, "view_normal": view_normal, "depth": depth, "roughness": roughness}
+    return [values[row.name] for row in INPUTS if row.transform == "surface"]
+
+
+@compiled.by(kernels.network_inputs)
+def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidden: nn.Linear) -> tuple[Tensor, Tensor]:
+    """patches_of the network's inputs (see INPUTS), and ReLU of the layer `hidden` of each pixel, (B, ·, H, W)."""
+    exposed = torch.stack(exposed_images(inputs), dim=1).clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
+    colours = torch.log1p(exposed.clamp(max=MAX_EXPOSED)).flatten(1, 2)
+    depth = scale.normalised_depth(frame.depth)
+    surfaces = surface_inputs(frame.albedo, frame.view_normal(), depth, frame.roughness)
+    channels = torch.cat([colours, *per_pixel_inputs(inputs, frame.samples), *surfaces], dim=1)
+    pixels = torch.relu(hidden(channels.movedim(1, -1).to(hidden.weight.dtype))).movedim(-1, 1)
+    return patches_of(channels), pixels
 
 
 class One(Denoiser):
-    """Recurrent kernel prediction. Where no surface vouches for history, the weight of the frame is 1."""
+    """Recurrent kernel prediction. Without validated history, the weight of the current frame is 1."""
 
-    reads = (
-        "direct",
-        "indirect",
-        "emission",
-        "albedo",
-        "normal",
-        "depth",
-        "roughness",
-        "mesh_id",
-        "motion",
-    )
+    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     convex = True
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
     def __init__(self, *, steps: Sequence[int] = STEPS, signal: Signal | None = None):
-        """`steps` are the pixels between the taps of each level of the filter."""
+        """`steps` are the pixels between the taps of each filter level."""
         super().__init__(signal=signal)
         self.steps = steps
-        self.inputs = dict(ONE_INPUTS)
-        self.network = Trunk(sum(ONE_INPUTS.values()), sum(outputs_of_one(len(steps))), self.widths)
+        self.inputs = dict(INPUT_CHANNELS)
+        self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(head_channels(len(steps)).values()), self.widths)
 
-    def evidence(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> Evidence:
-        found = torch.zeros_like(surface)
-        past = found.expand(-1, 7 + LATENT, -1, -1)
+    def pixel_inputs(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> PixelInputs:
+        """Means around each pixel, and reprojected history."""
+        has_history = torch.zeros_like(surface)
+        history = has_history.expand(-1, sum(HISTORY), -1, -1)
         if before is not None:
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
-            past, where = reproject(frame, carried, before.surfaces)
-            found = where.to(noisy) * surface
-        return Evidence(noisy, *mesh_means(noisy, frame.mesh_id), past, found)
+            history, valid = reproject(frame, carried, before.surfaces)
+            has_history = valid.to(noisy) * surface
+        return PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
 
-    def speak(self, frame: Frame, scale: RunningScale, known: Evidence) -> Said:
-        """What the network says of all that is known."""
-        patches, hidden = network_inputs(frame, scale, known, self.network.hidden)
+    def run_network(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
+        """The network's decoded outputs."""
+        patches, hidden = network_inputs(frame, scale, inputs, self.network.hidden)
         height, width = frame.size
-        said = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
-        said = said.to(known.noisy)
-        return Said(*interpret(said, hidden, self.network.last, known, frame.samples.to(known.noisy)))
+        head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
+        noisy = inputs.noisy
+        return Decoded(*decode_head(head.to(noisy), hidden, self.network.last, inputs, frame.samples.to(noisy)))
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
         surface = (frame.depth > 0).to(frame.depth)
-        noisy = frame.irradiance(self.signal).clamp(0.0, LARGEST_IRRADIANCE) * surface
+        noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        known = self.evidence(frame, noisy, surface, before)
-        said = self.speak(frame, scale, known)
-        image = said.accumulated
-        planes = (each.split(1, dim=1) for each in (said.sharpness, said.own, said.importance))
-        for step, sharpness, own, importance in zip(self.steps, *planes, strict=True):
-            image = affinity_level(image, said.features, sharpness, own, importance, surface, step)
-        output = torch.lerp(known.past[:, :3], image, said.alpha[:, 1:]) * surface
+        inputs = self.pixel_inputs(frame, noisy, surface, before)
+        decoded = self.run_network(frame, scale, inputs)
+        image = decoded.accumulated
+        planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
+        for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):
+            image = affinity_level(image, decoded.features, sharpness, centre, importance, surface, step)
+        output = torch.lerp(inputs.history[:, :3], image, decoded.alpha[:, 1:]) * surface
         return output, OneState(
             frame.moment,
             output,
-            said.accumulated,
-            said.length,
-            said.latent,
+            decoded.accumulated,
+            decoded.length,
+            decoded.latent,
             Surfaces.of(frame),
             scale,
-            said.alpha.detach(),
+            decoded.alpha.detach(),
         )
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

@@ -16,8 +16,8 @@ from eval.bench.race import FEWEST_FRAMES, TIMED_FRAMES, race
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.selection import cannot_run
+from models.compiled.one import INPUT_CHANNELS, STEPS, head_channels
 from models.networks.one import One
-from models.parameters import ONE_INPUTS, STEPS, outputs_of_one
 from models.registry import create, parse_name
 from models.spec import DenoiserSpec
 from provenance import device_in_words
@@ -217,8 +217,8 @@ def test_synthetic_frames_look_like_rendered_ones():
 def test_transposed_convolutions_count_their_inputs():
     """By hand for `one`: each layer's weights, at the resolution at which they are applied."""
     a, b, c = One.widths
-    inputs = sum(ONE_INPUTS.values())
-    outputs = sum(outputs_of_one(len(STEPS)))
+    inputs = sum(INPUT_CHANNELS.values())
+    outputs = sum(head_channels(len(STEPS)).values())
     half = 4 * inputs * a + (1 + 9) * a * a + 4 * a * outputs
     quarter = 4 * a * b + 2 * 9 * b * b + 4 * b * a
     eighth = 4 * b * c + 2 * 9 * c * c + 4 * c * b

@@ -10,10 +10,10 @@ from torch import Tensor
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
+from models.compiled.one import FEATURES
 from models.history.reprojection import reproject
 from models.history.surfaces import Surfaces
 from models.networks.one import One
-from models.parameters import COMPARED
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = (24, 40)
@@ -165,7 +165,7 @@ def test_levels_of_the_filter_can_be_chosen():
 @pytest.mark.parametrize("compiled_kernels", [True, False])
 def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh, compiled_kernels):
     """Logits at their bounds, and light whose sum float32 could not hold."""
-    fresh.network.leave.bias.data[COMPARED:] = 50.0
+    fresh.network.leave.bias.data[FEATURES:] = 50.0
     images = [torch.full((1, 3, *SIZE), 3e38) for _ in range(3)]
     with nullcontext() if compiled_kernels else compiled.disabled():
         outputs, state = play(fresh, frames(images))
