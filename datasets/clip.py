@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS
-from datasets.mirrors import seen
+from datasets import mirrors
+from datasets.channels import CHANNELS, NOISY_CHANNELS
 from errors import BadInput
 from files import read_json
 from scenes.camera import View, motion_vectors, pixel_centres
@@ -26,12 +26,12 @@ WHOLE_IMAGE: ImageWindow = (slice(None), slice(None))
 
 
 def is_clip(path: Path) -> bool:
-    """Whether there is a clip at `path`. A folder with clip.json is a whole one, because clips appear by renaming."""
+    """Whether there is a clip at `path`. A folder with clip.json is complete, because clips appear by renaming."""
     return (path / "clip.json").exists()
 
 
 class Clip:
-    """One clip on disk, of which only what is asked for is read.
+    """One clip on disk; channels are read on demand.
 
     Raises BadInput, naming the file, where the clip is missing, incomplete or damaged.
     """
@@ -70,17 +70,17 @@ class Clip:
     @property
     def realisations(self) -> int:
         """Number of independent noise realisations of the noisy channels."""
-        entries = [self.entry(channel) for channel in ("direct", "indirect")]
-        return max(entry["shape"][1] if "shape" in entry else 1 for entry in entries)  # one may be black, and a value
+        entries = [self.entry(channel) for channel in NOISY_CHANNELS]
+        return max(entry["shape"][1] if "shape" in entry else 1 for entry in entries)  # a black one has no shape
 
     def entry(self, channel: str) -> dict[str, Any]:
-        """What clip.json says of how a channel is stored. Raises BadInput where the channel was not rendered."""
+        """How a channel is stored, from clip.json. Raises BadInput where the channel was not rendered."""
         if channel not in self.channels:
             raise BadInput(f"{self.path} holds no '{channel}': it was not rendered; render the data set with it")
         return self.channels[channel]
 
     def map(self, channel: str) -> NDArray[Any]:
-        """The memory-mapped array of a channel that has a file, checked against the shape that clip.json states."""
+        """The memory-mapped array of a channel that has a file, checked against the shape in clip.json."""
         if channel not in self._maps:
             entry = self.entry(channel)
             path = self.path / entry["file"]
@@ -92,12 +92,12 @@ class Clip:
             except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load reads the header as Python
                 raise BadInput(f"{path} is damaged ({error}): delete {self.path} and rerun `onespp dataset`") from None
             if list(array.shape) != entry["shape"] or array.dtype != np.dtype(entry["dtype"]):
-                raise BadInput(f"{path} is not what clip.json says: delete {self.path} and rerun `onespp dataset`")
+                raise BadInput(f"{path} does not match clip.json: delete {self.path} and rerun `onespp dataset`")
             self._maps[channel] = array
         return self._maps[channel]
 
     def read(self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0) -> NDArray[Any]:
-        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) for channels that have halves.
+        """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) of two sample buffers.
 
         The array is the same whether the channel is stored in full, stored as one value or derived from others.
         Raises BadInput where the channel was not rendered, or its file is missing or damaged.
@@ -107,41 +107,43 @@ class Clip:
         spec = CHANNELS[channel]
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
-            leading = (2,) if spec.has_buffers else ()
+            buffers = (2,) if spec.has_buffers else ()
             value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
-            return np.broadcast_to(value, (*leading, *area, spec.components))
+            return np.broadcast_to(value, (*buffers, *area, spec.components))
         if "derived" in entry:
             return self._motion(self.read, frame, max(frame - 1, 0), window)
         array = self.map(channel)
         images = array[frame, realisation] if "S" in spec.axes else array[frame]
         return images[..., rows, columns, :]
 
-    def seen(self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0) -> NDArray[Any]:
-        """As `read`, but in mirrors of what these show, which is what denoisers see. See datasets.mirrors."""
-        return seen(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
+    def read_visible(
+        self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
+    ) -> NDArray[Any]:
+        """As `read`, but in mirrors of what these show: the input of denoisers. See datasets.mirrors."""
+        return mirrors.visible(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
 
     def view(self, frame: int) -> View:
         """The camera and the poses of all meshes in one frame."""
         return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
     def motion_to(self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE) -> NDArray[np.float32]:
-        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip, of what denoisers see.
+        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip, of visible surfaces.
 
         They are computed from depth, the cameras and the poses of the meshes.
         """
-        return self._motion(self.seen, frame, other, window)
+        return self._motion(self.read_visible, frame, other, window)
 
     def _motion(
         self, surface: Callable[..., NDArray[Any]], frame: int, other: int, window: ImageWindow
     ) -> NDArray[np.float32]:
-        """Motion vectors of the surfaces that are read by `surface`: `read` or `seen`."""
+        """Motion vectors of the surfaces that are read by `surface`: `read` or `read_visible`."""
         pixels = pixel_centres(self.height, self.width)[window]
         depth = surface("depth", frame, window)[..., 0].astype(np.float64)
         mesh_id = surface("mesh_id", frame, window)[..., 0]
         return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
 
     def reference(self, frame: int, signal: Literal["total", "indirect"] = "total") -> NDArray[np.float32]:
-        """Both halves (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone."""
+        """Both buffers (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone."""
         indirect = self.read("indirect_reference", frame).astype(np.float32)
         if signal == "indirect":
             return indirect
@@ -163,8 +165,8 @@ class Dataset:
         self.facts = read_json(path / "dataset.json", ("schema",))
         if self.facts["schema"] != SCHEMA:
             raise BadInput(
-                f"{path} has schema version {self.facts['schema']}, this onespp reads version {SCHEMA}: "
-                "render it again with `onespp dataset` into a new folder"
+                f"{path} has schema version {self.facts['schema']}, not {SCHEMA}: render it again with "
+                "`onespp dataset` into a new folder"
             )
 
     def planned(self, splits: Sequence[str] = SPLITS) -> list[Path]:

@@ -1,29 +1,22 @@
 """The Frame: the one type that goes from data sets to denoisers and metrics."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from datasets.channels import (
-    ALBEDO_FLOOR,
-    CAMERA_CHANNELS,
-    CHANNELS,
-    HIT_CHANNELS,
-    MOTION_CHANNELS,
-    NOISY_CHANNELS,
-    SAMPLE_BUFFERS,
-)
+from datasets.cameras import Cameras
+from datasets.channels import ALBEDO_FLOOR, CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow
 from errors import BadInput
-from scenes.camera import View
 
 Signal = Literal["total", "indirect"]
-LARGEST = 1e35  # whose sum with another, divided by the smallest albedo, is still finite in float32
+MAX_MAGNITUDE = 1e35  # of a channel: the sum of two, divided by the smallest albedo, is still finite in float32
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
@@ -35,59 +28,14 @@ def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
     return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
 
 
-def mean_where_met(met: Tensor) -> Tensor:
-    """The mean along the first axis of what samples met, of those that met anything: that are not 0."""
-    return met.sum(dim=0) / (met > 0).sum(dim=0).clamp(min=1)
+class ChannelTensor:
+    """A channel as an attribute of Frame. Raises BadInput where it was not loaded."""
 
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
 
-@dataclass(frozen=True)
-class Cameras:
-    """What projects the surfaces of a batch of frames; float64. See scenes.camera for the conventions."""
-
-    K: Tensor  # (B, 3, 3)
-    camera_to_world: Tensor  # (B, 4, 4)
-    object_to_world: Tensor  # (B, M, 4, 4), entry mesh_id - 1: rigid transform from the rest pose
-
-    @staticmethod
-    def of(view: View, window: ImageWindow = WHOLE_IMAGE) -> "Cameras":
-        """The cameras (B = 1) of an image that is cut to `window`."""
-        K = view.K.copy()
-        K[:2, 2] -= [window[1].start or 0, window[0].start or 0]
-        return Cameras(
-            torch.from_numpy(K)[None],
-            torch.from_numpy(view.camera_to_world)[None],
-            torch.from_numpy(view.object_to_world)[None],
-        )
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "Cameras":
-        """The cameras with `function` of every matrix."""
-        return Cameras(function(self.K), function(self.camera_to_world), function(self.object_to_world))
-
-    def rot90(self, width: int) -> "Cameras":
-        """The cameras that see the image turned by 90° counter-clockwise: rolled about the viewing axis.
-
-        A position (x, y) of the image, `width` pixels wide, becomes (y, width - x).
-        """
-        roll = torch.eye(4, dtype=torch.float64)
-        roll[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-        turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, width], [0.0, 0.0, 1.0]], dtype=torch.float64)
-        return replace(self, K=turn @ self.K @ roll[:3, :3], camera_to_world=self.camera_to_world @ roll)
-
-    @staticmethod
-    def stack(cameras: Sequence["Cameras"]) -> "Cameras":
-        """One batch of all `cameras`. Scenes with fewer meshes than others are padded with meshes at rest."""
-        meshes = max(each.object_to_world.shape[1] for each in cameras)
-
-        def padded(poses: Tensor) -> Tensor:
-            batch, count = poses.shape[:2]
-            rest = torch.eye(4, dtype=torch.float64).expand(batch, meshes - count, 4, 4)
-            return torch.cat([poses, rest], dim=1)
-
-        return Cameras(
-            torch.cat([each.K for each in cameras]),
-            torch.cat([each.camera_to_world for each in cameras]),
-            torch.cat([padded(each.object_to_world) for each in cameras]),
-        )
+    def __get__(self, frame: "Frame", owner: type) -> Tensor:
+        return frame.channel(self.name)
 
 
 @dataclass(frozen=True)
@@ -100,41 +48,71 @@ class Moment:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of one noise realisation: tensors (B, C, H, W), float32, as attributes named like the channels.
+    """One frame of one noise realisation: `channels` are tensors (B, C, H, W), float32.
 
-    Channels with halves, such as `direct_reference`, are (B, 2, 3, H, W). Using a channel that was not read raises
-    BadInput.
-    Units and ranges are those of the data set (docs/format.md). `gain` belongs to training augmentation (RAE §4.3):
-    networks multiply their exposure by it, while radiance stays as rendered. `whole` belongs to training crops: what
-    models.history.running_scale measures in the whole frame, (B, 2); None where this is the whole frame. `spp` are the
-    samples a pixel of the noisy channels; None where that is not known.
+    Units and ranges are those of the data set (docs/format.md). Channels of two sample buffers are (B, 2, 3, H, W).
+
+    Attributes:
+        previous: the cameras of the frame that motion vectors lead to.
+        source: names the clip in messages.
+        spp: samples per pixel of the noisy channels (B, 1, 1, 1); None if unknown.
+        colour_gain: training alone: what networks multiply their exposure by (RAE §4.3), (B, 3, 1, 1); None for 1.
+        whole: training alone: what models.history.running_scale measures in the frame that this is a crop of, (B, 2).
     """
 
     channels: dict[str, Tensor]
     now: Cameras
-    previous: Cameras  # of the frame that motion vectors lead to
-    gain: Tensor  # (B, 3, 1, 1)
-    source: str = ""  # names the clip in messages
+    previous: Cameras
+    source: str = ""
+    spp: Tensor | None = None
+    colour_gain: Tensor | None = None
     whole: Tensor | None = None
-    spp: Tensor | None = None  # (B, 1, 1, 1)
 
-    def __getattr__(self, name: str) -> Tensor:
-        if name not in CHANNELS:
-            raise AttributeError(name)
+    direct = ChannelTensor()
+    indirect = ChannelTensor()
+    direct_halves = ChannelTensor()
+    indirect_halves = ChannelTensor()
+    direct_reference = ChannelTensor()
+    indirect_reference = ChannelTensor()
+    emission = ChannelTensor()
+    albedo = ChannelTensor()
+    normal = ChannelTensor()
+    depth = ChannelTensor()
+    roughness = ChannelTensor()
+    mesh_id = ChannelTensor()
+    motion = ChannelTensor()
+    dual_motion = ChannelTensor()
+    shadow_motion = ChannelTensor()
+    reflection_motion = ChannelTensor()
+    gradient = ChannelTensor()
+    hit_distance = ChannelTensor()
+    light_distance = ChannelTensor()
+    light_angle = ChannelTensor()
+
+    def channel(self, name: str) -> Tensor:
+        """A channel by its name. Raises BadInput where it was not loaded."""
         if name not in self.channels:
             raise BadInput(f"{self.source}: the channel '{name}' was not loaded for this frame")
         return self.channels[name]
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W) in pixels."""
-        height, width = next(iter(self.channels.values())).shape[-2:]
-        return height, width
+    def with_channels(self, channels: Mapping[str, Tensor]) -> "Frame":
+        """The frame with some channels replaced or added."""
+        return replace(self, channels=self.channels | dict(channels))
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(B, H, W)."""
-        return (len(self.gain), *self.size)
+        shape = next(iter(self.channels.values())).shape
+        return shape[0], shape[-2], shape[-1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) in pixels."""
+        return self.shape[1:]
+
+    def ones(self, components: int) -> Tensor:
+        """Ones (B, components, 1, 1) on the frame's device."""
+        return next(iter(self.channels.values())).new_ones(self.shape[0], components, 1, 1)
 
     @property
     def moment(self) -> Moment:
@@ -147,15 +125,17 @@ class Frame:
         So a cut needs no flag: the first frame of another shot names other previous cameras. Between two still shots
         from the same place neither camera nor meshes differ, and a cut goes unnoticed: pass None as the state there.
         """
-        return moment.shape == self.shape and all(
-            a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, atol=1e-12)
-            for a, b in zip(vars(self.previous).values(), vars(moment.cameras).values(), strict=True)
-        )
+        return moment.shape == self.shape and self.previous.almost_equal(moment.cameras)
 
     @property
     def samples(self) -> Tensor:
-        """Samples a pixel of the noisy channels, (B, 1, 1, 1); 1 where that is not known."""
-        return torch.ones_like(self.gain[:, :1]) if self.spp is None else self.spp
+        """Samples per pixel of the noisy channels, (B, 1, 1, 1); 1 if unknown."""
+        return self.ones(1) if self.spp is None else self.spp
+
+    @property
+    def gain(self) -> Tensor:
+        """What networks multiply their exposure by, (B, 3, 1, 1)."""
+        return self.ones(3) if self.colour_gain is None else self.colour_gain
 
     @property
     def divisor(self) -> Tensor:
@@ -168,48 +148,34 @@ class Frame:
         return None if self.depth.amin() > 0 else (self.depth > 0).to(self.depth)
 
     def finite(self) -> "Frame":
-        """The frame with 0 instead of NaN and infinities in all channels: one bad pixel must not poison a filter.
+        """The frame with 0 instead of NaN and infinities in all channels, and the rest clamped to +-MAX_MAGNITUDE.
 
-        What is so large that demodulation would make it infinite is cut. The sum of a channel tells whether it has any
-        such number, at a fraction of the cost of looking at every pixel.
+        The sum of a channel shows whether it has any such number, at a fraction of the cost of a test of every pixel.
         """
-        bad = [name for name, tensor in self.channels.items() if not tensor.sum().abs() < LARGEST]
         mended = {
-            name: torch.nan_to_num(self.channels[name], nan=0.0, posinf=0.0, neginf=0.0).clamp(-LARGEST, LARGEST)
-            for name in bad
+            name: tensor.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(-MAX_MAGNITUDE, MAX_MAGNITUDE)
+            for name, tensor in self.channels.items()
+            if not tensor.sum().abs() < MAX_MAGNITUDE
         }
-        return replace(self, channels=self.channels | mended) if bad else self
-
-    def with_more_samples(self, others: Sequence["Frame"]) -> "Frame":
-        """The frame with the means over itself and `others`, further realisations of it, of noise and what it met."""
-        frames = [self, *others]
-
-        def stacked(name: str) -> Tensor:
-            return torch.stack([frame.channels[name] for frame in frames])
-
-        means = {name: stacked(name).mean(dim=0) for name in self.channels.keys() & set(NOISY_CHANNELS)}
-        means |= {name: mean_where_met(stacked(name)) for name in self.channels.keys() & set(HIT_CHANNELS)}
-        return replace(self, channels=self.channels | means, spp=len(frames) * self.samples)
+        return self.with_channels(mended) if mended else self
 
     @property
     def has_buffers(self) -> bool:
-        """Whether the samples of the noisy channels are known in two independent halves."""
-        return self.channels.keys() & set(SAMPLE_BUFFERS.values()) != set()
+        """Whether the noisy channels are also there as two independent sample buffers."""
+        return not self.channels.keys().isdisjoint(SAMPLE_BUFFERS.values())
 
     def buffer(self, which: int) -> "Frame":
-        """The frame with half of its samples alone: those of half 0 or 1."""
-        known = {name: halves for name, halves in SAMPLE_BUFFERS.items() if {name, halves} <= self.channels.keys()}
-        noisy = {name: self.channels[halves][:, which] for name, halves in known.items()}
-        others = {name: tensor for name, tensor in self.channels.items() if name not in SAMPLE_BUFFERS.values()}
+        """The frame with the samples of buffer 0 (A) or 1 (B) alone."""
+        others = {name: tensor for name, tensor in self.channels.items() if CHANNELS[name].kind != "buffers"}
+        noisy = {
+            name: self.channels[buffers][:, which]
+            for name, buffers in SAMPLE_BUFFERS.items()
+            if {name, buffers} <= self.channels.keys()
+        }
         return replace(self, channels=others | noisy, spp=self.samples / 2)
 
-    def lit(self, light: Tensor) -> "Frame":
-        """The frame with all light but emission, noisy and in references, times `light` (H, W)."""
-        lit = {name: tensor * light for name, tensor in self.channels.items() if CHANNELS[name].is_reflected}
-        return replace(self, channels=self.channels | lit)
-
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
-        """The frame with `function` of every channel; cameras and gain stay."""
+        """The frame with `function` applied to every channel."""
         return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})
 
     def radiance(self, signal: Signal) -> Tensor:
@@ -222,11 +188,11 @@ class Frame:
         return reflected / self.divisor
 
     def reference_buffers(self, signal: Signal) -> Tensor:
-        """Radiance without emission (B, 2, 3, H, W) of both halves of the reference, whose noise is independent."""
+        """Radiance without emission (B, 2, 3, H, W) of the reference, in two buffers whose noise is independent."""
         return self.indirect_reference if signal == "indirect" else self.direct_reference + self.indirect_reference
 
     def reference_irradiance(self, signal: Signal) -> Tensor:
-        """Irradiance (B, 3, H, W) of the reference, the mean of its halves."""
+        """Irradiance (B, 3, H, W) of the reference."""
         return self.reference_buffers(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
@@ -250,25 +216,14 @@ class Frame:
         """Shading normals (B, 3, H, W) in view space."""
         return torch.einsum("bji,bihw->bjhw", self.to_view, self.normal)
 
-    def rot90(self) -> "Frame":
-        """The frame turned by 90° counter-clockwise: images, motion vectors and cameras alike."""
-        width = self.size[1]
-        channels = {name: torch.rot90(tensor, dims=(-2, -1)) for name, tensor in self.channels.items()}
-        for name in channels.keys() & set(MOTION_CHANNELS):
-            dx, dy = channels[name].unbind(dim=1)
-            channels[name] = torch.stack([dy, -dx], dim=1)
-        return replace(self, channels=channels, now=self.now.rot90(width), previous=self.previous.rot90(width))
-
     def to(self, device: torch.device | str) -> "Frame":
         """The frame with all tensors on `device`."""
-        if self.gain.device == torch.device(device):
-            return self
 
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device)
 
-        whole, spp = (None if tensor is None else move(tensor) for tensor in (self.whole, self.spp))
-        moved = replace(self.map(move), gain=move(self.gain), whole=whole, spp=spp)
+        spp, gain, whole = (None if x is None else move(x) for x in (self.spp, self.colour_gain, self.whole))
+        moved = replace(self.map(move), spp=spp, colour_gain=gain, whole=whole)
         return replace(moved, now=self.now.map(move), previous=self.previous.map(move))
 
     @staticmethod
@@ -279,10 +234,10 @@ class Frame:
             {name: torch.cat([frame.channels[name] for frame in frames]) for name in frames[0].channels},
             now=Cameras.stack([frame.now for frame in frames]),
             previous=Cameras.stack([frame.previous for frame in frames]),
-            gain=torch.cat([frame.gain for frame in frames]),
             source=frames[0].source,
-            whole=torch.cat(wholes) if wholes else None,
             spp=torch.cat([frame.samples for frame in frames]),
+            colour_gain=torch.cat([frame.gain for frame in frames]),
+            whole=torch.cat(wholes) if wholes else None,
         )
 
 
@@ -296,52 +251,50 @@ def read_frame(
 ) -> Frame:
     """Frame `index` (B = 1) of a clip, with the named channels of one noise realisation, cut to `window`.
 
-    In mirrors they are of what these show (see datasets.mirrors).
+    In mirrors they are of what these show (see datasets.mirrors). Sample buffers are left out where the clip has none.
 
-    `previous` is the frame that is played before this one, by default the one before it in the clip. Where it is
-    another (in reversed playback, or while the camera stands still), motion vectors are computed for it.
+    `previous` is the frame that is played before this one, by default the one before it in the clip. For another one
+    (in reversed playback, or while the camera stands still), motion vectors are computed.
 
-    Halves of noisy channels are left out where the clip has none.
-
-    Raises BadInput where another channel was not rendered or is damaged, and for what only the renderer knows in
-    reversed playback.
+    Raises BadInput where another channel was not rendered or is damaged, and in reversed playback for channels that
+    only the renderer can compute.
     """
     stored_previous = max(index - 1, 0)  # where the clip's own motion vectors lead
     if previous is None:
         previous = stored_previous
     tensors = {}
     for name in channels:
-        if name in CAMERA_CHANNELS or (name in SAMPLE_BUFFERS.values() and name not in clip.channels):
+        channel = CHANNELS[name]
+        if not channel.is_image or (channel.kind == "buffers" and name not in clip.channels):
             continue
-        if CHANNELS[name].is_temporal and previous != stored_previous:
-            array = for_playback(clip, name, index, previous, window)
+        if channel.is_temporal and previous != stored_previous:
+            array = temporal_channel(clip, name, index, previous, window)
         else:
-            array = clip.seen(name, index, window, realisation)
-        tensors[name] = to_tensor(array, has_buffers=CHANNELS[name].has_buffers)
+            array = clip.read_visible(name, index, window, realisation)
+        tensors[name] = to_tensor(array, has_buffers=channel.has_buffers)
     return Frame(
         tensors,
         now=Cameras.of(clip.view(index), window),
         previous=Cameras.of(clip.view(previous), window),
-        gain=torch.ones(1, 3, 1, 1),
         source=str(clip.path),
         spp=torch.full((1, 1, 1, 1), float(clip.facts["noisy_spp"])),
     )
 
 
-def for_playback(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> np.ndarray:
+def temporal_channel(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> NDArray[np.float32]:
     """A temporal channel (h, w, 2), to a frame that is not the one before in the clip.
 
-    Dual motion vectors depend on what hid a surface and gradients on how light changes, which only the renderer sees:
-    they cannot be computed afterwards. But while time stands still nothing is hidden and nothing changes: dual motion
-    equals motion, and both are 0 like the gradient.
+    Dual motion vectors depend on what hid a surface and gradients on how light changes: only the renderer can compute
+    them. But while time stands still nothing is hidden and nothing changes: dual motion equals motion, and both are 0
+    like the gradient.
     """
     if name != "motion" and previous != index:
         raise BadInput(f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing")
     return clip.motion_to(index, previous, window)
 
 
-def to_tensor(array: np.ndarray, has_buffers: bool = False) -> Tensor:
-    """(H, W, C) as (1, C, H, W), or with halves (2, H, W, C) as (1, 2, C, H, W); float32."""
+def to_tensor(array: NDArray[np.generic], has_buffers: bool = False) -> Tensor:
+    """(H, W, C) as (1, C, H, W), or two buffers (2, H, W, C) as (1, 2, C, H, W); float32."""
     tensor = torch.from_numpy(np.ascontiguousarray(np.moveaxis(array.astype(np.float32), -1, -3)))
     assert tensor.ndim == (4 if has_buffers else 3)
     return tensor[None]

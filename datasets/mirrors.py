@@ -1,4 +1,4 @@
-"""What denoisers see of mirrors: what stands in them, as if it stood behind them."""
+"""Mirrors as denoisers see them: what a mirror shows, as if it stood behind the mirror."""
 
 from collections.abc import Callable, Container
 from typing import Any
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from datasets.channels import CHANNELS, MIRRORED
 
 
-def seen(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
-    """A channel (..., H, W, C) of which `stored` are there to `read`: of what mirrors show, where that is stored.
+def visible(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
+    """A channel (..., H, W, C), in mirrors of the surfaces that these show, if the `stored` channels describe them.
 
-    Whatever else moves in a pixel of a mirror, its motion is that of what the mirror shows; and how light changes there
-    the renderer has only told of the mirror itself, so that the gradient is 0.
+    All motion in a mirror is that of what the mirror shows. The renderer's gradient is of the mirror itself: there it
+    counts as 0.
     """
     if MIRRORED.get(name) in stored:
         return read(MIRRORED[name])
@@ -21,4 +21,4 @@ def seen(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]])
     if not CHANNELS[name].is_temporal or MIRRORED["motion"] not in stored:
         return own
     in_mirror = read(MIRRORED["depth"]) != read("depth")
-    return np.where(in_mirror, 0 if name == "gradient" else read(MIRRORED["motion"]), own)
+    return np.where(in_mirror, 0 if CHANNELS[name].kind == "gradient" else read(MIRRORED["motion"]), own)

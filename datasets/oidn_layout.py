@@ -64,8 +64,8 @@ def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
     noisy = f"{group}_{clip.facts['noisy_spp']:04d}spp"
     images: dict[str, Callable[[], NDArray[np.generic]]] = {
         f"{noisy}.hdr": lambda: noisy_radiance(clip, frame, realisation),
-        f"{noisy}.alb": lambda: clip.seen("albedo", frame),
-        f"{noisy}.nrm": lambda: clip.seen("normal", frame),
+        f"{noisy}.alb": lambda: clip.read_visible("albedo", frame),
+        f"{noisy}.nrm": lambda: clip.read_visible("normal", frame),
         f"{group}_{TARGET}.hdr": lambda: clip.reference(frame).mean(axis=0),
     }
     for name, read in images.items():

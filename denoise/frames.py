@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets import mirrors
+from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
 from datasets.exr import FACTS_ATTRIBUTE, channels_of, view_of_facts
-from datasets.frame import Cameras, Frame, to_tensor
+from datasets.frame import Frame, to_tensor
 from denoise.cameras import (
     STILL,
     in_the_world,
@@ -147,7 +148,6 @@ class Shot:
             {name: to_tensor(channels[name], CHANNELS[name].has_buffers) for name in self.reads if name in channels},
             now=Cameras.of(view),
             previous=Cameras.of(before if self.reading.has_history else NOWHERE),
-            gain=torch.ones(1, 3, 1, 1),
             source=self.source,
             spp=torch.full((1, 1, 1, 1), self.spp * (2 if "half" in pixels.arrays else 1)),
         )
@@ -323,13 +323,12 @@ class OwnShot:
         self.view = view
         return Frame(
             {
-                name: to_tensor(mirrors.seen(name, arrays, arrays.__getitem__), CHANNELS[name].has_buffers)
+                name: to_tensor(mirrors.visible(name, arrays, arrays.__getitem__), CHANNELS[name].has_buffers)
                 for name in self.reads
                 if name in arrays
             },
             now=Cameras.of(view),
             previous=Cameras.of(before),
-            gain=torch.ones(1, 3, 1, 1),
             source=str(image.path),
             spp=torch.full((1, 1, 1, 1), float(facts["noisy_spp"])),
         )

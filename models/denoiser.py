@@ -112,7 +112,7 @@ class Denoiser(torch.nn.Module):
     def check_constants(self, frame: Frame) -> None:
         """Raise BadInput where a channel that the network does without is not what it was in training."""
         for name, value in self.constants.items():
-            channel: Tensor = getattr(frame, name)
+            channel = frame.channel(name)
             wanted = channel.new_tensor(value)[:, None, None]
             if ((channel - wanted).abs() > CONSTANT).any():
                 raise BadInput(

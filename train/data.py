@@ -13,10 +13,10 @@ from torch.utils.data import DataLoader
 from datasets.clip import Clip
 from models.denoiser import Denoiser
 from models.networks.wskp import KernelPredictor
+from train.augmentation import Augmentation
 from train.crops import AccumulatedCrops, Crops
 from train.recipe import Recipe
-from train.sequences import Augmentation, TrainingSequences, collate
-from train.whole_frames import WholeFrames
+from train.sequences import TrainingSequences, collate
 
 Items = TrainingSequences | AccumulatedCrops
 
@@ -35,8 +35,8 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
         assert isinstance(denoiser, KernelPredictor)
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
     augmentation = recipe.augmentation if training else Augmentation()
-    measure = WholeFrames(denoiser.signal)
-    return TrainingSequences(clips, denoiser.reads, recipe.frames(training), recipe.crop, augmentation, seed, measure)
+    frames = recipe.frames(training)
+    return TrainingSequences(clips, denoiser.reads, frames, recipe.crop, augmentation, seed, denoiser.signal)
 
 
 def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:

@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass, field
 
+from train.augmentation import Augmentation
 from train.losses.network_loss import LossTerms
-from train.sequences import Augmentation
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from errors import BadInput
+from train.augmentation import Augmentation
 from train.losses.displayed import DisplayedTerms
 from train.losses.lbf import LBFTerms
 from train.losses.nbgd import NBGDTerms
@@ -11,7 +12,6 @@ from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipe import Recipe
-from train.sequences import Augmentation
 
 RAE_RECIPE = Recipe(
     loss=RAETerms(),  # §4.4

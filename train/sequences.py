@@ -1,7 +1,7 @@
 """Training sequences: random crops of consecutive frames, augmented, read through memory maps."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,22 +10,10 @@ from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
-from datasets.frame import Frame, read_frame
+from datasets.frame import Frame, Signal, read_frame
 from errors import BadInput
-from train.shading import WanderingEdge
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """Which augmentations are on, those of RAE §4.3 first. Each transforms all channels and cameras consistently."""
-
-    reverse: bool = False  # half of the sequences are played backward
-    stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
-    rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
-    gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
-    exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5
-    samples: bool = False  # three in ten sequences are means of 2, 4, 8, ... realisations
-    light: bool = False  # over three in ten sequences the edge of a shadow or of more light wanders
+from models.history.running_scale import measure
+from train.augmentation import Augmentation, averaged
 
 
 def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
@@ -35,7 +23,7 @@ def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
             size = f" of {crop}x{crop}" if crop else ""
             raise BadInput(
                 f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small to train on "
-                f"{length} frames{size}; train with a smaller profile"
+                f"{length} frames{size}; train with a smaller budget"
             )
 
 
@@ -48,14 +36,35 @@ def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> Ima
     return slice(top, top + crop), slice(left, left + crop)
 
 
+class WholeFrames:
+    """What running_scale measures in the noisy light of `signal`, once for each frame and realisation.
+
+    A crop of 64 x 64 pixels may be three times brighter or darker than its frame; in use networks see whole frames.
+    """
+
+    def __init__(self, signal: Signal):
+        self.signal = signal
+        self.measured: dict[tuple[str, int, int], Tensor] = {}
+
+    @torch.no_grad()
+    def __call__(self, clip: Clip, index: int, realisation: int) -> Tensor:
+        """Logarithms of luminance and depth of frame `index`, (1, 2)."""
+        key = (str(clip.path), index, realisation)
+        if key not in self.measured:
+            light = ("indirect",) if self.signal == "indirect" else NOISY_CHANNELS
+            frame = read_frame(clip, index, (*light, "albedo", "depth"), realisation)
+            radiance = frame.irradiance(self.signal).clamp(min=0) * frame.divisor
+            self.measured[key] = measure(radiance, frame.depth)
+        return self.measured[key]
+
+
 class TrainingSequences(TorchDataset[list[Frame]]):
     """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
 
     References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
-    have together as many pixels as the clips. Raises BadInput where a clip is shorter than a sequence or smaller than a
+    have together as many pixels as the clips. Frames name the scale of the frames that they are crops of in the noisy
+    light of `signal`, unless that is None. Raises BadInput where a clip is shorter than a sequence or smaller than a
     crop.
-
-    `measure` tells of a clip, the number of a frame and that of its realisation what Frame.whole holds, (1, N).
     """
 
     def __init__(
@@ -66,16 +75,17 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         crop: int | None,
         augmentation: Augmentation,
         seed: int,
-        measure: Callable[[Clip, int, int], Tensor] | None = None,
+        signal: Signal | None = None,
     ):
         check_fits(clips, length, crop)
         self.clips = clips
         self.channels = tuple(dict.fromkeys([*reads, *REFERENCE_CHANNELS]))
+        self.sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
         self.length = length
         self.crop = crop
         self.augmentation = augmentation
         self.seed = seed
-        self.measure = measure
+        self.whole_frames = WholeFrames(signal) if signal else None
         self.epoch = 0
         pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
         self.probabilities = pixels / pixels.sum()
@@ -92,64 +102,25 @@ class TrainingSequences(TorchDataset[list[Frame]]):
     def __getitem__(self, index: int) -> list[Frame]:
         rng = np.random.default_rng([self.seed, self.epoch, index])
         clip = self.clips[rng.choice(len(self.clips), p=self.probabilities)]
-        playback = self._playback(clip, rng)
+        playback = self.augmentation.playback(clip.frames, self.length, rng)
         window = random_window(clip, self.crop, rng)
-        # Dealt out rather than drawn, so that a stopped camera sees new noise while there are unused realisations.
-        deal = rng.permutation(clip.realisations)
-        turns = int(rng.integers(4)) if self.augmentation.rotate else 0
-        gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.augmentation.gain else None
-        if self.augmentation.exposure:
-            gain = torch.full((1, 3, 1, 1), 2 ** float(rng.uniform(-1.5, 1.5)))
-
         stopped = len(set(playback)) < self.length
-        together = self._realisations_together(len(deal), rng) if self.augmentation.samples and not stopped else 1
-
-        edge = WanderingEdge.random(rng, self.length) if self.augmentation.light and rng.random() < 0.3 else None
-
-        brighter = 0.0  # the logarithm of how much light a change adds
+        draw = self.augmentation.draw(clip.realisations, self.length, stopped, rng)
         frames = []
-        for t, position in enumerate(playback):
-            chosen = [int(deal[(together * t + i) % len(deal)]) for i in range(together)]
-            realisation = chosen[0]
-            previous = playback[max(t - 1, 0)]
-            frame = read_frame(clip, position, self.channels, realisation, previous, window)
-            if together > 1:
-                sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
-                frame = frame.with_more_samples(
-                    [read_frame(clip, position, sampled, i, window=window) for i in chosen[1:]]
-                )
-            if edge is not None:
-                light = edge.light(t, *frame.size)
-                brighter = float(torch.log(light).mean())
-                frame = frame.lit(light)
-            for _ in range(turns):
-                frame = frame.rot90()
-            if gain is not None:
-                frame = replace(frame, gain=gain)
-            if self.measure is not None:
-                frame = replace(frame, whole=self.measure(clip, position, realisation) + torch.tensor([brighter, 0.0]))
-            frames.append(frame)
+        for time, position in enumerate(playback):
+            first, *others = draw.realisations(time)
+            frame = read_frame(clip, position, self.channels, first, playback[max(time - 1, 0)], window)
+            if others:
+                more = [read_frame(clip, position, self.sampled, other, window=window) for other in others]
+                frame = averaged([frame, *more])
+            if self.whole_frames is not None:
+                frame = replace(frame, whole=self.whole_frames(clip, position, first))
+            frames.append(draw.apply(frame, time))
         return frames
-
-    @staticmethod
-    def _realisations_together(count: int, rng: np.random.Generator) -> int:
-        """1 in seven of ten cases, else 2, 4, 8, ... of `count`."""
-        most = int(np.log2(count))
-        return 2 ** int(rng.integers(1, most + 1)) if most and rng.random() >= 0.7 else 1
-
-    def _playback(self, clip: Clip, rng: np.random.Generator) -> list[int]:
-        """Frame numbers in the order in which they are played."""
-        start = int(rng.integers(clip.frames - self.length + 1))
-        positions = np.arange(start, start + self.length)
-        if self.augmentation.reverse and rng.random() < 0.5:
-            positions = positions[::-1]
-        if self.augmentation.stop and rng.random() < 0.25:
-            positions = positions[np.minimum(np.arange(self.length), rng.integers(self.length))]
-        return [int(position) for position in positions]
 
 
 class Batch:
-    """What a training step sees: for each time step, one Frame of all sequences.
+    """A batch of sequences: one Frame of all of them for each time step.
 
     It is not a list, because Fabric converts the tensors in collections, and cameras must stay float64.
     """

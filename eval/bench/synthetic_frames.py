@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.cameras import Cameras
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS
-from datasets.frame import Cameras, Frame, to_tensor
+from datasets.frame import Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
 # Normal n and offset d of each plane, n · p = d.
@@ -160,6 +161,5 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         "light_distance": np.zeros_like(seen.depth)[..., None],
         "light_angle": np.where(hit, 0.05, 0),
     }
-    gain = to_tensor(np.ones((1, 1, 3)))
     tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
-    return Frame(tensors, Cameras.of(now), Cameras.of(before), gain, "synthetic sequence")
+    return Frame(tensors, Cameras.of(now), Cameras.of(before), "synthetic sequence")

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from datasets.cameras import Cameras
 from datasets.channels import CHANNELS, LENGTH, channels_of
-from datasets.frame import Cameras, Frame
+from datasets.frame import Frame
 
 FrameChange = Callable[[Frame], Frame]
 

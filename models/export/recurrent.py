@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import LARGEST, Frame
+from datasets.frame import MAX_MAGNITUDE, Frame
 from models.export.reprojection import View, expectation, fetch, places, table_of
 from models.export.step import MESHES, Carried, Port, Step, Warp, image
 from models.history.surfaces import to_previous_camera
@@ -98,5 +98,5 @@ class RecurrentStep(Step):
 def demodulation(x: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Noisy irradiance and its divisor (1, 3, H, W), and 1 for pixels that show a surface, else 0, (1, 1, H, W)."""
     divisor = x["albedo"].clamp(min=ALBEDO_FLOOR)
-    noisy = torch.where(x["noisy"].abs() < LARGEST, x["noisy"], 0) / divisor
+    noisy = torch.where(x["noisy"].abs() < MAX_MAGNITUDE, x["noisy"], 0) / divisor
     return noisy, divisor, (x["depth"] > 0).to(x["depth"])

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datasets.frame import LARGEST, Frame
+from datasets.frame import MAX_MAGNITUDE, Frame
 from models import compiled
 from models.compiled import bmfr as kernels
 from models.compiled.bmfr import BLOCK_SIDE, MIN_RELATIVE_EXTENT, REGRESSORS
@@ -136,7 +136,7 @@ class BMFR(Accumulating):
         axes = ray_axes(frame.now)
         noise = feature_noise(number).to(axes)
         fitted = regress(history.irradiance, frame.normal, frame.depth, axes, noise, grid_offset(number))
-        fitted = fitted.clamp(0, LARGEST)
+        fitted = fitted.clamp(0, MAX_MAGNITUDE)
         if before:
             past, _ = reproject(frame, before.fitted, before.history.surfaces)
             # The length is 1 where no history was found.

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datasets.frame import Cameras, Frame
+from datasets.cameras import Cameras
+from datasets.frame import Frame
 
 BACKGROUND_ID = 0  # mesh id of pixels that show no surface
 

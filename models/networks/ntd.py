@@ -219,7 +219,7 @@ class NTD(Denoiser):
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         warped = noisy
         if before:
-            previous, found = warp_output(before, getattr(frame, self.vectors))
+            previous, found = warp_output(before, frame.channel(self.vectors))
             warped = torch.where(found, previous, noisy)
         parts = {
             "noisy": self.compress(noisy, scale, frame),

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from datasets.cameras import Cameras
 from datasets.clip import Dataset
-from datasets.frame import Cameras, Frame, read_frame
+from datasets.frame import Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
 
 CHANNELS = (

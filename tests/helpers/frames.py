@@ -6,7 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from datasets.frame import Cameras, Frame
+from datasets.cameras import Cameras
+from datasets.frame import Frame
 from models.denoiser import Denoiser, State
 
 FOCAL_LENGTH = 10.0  # px
@@ -52,8 +53,7 @@ def flat_frame(
     channels["light_distance"] = 2 * ones
     channels["light_angle"] = 0.2 * ones
     bodies = torch.eye(4, dtype=torch.float64).expand(1, MESHES, 4, 4)
-    gain = torch.ones(1, 3, 1, 1)
-    return Frame(channels, Cameras(K[None], now, bodies), Cameras(K[None], before, bodies), gain, "test")
+    return Frame(channels, Cameras(K[None], now, bodies), Cameras(K[None], before, bodies), "test")
 
 
 def chain(frames: list[Frame]) -> list[Frame]:

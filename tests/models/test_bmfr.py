@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datasets.frame import Cameras
+from datasets.cameras import Cameras
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
 from models.filters import bmfr

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
+from datasets.cameras import Cameras
 from datasets.clip import Dataset
-from datasets.frame import Cameras, read_frame
+from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled

@@ -345,7 +345,7 @@ def test_training_sees_what_inference_cuts_off(frames):
 
 def test_gain_changes_what_the_network_sees_and_not_the_filtered_light(ntd, frames):
     frame = frames[0]
-    gained = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
+    gained = replace(frame, colour_gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
     _, state = play(ntd, [frame])
     light = torch.rand(1, 3, 4, 4)
     plain, tinted = (ntd.compress(light, state.scale, f) for f in (frame, gained))

@@ -13,9 +13,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from datasets.cameras import Cameras
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Dataset
-from datasets.frame import Cameras, Frame, read_frame
+from datasets.frame import Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
 from eval.stress.irradiance_range import ROUNDING, range_violation

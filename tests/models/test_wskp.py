@@ -134,7 +134,7 @@ def test_compiled_features_equal_pytorch_s(tiny):
     wskp = registry.create("wskp3")
     clip = Dataset(tiny).clips("test")[1]
     frame = Frame.stack([read_frame(clip, index, wskp.reads) for index in (2, 3)])
-    frame = replace(frame, gain=torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 0.0]])[..., None, None])
+    frame = replace(frame, colour_gain=torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 0.0]])[..., None, None])
     irradiance = frame.irradiance("total")
     scale = running_scale(irradiance, frame.depth, None)
     fast = wskp.features(frame, irradiance, scale)

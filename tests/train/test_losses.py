@@ -118,7 +118,7 @@ def test_gains_scale_input_and_target_alike(batch_of):
     frame = batch_of("rae").frames[0]
     rae = RAE()
     _, state = rae.predict(frame, None)
-    tinted = replace(frame, gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
+    tinted = replace(frame, colour_gain=torch.tensor([0.5, 1.0, 2.0])[None, :, None, None])
     reference = frame.reference_irradiance("total")
     plain, gained = (rae.compress(reference, state.scale, f) for f in (frame, tinted))
     torch.testing.assert_close(gained, plain * torch.tensor([0.5, 1.0, 2.0])[None, :, None, None] ** 0.2)

@@ -7,13 +7,13 @@ import pytest
 
 from errors import BadInput
 from models.registry import DENOISERS, create
+from train.augmentation import Augmentation
 from train.losses.displayed import DisplayedTerms
 from train.losses.nbgd import NBGDTerms
 from train.losses.ntd import NTDTerms
 from train.losses.rae import RAETerms
 from train.losses.wskp import SMAPETerms
 from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
-from train.sequences import Augmentation
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
 ENDS_WELL = {"anneal", "average", "rate"}

@@ -155,7 +155,7 @@ def test_the_loss_of_a_sequence_by_hand(batch, monkeypatch):
         return outputs[-1], state
 
     monkeypatch.setattr(rae, "predict", predict)
-    frames = [replace(frame, gain=gain.expand(2, 3, 1, 1)) for frame in batch.frames]
+    frames = [replace(frame, colour_gain=gain.expand(2, 3, 1, 1)) for frame in batch.frames]
     weights = (0.2, 0.5, 1.0)
     value, parts = RelativeLoss(rae, RelativeTerms(temporal=0.7, frames=weights))(Batch(frames))
 

@@ -8,9 +8,9 @@ import torch
 from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
 from models.registry import create
-from train import whole_frames
-from train.sequences import Augmentation, TrainingSequences, collate
-from train.whole_frames import WholeFrames
+from train import sequences as module
+from train.augmentation import Augmentation
+from train.sequences import TrainingSequences, WholeFrames, collate
 
 Played = tuple[Clip, int, int]
 
@@ -45,7 +45,8 @@ def test_crops_get_the_scale_of_their_whole_frames(clips, name, reverse):
     denoiser = create(name)
     measure = Recorded(denoiser.signal)
     augmentation = Augmentation(reverse=reverse, stop=True, gain=True)
-    sequences = TrainingSequences(clips, denoiser.reads, 4, 32, augmentation, 0, measure)
+    sequences = TrainingSequences(clips, denoiser.reads, 4, 32, augmentation, 0)
+    sequences.whole_frames = measure
     unlike = 0
     for index in range(6):
         measure.asked.clear()
@@ -71,12 +72,12 @@ def test_each_frame_is_measured_once(clips, monkeypatch):
     first = measure(clips[0], 3, 1)
     other = [measure(*asked) for asked in ((clips[0], 3, 0), (clips[0], 4, 1), (clips[1], 3, 1))]
     assert not any(torch.equal(first, each) for each in other)
-    monkeypatch.setattr(whole_frames, "measure", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(module, "measure", lambda *_: pytest.fail("measured again"))
     assert torch.equal(measure(clips[0], 3, 1), first)
 
 
 def test_what_whole_frames_say_survives_batches(clips):
-    sequences = TrainingSequences(clips, ("indirect", "depth"), 2, 32, Augmentation(), 0, WholeFrames("indirect"))
+    sequences = TrainingSequences(clips, ("indirect", "depth"), 2, 32, Augmentation(), 0, "indirect")
     batch = collate([sequences[0], sequences[1]]).to("cpu")
     assert torch.equal(batch.frames[1].whole, torch.cat([sequences[0][1].whole, sequences[1][1].whole]))
     assert batch.frames[0].whole.shape == (2, 2)

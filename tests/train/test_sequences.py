@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from datasets.cameras import Cameras
 from datasets.channels import CHANNELS, HIT_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Dataset
-from datasets.frame import Cameras, Frame, read_frame
+from datasets.frame import Frame, read_frame
 from errors import BadInput
+from train.augmentation import Augmentation, averaged, rotated
 from train.data import loader
-from train.sequences import Augmentation, TrainingSequences, collate
+from train.sequences import TrainingSequences, collate
 
 FORWARD_ALONE = tuple(name for name, channel in CHANNELS.items() if channel.is_temporal and name != "motion")
 IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
@@ -111,7 +113,7 @@ def test_augmented_images_agree_along_motion(clips, kind):
 
 def test_rotation_turns_images_normals_and_cameras_alike(clips):
     frame = read_frame(clips[1], 4, IMAGE_CHANNELS, window=(slice(8, 40), slice(20, 52)))
-    turned = frame.rot90()
+    turned = rotated(frame)
     for name in set(IMAGE_CHANNELS) - {"motion"}:
         images = [f.channels[name].numpy() for f in (turned, frame)]
         np.testing.assert_array_equal(images[0], np.rot90(images[1], axes=(-2, -1)), name)
@@ -122,10 +124,10 @@ def test_rotation_turns_images_normals_and_cameras_alike(clips):
     before = torch.rot90(frame.view_normal()[0], dims=(1, 2))
     after = turned.view_normal()[0]
     torch.testing.assert_close(after, torch.stack([-before[1], before[0], before[2]]), atol=2e-3, rtol=0)
-    assert (before[2][frame.rot90().mesh_id[0, 0] > 0] > -0.01).all()  # toward the viewer
+    assert (before[2][rotated(frame).mesh_id[0, 0] > 0] > -0.01).all()  # toward the viewer
     full_turn = frame
     for _ in range(4):
-        full_turn = full_turn.rot90()
+        full_turn = rotated(full_turn)
     for name in IMAGE_CHANNELS:
         torch.testing.assert_close(full_turn.channels[name], frame.channels[name], rtol=0, atol=0)
     torch.testing.assert_close(full_turn.now.K, frame.now.K)
@@ -236,9 +238,9 @@ def test_batches_stack_sequences_and_pad_meshes(clips):
 
 
 def test_too_short_or_small_clips_are_refused(clips):
-    with pytest.raises(BadInput, match="smaller profile"):
+    with pytest.raises(BadInput, match="smaller budget"):
         sequences(clips, length=9)
-    with pytest.raises(BadInput, match="smaller profile"):
+    with pytest.raises(BadInput, match="smaller budget"):
         sequences(clips, crop=65)
 
 
@@ -275,7 +277,7 @@ def test_sequences_of_several_samples_are_means_of_realisations(tiny):
 
 def test_means_of_frames_keep_everything_but_the_noise(clips):
     frames = [read_frame(clips[0], 3, IMAGE_CHANNELS, realisation) for realisation in (0, 1)]
-    mean = frames[0].with_more_samples(frames[1:])
+    mean = averaged(frames)
     assert mean.samples.item() == 2 * frames[0].samples.item()
     for name in frames[0].channels:
         if name in ("direct", "indirect"):
