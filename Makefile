@@ -13,7 +13,12 @@ LLVM := libllvm19
 .NOTPARALLEL:
 .PHONY: all setup dataset train eval bench stress report test test-all lint clean
 
+# Seconds since this call of make began, for the documentation.
+START := $(shell date +%s)
+SECONDS = $$(( $$(date +%s) - $(START) ))
+
 all: dataset train eval report
+	@echo $(SECONDS) > $(RUNS)/make.seconds
 
 setup: $(READY)
 
@@ -54,6 +59,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test: $(READY)
 	$(PYTEST)
+	@mkdir -p $(RUNS) && echo $(SECONDS) > $(RUNS)/test.seconds
 
 test-all: $(READY)
 	$(PYTEST) -m '' --hypothesis-profile thorough

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from allocator import keep_freed_memory
 from errors import BadInput
+from process import set_up_process
 
 Data = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/PROFILE")]
 DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/BUDGET")]
@@ -489,7 +489,7 @@ SUMMARIES = {
 def main(arguments: list[str] | None = None) -> None:
     """Run one command. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
     words = sys.argv[1:] if arguments is None else arguments
-    keep_freed_memory()
+    set_up_process()
     try:
         run(words)
     except BadInput as error:

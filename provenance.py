@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval", "denoise")
-BESIDE_THEM = ("allocator", "errors", "extras", "files", "plotting", "provenance", "timing")
+BESIDE_THEM = ("errors", "extras", "files", "plotting", "process", "provenance", "timing")
 
 # What decides the bytes of a data set, and the numbers of whatever denoises it.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")

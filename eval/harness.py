@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import torch
 from tqdm import tqdm
 
-from allocator import keep_freed_memory
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
@@ -36,6 +35,7 @@ from eval.selection import evaluated, with_indirect_baselines
 from eval.text_table import results_table
 from extras import can_draw
 from models.spec import DenoiserSpec
+from process import set_up_process
 from provenance import device_in_words
 from timing import thread_count, threads_for
 
@@ -112,7 +112,7 @@ class ClipJob(NamedTuple):
 def start_worker() -> None:
     """An interrupt is the parent's to act on. Ended then, a worker must not leave behind a lock that bars share."""
     on_signal(SIGINT, SIG_IGN)
-    keep_freed_memory()
+    set_up_process()
     tqdm.set_lock(threading.RLock())
 
 

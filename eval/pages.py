@@ -24,7 +24,7 @@ from eval.text_table import PRINTED
 from eval.tradeoff.samples import SampleTrade
 from eval.tradeoff.shrinkage import Gain, gains_rows
 from files import read_json, write_file, write_json
-from provenance import ROOT
+from provenance import ROOT, device_in_words
 
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -94,8 +94,11 @@ def extract_stress(runs: Path) -> dict[str, Any]:
 
 
 def extract_times(runs: Path) -> dict[str, Any]:
-    """Seconds that `make` and `make test` took, which they leave in RUNS."""
-    return read_json(runs / "times.json")
+    """Seconds that `make` and `make test` took, which they leave in RUNS, on this machine."""
+    files = {name: runs / f"{name}.seconds" for name in ("make", "test")}
+    if missing := [str(file) for file in files.values() if not file.exists()]:
+        raise BadInput(f"{' and '.join(missing)} missing")
+    return {"device": device_in_words()} | {name: int(file.read_text()) for name, file in files.items()}
 
 
 EXTRACTS: dict[str, Callable[[Path], dict[str, Any]]] = {

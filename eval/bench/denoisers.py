@@ -11,7 +11,6 @@ from tabulate import tabulate
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from allocator import keep_freed_memory
 from datasets.frame import Frame
 from eval.bench.memory import alone, growth_mb
 from eval.bench.output import bench_folder
@@ -25,6 +24,7 @@ from models.names import DenoiserName
 from models.registry import DENOISERS, create, parse_name, prototype
 from models.spec import DenoiserSpec, precisions_of
 from models.wrappers.wrapper import unwrapped
+from process import keep_freed_memory
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 
