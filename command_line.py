@@ -4,6 +4,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -12,6 +13,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from denoise.job import Job
 from errors import BadInput
 from process import set_up_process
 
@@ -38,10 +40,11 @@ Denoisers = Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", he
 Scenes = Annotated[
     tuple[str, ...], Positional, arg(metavar="SCENE...", help="such as cornell_box, room-3 or my-scene.toml")
 ]
-ClipFolder = Annotated[Path, Positional, arg(metavar="CLIP", help="the clip's folder")]
 Size = Annotated[str, arg(metavar="WxH", help="size of the images")]
-Sizes = Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")]
+Threads = Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")]
+Flag = Annotated[bool, FlagCreatePairsOff]
 Png = Annotated[Path, arg(metavar="PNG", help="the image to write")]
+RUNS = Path("runs")
 SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
@@ -49,7 +52,7 @@ def data_folder(data: Path | None, name: str) -> Path:
     return data or Path("data") / name
 
 
-def preview(names: Scenes = (), out: Png = Path("runs/preview.png"), seed: int = 0, spp: int = 64) -> None:
+def preview(names: Scenes = (), out: Png = RUNS / "preview.png", seed: int = 0, spp: int = 64) -> None:
     """Draw a contact sheet of scenes, by default of 16 rooms: the middle frame of each."""
     from eval.figures.contact_sheet import contact_sheet
 
@@ -64,10 +67,10 @@ def dataset(
     scene: Annotated[Path | None, arg(metavar="TOML")] = None,
     seed: int = 0,
     reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
-    part: Annotated[str | None, arg(metavar="K/N")] = None,
-    ray: Annotated[bool, FlagCreatePairsOff] = False,
-    halton: Annotated[bool, FlagCreatePairsOff] = False,
-    regularise: Annotated[bool, FlagCreatePairsOff] = False,
+    part: Annotated[str, arg(metavar="K/N")] = "1/1",
+    ray: Flag = False,
+    halton: Flag = False,
+    regularise: Flag = False,
 ) -> None:
     """Render the missing clips of a profile, or of your own scene.
 
@@ -88,31 +91,23 @@ def dataset(
     if ray:
         from render.job.cluster import render_on_cluster
     folder = data_folder(data, scene.stem if scene else profile)
-    share = Share.parse(part or "1/1")
-    options = Options(halton, regularise)
+    source = str(scene.resolve()) if scene else profile
     render = render_on_cluster if ray else render_here
-    rendered = generate(
-        folder,
-        str(scene.resolve()) if scene else profile,
-        seed,
-        share,
-        channels_read(reads or TRAINABLE),
-        options,
-        render,
-    )
+    channels = channels_read(reads or TRAINABLE)
+    rendered = generate(folder, source, seed, Share.parse(part), channels, Options(halton, regularise), render)
     print(f"{folder}: {rendered} clips rendered")
 
 
 def train(
     names: Denoisers = (),
     data: DataOfBudget = None,
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     budget: Budget = "quick",
     seed: int = 0,
     precision: Literal["float32", "bfloat16"] | None = None,
     micro_batch: Annotated[int | None, arg(metavar="N")] = None,
     from_: Annotated[str | None, arg(name="from", metavar="weights|FILE")] = None,
-    specialise: Annotated[bool, FlagCreatePairsOff] = False,
+    specialise: Flag = False,
 ) -> None:
     """Train networks, or resume: by default wskp6, and in budgets other than quick also rae and ntd-mean.
 
@@ -138,7 +133,7 @@ def train(
 def evaluate(
     names: Denoisers = (),
     data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="datasets; by default data/BUDGET")] = (),
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     budget: Budget = "quick",
     processes: Annotated[int, arg(metavar="N", help="evaluate at most this many clips in parallel")] = os.cpu_count()
     or 1,
@@ -155,7 +150,7 @@ def evaluate(
 
 
 def report(
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     megabytes: Annotated[float, arg(help="size of all images; where not all frames fit, every n-th is shown")] = 24,
 ) -> None:
     """Write a self-contained page of all results, RUNS/report/index.html, and an animation of each clip."""
@@ -192,7 +187,7 @@ def verify(data: Path = Path("data/quick")) -> None:
         print(problem)
     if problems:
         raise BadInput(f"{data}: {len(problems)} problems; delete the clips named above and rerun `onespp dataset`")
-    print(f"{data}: everything is as it was written")
+    print(f"{data}: all files are intact")
 
 
 def exr(
@@ -218,10 +213,10 @@ def exr(
 
 
 def show(
-    clip: ClipFolder,
+    clip: Annotated[Path, Positional, arg(metavar="CLIP", help="the clip's folder")],
     names: Denoisers = (),
-    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/show"),
-    runs: Runs = Path("runs"),
+    out: Annotated[Path, arg(metavar="DIR")] = RUNS / "show",
+    runs: Runs = RUNS,
     budget: Budget = "quick",
 ) -> None:
     """Draw a clip as denoised by those named, or by all that can run.
@@ -237,8 +232,8 @@ def show(
 def study_triptych(
     scene: Annotated[str, Positional, arg(metavar="SCENE", help="a built-in one")] = "room-2014",
     denoiser: Annotated[str, arg(metavar="NAME")] = "one",
-    out: Png = Path("runs/triptych.png"),
-    runs: Runs = Path("runs"),
+    out: Png = RUNS / "triptych.png",
+    runs: Runs = RUNS,
     frame: Annotated[int, arg(metavar="N", help="frame number; history begins at 0")] = 12,
     spp: Annotated[int, arg(metavar="N", help="samples per pixel of the reference")] = 512,
 ) -> None:
@@ -256,7 +251,7 @@ def export(
     ],
     to: Literal["onnx", "pt2"] = "onnx",
     out: Annotated[Path | None, arg(metavar="DIR", help="by default RUNS/export/DENOISER-TO")] = None,
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     weights: Annotated[Path | None, arg(metavar="FILE", help="by default the shipped ones")] = None,
     precision: Annotated[Literal["float32", "float16"], arg(help="of the network")] = "float32",
     warp: Annotated[
@@ -271,9 +266,9 @@ def export(
 
 def bench_export(
     name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")] = "wskp6",
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     size: Size = "1280x720",
-    threads: Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")] = None,
+    threads: Threads = None,
 ) -> None:
     """Time an exported denoiser under onnxruntime beside ours."""
     from eval.bench.export import bench_export as bench
@@ -283,8 +278,8 @@ def bench_export(
 
 def bench_denoisers(
     names: Denoisers = (),
-    runs: Runs = Path("runs"),
-    size: Sizes = ("1280x720",),
+    runs: Runs = RUNS,
+    size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")] = ("1280x720",),
     threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default 1, and as many as PyTorch uses")] = (),
 ) -> None:
     """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers."""
@@ -293,14 +288,14 @@ def bench_denoisers(
     print(bench(runs, names, size, threads))
 
 
-def bench_rendering(names: Scenes = (), runs: Runs = Path("runs")) -> None:
+def bench_rendering(names: Scenes = (), runs: Runs = RUNS) -> None:
     """Measure samples per second and seconds to 40 dB beside stock Mitsuba, by default in eight scenes."""
     from eval.bench.rendering import bench_rendering as bench
 
     print(bench(runs, names))
 
 
-def study_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget = "quick") -> None:
+def study_light(names: Denoisers = (), runs: Runs = RUNS, budget: Budget = "quick") -> None:
     """How many frames the output lags after a light changes, by its quality under steady light.
 
     Renders four clips of the Cornell box in a few minutes; table, plot and results.json in RUNS/study/light.
@@ -310,7 +305,7 @@ def study_light(names: Denoisers = (), runs: Runs = Path("runs"), budget: Budget
     print(study(runs, names, budget))
 
 
-def study_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
+def study_error(names: Denoisers = (), runs: Runs = RUNS) -> None:
     """How close estimated errors and predicted sample counts are to the true ones.
 
     Renders four clips in about ten minutes and filters them at 4 to 128 spp; table, plots and results.json in
@@ -322,7 +317,7 @@ def study_error(names: Denoisers = (), runs: Runs = Path("runs")) -> None:
 
 
 def bench_training(
-    names: Denoisers = (), data: DataOfBudget = None, runs: Runs = Path("runs"), budget: Budget = "quick"
+    names: Denoisers = (), data: DataOfBudget = None, runs: Runs = RUNS, budget: Budget = "quick"
 ) -> None:
     """Measure where the time of a training step goes, by default of rae, wskp6 and ntd."""
     from eval.bench.training import bench_training as bench
@@ -332,7 +327,7 @@ def bench_training(
 
 def stress(
     names: Denoisers = (),
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     budget: Budget = "quick",
     long: Annotated[bool, FlagCreatePairsOff, arg(help="also run sequences of 10 000 frames (minutes)")] = False,
     precision: Annotated[Literal["float32", "bfloat16", "float16"], arg(help="of networks")] = "float32",
@@ -351,7 +346,7 @@ def stress(
 def trade(
     names: Denoisers = (),
     data: DataOfBudget = None,
-    runs: Runs = Path("runs"),
+    runs: Runs = RUNS,
     budget: Budget = "quick",
     size: Annotated[str, arg(metavar="WxH", help="of the images that were timed")] = "1280x720",
     threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
@@ -366,63 +361,20 @@ def trade(
     print(compare(data_folder(data, budget), runs, budget, names, size, threads, spp))
 
 
-Patterns = tuple[str, ...]  # such as 'frames/*.exr', or files
-
-
-def denoise(
-    frames: Annotated[
-        Patterns, Positional, arg(metavar="PATTERN...", help="files with the colour, usually with all layers")
-    ] = (),
-    denoiser: Annotated[str, arg(metavar="DENOISER", help="NETWORK@BUDGET for weights in RUNS")] = "one",
-    out: Annotated[Path, arg(metavar="DIR", help="output folder; frames keep their names")] = Path("denoised"),
-    weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default the shipped ones")] = None,
-    runs: Runs = Path("runs"),
-    hdr: Annotated[Patterns, arg(metavar="PATTERN...", help="another name for the colour's files")] = (),
-    half: Annotated[Patterns, arg(metavar="PATTERN...", help="sample buffer B of the same frames, for NAME+js")] = (),
-    alb: Annotated[Patterns, arg(metavar="PATTERN...", help="albedo in separate files")] = (),
-    nrm: Annotated[Patterns, arg(metavar="PATTERN...", help="normals in separate files")] = (),
-    mv: Annotated[Patterns, arg(metavar="PATTERN...", help="motion vectors in separate files")] = (),
-    depth: Annotated[Patterns, arg(metavar="PATTERN...", help="depth in separate files")] = (),
-    layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...")] = (),
-    motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT")] = None,
-    ref: Annotated[Patterns, arg(metavar="PATTERN...", aliases=["-r"], help="references to compare with")] = (),
-    frame_range: Annotated[str | None, arg(name="frames", metavar="A-B", help="frame numbers to denoise")] = None,
-    reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frame numbers at which history is reset")] = (),
-    quality: Annotated[Literal["high", "balanced", "fast"] | None, arg(aliases=["-q"], help="of OIDN")] = None,
-    stored_as: Annotated[Literal["half", "float"] | None, arg(name="as", help="by default as in the input")] = None,
-    png: Annotated[bool, FlagCreatePairsOff, arg(help="write a preview beside each frame")] = False,
-    spp: Annotated[float, arg(metavar="N", help="samples per pixel of the frames, of each buffer")] = 1.0,
-    error: Annotated[bool, FlagCreatePairsOff] = False,
-    until: Annotated[float | None, arg(metavar="E")] = None,
-    threads: Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")] = None,
-) -> None:
+def denoise(job: Annotated[Job, arg(name="")], runs: Runs = RUNS, threads: Threads = None) -> None:
     """Denoise OpenEXR sequences of any renderer, or resume.
 
     Layers are recognised by common names, the motion vectors' convention by trial; both are printed first.
-
-    Args:
-        layers: name layers yourself, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y.
-        motion: the motion vectors' convention, such as XY,+x,-y,pixels, in the notation that is printed.
-        error: add the layer `error`, an estimate of each pixel's error; needs NAME+js and two sample buffers, and takes
-            three passes instead of one.
-        until: print which frames have a relative error of at most E, such as 0.02, and how many samples others need.
     """
-    from denoise.run import Job
     from denoise.run import denoise as denoise_sequence
     from eval.bench.sizes import threads_or_all
     from eval.selection import weights_of
     from models.registry import parse_name
     from timing import thread_count
 
-    colour = (*frames, *hdr)
-    if not colour:
-        raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
-    weights = weights or weights_of(parse_name(denoiser), runs)
-    passes = {"colour": colour, "half": half, "albedo": alb, "normal": nrm, "motion": mv, "depth": depth}
-    patterns = {name: each for name, each in passes.items() if each}
-    selection = (layers, motion, ref, frame_range, reset_at)
+    weights = job.weights or weights_of(parse_name(job.denoiser), runs)
     with thread_count(threads_or_all(threads)):
-        denoise_sequence(Job(patterns, denoiser, out, weights, *selection, quality, stored_as, png, spp, error, until))
+        denoise_sequence(replace(job, weights=weights))
 
 
 def weights(
@@ -448,23 +400,9 @@ Command = Callable[..., None]
 Commands = dict[str, "Command | Commands"]
 
 GROUPS: dict[str, Commands] = {
-    "Pipeline": {
-        "preview": preview,
-        "dataset": dataset,
-        "train": train,
-        "eval": evaluate,
-        "report": report,
-    },
-    "Datasets": {
-        "info": info,
-        "verify": verify,
-        "exr": exr,
-    },
-    "Your own frames": {
-        "denoise": denoise,
-        "weights": weights,
-        "export": export,
-    },
+    "Pipeline": {"preview": preview, "dataset": dataset, "train": train, "eval": evaluate, "report": report},
+    "Datasets": {"info": info, "verify": verify, "exr": exr},
+    "Your own frames": {"denoise": denoise, "weights": weights, "export": export},
     "Comparisons": {
         "show": show,
         "trade": trade,
@@ -487,7 +425,7 @@ SUMMARIES = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command. Exits with 2 and one line on what the user can fix, 130 when interrupted."""
+    """Run one command. Exits with 2 and one line on what the user can correct, 130 when interrupted."""
     words = sys.argv[1:] if arguments is None else arguments
     set_up_process()
     try:
@@ -497,24 +435,19 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        remedy = "make room" if full else "mend that or choose another folder"
+        remedy = "make room" if full else "correct that or choose another folder"
         sys.exit(complain(f"{where}{error.strerror or error}; {remedy} and run it again"))
     except KeyboardInterrupt:
-        print("\ninterrupted; run the same command again to go on", file=sys.stderr)
+        print("\ninterrupted; run the same command again to resume", file=sys.stderr)
         sys.exit(130)
 
 
 def run(words: list[str]) -> None:
-    """Find the command that `words` begin with, and call it with the rest. Prints an overview where it is asked for."""
+    """Call the command that `words` begin with; print an overview where they ask for help."""
     path = "onespp"
     groups = GROUPS
-    while True:
-        commands = {name: command for group in groups.values() for name, command in group.items()}
-        if path == "onespp":
-            commands["study"] = STUDIES
-        if not words or words[0] in ("-h", "--help"):
-            print("\n".join(overview(path, groups)))
-            return
+    commands = {name: command for group in GROUPS.values() for name, command in group.items()} | {"study": STUDIES}
+    while words and words[0] not in ("-h", "--help"):
         name, *words = words
         if name not in commands:
             raise BadInput(f"unknown command '{path} {name}'; the commands are {', '.join(commands)}")
@@ -523,7 +456,9 @@ def run(words: list[str]) -> None:
         if not isinstance(command, dict):
             tyro.cli(command, prog=path, args=words)
             return
+        commands = command
         groups = {SUMMARIES[name]: command}
+    print("\n".join(overview(path, groups)))
 
 
 def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
@@ -545,6 +480,6 @@ def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
 
 
 def complain(message: str) -> int:
-    """Print what the user can fix. Returns the exit code."""
+    """Print what the user can correct. Returns the exit code."""
     print(f"onespp: {message}", file=sys.stderr)
     return 2

@@ -1,1 +1,1 @@
-"""Other renderers' frames: read, understood, denoised and written."""
+"""Frames of other renderers: reading, interpreting, denoising and writing them."""

@@ -7,22 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.frame import Frame
-from denoise.frames import Reading, Shot
-from denoise.layers import KNOWN
-from denoise.motion_meaning import Meaning
-from denoise.pixels import Pixels, mend, surface_of
-from denoise.sequence import COLOUR
+from denoise.foreign_frame import ForeignFrame, make_finite, surface_of
+from denoise.frames import FrameBuilder, InputConventions
+from denoise.layers import COLOUR, QUANTITIES
+from denoise.motion_convention import MotionConvention
 from errors import BadInput
 from scenes.camera import View
 
 CAMERA = "camera"
 COMPONENTS = {"depth": 1, "distance": 1, "roughness": 1, "motion": 2}  # of others 3
 
+Quantities = Mapping[str, NDArray[np.floating] | View]  # of one frame
 
-def frames_of_arrays(
-    sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], reads: tuple[str, ...], spp: float
-) -> Iterator[Frame]:
-    """A Frame with the channels in `reads` for each mapping of arrays (H, W, C); onespp.frames says what they hold.
+
+def frames_of_arrays(sequence: Iterable[Quantities], reads: tuple[str, ...], spp: float) -> Iterator[Frame]:
+    """A Frame with the channels in `reads` for each mapping of arrays (H, W, C); see onespp.frames for their content.
 
     Raises BadInput, naming the frame and the quantity, for what cannot be used.
     """
@@ -30,26 +29,28 @@ def frames_of_arrays(
     first = next(remaining, None)
     if first is None:
         return
-    reading = Reading(Meaning() if "motion" in first else None, cameras="arrays" if CAMERA in first else None)
-    shot = Shot(reading, reads, "arrays", spp)
+    motion = MotionConvention() if "motion" in first else None
+    conventions = InputConventions(motion, cameras="arrays" if CAMERA in first else None)
+    builder = FrameBuilder(conventions, reads, "arrays", spp)
     for index, quantities in enumerate(chain([first], remaining)):
         if quantities.keys() != first.keys():
             other = min(quantities.keys() ^ first.keys())
             raise BadInput(f"frame {index} of the arrays: '{other}' is in some frames and not in others")
-        yield shot.frame(pixels_of(quantities, f"frame {index} of the arrays"))
+        yield builder.build(foreign_frame(quantities, f"frame {index} of the arrays"))
 
 
-def pixels_of(quantities: Mapping[str, NDArray[np.floating] | View], source: str) -> Pixels:
-    """The pixels of one frame; the arrays themselves are left as they are."""
+def foreign_frame(quantities: Quantities, source: str) -> ForeignFrame:
+    """One frame; the arrays themselves stay as they are."""
     view = quantities.get(CAMERA)
     arrays = {name: np.array(array, np.float32) for name, array in quantities.items() if name != CAMERA}
     if COLOUR not in arrays:
         raise BadInput(f"{source}: there is no '{COLOUR}'")
     for name, array in arrays.items():
-        if name not in KNOWN:
-            raise BadInput(f"{source}: '{name}' is not known; what is are {', '.join(KNOWN)} and {CAMERA}")
+        if name not in QUANTITIES:
+            raise BadInput(f"{source}: unknown quantity '{name}'; there are {', '.join(QUANTITIES)} and {CAMERA}")
         expected = (*arrays[COLOUR].shape[:2], COMPONENTS.get(name, 3))
         if array.shape != expected:
             raise BadInput(f"{source}: '{name}' has the shape {array.shape}, not {expected}")
-    nonfinite = mend(arrays)
-    return Pixels(arrays, surface_of(arrays, None), nonfinite, source, view=view if isinstance(view, View) else None)
+    nonfinite = make_finite(arrays)
+    view = view if isinstance(view, View) else None
+    return ForeignFrame(arrays, surface_of(arrays, None), nonfinite, source, view=view)

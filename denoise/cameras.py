@@ -1,4 +1,4 @@
-"""The camera of a foreign frame: from the header's matrices, or from where its pixels say that surfaces are."""
+"""The camera of a foreign frame: from the header's matrices, or fitted to the positions of its pixels."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from scenes.camera import Array, View, pixel_centres
 
-SAMPLES = 1 << 14  # positions that a camera is fitted to
-FEW = 12  # of them that are tried at first
-DRAWS = 32  # of that many: one is all but sure to be free of outliers where less than a tenth are
-LARGEST_ERROR = 1 / 200  # of the image: the median distance of fitted positions from their pixels, rounded to half
-FLAT = 1e-4  # thickness of the positions, of their extent, below which they leave the camera open
-ORIGIN = 0.01  # of the positions' distance: a camera so close to (0, 0, 0) stands there
-SQUARE = 0.01  # by how much focal lengths may differ
+POSITIONS = 1 << 14  # that a camera is fitted to
+DRAW_SIZE = 12  # of them that a first fit takes
+DRAWS = 32  # first fits: one of them has no outlier, almost surely, where less than a tenth of the positions are
+MAX_ERROR = 1 / 200  # of the image: the median distance of fitted positions from their pixels, rounded to half
+MIN_THICKNESS = 1e-4  # of the positions, relative to their extent: flatter ones do not determine the camera
+MAX_ORIGIN_DISTANCE = 0.01  # relative to the positions': a camera closer to (0, 0, 0) is taken to be there
+MAX_OBLONGNESS = 0.01  # by how much focal lengths may differ
 
-STILL = np.eye(4)[None]  # object_to_world: what moves by itself is not known
+STILL = np.eye(4)[None]  # object_to_world: motion of objects is not known
 
 
 def view_of(projection: Array) -> View | None:
@@ -42,31 +42,31 @@ def view_of(projection: Array) -> View | None:
 def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]) -> View | None:
     """The view that sees `positions` (H, W, 3) at their pixels where there is a `surface` (H, W).
 
-    The direct linear transform (Hartley and Zisserman, §7.1), first of a few points (RANSAC, §4.7), then of all that
-    agree. None where there is no such pinhole camera, or more than one, as for points in a plane.
+    The direct linear transform (Hartley and Zisserman, §7.1), first of a few points (RANSAC, §4.7), then of all
+    inliers. None where there is no such pinhole camera, or more than one, as for points in a plane.
     """
-    place = np.nonzero(surface & np.isfinite(positions).all(axis=-1))
-    stride = max(1, len(place[0]) // SAMPLES)
-    rows, columns = (index[::stride] for index in place)
+    usable = np.nonzero(surface & np.isfinite(positions).all(axis=-1))
+    stride = max(1, len(usable[0]) // POSITIONS)
+    rows, columns = (index[::stride] for index in usable)
     points = positions[rows, columns].astype(np.float64)
     pixels = pixel_centres(*surface.shape)[rows, columns]
-    if len(points) < FEW:
+    if len(points) < DRAW_SIZE:
         return None
     middle = points.mean(axis=0)
     thickness = np.linalg.svd(points - middle, compute_uv=False)
-    if thickness[2] < FLAT * thickness[0]:
+    if thickness[2] < MIN_THICKNESS * thickness[0]:
         return None
 
     def median_error(fit: Array) -> float:
         return float(np.median(reprojection_error(fit, points, pixels)))
 
     rng = np.random.default_rng(0)
-    draws = (rng.choice(len(points), FEW, replace=False) for _ in range(DRAWS))
-    fit = min((linear_fit(points[few], pixels[few]) for few in draws), key=median_error)
+    draws = (rng.choice(len(points), DRAW_SIZE, replace=False) for _ in range(DRAWS))
+    fit = min((linear_fit(points[draw], pixels[draw]) for draw in draws), key=median_error)
     for _ in range(2):
-        good = reprojection_error(fit, points, pixels) <= max(3 * median_error(fit), 1e-3)
-        fit = linear_fit(points[good], pixels[good])
-    return view_of(fit) if median_error(fit) <= LARGEST_ERROR * max(surface.shape) else None
+        inliers = reprojection_error(fit, points, pixels) <= max(3 * median_error(fit), 1e-3)
+        fit = linear_fit(points[inliers], pixels[inliers])
+    return view_of(fit) if median_error(fit) <= MAX_ERROR * max(surface.shape) else None
 
 
 def linear_fit(points: Array, pixels: Array) -> Array:
@@ -106,8 +106,8 @@ def reprojection_error(projection: Array, points: Array, pixels: Array) -> Array
 def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View | None:
     """The view of `worldToNDC`, None without.
 
-    OpenEXR means coordinates of [-1, 1] with y up; where the viewing axis meets the image at (1/2, 1/2), they are
-    [0, 1]. A matrix that makes pixels oblong is not believed: pbrt writes one for images that are not square.
+    OpenEXR specifies coordinates in [-1, 1] with y up; where the viewing axis meets the image at (1/2, 1/2), they are
+    in [0, 1]. A matrix that makes pixels oblong is ignored: pbrt writes one for images that are not square.
     """
     if "worldToNDC" not in header:
         return None
@@ -121,7 +121,7 @@ def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View |
     to_pixels = np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]], [0, 0, 1.0]])
     view = view_of(to_pixels @ ndc[[0, 1, 3]])
     aspect = float(header.get("pixelAspectRatio", 1.0))
-    if view is None or abs(view.K[1, 1] / (view.K[0, 0] * aspect) - 1) > SQUARE:
+    if view is None or abs(view.K[1, 1] / (view.K[0, 0] * aspect) - 1) > MAX_OBLONGNESS:
         return None
     return view
 
@@ -129,14 +129,15 @@ def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View |
 def is_own_space(
     view: View, header: Mapping[str, Any], positions: NDArray[np.float32], surface: NDArray[np.bool_]
 ) -> bool:
-    """Whether the `positions` that a camera was fitted to are in its own coordinates: it stands where these begin.
+    """Whether the `positions` that a camera was fitted to are in its own coordinates: the camera is at the origin.
 
-    Where the header has `worldToCamera`, that is where it would stand in the world instead.
+    Where the header has `worldToCamera`, it is if the fit is closer to the origin than to the camera's place in the
+    world.
     """
     eye = view.camera_to_world[:3, 3]
     if "worldToCamera" in header:
         return bool(np.linalg.norm(eye) <= np.linalg.norm(eye - to_world(header)[:3, 3]))
-    return bool(np.linalg.norm(eye) < ORIGIN * np.median(np.linalg.norm(positions[surface], axis=-1)))
+    return bool(np.linalg.norm(eye) < MAX_ORIGIN_DISTANCE * np.median(np.linalg.norm(positions[surface], axis=-1)))
 
 
 def to_world(header: Mapping[str, Any]) -> Array:
@@ -145,7 +146,7 @@ def to_world(header: Mapping[str, Any]) -> Array:
 
 
 def in_the_world(view: View, header: Mapping[str, Any]) -> View | None:
-    """A view fitted in the camera's own coordinates, moved to where `worldToCamera` says; None without it."""
+    """A view fitted in the camera's own coordinates, moved to the world by `worldToCamera`; None without it."""
     if "worldToCamera" not in header:
         return None
     return view._replace(camera_to_world=to_world(header) @ view.camera_to_world)

@@ -11,7 +11,8 @@ from tabulate import tabulate
 
 from datasets.frame import to_tensor
 from denoise.exr_image import ExrImage
-from denoise.sequence import COLOUR, FrameFiles
+from denoise.layers import COLOUR
+from denoise.sequence import FrameFiles
 from denoise.sources import find_sources
 from errors import BadInput
 from eval.comparison import Comparison
@@ -25,17 +26,17 @@ FILE = "metrics.csv"
 def compare(
     frames: Sequence[FrameFiles], references: Sequence[Path], out: Path, target: Sequence[str], exposure: float
 ) -> str:
-    """Measure the `target` channels of frames on disk against references, as displayed; keep all in metrics.csv.
+    """Measure the `target` channels of frames on disk against references, as displayed, and write metrics.csv.
 
     Returns a table of the means. Raises BadInput where a reference is of another size.
     """
     rows = []
     for files, reference in zip(frames, references, strict=True):
-        halves = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)  # of one reference: its noise is not known
+        reference_pair = to_tensor(radiance(reference, target)).repeat(2, 1, 1, 1)  # of one: its noise is unknown
         denoised = to_tensor(radiance(out / files.name, target))
-        if halves.shape[1:] != denoised.shape[1:]:
+        if reference_pair.shape[1:] != denoised.shape[1:]:
             raise BadInput(f"{reference} is of another size than {out / files.name}")
-        comparison = Comparison(denoised, halves, exposure)
+        comparison = Comparison(denoised, reference_pair, exposure)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in MEASURED)])
     text = io.StringIO(newline="")
     csv.writer(text).writerows([["frame", *MEASURED], *rows])
@@ -49,7 +50,7 @@ def compare(
 
 
 def radiance(path: Path, target: Sequence[str]) -> NDArray[np.float32]:
-    """The radiance (H, W, 3) of a finished image, finite: its `target` channels, or else those known to be radiance."""
+    """The radiance (H, W, 3) of a finished image, finite: its `target` channels, or else those called like radiance."""
     image = ExrImage(path)
     channels = target if all(name in image.channels for name in target) else find_sources({COLOUR: image}, {}).target
     return np.nan_to_num(image.stacked(channels), nan=0.0, posinf=0.0, neginf=0.0)

@@ -1,4 +1,4 @@
-"""error.csv: how far each denoised frame is from the truth, as the halves of its samples tell."""
+"""error.csv: the estimated error of each denoised frame."""
 
 import csv
 import io
@@ -20,11 +20,11 @@ class FrameError:
     """One row.
 
     Attributes:
-        spp: samples a pixel that the frame has.
-        relative_error: root of the mean squared error relative to the light around each pixel.
+        spp: samples per pixel of the frame.
+        relative_error: root of the mean squared error relative to the mean light of each pixel's neighbourhood.
         at_most: the same with two standard errors added.
-        until: what `at_most` is to be; None where nobody asked.
-        samples: a pixel, that this takes; `spp` where it is reached, infinite beyond reason.
+        until: the relative error to reach; None where none was given.
+        samples: per pixel, to reach it; `spp` where it is reached, infinite beyond a limit.
     """
 
     frame: int
@@ -45,16 +45,16 @@ class FrameError:
             None if until is None else np.ceil(estimate.samples_for(until)).item(),
         )
 
-
-def row_of(words: dict[str, str]) -> FrameError:
-    """Raises ValueError, KeyError or TypeError for what is no row."""
-    until, samples = (float(words[name]) if words[name] else None for name in ("until", "samples"))
-    spp, relative_error, at_most = (float(words[name]) for name in ("spp", "relative_error", "at_most"))
-    return FrameError(int(words["frame"]), spp, relative_error, at_most, until, samples)
+    @staticmethod
+    def parse(row: dict[str, str]) -> "FrameError":
+        """Raises ValueError, KeyError or TypeError for what is no row."""
+        until, samples = (float(row[name]) if row[name] else None for name in ("until", "samples"))
+        spp, relative_error, at_most = (float(row[name]) for name in ("spp", "relative_error", "at_most"))
+        return FrameError(int(row["frame"]), spp, relative_error, at_most, until, samples)
 
 
 class ErrorTable:
-    """The rows of a folder's frames, on disk after each. Raises BadInput where the file there is damaged."""
+    """The rows of a folder's frames, written after each. Raises BadInput where the file there is damaged."""
 
     def __init__(self, folder: Path):
         self.path = folder / FILE
@@ -62,7 +62,7 @@ class ErrorTable:
         if self.path.exists():
             try:
                 with self.path.open(newline="") as file:
-                    rows = [row_of(words) for words in csv.DictReader(file)]
+                    rows = [FrameError.parse(row) for row in csv.DictReader(file)]
             except (TypeError, ValueError, KeyError, csv.Error):
                 raise BadInput(f"{self.path} is damaged: delete it and run the command again") from None
             self.rows = {row.frame: row for row in rows}
@@ -76,14 +76,14 @@ class ErrorTable:
         write_file(self.path, text.getvalue().encode())
 
     def has(self, frame: int, until: float | None) -> bool:
-        """Whether there is a row of the frame for what is asked for now."""
+        """Whether there is a row of the frame for this relative error."""
         return frame in self.rows and self.rows[frame].until == until
 
     def summary(self, frames: Iterable[int]) -> str:
-        """Which of the frames are done, and how many samples the others take."""
+        """How many of the frames have reached the relative error, and how many samples the others need."""
         rows = [self.rows[frame] for frame in frames]
         waiting = [row.samples for row in rows if row.samples and row.samples > row.spp]
         text = f"{len(rows) - len(waiting)} of {len(rows)} frames have a relative error of at most {rows[0].until:g}"
         if waiting:
-            text += f"; the others take {min(waiting):g} to {max(waiting):g} samples a pixel"
+            text += f"; the others need {min(waiting):g} to {max(waiting):g} samples per pixel"
         return f"{text} ({self.path})"

@@ -1,6 +1,8 @@
-"""An OpenEXR file in memory, of whatever maker: its planes by name, its header, and how it is written with changes."""
+"""An OpenEXR file of any program in memory: its planes by name, its header, and writing it with changes."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,24 @@ from numpy.typing import NDArray
 from errors import BadInput
 from files import replacing
 
-LARGEST_HALF = 65504.0
+MAX_HALF = 65504.0
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """A context in which the OpenEXR library prints nothing: of a damaged file it writes many lines."""
+    stderr = os.dup(2)
+    with open(os.devnull, "w") as null, redirect_stdout(null):
+        os.dup2(null.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
 
 
 def plane_name(part: str, channel: str, several: bool) -> str:
-    """The channel's name with that of its part before it, unless it is the file's only part or begins with it."""
+    """The channel's name, after that of its part unless it is the file's only part or the name begins with it."""
     begins = channel.casefold().startswith(f"{part}.".casefold())
     return f"{part}.{channel}" if several and part and not begins else channel
 
@@ -28,10 +43,11 @@ class ExrImage:
         if not path.is_file():
             raise BadInput(f"{path} is missing")
         try:
-            headers = OpenEXR.File(str(path), header_only=True)
-            self.file = headers if header_only else OpenEXR.File(str(path), separate_channels=True)
+            with silenced():
+                headers = OpenEXR.File(str(path), header_only=True)
+                self.file = headers if header_only else OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, TypeError) as error:
-            raise BadInput(f"{path} is damaged or no OpenEXR image ({error}): render it again") from None
+            raise BadInput(f"{path} is damaged or not an OpenEXR image ({error}): render it again") from None
         if len(self.file.parts) < len(headers.parts) or not headers.parts:  # OpenEXR leaves out what it cannot read
             raise BadInput(f"{path} is damaged: render it again")
         several = len(self.file.parts) > 1
@@ -60,18 +76,18 @@ class ExrImage:
         """Put `image` (H, W, C) in place of the named channels, in their own precision or in `dtype`."""
         for index, name in enumerate(channels):
             target = np.dtype(dtype or self.channels[name].pixels.dtype)
-            limit = LARGEST_HALF if target == np.float16 else np.inf
+            limit = MAX_HALF if target == np.float16 else np.inf
             self.channels[name].pixels = np.ascontiguousarray(image[..., index].clip(-limit, limit), target)
 
     def add(self, layer: str, image: NDArray[np.float32], beside: str) -> None:
         """Put `image` (H, W, 3), not negative, as R, G and B of a layer into the part that has the channel `beside`.
 
-        It is in half precision. A layer of that name, in whatever part, is replaced.
+        It is in half precision. A layer of that name, in any part, is replaced.
         """
         home = next(part for part in self.file.parts if self.channels[beside] in part.channels.values())
         for index, component in enumerate("RGB"):
             name = f"{layer}.{component}"
-            plane = np.ascontiguousarray(image[..., index].clip(0, LARGEST_HALF), np.float16)
+            plane = np.ascontiguousarray(image[..., index].clip(0, MAX_HALF), np.float16)
             if name in self.channels:
                 self.channels[name].pixels = plane
             else:

@@ -1,52 +1,49 @@
-"""Which channels of a file hold what: the layer names in use, and those that the user states."""
+"""Which channels of a file hold which quantity: by the layer names in use, or by names that the user gives."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from errors import BadInput
 
+COLOUR = "colour"  # the quantity that a frame cannot do without
 
-class Known(NamedTuple):
-    """The layers that hold a quantity: their names, best first, and the components that they must have."""
 
-    names: tuple[str, ...]  # compared without case, spaces, _ and -
+class LayerNames(NamedTuple):
+    """How the layers of a quantity are called, and the components that they must have."""
+
+    names: tuple[str, ...]  # best first; compared without case, spaces, _ and -
     components: tuple[str, ...]  # letters of channel names, best first
-    meaning: str
 
 
 RGB = ("rgb",)
 VECTOR = ("xyz", "rgb")
 SCALAR = ("v", "z", "y", "r", "x", "d")
-KNOWN: dict[str, Known] = {
-    "colour": Known(("noisyimage", "beauty", "combined", "", "rgba", "rgb", "color", "colour", "c"), RGB, "radiance"),
-    "half": Known(("otherhalf",), RGB, "radiance by as many other samples a pixel"),
-    "emission": Known(("emission", "emit"), RGB, "light seen directly, free of noise"),
-    "albedo": Known(("denoisingalbedo", "albedo", "visiblediffuse", "diffcol", "alb"), RGB, "reflectance"),
-    "normal": Known(
-        ("normal", "normals", "ns", "visiblenormals", "optixnormals", "denoisingnormal", "n", "nrm"),
-        VECTOR,
-        "shading normals",
+QUANTITIES: dict[str, LayerNames] = {
+    COLOUR: LayerNames(("noisyimage", "beauty", "combined", "", "rgba", "rgb", "color", "colour", "c"), RGB),
+    "half": LayerNames(("otherhalf",), RGB),  # radiance of as many other samples per pixel
+    "emission": LayerNames(("emission", "emit"), RGB),  # of surfaces seen directly, free of noise
+    "albedo": LayerNames(("denoisingalbedo", "albedo", "visiblediffuse", "diffcol", "alb"), RGB),
+    "normal": LayerNames(  # shading normals
+        ("normal", "normals", "ns", "visiblenormals", "optixnormals", "denoisingnormal", "n", "nrm"), VECTOR
     ),
-    "depth": Known(("depth", "z", "denoisingdepth"), SCALAR, "distance along the viewing axis"),
-    "distance": Known(("distance",), SCALAR, "distance along the ray"),
-    "position": Known(("p", "position", "positions"), VECTOR, "where surfaces are"),
-    "motion": Known(
-        ("vector", "motion", "motionvector", "motionvectors", "velocity", "mv", "flow"),
-        ("xyzw", "xy", "uv", "rg"),
-        "screen-space motion",
+    "depth": LayerNames(("depth", "z", "denoisingdepth"), SCALAR),  # distance along the viewing axis
+    "distance": LayerNames(("distance",), SCALAR),  # along the ray
+    "position": LayerNames(("p", "position", "positions"), VECTOR),
+    "motion": LayerNames(
+        ("vector", "motion", "motionvector", "motionvectors", "velocity", "mv", "flow"), ("xyzw", "xy", "uv", "rg")
     ),
-    "roughness": Known(("roughness",), SCALAR, "GGX alpha"),
+    "roughness": LayerNames(("roughness",), SCALAR),  # GGX alpha
 }
 
 
-class Layer(NamedTuple):
+class ExrLayer(NamedTuple):
     """A layer of a file, and the names of those of its channels that hold a quantity."""
 
     name: str
     channels: tuple[str, ...]
 
 
-def plain(name: str) -> str:
+def normalised(name: str) -> str:
     """A name without case, spaces, _ and -."""
     return name.casefold().translate({ord(c): None for c in " _-"})
 
@@ -69,52 +66,53 @@ def grouped(channels: Iterable[str]) -> dict[str, dict[str, str]]:
     return layers | {channel: {"v": channel} for channel in beside_colour}
 
 
-def layer_of(quantity: str, name: str, members: Mapping[str, str]) -> Layer | None:
+def layer_of(quantity: str, name: str, members: Mapping[str, str]) -> ExrLayer | None:
     """The layer of the given `members`, if it has the components of the quantity."""
-    for letters in KNOWN[quantity].components:
+    for letters in QUANTITIES[quantity].components:
         if all(letter in members for letter in letters):
-            return Layer(name, tuple(members[letter] for letter in letters))
+            return ExrLayer(name, tuple(members[letter] for letter in letters))
     return None
 
 
-def candidates(quantity: str, channels: Iterable[str]) -> list[Layer]:
-    """All layers that hold a quantity by their names, best first, whatever stands before them (`ViewLayer.`)."""
+def candidates(quantity: str, channels: Iterable[str]) -> list[ExrLayer]:
+    """All layers that hold a quantity by the last part of their names, best first."""
     layers = sorted(grouped(channels).items(), key=lambda item: item[0].casefold().startswith("composite"))
-    found = []
-    for wanted in KNOWN[quantity].names:
-        for name, members in layers:
-            if plain(name.rpartition(".")[2]) == wanted and (layer := layer_of(quantity, name, members)):
-                found.append(layer)
-    return found
+    return [
+        layer
+        for wanted in QUANTITIES[quantity].names
+        for name, members in layers
+        if normalised(name.rpartition(".")[2]) == wanted and (layer := layer_of(quantity, name, members))
+    ]
 
 
-def stated_layers(stated: Sequence[str]) -> dict[str, str]:
-    """The layer of each quantity from texts such as "albedo=MyAOV.albedo". Raises BadInput for what is no such text."""
+def parse_layers(options: Sequence[str]) -> dict[str, str]:
+    """The layer of each quantity from texts such as "albedo=MyAOV.albedo". Raises BadInput for any other text."""
     layers = {}
-    for text in stated:
+    for text in options:
         quantity, equals, layer = text.partition("=")
-        if not equals or not layer or quantity not in KNOWN:
+        if not equals or not layer or quantity not in QUANTITIES:
             raise BadInput(
-                f"'{text}' states no layer: write QUANTITY=LAYER, where QUANTITY is one of {', '.join(KNOWN)}"
+                f"'{text}' does not name a layer: write QUANTITY=LAYER, where QUANTITY is one of "
+                f"{', '.join(QUANTITIES)}"
             )
         layers[quantity] = layer
     return layers
 
 
-def stated_layer(quantity: str, stated: str, channels: Sequence[str], file: str) -> Layer:
-    """The layer that the user states: a layer's name, or channels "A.X,A.Y". Raises BadInput where it is not there."""
-    named = tuple(stated.split(","))
+def named_layer(quantity: str, text: str, channels: Sequence[str], file: str) -> ExrLayer:
+    """The layer that the user names: a layer's name, or channels "A.X,A.Y". Raises BadInput where it is missing."""
+    named = tuple(text.split(","))
     layers = grouped(channels)
-    layer = layer_of(quantity, stated, layers[stated]) if stated in layers else None
-    if layer is None and set(named) <= set(channels) and len(named) in map(len, KNOWN[quantity].components):
-        layer = Layer(stated, named)
+    layer = layer_of(quantity, text, layers[text]) if text in layers else None
+    if layer is None and set(named) <= set(channels) and len(named) in map(len, QUANTITIES[quantity].components):
+        layer = ExrLayer(text, named)
     if layer is None:
-        raise BadInput(f"{file} has no layer '{stated}' that could be its {quantity}; it has {in_words(channels)}")
+        raise BadInput(f"{file} has no layer '{text}' that could be its {quantity}; it has {list_layers(channels)}")
     return layer
 
 
-def in_words(channels: Iterable[str]) -> str:
-    """The layers that there are, with their components: "Albedo.RGB, R, G, B"."""
+def list_layers(channels: Iterable[str]) -> str:
+    """The layers with their components: "Albedo.RGB, R, G, B"."""
     layers: dict[str, str] = {}
     for channel in channels:
         layer, dot, component = channel.rpartition(".")

@@ -1,118 +1,79 @@
-"""`onespp denoise`: anybody's frames through a denoiser, one after another, and what came of them on disk."""
+"""`onespp denoise`: frames of any renderer through a denoiser, one after another, and the results on disk."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from datasets.frame import Frame
 from datasets.tonemap import clip_exposure, display, luminance
+from denoise.analysis import Analysis, analyse
 from denoise.comparison import compare, radiance
 from denoise.error_table import ErrorTable, FrameError
 from denoise.exr_image import ExrImage
-from denoise.frames import OwnShot, Shot
-from denoise.layers import stated_layers
-from denoise.motion_meaning import Meaning
-from denoise.pixels import open_passes, read_pixels
-from denoise.sequence import COLOUR, FrameFiles, files_of, gaps, numbered, sequence_of, shots
-from denoise.settings import claim
-from denoise.sources import Sources, find_sources, has_halves
-from denoise.understanding import Understanding, report, understand
+from denoise.foreign_frame import open_passes, read_foreign_frame
+from denoise.frames import FrameBuilder, OwnFrameBuilder
+from denoise.job import Job
+from denoise.layers import COLOUR, parse_layers
+from denoise.motion_convention import MotionConvention
+from denoise.sequence import FrameFiles, files_of, gaps, numbered, sequence_of, split_at_cuts
+from denoise.sources import Sources, find_sources, has_two_buffers
 from errors import BadInput
 from eval.bench.memory import status_mb
 from extras import requires_extra
-from files import replacing
+from files import read_json, replacing, write_json
 from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN, OIDNQuality
 from models.registry import parse_name
 from models.spec import DenoiserSpec, fastest_precision
-from models.wrappers.error_estimate import ErrorEstimate, with_error
+from models.wrappers.error_estimate import with_error
 from models.wrappers.shrinkage import Shrunk
 from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, file_digest, versions
 
-Precision = Literal["half", "float"]
 ERROR_LAYER = "error"
+SETTINGS_FILE = "denoise.json"
 DTYPES: dict[str | None, type | None] = {None: None, "half": np.float16, "float": np.float32}
 
-
-@dataclass(frozen=True)
-class Job:
-    """What is asked for.
-
-    Attributes:
-        patterns: of the files of each pass; of "colour" at least one.
-        layers: which layers hold what, such as "albedo=MyAOV.albedo", before all names that are known.
-        motion: the meaning of motion vectors, such as "XY,+x,+y,pixels"; by default found out.
-        references: patterns of the frames to measure against.
-        frames: numbers "A-B" of the frames to denoise.
-        reset_at: numbers of frames at which history begins anew.
-        stored_as: precision of denoised channels, by default that of the input.
-        previews: whether to write a PNG beside each frame.
-        spp: samples a pixel of the colour; what our own files say is known.
-        error: whether to add the layer `error` to each frame: how far each pixel is from the truth, as halves tell.
-        until: the relative error at which a frame is done; the samples that the others need go into error.csv.
-    """
-
-    patterns: Mapping[str, Sequence[str]]
-    denoiser: str
-    out: Path
-    weights: Path | None
-    layers: Sequence[str] = ()
-    motion: str | None = None
-    references: Sequence[str] = ()
-    frames: str | None = None
-    reset_at: Sequence[int] = ()
-    quality: OIDNQuality | None = None
-    stored_as: Precision | None = None
-    previews: bool = False
-    spp: float = 1.0
-    error: bool = False
-    until: float | None = None
-
-    @property
-    def tells_error(self) -> bool:
-        return self.error or self.until is not None
+FrameReader = Callable[[FrameFiles], tuple[ExrImage, Frame, int]]
 
 
 @torch.inference_mode()
 def denoise(job: Job) -> None:
-    """Do what is asked for, or go on with it; prints what was found in the files, and a summary.
-
-    Raises BadInput for what the user can mend.
-    """
-    if job.previews:
+    """Denoise a sequence, or resume; prints the analysis of the files, and a summary. Raises BadInput."""
+    if job.png:
         with requires_extra("report"):
             import PIL.Image  # noqa: F401 - so that a missing package is named before the work
-    frames = sequence_of(job.patterns, job.frames)
+    frames = sequence_of(job.patterns, job.frame_range)
     references = reference_files(job, frames)
     check_names(job.out, frames)
-    sequence = shots(frames, job.reset_at)
-    sources = find_sources(open_passes(frames[0], header_only=True), stated_layers(job.layers))
+    shots = split_at_cuts(frames, job.reset_at)
+    sources = find_sources(open_passes(frames[0], header_only=True), parse_layers(job.layers))
     name = parse_name(job.denoiser)
-    spec = DenoiserSpec(name, "total", fastest_precision(name), job.weights)
+    spec = DenoiserSpec(name, "total", fastest_precision(name, job.device), job.weights, device=job.device)
     denoiser = build(spec, job.quality)
-    if job.tells_error:
-        check_error_can_be_told(job, denoiser, sources, frames[0])
-    work = Work(job, spec, denoiser, sequence, sources)
-    print(work.introduction())
-    claim(job.out, work.settings())
-    nonfinite = list(work.play())
+    if job.estimates_error:
+        check_error_estimate(job, denoiser, sources, frames[0])
+    sequence = SequenceDenoiser(job, spec, denoiser, shots, sources)
+    print(sequence.introduction())
+    check_settings(job.out, sequence.settings())
+    nonfinite = list(sequence.play())
     print(f"{job.out}: {len(frames)} frames, {len(nonfinite)} of them new", end="; ")
     print(f"{sum(nonfinite)} pixels were not finite and count as 0", end="")
     peak = status_mb("VmHWM")
     print(f"; peak memory {peak / 1000:.2f} GB" if peak else "")
     if job.until is not None:
-        print(work.errors.summary(frame.number for frame in frames))
+        print(sequence.errors.summary(frame.number for frame in frames))
     if references:
-        print(compare(frames, references, job.out, sources.target, work.exposure))
+        print(compare(frames, references, job.out, sources.target, sequence.exposure))
 
 
 def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
@@ -121,16 +82,17 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
     if quality:
         inner = unwrapped(denoiser)
         if not isinstance(inner, OIDN):
-            raise BadInput(f"--quality is OIDN's, '{spec.name}' has none")
+            raise BadInput(f"--quality is an option of OIDN, not of '{spec.name}'")
         inner.quality = quality
     return denoiser
 
 
-def check_error_can_be_told(job: Job, denoiser: Denoiser, sources: Sources, first: FrameFiles) -> None:
-    """Raise BadInput for a denoiser that tells no error, frames that have no halves, and an error that none has."""
+def check_error_estimate(job: Job, denoiser: Denoiser, sources: Sources, first: FrameFiles) -> None:
+    """Raise BadInput for a denoiser or frames that do not allow an error estimate, and for an error out of range."""
     if not isinstance(denoiser, Shrunk):
-        raise BadInput(f"{job.denoiser} does not tell its error: name {job.denoiser}+js")
-    if not (has_halves(ExrImage(first.passes[COLOUR], header_only=True)) if sources.is_ours else sources.has("half")):
+        raise BadInput(f"{job.denoiser} does not estimate its error: use {job.denoiser}+js")
+    image = ExrImage(first.passes[COLOUR], header_only=True)
+    if not (has_two_buffers(image) if sources.is_ours else sources.has("half")):
         raise BadInput("--error and --until need two halves of the samples: name the other by --half")
     if job.until is not None and not 0 < job.until < math.inf:
         raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
@@ -138,26 +100,44 @@ def check_error_can_be_told(job: Job, denoiser: Denoiser, sources: Sources, firs
 
 def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
     """The reference of each frame, or none at all. Raises BadInput where one is missing."""
-    if not job.references:
+    if not job.ref:
         return []
-    files = numbered(files_of(job.references))
+    files = numbered(files_of(job.ref))
     for frame in frames:
         if frame.number not in files:
-            raise BadInput(f"'{' '.join(job.references)}' has no reference of frame {frame.number}")
+            raise BadInput(f"'{' '.join(job.ref)}' has no reference of frame {frame.number}")
     return [files[frame.number] for frame in frames]
 
 
 def check_names(out: Path, frames: Sequence[FrameFiles]) -> None:
     """Raise BadInput where an output would overwrite an input, or another output."""
     if any(path.parent.resolve() == out.resolve() for frame in frames for path in frame.passes.values()):
-        raise BadInput(f"--out {out} holds the frames to denoise: choose another folder")
+        raise BadInput(f"--out {out} contains the frames to denoise: choose another folder")
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
         raise BadInput("frames of different folders have the same name: denoise one folder at a time")
 
 
+def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
+    """Make the folder and write the settings into it. Raises BadInput where it has frames with other settings."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / SETTINGS_FILE
+    if not path.exists():
+        write_json(path, dict(settings))
+        return
+    present = read_json(path)
+    changed = [key for key in sorted(settings.keys() | present.keys()) if settings.get(key) != present.get(key)]
+    if changed:
+        raise BadInput(f"{out} has frames denoised with other settings ({', '.join(changed)}): choose another --out")
+
+
+def image_of(tensor: Tensor) -> NDArray[np.float32]:
+    """(H, W, C) of (1, C, H, W)."""
+    return tensor[0].permute(1, 2, 0).cpu().numpy()
+
+
 @dataclass
-class Work:
+class SequenceDenoiser:
     """A job whose files and denoiser are known."""
 
     job: Job
@@ -167,33 +147,34 @@ class Work:
     sources: Sources
 
     @cached_property
-    def understanding(self) -> Understanding:
-        stated = Meaning.parse(self.job.motion) if self.job.motion else None
-        return understand(self.shots, self.sources, self.denoiser.reads, stated)
+    def analysis(self) -> Analysis:
+        given = MotionConvention.parse(self.job.motion) if self.job.motion else None
+        return analyse(self.shots, self.sources, self.denoiser.reads, given)
 
     @cached_property
     def exposure(self) -> float:
-        """Of previews and metrics: what the first frame needs, its reference if there is one."""
+        """Of previews and metrics: that of the first frame, or of its reference if there is one."""
         first = self.shots[0][0]
-        if self.job.references:
+        if self.job.ref:
             image = radiance(reference_files(self.job, [first])[0], self.sources.target)
         elif self.sources.is_ours:
             image = radiance(first.passes[COLOUR], self.sources.target)
         else:
-            image = read_pixels(first, self.sources)[0].arrays[COLOUR]
+            image = read_foreign_frame(first, self.sources)[0].arrays[COLOUR]
         return clip_exposure(luminance(image.clip(0, None)))
 
     def introduction(self) -> str:
-        """What was found, what is derived, what is done without."""
+        """The frames, and where each quantity comes from."""
         frames = [frame for shot in self.shots for frame in shot]
         head = f"{len(frames)} frames, {frames[0].passes[COLOUR]} to {frames[-1].passes[COLOUR].name}"
         if missing := gaps(frames):
             head += f"; frames are missing before {', '.join(map(str, missing))}: history begins anew there"
         ours = [("everything", "onespp's own channels and cameras")]
-        return f"{head}\n{report(ours if self.sources.is_ours else self.understanding.words)}"
+        report = ours if self.sources.is_ours else self.analysis.report
+        return "\n".join([head, *(f"  {quantity:<13} {origin}" for quantity, origin in report)])
 
     def settings(self) -> dict[str, Any]:
-        """All that the bytes of a frame follow from, but for the files themselves."""
+        """All that the bytes of a frame depend on, except the files themselves."""
         job = self.job
         first = self.shots[0][0]
         return {
@@ -205,17 +186,17 @@ class Work:
             "first frame": first.number,
             "reset-at": sorted(job.reset_at),
             "layers": sorted(job.layers),
-            "motion": str(job.motion if self.sources.is_ours else self.understanding.reading.meaning),
+            "motion": str(job.motion if self.sources.is_ours else self.analysis.conventions.motion),
             "as": job.stored_as,
             "spp": job.spp,
             "error": job.error or None,
             "versions": versions(DENOISING),
-        }
+        } | ({} if job.device == "cpu" else {"device": job.device})
 
     def play(self) -> Iterator[int]:
-        """Denoise what is not there yet; yields how many pixels of each new frame were not finite.
+        """Denoise the missing frames; yields how many pixels of each new frame were not finite.
 
-        Within a shot every frame follows from those before it: finished ones are computed again, but not written, where
+        Within a shot every frame depends on those before it: finished ones are computed again, but not written, where
         a later one is missing.
         """
         with tqdm(total=sum(map(len, self.shots)), desc=self.job.denoiser, unit="frame") as progress:
@@ -224,11 +205,11 @@ class Work:
                 yield from self.play_shot(shot, start, progress)
 
     def is_finished(self, files: FrameFiles) -> bool:
-        """Whether a frame's output is there, and its error if asked for, and no older than what it was made of."""
-        outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.previews else [])]
+        """Whether a frame's outputs, and its error if asked for, are there and no older than its inputs."""
+        outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.png else [])]
         if not all(path.exists() for path in outputs):
             return False
-        if self.teller and not self.errors.has(files.number, self.job.until):
+        if self.estimator and not self.errors.has(files.number, self.job.until):
             return False
         newest = max(path.stat().st_mtime for path in files.passes.values())
         return all(path.stat().st_mtime >= newest for path in outputs)
@@ -239,35 +220,37 @@ class Work:
     def play_shot(self, shot: Sequence[FrameFiles], start: int, progress: Any) -> Iterator[int]:
         """The frames of a shot, of which those before `start` are finished."""
         state: State | None = None
-        player = self.player()
+        read = self.frame_reader()
         for index, files in enumerate(shot):
-            carries = self.has_history and (index == 0 or type(state) is not State)
-            if start < len(shot) and (carries or index >= start):
-                image, frame, nonfinite = player(files)
+            needs_state = self.has_history and (index == 0 or type(state) is not State)
+            if start < len(shot) and (needs_state or index >= start):
+                image, frame, nonfinite = read(files)
                 if frame.size != self.size:
                     raise BadInput(
                         f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence"
                     )
-                if self.teller and index >= start:
-                    output, state, estimate = with_error(self.teller, frame, state)
-                    self.keep_error(estimate, files.number, image)
-                else:
-                    output, state = self.denoiser(frame, state)
+                output, state = self.step(files, image, frame.to(self.denoiser.device), state, index >= start)
                 if index >= start:
-                    self.write(files, image, output[0].permute(1, 2, 0).numpy())
+                    self.write(files, image, image_of(output))
                     yield nonfinite
             progress.update()
 
-    @cached_property
-    def teller(self) -> Shrunk | None:
-        """The denoiser, where it is asked how far it is from the truth."""
-        return self.denoiser if self.job.tells_error and isinstance(self.denoiser, Shrunk) else None
-
-    def keep_error(self, estimate: ErrorEstimate, number: int, image: ExrImage) -> None:
-        """What is asked for of a frame's error: its row, its layer."""
-        self.errors.add(FrameError.of(number, estimate, self.job.until))
+    def step(
+        self, files: FrameFiles, image: ExrImage, frame: Frame, state: State | None, is_new: bool
+    ) -> tuple[Tensor, State]:
+        """The denoised frame and the next state; the error of a new frame goes into the table and its image."""
+        if not (self.estimator and is_new):
+            return self.denoiser(frame, state)
+        output, state, estimate = with_error(self.estimator, frame, state)
+        self.errors.add(FrameError.of(files.number, estimate, self.job.until))
         if self.job.error:
-            image.add(ERROR_LAYER, estimate.radiance()[0].permute(1, 2, 0).numpy(), self.sources.target[0])
+            image.add(ERROR_LAYER, image_of(estimate.radiance()), self.sources.target[0])
+        return output, state
+
+    @cached_property
+    def estimator(self) -> Shrunk | None:
+        """The denoiser, where it is to estimate its error."""
+        return self.denoiser if self.job.estimates_error and isinstance(self.denoiser, Shrunk) else None
 
     @cached_property
     def errors(self) -> ErrorTable:
@@ -281,33 +264,34 @@ class Work:
 
     @property
     def has_history(self) -> bool:
-        return self.sources.is_ours or self.understanding.reading.has_history
+        return self.sources.is_ours or self.analysis.conventions.has_history
 
-    def player(self) -> Callable[[FrameFiles], tuple[ExrImage, Frame, int]]:
-        """What makes a frame of files: the image to write to, the Frame, and how many pixels were not finite."""
+    def frame_reader(self) -> FrameReader:
+        """A function from a frame's files to the image to write, the Frame, and how many pixels were not finite."""
         if self.sources.is_ours:
-            own = OwnShot(self.denoiser.reads)
+            own = OwnFrameBuilder(self.denoiser.reads)
 
-            def ours(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-                file = ExrImage(files.passes[COLOUR])
-                frame = own.frame(file)
-                images = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # halves are images, too
-                bad = [~torch.isfinite(image).all(dim=1) for image in images]
-                return file, frame, int(torch.stack(bad).any(dim=0).sum())
+            def read_own(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
+                image = ExrImage(files.passes[COLOUR])
+                frame = own.build(image)
+                tensors = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # sample buffers are images too
+                bad = [~torch.isfinite(tensor).all(dim=1) for tensor in tensors]
+                return image, frame, int(torch.stack(bad).any(dim=0).sum())
 
-            return ours
-        shot = Shot(self.understanding.reading, self.denoiser.reads, str(self.shots[0][0].passes[COLOUR]), self.job.spp)
+            return read_own
+        source = str(self.shots[0][0].passes[COLOUR])
+        builder = FrameBuilder(self.analysis.conventions, self.denoiser.reads, source, self.job.spp)
 
-        def foreign(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-            pixels, image = read_pixels(files, self.sources)
-            return image, shot.frame(pixels), pixels.nonfinite
+        def read_foreign(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
+            foreign, image = read_foreign_frame(files, self.sources)
+            return image, builder.build(foreign), foreign.nonfinite
 
-        return foreign
+        return read_foreign
 
     def write(self, files: FrameFiles, image: ExrImage, radiance: NDArray[np.float32]) -> None:
-        """The frame's file with denoised radiance in it, and its preview."""
+        """Write the frame's file with denoised radiance in it, and its preview."""
         image.replace(self.sources.target, radiance, DTYPES[self.job.stored_as])
-        if self.job.previews:
+        if self.job.png:
             from PIL import Image
 
             shown = display(np.nan_to_num(radiance).clip(0, None), self.exposure)

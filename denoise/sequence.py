@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from denoise.layers import COLOUR
 from errors import BadInput
-
-COLOUR = "colour"  # the pass that a frame cannot do without
 
 
 @dataclass(frozen=True)
@@ -21,23 +20,23 @@ class FrameFiles:
 
     @property
     def name(self) -> str:
-        """What the output file is called: as the colour file is."""
+        """The name of the output file: that of the colour file."""
         return self.passes[COLOUR].name
 
 
 def files_of(patterns: Sequence[str]) -> list[Path]:
-    """All files that patterns such as 'frames/*.exr' or plain paths mean. Raises BadInput where there are none."""
-    found: list[str] = []
+    """All files that match patterns such as 'frames/*.exr' or plain paths. Raises BadInput for a pattern without."""
+    paths: list[str] = []
     for pattern in patterns:
         matching = [pattern] if Path(pattern).is_file() else glob.glob(pattern)
         if not matching:
             raise BadInput(f"no file matches '{pattern}'")
-        found += matching
-    return [Path(name) for name in sorted(dict.fromkeys(found))]
+        paths += matching
+    return [Path(name) for name in sorted(dict.fromkeys(paths))]
 
 
 def numbered(paths: Sequence[Path]) -> dict[int, Path]:
-    """Files by frame number: of the numbers in their names the last that tells them apart.
+    """Files by frame number: of the numbers in their names the last that differs between all of them.
 
     Raises BadInput where none does.
     """
@@ -48,11 +47,11 @@ def numbered(paths: Sequence[Path]) -> dict[int, Path]:
         numbers = [int(run[-place]) for run in runs]
         if len(set(numbers)) == len(numbers):
             return dict(sorted(zip(numbers, paths, strict=True)))
-    raise BadInput(f"no number in the names of {paths[0]} to {paths[-1]} tells their frames apart: name one sequence")
+    raise BadInput(f"the names of {paths[0]} to {paths[-1]} have no frame numbers that differ: name one sequence")
 
 
 def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = None) -> list[FrameFiles]:
-    """The frames of the patterns of all passes, by number; of "colour" as many as there are, within `numbers` "A-B".
+    """The frames of the patterns of all passes, by number; of "colour" all that there are within `numbers` "A-B".
 
     Raises BadInput where a pass lacks a frame, or no frame is left.
     """
@@ -60,8 +59,8 @@ def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = Non
     first, last = frame_range(numbers)
     chosen = [number for number in passes[COLOUR] if first <= number <= last]
     if not chosen:
-        have = list(passes[COLOUR])
-        raise BadInput(f"there is no frame within --frames {numbers}: there are {have[0]} to {have[-1]}")
+        available = list(passes[COLOUR])
+        raise BadInput(f"there is no frame within --frames {numbers}: there are {available[0]} to {available[-1]}")
     for name, files in passes.items():
         missing = [number for number in chosen if number not in files]
         if missing:
@@ -72,12 +71,12 @@ def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = Non
 
 
 def frame_range(text: str | None) -> tuple[int, int]:
-    """(first, last) of "A-B" or "A"; all for None. Raises BadInput for what is no such text."""
+    """(first, last) of "A-B" or "A"; all for None. Raises BadInput for any other text."""
     if text is None:
         return 0, 2**62
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
     if not match:
-        raise BadInput(f"'{text}' are no frames such as 1-24")
+        raise BadInput(f"'{text}' is not a range of frames such as 1-24")
     return int(match[1]), int(match[2] or match[1])
 
 
@@ -86,10 +85,10 @@ def gaps(frames: Sequence[FrameFiles]) -> list[int]:
     return [after.number for before, after in pairwise(frames) if after.number != before.number + 1]
 
 
-def shots(frames: Sequence[FrameFiles], resets: Sequence[int]) -> list[list[FrameFiles]]:
-    """The frames cut at those numbers in `resets` where history begins anew.
+def split_at_cuts(frames: Sequence[FrameFiles], resets: Sequence[int]) -> list[list[FrameFiles]]:
+    """The frames, cut before the numbers in `resets` and after missing frames: there history begins anew.
 
-    Raises BadInput for the number of no frame.
+    Raises BadInput where no frame has such a number.
     """
     unknown = set(resets) - {frame.number for frame in frames}
     if unknown:

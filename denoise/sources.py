@@ -7,11 +7,20 @@ from dataclasses import dataclass
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS
 from datasets.exr import FACTS_ATTRIBUTE, layer_names
 from denoise.exr_image import ExrImage
-from denoise.layers import KNOWN, Layer, candidates, grouped, in_words, layer_of, plain, stated_layer
-from denoise.sequence import COLOUR
+from denoise.layers import (
+    COLOUR,
+    QUANTITIES,
+    ExrLayer,
+    candidates,
+    grouped,
+    layer_of,
+    list_layers,
+    named_layer,
+    normalised,
+)
 from errors import BadInput
 
-PASS_LAYERS = ("", "rgb", "rgba", "beauty", "combined")  # what a pass of its own may be called in its file
+PASS_LAYERS = ("", "rgb", "rgba", "beauty", "combined")  # usual names of the layer in a file with a single pass
 
 
 @dataclass(frozen=True)
@@ -19,8 +28,12 @@ class Source:
     """A layer of one of a frame's files."""
 
     pass_name: str
-    layer: Layer
-    others: tuple[str, ...] = ()  # layers that could have been meant as well
+    layer: ExrLayer
+    others: tuple[str, ...] = ()  # further layers that have a name of the quantity
+
+    def __str__(self) -> str:
+        also = f" (also there: {', '.join(self.others)})" if self.others else ""
+        return f"{self.layer.name or 'R,G,B'}{also}"
 
 
 @dataclass(frozen=True)
@@ -28,7 +41,7 @@ class Sources:
     """Where everything is.
 
     Attributes:
-        quantities: by names of layers.KNOWN.
+        quantities: by names of layers.QUANTITIES.
         alpha: the channel beside the colour that is 0 where a pixel shows nothing.
         target: the channels of the colour's file that denoised radiance replaces.
         is_ours: whether the files are those of `onespp exr`, with channels and cameras under our own names.
@@ -54,66 +67,59 @@ def is_ours(image: ExrImage) -> bool:
     return isinstance(facts, dict) and all(name in image.channels for name in [*needed, *"RGB"])
 
 
-def has_halves(image: ExrImage) -> bool:
-    """Whether a file that `onespp exr` wrote holds the halves of its samples."""
+def has_two_buffers(image: ExrImage) -> bool:
+    """Whether a file that `onespp exr` wrote has two independent sample buffers."""
     return all(f"{layer}.R" in image.channels for name in SAMPLE_BUFFERS.values() for layer in layer_names(name))
 
 
-def find_sources(images: Mapping[str, ExrImage], stated: Mapping[str, str]) -> Sources:
-    """Look through the files of one frame, by pass. What is `stated` by the user is in the colour's file.
+def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> Sources:
+    """The sources in the files of one frame, by pass; layers that the user has `named` are in the colour's file.
 
-    Raises BadInput where there is no colour, or not what was stated, with what there is instead.
+    Raises BadInput, listing the layers, where there is no colour, or no layer of such a name.
     """
-    colour_image = images[COLOUR]
-    channels = list(colour_image.channels)
-    if is_ours(colour_image) and len(images) == 1 and not stated:
+    image = images[COLOUR]
+    channels = list(image.channels)
+    if is_ours(image) and len(images) == 1 and not named:
         return Sources({}, None, ("R", "G", "B"), True)
     quantities: dict[str, Source] = {}
-    for quantity in KNOWN:
-        if quantity in stated:
-            quantities[quantity] = Source(
-                COLOUR, stated_layer(quantity, stated[quantity], channels, str(colour_image.path))
-            )
+    for quantity in QUANTITIES:
+        if quantity in named:
+            quantities[quantity] = Source(COLOUR, named_layer(quantity, named[quantity], channels, str(image.path)))
         elif quantity in images and quantity != COLOUR:
             quantities[quantity] = Source(quantity, layer_of_pass(quantity, images[quantity]))
-        elif found := candidates(quantity, channels):
-            best, *others = found
+        elif layers := candidates(quantity, channels):
+            best, *others = layers
             quantities[quantity] = Source(COLOUR, best, tuple(layer.name or "R,G,B" for layer in others))
     if COLOUR not in quantities:
         raise BadInput(
-            f"{colour_image.path} has no layer known to be radiance; it has {in_words(channels)}: "
-            "state it by --layers colour=LAYER"
+            f"{image.path} has no layer known to be radiance; it has {list_layers(channels)}: "
+            "name it by --layers colour=LAYER"
         )
     layer = quantities[COLOUR].layer
     prefix = f"{layer.name}." if layer.name else ""
-    alpha = next((name for name in (f"{prefix}A", f"{prefix}a") if name in colour_image.channels), None)
+    alpha = next((name for name in (f"{prefix}A", f"{prefix}a") if name in channels), None)
     return Sources(quantities, alpha, target_of(layer, channels), False)
 
 
-def layer_of_pass(quantity: str, image: ExrImage) -> Layer:
-    """The layer of a file that holds one pass: one with a name of the quantity's, or else its only or plain layer."""
+def layer_of_pass(quantity: str, image: ExrImage) -> ExrLayer:
+    """The layer of a file with a single pass: one called like the quantity, or else its plain or first layer.
+
+    Raises BadInput where no layer has the components of the quantity.
+    """
     channels = list(image.channels)
-    found = candidates(quantity, channels)
-    plain_ones = [layer for name in PASS_LAYERS for layer in any_layer(quantity, channels) if plain(layer.name) == name]
-    choice = [*found, *plain_ones, *any_layer(quantity, channels)]
+    fitting = [layer for name, members in grouped(channels).items() if (layer := layer_of(quantity, name, members))]
+    usual = [layer for name in PASS_LAYERS for layer in fitting if normalised(layer.name) == name]
+    choice = [*candidates(quantity, channels), *usual, *fitting]
     if not choice:
-        raise BadInput(f"{image.path} has no layer that could be the {quantity}; it has {in_words(channels)}")
+        raise BadInput(f"{image.path} has no layer that could be the {quantity}; it has {list_layers(channels)}")
     return choice[0]
 
 
-def any_layer(quantity: str, channels: Sequence[str]) -> list[Layer]:
-    """All layers with the components of the quantity, whatever their names."""
-    found = (layer_of(quantity, name, members) for name, members in grouped(channels).items())
-    return [layer for layer in found if layer]
-
-
-def target_of(colour: Layer, channels: Sequence[str]) -> tuple[str, ...]:
+def target_of(colour: ExrLayer, channels: Sequence[str]) -> tuple[str, ...]:
     """The channels that denoised radiance replaces: those it was, but Blender's `Combined` for its `Noisy Image`."""
     head, dot, tail = colour.name.rpartition(".")
-    if plain(tail) == "noisyimage":
-        combined = [
-            layer for layer in candidates("colour", channels) if plain(layer.name) == plain(f"{head}{dot}Combined")
-        ]
-        if combined:
-            return combined[0].channels
+    if normalised(tail) == "noisyimage":
+        for layer in candidates(COLOUR, channels):
+            if normalised(layer.name) == normalised(f"{head}{dot}Combined"):
+                return layer.channels
     return colour.channels

@@ -96,4 +96,4 @@ def test_verify_and_info_of_good_data(capsys, tiny):
     main(["verify", "--data", str(tiny)])
     main(["info", "--data", str(tiny)])
     out = capsys.readouterr().out
-    assert "everything is as it was written" in out and "floor dB" in out
+    assert "all files are intact" in out and "floor dB" in out

@@ -1,4 +1,4 @@
-"""Denoisers on another device than the CPU, as far as a machine without a GPU can tell: see tests.helpers.other_device."""
+"""Denoisers on another device than the CPU, as far as a machine without a GPU can show it."""
 
 import numpy as np
 import pytest

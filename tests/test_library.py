@@ -98,7 +98,7 @@ def test_bad_pixels_and_background_of_own_arrays():
     [
         ({"colour": np.zeros((4, 4))}, "'colour' has the shape"),
         ({"depth": np.zeros((24, 32, 3))}, r"'depth' has the shape \(24, 32, 3\), not \(24, 32, 1\)"),
-        ({"colours": np.zeros((24, 32, 3))}, "'colours' is not known"),
+        ({"colours": np.zeros((24, 32, 3))}, "unknown quantity 'colours'"),
     ],
 )
 def test_unusable_arrays_are_named(changes, message):
@@ -110,7 +110,7 @@ def test_unusable_arrays_are_named(changes, message):
 
 @pytest.mark.parametrize("spp", [0.0, -1.0, float("nan"), float("inf")])
 def test_frames_of_no_samples_are_refused(spp):
-    with pytest.raises(BadInput, match="are no samples"):
+    with pytest.raises(BadInput, match="is no number of samples"):
         next(onespp.frames([arrays(0)], onespp.load("noisy"), spp))
 
 

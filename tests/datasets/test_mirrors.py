@@ -12,7 +12,7 @@ from datasets.clip import Clip
 from datasets.exr import write_exr
 from datasets.frame import read_frame
 from denoise.exr_image import ExrImage
-from denoise.frames import OwnShot
+from denoise.frames import OwnFrameBuilder
 from render.clip import Sampling
 from render.job.clip_job import write_clip
 from scenes.animation import Scene, Shape
@@ -96,11 +96,11 @@ def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
 
 
 def test_exported_frames_are_seen_alike(clip, tmp_path):
-    shot = OwnShot(SEEN)
+    builder = OwnFrameBuilder(SEEN)
     for index in range(FRAMES):
         path = tmp_path / f"{index}.exr"
         write_exr(path, clip, index)
-        frame = shot.frame(ExrImage(path))
+        frame = builder.build(ExrImage(path))
         expected = read_frame(clip, index, SEEN)
         assert frame.channels.keys() == expected.channels.keys()
         for name, tensor in expected.channels.items():

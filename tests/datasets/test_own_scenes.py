@@ -51,7 +51,7 @@ def test_it_is_a_data_set_like_any_other(made, capsys):
     main(["verify", "--data", str(made / "data")])
     main(["info", "--data", str(made / "data")])
     out = capsys.readouterr().out
-    assert "everything is as it was written" in out and "my" in out
+    assert "all files are intact" in out and "my" in out
 
 
 def test_its_first_test_clip_begins_with_the_files_camera(made):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from datasets.frame import Frame
-from denoise.frames import Shot, camera_kind
-from denoise.pixels import open_passes, read_pixels
+from denoise.analysis import analyse
+from denoise.foreign_frame import open_passes, read_foreign_frame
+from denoise.frames import FrameBuilder, camera_conventions
 from denoise.sequence import sequence_of
 from denoise.sources import find_sources
-from denoise.understanding import understand
 from tests.helpers import foreign
 
 READS = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
@@ -21,8 +21,8 @@ READS = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughne
 def frames_of(folder: Path) -> list[Frame]:
     files = sequence_of({"colour": [str(folder / "*.exr")]})
     sources = find_sources(open_passes(files[0], header_only=True), {})
-    shot = Shot(understand([files], sources, READS, None).reading, READS, "test")
-    return [shot.frame(read_pixels(each, sources)[0]) for each in files]
+    builder = FrameBuilder(analyse([files], sources, READS, None).conventions, READS, "test")
+    return [builder.build(read_foreign_frame(each, sources)[0]) for each in files]
 
 
 def header_of(frame: Frame) -> dict[str, np.ndarray]:
@@ -124,14 +124,14 @@ def test_albedo_is_clamped_and_bad_motion_is_none(spheres, tmp_path):
 def test_cameras_are_taken_from_positions_before_the_header(box, tmp_path):
     foreign.write(tmp_path / "1.exr", foreign.pbrt(box[0]), header_of(box[1]))
     files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
-    pixels, _ = read_pixels(files[0], find_sources(open_passes(files[0]), {}))
-    assert camera_kind(pixels).cameras == "positions"
+    pixels, _ = read_foreign_frame(files[0], find_sources(open_passes(files[0]), {}))
+    assert camera_conventions(pixels).cameras == "positions"
 
 
 def test_a_camera_without_depth_makes_up_no_motion(box, tmp_path):
     for index, frame in enumerate(box[:2]):
         foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)}, header_of(frame))
     files = sequence_of({"colour": [str(tmp_path / "*.exr")]})
-    understood = understand([files], find_sources(open_passes(files[0]), {}), READS, None)
-    assert not understood.reading.has_history
-    assert ("motion", "none: no history, every frame by itself") in understood.words
+    analysis = analyse([files], find_sources(open_passes(files[0]), {}), READS, None)
+    assert not analysis.conventions.has_history
+    assert ("motion", "none: no history, every frame by itself") in analysis.report

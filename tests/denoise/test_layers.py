@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from denoise.layers import KNOWN, candidates, in_words, stated_layer, stated_layers
+from denoise.layers import QUANTITIES, candidates, list_layers, named_layer, parse_layers
 from errors import BadInput
 
 
@@ -41,7 +41,7 @@ def test_names_in_use_are_found(quantity, layer, prefix):
     names = channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer)
     found = candidates(quantity, names)
     assert len(found) == 1 and set(found[0].channels) <= set(channels(prefix + layer))
-    others = set(KNOWN) - {quantity}
+    others = set(QUANTITIES) - {quantity}
     assert not any(candidates(other, channels(prefix + layer)) for other in others)
 
 
@@ -63,20 +63,20 @@ def test_order_of_channels_in_the_file_does_not_matter():
 
 def test_what_the_user_states():
     names = channels("My.AOV.RGB", "uv.UV", "A.XYZW")
-    assert stated_layer("albedo", "My.AOV", names, "f").channels == ("My.AOV.R", "My.AOV.G", "My.AOV.B")
-    assert stated_layer("motion", "A.Z,A.W", names, "f").channels == ("A.Z", "A.W")
-    assert stated_layers(["albedo=My.AOV", "motion=A.Z,A.W"]) == {"albedo": "My.AOV", "motion": "A.Z,A.W"}
+    assert named_layer("albedo", "My.AOV", names, "f").channels == ("My.AOV.R", "My.AOV.G", "My.AOV.B")
+    assert named_layer("motion", "A.Z,A.W", names, "f").channels == ("A.Z", "A.W")
+    assert parse_layers(["albedo=My.AOV", "motion=A.Z,A.W"]) == {"albedo": "My.AOV", "motion": "A.Z,A.W"}
     for wrong in ("Your.AOV", "My.AOV.R", "A.X,A.Q"):
         with pytest.raises(BadInput, match=r"f has no layer .*it has My\.AOV\.RGB, uv\.UV, A\.XYZW"):
-            stated_layer("albedo", wrong, names, "f")
+            named_layer("albedo", wrong, names, "f")
     for wrong in ("albedo", "albedo=", "taste=A"):
         with pytest.raises(BadInput, match="QUANTITY=LAYER"):
-            stated_layers([wrong])
+            parse_layers([wrong])
 
 
 @given(st.lists(st.text(max_size=12), max_size=8))
 def test_any_names_can_be_looked_through(names):
-    for quantity in KNOWN:
+    for quantity in QUANTITIES:
         for layer in candidates(quantity, names):
             assert set(layer.channels) <= set(names)
-    assert in_words(names)
+    assert list_layers(names)

@@ -21,7 +21,8 @@ from datasets.exr import export_clip
 from datasets.frame import Frame, read_frame
 from denoise.error_table import ErrorTable
 from denoise.exr_image import ExrImage
-from denoise.run import Job, denoise
+from denoise.job import Job
+from denoise.run import denoise
 from errors import BadInput
 from eval.tradeoff.resampled_clips import with_samples
 from models.registry import create
@@ -33,8 +34,7 @@ from tests.helpers.frames import run
 
 
 def job(folder: Path, out: Path, denoiser: str = "svgf", weights: Path | None = None, **options: object) -> Job:
-    patterns = {"colour": [str(folder / "*.exr")], **options.pop("passes", {})}
-    return Job(patterns, denoiser, out, weights, **options)
+    return Job((str(folder / "*.exr"),), denoiser, out, weights, **options)
 
 
 def outputs(out: Path, layer: str = "") -> list[Tensor]:
@@ -63,7 +63,7 @@ def test_our_own_clip_gives_the_same_from_exr(tiny, tmp_path, name, capsys):
     clip = next(clip for clip in Dataset(tiny).clips("test") if clip.scene == "cornell_box_moving")
     export_clip(clip.path, tmp_path / "exr")
     weights = fresh_weights(name, tmp_path / "w") if create(name).is_network else None
-    denoise(job(tmp_path / "exr", tmp_path / "out", name, weights, frames="0-5"))
+    denoise(job(tmp_path / "exr", tmp_path / "out", name, weights, frame_range="0-5"))
     denoiser = load(name, weights, signal="total")
     expected = run(denoiser, (read_frame(clip, index, denoiser.reads) for index in range(6)))
     assert all(torch.equal(a, b) for a, b in zip(outputs(tmp_path / "out"), expected, strict=True))
@@ -153,10 +153,10 @@ def test_names_and_files_do_not_matter(spheres, tmp_path, style):
     foreign.write_sequence(tmp_path / "plain", spheres, plain)
     passes = {}
     if style == "files":
-        for name, layer in {"albedo": "albedo.RGB", "normal": "N.XYZ", "depth": "Z", "motion": "motion.XY"}.items():
+        for name, layer in {"alb": "albedo.RGB", "nrm": "N.XYZ", "depth": "Z", "mv": "motion.XY"}.items():
             letters = "RGB"[: 1 if layer == "Z" else 2 if layer == "motion.XY" else 3]
             foreign.write_sequence(tmp_path / name, spheres, lambda f, _l=layer, _c=letters: {_c: plain(f)[_l]})
-            passes[name] = [str(tmp_path / name / "*.exr")]
+            passes[name] = (str(tmp_path / name / "*.exr"),)
     renamed = "RGB" if style == "files" else None
     foreign.write_sequence(
         tmp_path / "in",
@@ -164,7 +164,7 @@ def test_names_and_files_do_not_matter(spheres, tmp_path, style):
         lambda f: {names.get(k, k): v for k, v in plain(f).items() if renamed in (None, k)},
     )
     denoise(job(tmp_path / "plain", tmp_path / "expected"))
-    denoise(job(tmp_path / "in", tmp_path / "out", passes=passes))
+    denoise(job(tmp_path / "in", tmp_path / "out", **passes))
     layer = "rgba.Beauty." if style == "beauty" else ""
     pairs = zip(outputs(tmp_path / "out", layer), outputs(tmp_path / "expected"), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
@@ -175,7 +175,7 @@ def test_a_mapping_for_names_that_nobody_knows(spheres, tmp_path):
         tmp_path / "in", spheres, lambda f: {"Foo.RGB": foreign.beauty(f), "Bar.RGB": foreign.image(f, "albedo")}
     )
     with pytest.raises(
-        BadInput, match=r"no layer known to be radiance; it has Bar\.BGR, Foo\.BGR: state it by --layers"
+        BadInput, match=r"no layer known to be radiance; it has Bar\.BGR, Foo\.BGR: name it by --layers"
     ):
         denoise(job(tmp_path / "in", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
@@ -195,7 +195,7 @@ def test_colour_alone_is_denoised_frame_by_frame(spheres, tmp_path, capsys):
         "1 for every surface",
     ):
         assert words in said
-    denoise(job(tmp_path / "in", tmp_path / "one", frames="3"))
+    denoise(job(tmp_path / "in", tmp_path / "one", frame_range="3"))
     assert torch.equal(outputs(tmp_path / "one")[0], outputs(tmp_path / "out")[2])
     noise = [
         (image[..., 1:] - image[..., :-1]).abs().mean()
@@ -219,7 +219,7 @@ def test_multi_part_files(spheres, tmp_path):
     ]
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "1.exr"))
-    denoise(Job({"colour": [str(tmp_path / "1.exr")]}, "svgf", tmp_path / "out", None))
+    denoise(Job((str(tmp_path / "1.exr"),), "svgf", tmp_path / "out"))
     with OpenEXR.File(str(tmp_path / "out" / "1.exr"), separate_channels=True) as file:
         assert [part.name() for part in file.parts] == ["rgba", "N"] and file.parts[1].header["owner"] == "N"
         np.testing.assert_array_equal(file.parts[1].channels["Z"].pixels, foreign.image(spheres[0], "normal")[..., 2])
@@ -272,7 +272,7 @@ def test_the_command_takes_shipped_weights_or_a_budgets_or_a_file(spheres, tmp_p
 @pytest.mark.parametrize("name", ["svgf", "noisy"])
 def test_an_interrupted_run_goes_on_to_the_same(spheres, tmp_path, name):
     foreign.write_sequence(tmp_path / "in", [*spheres, *spheres[::-1]], foreign.blender)
-    options = {"denoiser": name, "reset_at": [5], "previews": True}
+    options = {"denoiser": name, "reset_at": [5], "png": True}
     denoise(job(tmp_path / "in", tmp_path / "whole", **options))
     denoise(job(tmp_path / "in", tmp_path / "again", **options))
     for lost in ("0003.exr", "0007.exr", "0008.png"):
@@ -309,7 +309,7 @@ def test_settings_are_never_mixed(spheres, tmp_path):
 def test_history_ends_at_resets_and_gaps(spheres, tmp_path, capsys):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
     denoise(job(tmp_path / "in", tmp_path / "reset", reset_at=[3]))
-    denoise(job(tmp_path / "in", tmp_path / "late", frames="3-4"))
+    denoise(job(tmp_path / "in", tmp_path / "late", frame_range="3-4"))
     layer = "ViewLayer.Combined."
     pairs = zip(outputs(tmp_path / "reset", layer)[2:], outputs(tmp_path / "late", layer), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
@@ -322,9 +322,7 @@ def test_history_ends_at_resets_and_gaps(spheres, tmp_path, capsys):
 def test_references_and_previews(spheres, tmp_path, capsys):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
     foreign.write_sequence(tmp_path / "ref", spheres, lambda f: {"RGB": foreign.beauty(f) + 0.1})
-    denoise(
-        job(tmp_path / "in", tmp_path / "out", "noisy", references=[str(tmp_path / "ref" / "*.exr")], previews=True)
-    )
+    denoise(job(tmp_path / "in", tmp_path / "out", "noisy", ref=(str(tmp_path / "ref" / "*.exr"),), png=True))
     assert "mean RMSE" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "out" / "metrics.csv").open()))
     assert [row["frame"] for row in rows] == ["1", "2", "3", "4"]
@@ -340,17 +338,17 @@ def test_references_and_previews(spheres, tmp_path, capsys):
 
 def test_what_cannot_be_done_is_said(spheres, tmp_path):
     paths = foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
-    with pytest.raises(BadInput, match="use svgf"):
+    with pytest.raises(BadInput, match="reads gradient, which only onespp renders"):
         denoise(job(tmp_path / "in", tmp_path / "out", "asvgf"))
-    with pytest.raises(BadInput, match="has none"):
+    with pytest.raises(BadInput, match="is an option of OIDN"):
         denoise(job(tmp_path / "in", tmp_path / "out", quality="fast"))
     with pytest.raises(BadInput, match="choose another folder"):
         denoise(job(tmp_path / "in", tmp_path / "in"))
     with pytest.raises(BadInput, match="has no reference of frame 1"):
-        denoise(job(tmp_path / "in", tmp_path / "out", references=[str(paths[2])]))
+        denoise(job(tmp_path / "in", tmp_path / "out", ref=(str(paths[2]),)))
     small = foreign.write(tmp_path / "alb" / "1.exr", {"RGB": np.ones((3, 3, 3))})
     with pytest.raises(BadInput, match=r"1\.exr is 3x3 and .*0001\.exr 56x40"):
-        denoise(job(tmp_path / "in", tmp_path / "out", passes={"albedo": [str(small)]}, frames="1"))
+        denoise(job(tmp_path / "in", tmp_path / "out", alb=(str(small),), frame_range="1"))
     assert not (tmp_path / "out").exists()
     paths[2].write_bytes(paths[2].read_bytes()[:3000])
     with pytest.raises(BadInput, match=r"0003\.exr is damaged"):
@@ -416,7 +414,7 @@ def test_halves_tell_how_far_frames_are_from_the_truth(halves, tmp_path, capsys)
     told = [*words, "--out", str(tmp_path / "out"), "--error", "--until", "0.02"]
     main(told)
     said = capsys.readouterr().out
-    assert "0 of 4 frames have a relative error of at most 0.02; the others take" in said
+    assert "0 of 4 frames have a relative error of at most 0.02; the others need" in said
     for ours, theirs in zip(outputs(tmp_path / "out"), outputs(tmp_path / "plain"), strict=True):
         torch.testing.assert_close(ours, theirs)
     with (tmp_path / "out" / "error.csv").open() as file:
@@ -485,7 +483,7 @@ def test_our_own_frames_without_halves_tell_no_error(tiny, tmp_path):
 @pytest.mark.parametrize(
     "words, complaint",
     [
-        (["--denoiser", "svgf", "--error"], "name svgf+js"),
+        (["--denoiser", "svgf", "--error"], "use svgf+js"),
         (["--denoiser", "svgf+js", "--until", "0"], "no relative error"),
     ],
 )

@@ -2,7 +2,7 @@
 
 import pytest
 
-from denoise.sequence import gaps, sequence_of, shots
+from denoise.sequence import gaps, sequence_of, split_at_cuts
 from errors import BadInput
 
 
@@ -25,7 +25,7 @@ def test_frames_are_in_the_order_of_their_numbers(folder):
     assert [frame.name for frame in frames] == ["v2_9.exr", "v2_10.exr", "v2_100.exr"]
     assert sequence_of({"colour": ["v2_9.exr", "v2_100.exr", "v2_10.exr"]}) == frames  # as the shell expands them
     assert gaps(frames) == [100]
-    assert [[frame.number for frame in shot] for shot in shots(frames, [10])] == [[9], [10], [100]]
+    assert [[frame.number for frame in shot] for shot in split_at_cuts(frames, [10])] == [[9], [10], [100]]
 
 
 def test_the_number_that_differs_is_the_frame(folder):
@@ -36,7 +36,7 @@ def test_the_number_that_differs_is_the_frame(folder):
 def test_one_file_needs_no_number(folder):
     folder("still.exr", "a.exr", "b.exr")
     assert len(sequence_of({"colour": ["still.exr"]})) == 1
-    with pytest.raises(BadInput, match="tells their frames apart"):
+    with pytest.raises(BadInput, match="have no frame numbers"):
         sequence_of({"colour": ["?.exr"]})
 
 
@@ -55,7 +55,7 @@ def test_what_is_not_there_is_named(folder):
         sequence_of({"colour": ["x*"]})
     with pytest.raises(BadInput, match="no frame within --frames 5-6"):
         sequence_of({"colour": ["*.exr"]}, "5-6")
-    with pytest.raises(BadInput, match="'a-b' are no frames"):
+    with pytest.raises(BadInput, match="'a-b' is not a range"):
         sequence_of({"colour": ["*.exr"]}, "a-b")
     with pytest.raises(BadInput, match="--reset-at 7"):
-        shots(sequence_of({"colour": ["*.exr"]}), [7])
+        split_at_cuts(sequence_of({"colour": ["*.exr"]}), [7])

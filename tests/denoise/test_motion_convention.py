@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from denoise.motion_meaning import PAIRS, SIGNS, UNITS, Evidence, Meaning, meanings
-from denoise.understanding import blurred
+from denoise.analysis import blurred
+from denoise.motion_convention import PAIRS, SIGNS, UNITS, ConventionDetector, MotionConvention, conventions
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from tests.helpers.foreign import image
@@ -17,14 +17,14 @@ HEIGHT, WIDTH = 90, 160
 FAST = 12  # of the sequence's frames between two of these: a step of several pixels
 
 
-def said_as(meaning: Meaning, to_previous: np.ndarray, to_next: np.ndarray, components: int) -> np.ndarray:
+def said_as(convention: MotionConvention, to_previous: np.ndarray, to_next: np.ndarray, components: int) -> np.ndarray:
     """Vectors in a renderer's own terms; the pair that is not meant holds those to the next frame."""
-    size = {"pixels": (1, 1), "fractions": (WIDTH, HEIGHT), "half-fractions": (WIDTH / 2, HEIGHT / 2)}[meaning.unit]
-    scale = [SIGNS[meaning.x], SIGNS[meaning.y]] / np.array(size)
+    size = {"pixels": (1, 1), "fractions": (WIDTH, HEIGHT), "half-fractions": (WIDTH / 2, HEIGHT / 2)}[convention.unit]
+    scale = [SIGNS[convention.x], SIGNS[convention.y]] / np.array(size)
     vectors = np.zeros((HEIGHT, WIDTH, components))
-    vectors[..., PAIRS[meaning.pair]] = to_previous * scale
+    vectors[..., PAIRS[convention.pair]] = to_previous * scale
     if components == 4:
-        vectors[..., PAIRS["ZW" if meaning.pair == "XY" else "XY"]] = to_next * scale
+        vectors[..., PAIRS["ZW" if convention.pair == "XY" else "XY"]] = to_next * scale
     return vectors.astype(np.float32)
 
 
@@ -46,14 +46,14 @@ def moving():
 @pytest.mark.parametrize("components", [2, 4])
 def test_every_convention_is_found(moving, components):
     before, now, to_previous, to_next = moving
-    tried = meanings(components)
+    tried = conventions(components)
     assert len(tried) == 12 * components // 2
-    for meaning in tried:
-        evidence = Evidence(components)
-        evidence.add(now, before, said_as(meaning, to_previous, to_next, components))
-        finding = evidence.finding()
-        assert finding.meaning == meaning and finding.certain, finding.words
-        assert str(meaning) in finding.words
+    for convention in tried:
+        detector = ConventionDetector(components)
+        detector.add(now, before, said_as(convention, to_previous, to_next, components))
+        detection = detector.detection()
+        assert detection.convention == convention and detection.certain, detection.reason
+        assert str(convention) in detection.reason
 
 
 def guides(index: int) -> np.ndarray:
@@ -62,12 +62,13 @@ def guides(index: int) -> np.ndarray:
 
 
 def test_moving_objects_before_a_moving_camera():
-    for meaning in (Meaning(), Meaning("XY", "-", "+"), Meaning("XY", "+", "-", "fractions")):
-        evidence = Evidence(2)
+    for text in ("XY,+x,+y,pixels", "XY,-x,+y,pixels", "XY,+x,-y,fractions"):
+        convention = MotionConvention.parse(text)
+        detector = ConventionDetector(2)
         for index in (1, 2, 3):
             motion = image(synthetic_frame(index, HEIGHT, WIDTH), "motion")
-            evidence.add(guides(index), guides(index - 1), said_as(meaning, motion, motion, 2))
-        assert evidence.finding().meaning == meaning
+            detector.add(guides(index), guides(index - 1), said_as(convention, motion, motion, 2))
+        assert detector.detection().convention == convention
 
 
 def test_steady_motion_is_read_from_the_first_pair():
@@ -75,41 +76,41 @@ def test_steady_motion_is_read_from_the_first_pair():
     texture = rng.random((HEIGHT, 2 * WIDTH, 3), np.float32)
     now, before = (blurred(np.ascontiguousarray(texture[:, start : start + WIDTH])) for start in (10, 6))
     step = np.broadcast_to([4.0, 0.0], (HEIGHT, WIDTH, 2))
-    evidence = Evidence(4)
-    evidence.add(now, before, said_as(Meaning("XY", "+", "-"), step, -step, 4))
-    finding = evidence.finding()
-    assert finding.meaning.pair == "XY" and finding.meaning.x == "+"
-    assert not finding.certain  # nothing moves up or down
+    detector = ConventionDetector(4)
+    detector.add(now, before, said_as(MotionConvention("XY", "+", "-"), step, -step, 4))
+    detection = detector.detection()
+    assert detection.convention.pair == "XY" and detection.convention.x == "+"
+    assert not detection.certain  # nothing moves up or down
 
 
 def test_no_motion_and_senseless_motion_are_said():
     still = guides(0)
-    evidence = Evidence(2)
-    evidence.add(still, still, np.zeros((HEIGHT, WIDTH, 2), np.float32))
-    assert evidence.finding() == replace(evidence.finding(), meaning=Meaning(), certain=False)
-    assert "nothing moves" in evidence.finding().words
+    detector = ConventionDetector(2)
+    detector.add(still, still, np.zeros((HEIGHT, WIDTH, 2), np.float32))
+    assert detector.detection() == replace(detector.detection(), convention=MotionConvention(), certain=False)
+    assert "nothing moves" in detector.detection().reason
     rng = np.random.default_rng(3)
-    evidence.add(guides(20), still, rng.normal(0, 20, (HEIGHT, WIDTH, 2)).astype(np.float32))
-    assert not evidence.finding().certain and "no meaning warps well" in evidence.finding().words
+    detector.add(guides(20), still, rng.normal(0, 20, (HEIGHT, WIDTH, 2)).astype(np.float32))
+    assert not detector.detection().certain and "no convention warps well" in detector.detection().reason
 
 
-@given(st.sampled_from(meanings(4)))
-def test_words_lead_back(meaning):
-    assert Meaning.parse(str(meaning)) == meaning
+@given(st.sampled_from(conventions(4)))
+def test_words_lead_back(convention):
+    assert MotionConvention.parse(str(convention)) == convention
 
 
 def test_other_words_are_refused():
     for text in ("", "XY", "XY,+x,+y,inches", "AB,+x,+y,pixels"):
         with pytest.raises(BadInput, match=", ".join(UNITS)):
-            Meaning.parse(text)
+            MotionConvention.parse(text)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1)])
 def test_tiny_images_and_numbers_that_are_none(size):
-    evidence = Evidence(4)
+    detector = ConventionDetector(4)
     motion = np.full((*size, 4), np.nan, np.float32)
     motion[..., 1] = np.inf
     motion[..., 2] = 1e30
     guide = np.ones((*size, 3), np.float32)
-    evidence.add(guide, guide, motion)
-    assert np.isfinite(evidence.finding().meaning.pixels(motion)).all()
+    detector.add(guide, guide, motion)
+    assert np.isfinite(detector.detection().convention.pixels(motion)).all()

@@ -1,4 +1,4 @@
-"""The pixels of one foreign frame, by quantity: mended and counted."""
+"""The pixels of one foreign frame, by quantity, without NaN and infinities."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,28 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from denoise.exr_image import ExrImage
-from denoise.sequence import COLOUR, FrameFiles
+from denoise.layers import COLOUR
+from denoise.sequence import FrameFiles
 from denoise.sources import Sources
 from errors import BadInput
 from scenes.camera import View
 
 Image = NDArray[np.float32]
 
-FARTHEST = 1e9  # depth; beyond it is background: Blender says 1e10
+MIN_SKY_DEPTH = 1e9  # from here on a pixel is background: Blender writes 1e10
 MAY_BE_INFINITE = ("depth", "distance", "position")  # at the background
 
 
 @dataclass
-class Pixels:
+class ForeignFrame:
     """One frame.
 
     Attributes:
-        arrays: (H, W, C) by quantity (layers.KNOWN), as their maker means them; finite, albedo in [0, 1].
+        arrays: (H, W, C) by quantity (layers.QUANTITIES), in the renderer's conventions; finite, albedo in [0, 1].
         surface: where pixels show a surface, (H, W).
         nonfinite: how many pixels were not finite and were set to 0.
-        source: what messages call it.
+        source: its name in messages.
         header: attributes of the file that holds the colour.
-        view: its camera, where that is known without asking the header.
+        view: its camera, where that is given beside the pixels.
     """
 
     arrays: dict[str, Image]
@@ -59,29 +60,26 @@ def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrIm
     return images
 
 
-def read_pixels(files: FrameFiles, sources: Sources) -> tuple[Pixels, ExrImage]:
-    """All that a denoiser may need of a frame, and the file that holds its colour.
-
-    Raises BadInput where a file lacks what the first frame's has.
-    """
+def read_foreign_frame(files: FrameFiles, sources: Sources) -> tuple[ForeignFrame, ExrImage]:
+    """A frame, and the file that holds its colour. Raises BadInput where a file lacks what the first frame's has."""
     images = open_passes(files)
     arrays = {
         name: images[source.pass_name].stacked(source.layer.channels) for name, source in sources.quantities.items()
     }
     colour = images[COLOUR]
     alpha = colour.stacked([sources.alpha])[..., 0] if sources.alpha else None
-    nonfinite = mend(arrays)
-    return Pixels(arrays, surface_of(arrays, alpha), nonfinite, str(colour.path), colour.header), colour
+    nonfinite = make_finite(arrays)
+    return ForeignFrame(arrays, surface_of(arrays, alpha), nonfinite, str(colour.path), colour.header), colour
 
 
-def mend(arrays: dict[str, Image]) -> int:
+def make_finite(arrays: dict[str, Image]) -> int:
     """Set pixels that are not finite to 0 and clip the albedo to [0, 1], in place. Returns how many pixels were not."""
     bad = np.zeros(next(iter(arrays.values())).shape[:2], bool)
     for name, array in arrays.items():
         wrong = np.isnan(array) if name in MAY_BE_INFINITE else ~np.isfinite(array)
         if wrong.any():
             there = wrong.any(axis=-1)
-            array[there] = 0  # a colour that lacks one component has another hue
+            array[there] = 0  # all components: a colour that lacks one has another hue
             bad |= there
     if "albedo" in arrays:
         arrays["albedo"].clip(0, 1, out=arrays["albedo"])
@@ -89,16 +87,16 @@ def mend(arrays: dict[str, Image]) -> int:
 
 
 def surface_of(arrays: dict[str, Image], alpha: Image | None) -> NDArray[np.bool_]:
-    """Where pixels show a surface, (H, W): told by distances, or positions, or normals and albedo; and by alpha.
+    """Where pixels show a surface, (H, W): by distances, else positions, else normals and albedo; and by alpha.
 
-    An alpha channel that is 0 everywhere tells nothing.
+    An alpha channel that is 0 everywhere is ignored.
     """
     ranges = [arrays[name][..., 0] for name in ("depth", "distance") if name in arrays]
     if ranges:
-        surface = (ranges[0] > 0) & (ranges[0] < FARTHEST)
+        surface = (ranges[0] > 0) & (ranges[0] < MIN_SKY_DEPTH)
     elif "position" in arrays:
         position = arrays["position"]
-        surface = (position != 0).any(axis=-1) & (np.abs(position) < FARTHEST).all(axis=-1)
+        surface = (position != 0).any(axis=-1) & (np.abs(position) < MIN_SKY_DEPTH).all(axis=-1)
     elif "normal" in arrays:
         surface = (arrays["normal"] != 0).any(axis=-1)
         if "albedo" in arrays:

@@ -1,0 +1,139 @@
+"""What a sequence has, what is derived and what is missing: decided on its first frames, with a report for users."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch.nn.functional import avg_pool2d
+
+from datasets.channels import CHANNELS
+from datasets.tonemap import luminance
+from denoise.foreign_frame import ForeignFrame, Image, read_foreign_frame
+from denoise.frames import InputConventions, are_encoded, camera_conventions
+from denoise.layers import QUANTITIES
+from denoise.motion_convention import ConventionDetector, MotionConvention
+from denoise.sequence import FrameFiles
+from denoise.sources import Sources
+from errors import BadInput
+
+PAIRS = 4  # of frames that move, by which the convention of motion vectors is detected
+FRAMES = 12  # that are read at most to find them
+
+Report = list[tuple[str, str]]  # a quantity, and where it comes from
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """How to read a sequence, and a line for each quantity that a denoiser reads."""
+
+    conventions: InputConventions
+    report: Report
+
+
+def analyse(
+    shots: Sequence[Sequence[FrameFiles]], sources: Sources, reads: Sequence[str], given: MotionConvention | None
+) -> Analysis:
+    """Analyse the first frames of a foreign sequence for a denoiser that `reads` channels.
+
+    `given` is the convention of motion vectors, if the user names it. Raises BadInput for a channel that only onespp
+    renders.
+    """
+    if ours := [channel for channel in reads if CHANNELS[channel].renderer_only]:
+        raise BadInput(f"the denoiser reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
+    first, _ = read_foreign_frame(shots[0][0], sources)
+    conventions = camera_conventions(first)
+    report = [(quantity, str(sources.quantities[quantity])) for quantity in QUANTITIES if sources.has(quantity)]
+    if sources.has("normal"):
+        conventions = replace(conventions, normals_are_encoded=are_encoded(first.arrays["normal"], first.surface))
+    if sources.has("motion"):
+        convention, reason = motion_convention(shots, sources, given)
+        conventions = replace(conventions, motion=convention)
+        report.append(("convention", reason))
+    return Analysis(conventions, report + derived_and_missing(first, sources, conventions, reads))
+
+
+def derived_and_missing(
+    first: ForeignFrame, sources: Sources, conventions: InputConventions, reads: Sequence[str]
+) -> Report:
+    """The lines for what is derived and what is missing of the channels that are read."""
+    report = []
+    if conventions.normals_are_encoded:
+        report.append(("normal", "scaled from [0, 1] to [-1, 1]"))
+    if conventions.cameras:
+        origin = "the positions" if conventions.cameras == "positions" else "worldToNDC"
+        report.append(("cameras", f"from {origin}"))
+    else:
+        report.append(("cameras", "none; history is tested on normals and on depth along one axis"))
+    if conventions.in_camera_space:
+        moved = "moved to the world by worldToCamera" if conventions.cameras else "and no worldToCamera to move them"
+        report.append(("positions", f"in the camera's own space, {moved}"))
+    if not sources.has("albedo"):
+        report.append(("albedo", "none: radiance is filtered"))
+    if not sources.has("normal"):
+        report.append(("normal", "derived from depth" if conventions.cameras else "none: as if all faced the viewer"))
+    if conventions.cameras == "positions":
+        report.append(("depth", "derived from the positions, along the viewing axis"))
+    elif not sources.has("depth", "distance", "position"):
+        report.append(("depth", "none: 1 for every surface"))
+    elif not sources.has("depth") and not conventions.cameras:
+        report.append(("depth", "distances, taken as if along the viewing axis"))
+    if conventions.motion is None:
+        derived = "derived from positions or depth and cameras, as if nothing but the camera moved"
+        report.append(("motion", derived if conventions.has_history else "none: no history, every frame by itself"))
+    if "dual_motion" in reads:
+        report.append(("dual motion", "none: motion in its place"))
+    if "roughness" in reads and not sources.has("roughness"):
+        report.append(("roughness", "none: 1"))
+    background = 100 * (1 - first.surface.mean())
+    return [*report, ("background", f"{background:.1f} % of the first frame, left as it is")]
+
+
+def motion_convention(
+    shots: Sequence[Sequence[FrameFiles]], sources: Sources, given: MotionConvention | None
+) -> tuple[MotionConvention, str]:
+    """The convention of motion vectors, as `given` or as detected on the first frames that move, and why.
+
+    Raises BadInput where `given` names components that the layer does not have.
+    """
+    components = len(sources.quantities["motion"].layer.channels)
+    if given:
+        if given.pair == "ZW" and components < 4:
+            raise BadInput(f"--motion {given}: the motion layer has {components} components, there is no ZW")
+        return given, f"{given.description()} (as given)"
+    detector = ConventionDetector(components)
+    count = 0
+    for shot in shots:
+        before: Image | None = None
+        for files in shot:
+            if count == FRAMES or detector.pairs == PAIRS:
+                break
+            frame, _ = read_foreign_frame(files, sources)
+            now = guides(frame)
+            if before is not None:
+                detector.add(now, before, frame.arrays["motion"])
+            before = now
+            count += 1
+    detection = detector.detection()
+    remedy = "" if detection.certain else "; set it by --motion if that is wrong"
+    return detection.convention, detection.reason + remedy
+
+
+def guides(frame: ForeignFrame) -> Image:
+    """What motion should carry along unchanged, (H, W, C) of about 1: albedo and normals, or else light; blurred.
+
+    Edges are one pixel wide, where a warp by less than that errs more than none at all; and light is noisy.
+    """
+    images = [frame.arrays[name] for name in ("albedo", "normal") if name in frame.arrays]
+    if not images:
+        y = luminance(frame.arrays["colour"].clip(0, None))[..., None].astype(np.float32)
+        images = [y / (y + max(float(y.mean()), 1e-30))]
+    return blurred(np.concatenate(images, axis=-1))
+
+
+def blurred(image: Image) -> Image:
+    """An image (H, W, C) under a tent of 9 x 9 pixels: twice the mean of 5 x 5, fewer at the border."""
+    smooth = torch.from_numpy(image).permute(2, 0, 1)[None]
+    for _ in range(2):
+        smooth = avg_pool2d(smooth, 5, stride=1, padding=2, count_include_pad=False)
+    return smooth[0].permute(1, 2, 0).numpy()
