@@ -217,7 +217,9 @@ class Frame:
         return torch.einsum("bji,bihw->bjhw", self.to_view, self.normal)
 
     def to(self, device: torch.device | str) -> "Frame":
-        """The frame with all tensors on `device`."""
+        """The frame with all tensors on `device`; the frame itself if they are there."""
+        if self.now.K.device == torch.device(device):
+            return self
 
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device)
