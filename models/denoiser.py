@@ -14,38 +14,38 @@ from errors import BadInput
 
 @dataclass(frozen=True)
 class State:
-    """What a denoiser carries from frame to frame: tensors. Each denoiser has a subclass of its own."""
+    """What a denoiser carries from frame to frame; each has its own subclass."""
 
-    moment: Moment  # the frame after which it stands
+    moment: Moment  # of the frame that it follows
 
     def pictures(self) -> dict[str, Tensor]:
-        """What to look at when debugging, by name: (B, 1 or 3, H, W), in whatever units the name tells."""
+        """Images for debugging, by name with units: (B, 1 or 3, H, W)."""
         return {}
 
 
-# Why filters without a network compute in float32 alone, whatever the hardware.
+# Why filters without a network compute in float32 only.
 CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
-CONSTANT = 1e-3  # how far a channel may be from its one value: more than float16 rounds
+CONSTANT_TOLERANCE = 1e-3  # of a channel that counts as constant: more than float16 rounds
 
 S = TypeVar("S", bound=State)
 
 
 def as_it_is(value: Tensor) -> Tensor:
-    """What a network sees of a channel that is an input without any change."""
+    """The network input of a channel that is used unchanged."""
     return value
 
 
 def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None:
-    """The state as one of `kind`; None where it is another, or the frame does not follow it: another size, or a cut."""
+    """The state if it is of `kind` and the frame follows it, else None."""
     return state if isinstance(state, kind) and frame.follows(state.moment) else None
 
 
 class Denoiser(torch.nn.Module):
     """One frame in, linear HDR radiance out.
 
-    What is known of a denoiser is an attribute of its class; wrappers (models/wrappers) take over those of the denoiser
-    that they wrap. `registry.prototype` returns an instance to read them from, without weights.
+    Facts of a denoiser are attributes of its class; wrappers (models/wrappers) take over those of the denoiser that they
+    wrap. `registry.prototype` returns an instance without weights to read them from.
 
     Attributes:
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
@@ -90,10 +90,7 @@ class Denoiser(torch.nn.Module):
         return None
 
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        """What `forward` makes of the frame's finite part: pixels that are NaN or infinite count as 0.
-
-        Raises BadInput where one of `constants` varies.
-        """
+        """`forward`, with NaN and infinities replaced by 0. Raises BadInput where one of `constants` varies."""
         self.check_constants(frame)
         result: tuple[Tensor, State] = super().__call__(frame.finite(), state)
         return result
@@ -106,22 +103,22 @@ class Denoiser(torch.nn.Module):
         raise NotImplementedError
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
-        """The convolutions that see `inputs`."""
+        """The convolutions that read `inputs`."""
         raise NotImplementedError
 
     def check_constants(self, frame: Frame) -> None:
-        """Raise BadInput where a channel that the network does without is not what it was in training."""
+        """Raise BadInput where a channel that the network was specialised to varies."""
         for name, value in self.constants.items():
             channel = frame.channel(name)
             wanted = channel.new_tensor(value)[:, None, None]
-            if ((channel - wanted).abs() > CONSTANT).any():
+            if ((channel - wanted).abs() > CONSTANT_TOLERANCE).any():
                 raise BadInput(
                     f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
                     f"{type(self).__name__} are specialised: use general weights"
                 )
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
-        """Take the form for inference: no dropping back to training. Raises BadInput for a precision it refuses."""
+        """Switch to inference for good. Raises BadInput for a precision that it refuses."""
         if precision in self.refuses:
             raise BadInput(f"{type(self).__name__} does not compute in {precision}: {self.refuses[precision]}")
         self.eval()

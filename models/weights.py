@@ -19,7 +19,7 @@ def save_weights(
 ) -> None:
     """Write atomically: a reader sees the old file or the whole new one.
 
-    `made_by` names the code and the packages that have trained them, see train/made_by.py.
+    `made_by` names the code and packages that trained them, see train/made_by.py.
     """
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
     metadata = {"denoiser": name, "recipe": json.dumps(recipe), "made_by": json.dumps(list(made_by))}
@@ -29,14 +29,14 @@ def save_weights(
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """What a file says of its weights, as `save_weights` was told: "denoiser", "recipe", "made_by", and "constants"."""
+    """The metadata that `save_weights` wrote: "denoiser", "recipe", "made_by", and "constants"."""
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata() or {}
     return {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
-    """Fill `denoiser` from a file, specialised as that says.
+    """Load a file into `denoiser`, specialised as its metadata states.
 
     Raises BadInput where it is missing, damaged or of another network.
     """

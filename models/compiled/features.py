@@ -71,12 +71,12 @@ def feature_image(
 
 
 def network_features(
-    frame: Frame, irradiance: Tensor, scale: RunningScale, seen: Sequence[str] = tuple(FEATURES)
+    frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURES)
 ) -> Tensor:
     """See models.networks.features.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
-    out = torch.empty(len(irradiance), *frame.size, sum(FEATURES[name] for name in seen))
+    out = torch.empty(len(irradiance), *frame.size, sum(FEATURES[name] for name in names))
     for item in range(len(out)):
         feature_image(
             out[item].numpy(),
@@ -86,7 +86,7 @@ def network_features(
             array(frame.depth[item, 0]),
             exposure[item],
             depth_scale[item],
-            "albedo" in seen,
-            "normal" in seen,
+            "albedo" in names,
+            "normal" in names,
         )
     return out.permute(0, 3, 1, 2)

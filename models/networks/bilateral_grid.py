@@ -1,4 +1,4 @@
-"""Means over the cells of a bilateral grid, read out between cells: what NBGD filters with (Meng et al. 2020)."""
+"""Filtering by means over the cells of a bilateral grid, interpolated between cells (NBGD, Meng et al. 2020)."""
 
 import math
 from itertools import product
@@ -35,13 +35,13 @@ def cells_of_pixels(guide: Tensor, spacing: int) -> list[tuple[Tensor, Tensor]]:
     y, x = ((torch.arange(size).to(guide) + 0.5) / spacing - 0.5 for size in guide.shape[-2:])
     z = ((GUIDES - 1) * guide[:, 0] + 0.5) / spacing - 0.5
     item = torch.arange(batch, device=guide.device)[:, None, None]
-    found = []
+    weighted = []
     for (row, by_row), (column, by_column), (level, by_level) in product(
         cells_around(y[:, None], down), cells_around(x, across), cells_around(z, along)
     ):
         cell = ((item * down + row) * across + column) * along + level
-        found.append((cell.flatten(), (by_row * by_column * by_level).reshape(-1, 1)))
-    return found
+        weighted.append((cell.flatten(), (by_row * by_column * by_level).reshape(-1, 1)))
+    return weighted
 
 
 @compiled.by(kernels.grid_mean)
@@ -49,8 +49,8 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     """Filter `image` (B, 3, H, W) through a bilateral grid. Differentiable in image and guide.
 
     A pixel lies at (x, y, 255 guide) in a space of H × W × 256, which cells of spacing³ divide. Each cell has the mean
-    of the pixels around it, whose weights fall linearly along every axis, to 0 at a distance of a cell. A pixel gets
-    what linear interpolation between the cells around it says; borders have no cells outside.
+    of the pixels around it, whose weights fall linearly along every axis, to 0 at a distance of a cell. A pixel is
+    interpolated linearly between the cells around it; there are no cells outside the image.
 
     Args:
         image: float32, finite.

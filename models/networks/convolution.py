@@ -1,18 +1,16 @@
-"""A convolution, a sum and ReLU in one pass over memory: on CPUs, passes are most of the time of a wide image."""
+"""Convolution, sum and ReLU fused: on CPUs, passes over memory take most of the time of a large image."""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-FUSED = "_convolution_pointwise"  # what PyTorch's compiler uses; it is not documented and may go
+FUSED = "_convolution_pointwise"  # an undocumented operator of PyTorch's compiler
 
 
 class ConvReLU(nn.Conv2d):
     """relu(convolution(x) + other) with kernels of `size` x `size`, an odd one or the stride.
 
-    Zeros around the image keep its size, which a stride divides.
-
-    Inference on CPUs takes oneDNN's fused operator: PyTorch's own walk over the image up to three times.
+    Zero padding; the stride divides the size. Inference on CPUs uses oneDNN's fused operator.
     """
 
     def __init__(self, inputs: int, outputs: int, size: int = 3, stride: int = 1):
@@ -32,7 +30,7 @@ class ConvReLU(nn.Conv2d):
 
 
 def fusable(x: Tensor) -> bool:
-    """Whether oneDNN's fused operators, which know neither gradients nor autocast nor exports, can take `x`."""
+    """Whether oneDNN's fused operators can take `x`: they support neither gradients nor autocast nor export."""
     if torch.compiler.is_compiling():
         return False
     plain = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")

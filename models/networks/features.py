@@ -1,4 +1,4 @@
-"""What WSKP's networks see of a frame (Fan et al. 2021, §5.1)."""
+"""The inputs of WSKP's networks (Fan et al. 2021, §5.1)."""
 
 from collections.abc import Sequence
 
@@ -14,9 +14,9 @@ from models.history.running_scale import RunningScale
 
 @compiled.by(kernels.network_features)
 def network_features(
-    frame: Frame, irradiance: Tensor, scale: RunningScale, seen: Sequence[str] = tuple(FEATURES)
+    frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURES)
 ) -> Tensor:
-    """The network's input (B, 10, H, W) in [0, 1], or fewer channels where not all of FEATURES are `seen`.
+    """The network's input (B, 10, H, W) in [0, 1], or fewer channels for some `names` of FEATURES only.
 
     Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
     world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.
@@ -25,9 +25,9 @@ def network_features(
     colour = (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA)
     depth = scale.normalised_depth(frame.depth)
     parts = {"colour": colour, "albedo": frame.albedo, "normal": scaled_normal(frame.normal), "depth": depth}
-    return torch.cat([parts[name] for name in seen], dim=1)
+    return torch.cat([parts[name] for name in names], dim=1)
 
 
 def scaled_normal(normal: Tensor) -> Tensor:
-    """A normal's components from [-1, 1] in [0, 1]."""
+    """A normal's components, from [-1, 1] to [0, 1]."""
     return normal / 2 + 0.5

@@ -1,7 +1,7 @@
-"""Weight-shared kernel construction and fusion (Fan et al. 2021, §3 and §4.2), the heart of WSKP.
+"""Weight-shared kernel construction and fusion (Fan et al. 2021, §3 and §4.2).
 
 A window's weights are exp(I(q)) / sum exp(I(q')): a weight depends on the neighbour q alone, so the filtered image is
-the ratio of two box sums. No kernel is ever written out, and the cost hardly grows with the window.
+the ratio of two box sums. No kernel is materialised, and the cost hardly grows with the window.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from models.operators import MIN_DIVISOR, STRIP_ROWS
 def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
     """Sums of `window` consecutive entries along `dim`, which gets shorter by window - 1.
 
-    Powers of two of entries are added up, nothing is ever subtracted: running sums would cancel.
+    Sums of powers of two of entries are combined; running sums would suffer from cancellation.
     """
     length = x.shape[dim] - window + 1
     total: Tensor | None = None
@@ -42,7 +42,7 @@ def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
 
 
 def windowed_max(x: Tensor, window: int, dim: int) -> Tensor:
-    """Largest of `window` consecutive entries along `dim`, which gets shorter by window - 1."""
+    """Maxima of `window` consecutive entries along `dim`, which gets shorter by window - 1."""
     size = (1, window) if dim == -1 else (window, 1)
     return F.max_pool2d(x, size, stride=1)
 
@@ -53,7 +53,7 @@ def along(dim: int, margin: int) -> tuple[int, ...]:
 
 
 def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    """Box sums relative to the largest logit of every window: first of columns, then of rows of these."""
+    """Box sums relative to the maximum logit of every window: of columns, then of rows of these."""
     margin = window // 2
     top = logits
     total = values
@@ -74,7 +74,7 @@ def windowed_sums(logits: Tensor, values: Tensor, window: int, counted: Tensor |
     """(M, S) with exp(M) S = sum of exp(logits) * values over the window of each pixel, taps outside left out.
 
     `logits` (B, 1, H, W), any finite numbers; `values` (B, C, H, W); S (B, C, H, W); M (B, 1, H, W) or (1, 1, 1, 1).
-    Where `counted` (B, 1, H, W), of bool, is given, other pixels are left out as well.
+    With `counted` (B, 1, H, W), bool, other pixels are left out as well.
     """
     low, high = torch.aminmax(logits)
     if counted is not None:
@@ -127,7 +127,7 @@ class SharedKernel(torch.autograd.Function):
 def shared_kernel(image: Tensor, logits: Tensor, window: int, surface: Tensor | None = None) -> Tensor:
     """Filter `image` (B, C, H, W) with the kernels that `logits` (B, 1, H, W) encode (Eq. 3, 4). `window` is odd.
 
-    Only pixels that show a `surface` (B, 1, H, W) count.
+    Only pixels of a `surface` (B, 1, H, W) count.
     """
     filtered: Tensor = SharedKernel.apply(image, logits, window, surface)
     return filtered
@@ -163,17 +163,16 @@ def fuse(
     Args:
         image: (B, 3, H, W), finite. importance: I, (B, M, H, W), one map a window; any finite numbers.
         mixture: logits (B, M, H, W) whose softmax over M are the shares alpha. windows: M odd sizes.
-        surface: (B, 1, H, W), 1 for pixels that count and 0 for those that are left out like taps outside the image;
-            by default all count.
-    Returns (B, 3, H, W): a convex combination of the image's pixels within the largest window, taps outside the image
-    left out; a window none of whose pixels count adds 0. Differentiable in the first three.
+        surface: (B, 1, H, W), 1 for pixels that count, 0 for those that are left out; by default all count.
+    Returns (B, 3, H, W): a convex combination of pixels within the largest window; a window without any pixel that
+    counts adds 0. Differentiable in the first three.
     """
     training = torch.is_grad_enabled() and any(t.requires_grad for t in (image, importance, mixture))
     if training or image.device.type != "cpu":
         return fuse_whole(image, importance, mixture, windows, surface)
     fused = torch.empty_like(image)
     for rows, needed, within in strips(image.shape[-2], max(windows) // 2):
-        there = None if surface is None else surface[..., needed, :]
-        part = fuse_whole(image[..., needed, :], importance[..., needed, :], mixture[..., needed, :], windows, there)
+        valid = None if surface is None else surface[..., needed, :]
+        part = fuse_whole(image[..., needed, :], importance[..., needed, :], mixture[..., needed, :], windows, valid)
         fused[..., rows, :] = part[..., within, :]
     return fused

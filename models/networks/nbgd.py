@@ -1,23 +1,18 @@
 """NBGD: the neural bilateral grid denoiser (Meng et al. 2020), for one sample a pixel.
 
-A small network says for every pixel where it lies along the third axis of three bilateral grids, and how the three
-pictures that are read out of these are to be mixed. Pixels are averaged in the cells of a grid, so only pixels of about
-the same guide are, and the weights are learned through the grid. We do not have the whole of the paper's text: layers,
-grids and weights are those of the code that its authors published (github.com/xmeng525/
-RealTimeDenoisingNeuralBilateralGrid), which WSKP's authors compare with too: two convolutions of 5 x 5, 20 channels
-between them, leaky ReLU; grids of 4, 8 and 16 pixels a cell and 64, 32 and 16 cells along the guide. The seven layers
-with dense connections that the paper has for 64 samples a pixel are not here.
+A small network predicts each pixel's position along the third axis of three bilateral grids (its guides) and how to mix
+the three images read from these grids. The paper's full text was not available: layers, grids and mixing weights follow
+the authors' code (github.com/xmeng525/RealTimeDenoisingNeuralBilateralGrid): two 5 x 5 convolutions with 20 channels
+between them and leaky ReLU; grids of 4, 8 and 16 pixels per cell and 64, 32 and 16 cells along the guide. The paper's
+seven-layer network for 64 spp is not implemented.
 
-What is ours:
+What differs:
 
-- Inputs and accumulation are those of WSKP, which its §6.1 gives NBGD too. The authors' are the same ten channels.
-- Cells cover the whole of an image whose sides are no multiples of theirs.
-- Background is in no cell. The authors read out what they call 0 as an empty cell, black ones too; here a cell is empty
-  where no pixel has weight, and then nobody reads it.
+- Inputs and accumulation are those of WSKP, as in its §6.1; the ten channels are the authors'.
+- Cells cover images whose sides are no multiples of theirs; background is in no cell.
 - Tents are sharp; the authors round their tips by 10^-4 of a cell.
-- The third weight, 1 - w_1 - w_2, may be below 0, so the mixture is no convex combination: what becomes negative is cut
-  off.
-- Weights begin as PyTorch's do.
+- The third weight, 1 - w_1 - w_2, may be below 0: negative results are clamped to 0.
+- Weights have PyTorch's default initialisation.
 """
 
 from collections.abc import Sequence
@@ -37,7 +32,7 @@ SPACINGS = (4, 8, 16)  # px, and values of a guide, from cell to cell
 
 
 class NBGD(KernelPredictor):
-    """Three guides and two weights a pixel; means over the cells of three bilateral grids, mixed."""
+    """Three guides and two mixing weights per pixel; means over the cells of three bilateral grids, mixed."""
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -47,7 +42,7 @@ class NBGD(KernelPredictor):
             nn.LeakyReLU(LEAK, inplace=True),
             nn.Conv2d(WIDTH, outputs, KERNEL, padding=KERNEL // 2),
         )
-        # A pixel's cells begin up to two cells away.
+        # A pixel's cells reach up to two cells away.
         self.reach = 2 * (KERNEL // 2) + 2 * max(SPACINGS)
 
     def first_layers(self) -> Sequence[nn.Conv2d]:

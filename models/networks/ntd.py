@@ -1,4 +1,4 @@
-"""NTD: neural temporal denoising for indirect illumination, Zeng et al. 2021."""
+"""NTD: neural temporal denoising of indirect illumination (Zeng et al. 2021)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from models.networks.pixel_kernels import apply_kernels
 from models.operators import halve, halve_surface, pad_to_multiple
 
 INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
-WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper's are not known
+WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper does not print its own
 TAPS = 25  # of a 5 x 5 kernel
-Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, of the pixels that show a surface
-LEAST_SHARE = 1e-6  # of surfaces in what bilinear filters gather; with less there is none
-MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of an image that the network takes
+Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, over surface pixels
+MIN_SURFACE_SHARE = 1e-6  # of bilinear taps that show a surface; with less the result is invalid
+NTD_SIDE_MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of the network's images
 
 
 class Decode(nn.Module):
-    """Two convolutions of the upsampled features beside those skipped to here.
+    """Two convolutions of upsampled features and skip connection.
 
-    The first one is a sum of two, one a source: the same as one over both concatenated, without writing that down.
+    The first is a sum of two convolutions, one per source: equal to one over the concatenation, without storing it.
     """
 
     def __init__(self, below: int, skip: int):
@@ -42,7 +42,7 @@ class Decode(nn.Module):
 class KernelNet(nn.Module):
     """A U-Net (Ronneberger et al. 2015) that predicts kernels and weights in its last three layers (Fig. 6).
 
-    Where the paper is silent we choose two 3 x 3 convolutions and ReLU a level, nearest upsampling, and 1 x 1 heads.
+    Ours, where the paper is silent: two 3 x 3 convolutions and ReLU per level, nearest upsampling, 1 x 1 heads.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class KernelNet(nn.Module):
 def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     """image(p + motion(p)), bilinear (Eq. 3), and whether p + motion(p) is inside the image, (B, 1, H, W).
 
-    Outside, the border continues. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
+    Outside, the border is repeated. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
     """
     height, width = image.shape[-2:]
     x = torch.arange(width, device=motion.device) + 0.5
@@ -96,9 +96,9 @@ def combine_levels(
 ) -> Tensor:
     """i_f - U[alpha_c [D i_f]] + U[alpha_c i_c] (Eq. 4): D is `pool`, U is bilinear.
 
-    U is linear and so applied once. `fine` (B, C, H, W) is not negative; `coarse`, and `alpha` (B, 1, ·, ·), have half
-    the size, rounded up. D and U take pixels that show a `surface` (B, 1, H, W) of 1 and 0. With the paper's maximum,
-    what is taken away is brighter than what is put in its place.
+    U is linear, so it is applied once. `fine` (B, C, H, W) is not negative; `coarse` and `alpha` (B, 1, ·, ·) have half
+    the size, rounded up. D and U use pixels of the `surface` (B, 1, H, W). With the paper's maximum, more is
+    subtracted than added.
     """
     height, width = fine.shape[-2:]
 
@@ -108,8 +108,8 @@ def combine_levels(
     change = alpha * (coarse - pool(fine, surface))
     if surface is None:
         return fine + enlarge(change)
-    there = F.max_pool2d(surface, 2, ceil_mode=True)
-    return fine + enlarge(change * there) / enlarge(there).clamp(min=LEAST_SHARE)
+    valid = F.max_pool2d(surface, 2, ceil_mode=True)
+    return fine + enlarge(change * valid) / enlarge(valid).clamp(min=MIN_SURFACE_SHARE)
 
 
 def reconstruct_image(
@@ -124,7 +124,7 @@ def reconstruct_image(
     Args:
         noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
         predictions: of the network, coarse to fine, at least as large as the images.
-        surface: what pixels may be gathered from, see Frame.surface.
+        surface: the pixels that may be gathered, see Frame.surface.
         pool: D of Eq. 4.
     """
     pyramid = [noisy]
@@ -134,10 +134,10 @@ def reconstruct_image(
         surfaces.append(halve_surface(surfaces[-1]))
     output = pyramid[-1]
     alpha: Tensor | None = None
-    for image, there, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
+    for image, valid, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
-        filtered = apply_kernels(image, prediction[:, :TAPS], there)
-        output = filtered if alpha is None else combine_levels(filtered, output, alpha, there, pool)
+        filtered = apply_kernels(image, prediction[:, :TAPS], valid)
+        output = filtered if alpha is None else combine_levels(filtered, output, alpha, valid, pool)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
     return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS], surface), output, alpha), alpha
@@ -145,7 +145,7 @@ def reconstruct_image(
 
 @dataclass(frozen=True)
 class NTDState(State):
-    """The output to reproject, demodulated, and the running scales; the rest is to look at."""
+    """The demodulated output to reproject and the running scales; the rest is for debugging and the loss."""
 
     irradiance: Tensor  # (B, 3, H, W)
     scale: RunningScale
@@ -163,30 +163,27 @@ class NTDState(State):
 
 
 def warp_output(state: NTDState, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """The previous output where this frame's pixels were, as `warp` does; nothing is gathered from background."""
+    """The previous output where this frame's pixels were, and where that is valid; background is not gathered."""
     if state.surface is None:
         return warp(state.irradiance, motion)
     past, inside = warp(torch.cat([state.irradiance, state.surface], dim=1), motion)
     share = past[:, 3:]
-    return past[:, :3] / share.clamp(min=LEAST_SHARE), inside & (share > LEAST_SHARE)
+    return past[:, :3] / share.clamp(min=MIN_SURFACE_SHARE), inside & (share > MIN_SURFACE_SHARE)
 
 
 class NTD(Denoiser):
     """Predicts kernels for this frame's noise at three resolutions and for the previous output, reprojected.
 
-    Where the motion vector leaves the image, or leads to background, there is no previous output, and this frame's
-    noise stands in for it, as it does for all of the first frame (§5): so what comes into view, and all of the image
-    where a cut moves the camera far away, starts anew. The paper leaves the rest to the network and tests no surfaces,
-    and neither do we.
-
-    It denoises indirect light, as in the paper, unless it is built for "total".
+    Where the motion vector leaves the image or leads to background, this frame's noise replaces the previous output, as
+    in the first frame (§5). Like the paper, it validates no surfaces: the network decides. It denoises indirect light
+    unless it is created for "total".
 
     Attributes:
-        vectors: the channel by which the previous output is fetched.
+        vectors: the motion channel by which the previous output is reprojected.
     """
 
     vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
-    # The traditional vectors tell what is disoccluded, for the loss and for pictures.
+    # Traditional vectors are needed for the disocclusion mask of the loss.
     reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
     signal: Signal = "indirect"
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
@@ -213,14 +210,14 @@ class NTD(Denoiser):
         return torch.log1p(x.abs()).copysign(x)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, NTDState]:
-        """Irradiance (B, 3, H, W) as Eq. 4 makes it, which may be below 0, and the next state, in which it is not."""
+        """Irradiance (B, 3, H, W) of Eq. 4, which may be below 0, and the next state, in which it is clamped."""
         before = matching_state(state, NTDState, frame)
         noisy = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         warped = noisy
         if before:
-            previous, found = warp_output(before, frame.channel(self.vectors))
-            warped = torch.where(found, previous, noisy)
+            previous, valid = warp_output(before, frame.channel(self.vectors))
+            warped = torch.where(valid, previous, noisy)
         parts = {
             "noisy": self.compress(noisy, scale, frame),
             "warped": self.compress(warped, scale, frame),
@@ -230,7 +227,7 @@ class NTD(Denoiser):
         }
         x = torch.cat([parts[name] for name in self.inputs], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
-        predictions = self.network(pad_to_multiple(x, MULTIPLE))
+        predictions = self.network(pad_to_multiple(x, NTD_SIDE_MULTIPLE))
         surface = frame.surface
         irradiance, alpha = reconstruct_image(noisy, warped, predictions, surface, self.pool)
         if surface is not None:
@@ -245,17 +242,16 @@ class NTD(Denoiser):
 
 
 class NTDTraditional(NTD):
-    """The paper's ablation A (§6.3): the previous output is fetched by traditional motion vectors."""
+    """The paper's ablation A (§6.3): reprojection by traditional motion vectors."""
 
     vectors = "motion"
     reads = ("indirect", "albedo", "normal", "depth", "motion")
 
 
 class NTDMean(NTD):
-    """NTD with averages for the maxima in Eq. 4, so that combining levels keeps the light: ours.
+    """NTD with averages in place of the maxima of Eq. 4, which darken; ours.
 
-    Taking away the maximum of four noisy pixels and putting the coarser level's mean in its place darkens, which the
-    network must learn to make up for. Eq. 7 of WSKP (Fan et al. 2021), of the same form, averages as well.
+    Eq. 7 of WSKP (Fan et al. 2021) has the same form with averages.
     """
 
     def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:

@@ -17,7 +17,7 @@ POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
 ENCODER = (32, 32, 43, 57, 76, 101, 101)
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
-# The auxiliary inputs (§3.2): how many channels each has, and how they are made.
+# The auxiliary inputs (§3.2): the number of channels of each, and how to compute it.
 AUXILIARY: dict[str, tuple[int, Callable[[Frame, RunningScale], Tensor]]] = {
     "normal": (2, lambda frame, scale: frame.view_normal()[:, :2]),
     "depth": (1, lambda frame, scale: scale.normalised_depth(frame.depth)),
@@ -57,7 +57,7 @@ class RecurrentAutoencoder(nn.Module):
     """The network of Fig. 2: images whose sides are multiples of 32 in, images of the same size out.
 
     36 convolutions: 7 in the encoder, 3 in each of 6 recurrent blocks, 10 in the decoder, one linear output layer.
-    The widths `encoder` and `decoder` are ours: those drawn in the paper are not known.
+    The widths `encoder` and `decoder` are ours: the paper does not print its own.
     """
 
     def __init__(self, inputs: int = 7, encoder: Sequence[int] = ENCODER, decoder: Sequence[tuple[int, int]] = DECODER):
@@ -112,7 +112,7 @@ class RAE(Denoiser):
     def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
         super().__init__(signal=signal)
         self.inputs = {"colour": 3} | {name: AUXILIARY[name][0] for name in auxiliary}
-        needed = {*auxiliary, "depth"}  # depth has its running scale in any case
+        needed = {*auxiliary, "depth"}  # the running scale always reads depth
         self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
         network = RecurrentAutoencoder(sum(self.inputs.values()))
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -121,7 +121,7 @@ class RAE(Denoiser):
         return [self.network.first]
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
-        """The raw output p (B, 3, H, W), (gain · exposure · irradiance)^0.2 if all is well, and the next state."""
+        """The raw output p (B, 3, H, W), which estimates (gain · exposure · irradiance)^0.2, and the next state."""
         height, width = frame.size
         before = matching_state(state, RAEState, frame)
         irradiance = frame.irradiance(self.signal).clamp(min=0)
@@ -134,7 +134,7 @@ class RAE(Denoiser):
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
 
     def target(self, frame: Frame) -> Tensor:
-        """What training holds the output to, irradiance (B, 3, H, W)."""
+        """The training target, irradiance (B, 3, H, W)."""
         return frame.reference_irradiance(self.signal)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:

@@ -8,21 +8,21 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 BRANCH_SIZES = (1, 3, 5)
-LANES = 16  # numbers of float32 that a processor multiplies at once
+LANES = 16  # float32 numbers in a vector register
 
 
 class PairedConv2d(nn.Conv2d):
-    """A convolution that on processors takes two neighbouring pixels as one with twice the channels.
+    """A convolution that on CPUs treats two neighbouring pixels as one with twice the channels.
 
-    It adds up the same numbers, and some zeros. That is faster where the outputs of one pixel leave half of the last
-    LANES idle and those of two leave none. Channels last, as the images are, it moves nothing in memory.
+    Faster where the outputs of one pixel leave half a register idle and those of two fill it. In channels-last layout
+    no memory is moved.
     """
 
     pair_weight: Tensor  # (2 outputs, 2 inputs, k, (k + 1) / 2)
     pair_bias: Tensor
 
     def pair(self) -> None:
-        """Take over the weights for pairs; `weight` and `bias` stay. k is 5, 9, ..."""
+        """Compute the weights for pairs from `weight` and `bias`; k is 5, 9, ..."""
         outputs, inputs, size, _ = self.weight.shape
         middle = size // 4
         weight = self.weight.new_zeros(2, outputs, 2, inputs, size, 2 * middle + 1)
@@ -49,9 +49,8 @@ class PairedConv2d(nn.Conv2d):
 class RepVGGBlock(nn.Module):
     """Parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, and identity where widths match, summed; then ReLU or nothing.
 
-    The sum of the branches is one convolution with the sum of their kernels. It is computed that way in training too:
-    gradients reach every branch through the sum, and the images are convolved once. `merge` does it for good.
-    One size alone, without identity, is a plain convolution.
+    The sum of the branches is one convolution with the sum of their kernels, also in training: gradients reach every
+    branch through the sum. `merge` makes it permanent. A single size without identity is a plain convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, relu: bool, sizes: Sequence[int] = BRANCH_SIZES):

@@ -1,4 +1,4 @@
-"""WSKP: weight-sharing kernel prediction of Fan et al. 2021, its multi-resolution variant and its baseline KP."""
+"""WSKP: weight-sharing kernel prediction (Fan et al. 2021), its multi-resolution variant and its baselines KP."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ from models.networks.pixel_kernels import apply_kernels
 from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.operators import halve, halve_surface, pad_to_multiple
 
-WIDTH = 24  # ours: the widths drawn in the paper are not known
-LARGEST_WHOLE = 1920 * 1080  # px; the network's images of larger frames would take gigabytes: they are cut into strips
+WIDTH = 24  # ours: the paper does not print its widths
+MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips
 STRIP_PIXELS = 1 << 20
 
 
 @dataclass(frozen=True)
 class WSKPState(AccumulatedState):
-    """Accumulated frames, running exposure and depth scale, and what the network chose between windows, to look at."""
+    """Accumulated frames, running exposure and depth scale; for debugging, the mixture of windows."""
 
     scale: RunningScale
     mixture: Tensor | None  # logits (B, M, H, W)
@@ -42,14 +42,14 @@ class WSKPState(AccumulatedState):
 
 
 class KernelPredictor(Accumulating):
-    """Temporal accumulation, a network that predicts how to filter, the filter on irradiance, re-modulation (§4)."""
+    """Temporal accumulation, a network that predicts filter parameters, the filter on irradiance, remodulation (§4)."""
 
     reads = Accumulated.reads
     is_network = True
     dispensable: ClassVar = {"albedo": as_it_is, "normal": scaled_normal}
-    filter_reads = ("emission", "albedo", "normal", "depth")  # what is left to read once irradiance is accumulated
+    filter_reads = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
     network: nn.Module
-    reach: int | None = None  # rows above and below that a pixel's result follows from; None for all
+    reach: int | None = None  # rows above and below that a pixel depends on; None for all
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -69,12 +69,12 @@ class KernelPredictor(Accumulating):
     ) -> tuple[Tensor, Tensor | None]:
         """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any.
 
-        Nothing is gathered from background: see Frame.surface.
+        Background has no weight: see Frame.surface.
         """
         raise NotImplementedError
 
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
-        """The state after a frame, before any filter: accumulated irradiance and running scales."""
+        """The state before filtering: accumulated irradiance and running scales."""
         before = matching_state(state, WSKPState, frame)
         history = self.accumulated(frame, before)
         radiance = history.irradiance * frame.divisor
@@ -87,7 +87,7 @@ class KernelPredictor(Accumulating):
         Large images are filtered in strips of rows, with the same result.
         """
         height, width = frame.size
-        if self.reach is None or height * width <= LARGEST_WHOLE:
+        if self.reach is None or height * width <= MAX_WHOLE_PIXELS:
             return self.filter_whole(frame, irradiance, scale)
         rows = max(1, STRIP_PIXELS // width // THREAD_ROWS) * THREAD_ROWS
         strips = [self.filter_rows(frame, irradiance, scale, top, top + rows) for top in range(0, height, rows)]
@@ -97,17 +97,17 @@ class KernelPredictor(Accumulating):
     def filter_rows(
         self, frame: Frame, irradiance: Tensor, scale: RunningScale, top: int, bottom: int
     ) -> tuple[Tensor, Tensor | None]:
-        """What `filter_whole` returns, of the rows from `top` to before `bottom`."""
+        """Rows `top` to `bottom` of what `filter_whole` returns."""
         assert self.reach is not None
-        first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # the kernel rounds by its own strips: keep them
-        around = slice(first, bottom + self.reach)
+        first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # keep the kernel's strips: they decide rounding
+        needed = slice(first, bottom + self.reach)
         inner = slice(top - first, bottom - first)
-        part = replace(frame, channels={name: frame.channels[name][..., around, :] for name in self.filter_reads})
-        filtered, mixture = self.filter_whole(part, irradiance[..., around, :], scale)
+        part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in self.filter_reads})
+        filtered, mixture = self.filter_whole(part, irradiance[..., needed, :], scale)
         return filtered[..., inner, :], None if mixture is None else mixture[..., inner, :]
 
     def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
-        """What `filter` returns, in one piece."""
+        """`filter`, in one piece."""
         x = self.features(frame, irradiance, scale)
         predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
         return self.reconstruct(irradiance, predicted, frame.surface)
@@ -158,7 +158,7 @@ class WSKP3(WSKP):
 
 
 class KP(KernelPredictor):
-    """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel a pixel."""
+    """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel per pixel."""
 
     convex = True
     window = 13
@@ -180,7 +180,7 @@ def convolutions(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class MultiResolutionNet(nn.Module):
-    """A U-Net with an output for each of its three resolutions (§5.2). The widths are ours, the paper's not known."""
+    """A U-Net with an output at each of its three resolutions (§5.2). The widths are ours."""
 
     widths = (32, 48, 64)
 
@@ -209,18 +209,18 @@ class MultiResolutionNet(nn.Module):
 def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None) -> Tensor:
     """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W).
 
-    D counts pixels that show a `surface`, as `halve` does.
+    D averages surface pixels only, as `halve` does.
     """
     return fine + alpha * F.interpolate(coarse - halve(fine, surface), scale_factor=2.0)
 
 
 class MultiResolution(KernelPredictor):
-    """A filter at each of three resolutions, combined from the coarsest on by Eq. 7 (§5.2).
+    """A filter at each of three resolutions, combined from coarse to fine by Eq. 7 (§5.2).
 
-    Eq. 7 is no convex combination: what it makes negative is cut off.
+    Eq. 7 is no convex combination: negative results are clamped to 0.
     """
 
-    maps: ClassVar[int]  # that the filter takes, at each resolution
+    maps: ClassVar[int]  # channels of filter parameters at each resolution
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -233,7 +233,7 @@ class MultiResolution(KernelPredictor):
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)
 
     def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
-        """The image (B, 3, h, w) of one resolution, filtered as its `maps` (B, ·, h, w) say."""
+        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w)."""
         raise NotImplementedError
 
     def mixture(self, maps: Tensor) -> Tensor | None:
@@ -250,10 +250,10 @@ class MultiResolution(KernelPredictor):
             images.append(halve(images[-1], surfaces[-1]))
             surfaces.append(halve_surface(surfaces[-1]))
         output = images[-1]
-        for level, (image, there, predictions) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
+        for level, (image, valid, predictions) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
             maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
-            filtered = self.filter_level(image, maps, there)
-            output = combine_resolutions(filtered, output, torch.sigmoid(alpha), there) if level else filtered
+            filtered = self.filter_level(image, maps, valid)
+            output = combine_resolutions(filtered, output, torch.sigmoid(alpha), valid) if level else filtered
         mixture = self.mixture(maps[..., :height, :width])
         return output[..., :height, :width].clamp(min=0), mixture
 
@@ -272,7 +272,7 @@ class WSKPMR(MultiResolution):
 
 
 class MRKP(MultiResolution):
-    """The paper's other baseline (§6.1): the network of wskp-mr, and a free 5 x 5 kernel a pixel at each resolution."""
+    """The paper's other baseline (§6.1): the network of wskp-mr, and a 5 x 5 kernel per pixel at each resolution."""
 
     maps = 25
 

@@ -177,7 +177,7 @@ def test_large_frames_are_filtered_in_strips(height, monkeypatch):
     denoiser.prepare()
     with torch.inference_mode():
         whole, _ = denoiser(frame, None)
-        monkeypatch.setattr("models.networks.wskp.LARGEST_WHOLE", 1)
+        monkeypatch.setattr("models.networks.wskp.MAX_WHOLE_PIXELS", 1)
         monkeypatch.setattr("models.networks.wskp.STRIP_PIXELS", 32 * 90)
         strips, _ = denoiser(frame, None)
     assert torch.equal(strips, whole)

@@ -170,7 +170,7 @@ def test_large_frames_are_filtered_in_strips_bit_for_bit(name, height, monkeypat
     denoiser.prepare()
     with torch.inference_mode():
         whole, state = denoiser(frame, None)
-        monkeypatch.setattr("models.networks.wskp.LARGEST_WHOLE", 1)
+        monkeypatch.setattr("models.networks.wskp.MAX_WHOLE_PIXELS", 1)
         monkeypatch.setattr("models.networks.wskp.STRIP_PIXELS", 32 * 90)
         strips, state_of_strips = denoiser(frame, None)
     assert torch.equal(strips, whole)
