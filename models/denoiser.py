@@ -44,8 +44,8 @@ def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None
 class Denoiser(torch.nn.Module):
     """One frame in, linear HDR radiance out.
 
-    Facts of a denoiser are attributes of its class; wrappers (models/wrappers) take over those of the denoiser that they
-    wrap. `registry.prototype` returns an instance without weights to read them from.
+    Facts of a denoiser are attributes of its class; wrappers (models/wrappers) take over those of the wrapped denoiser.
+    `registry.prototype` returns an instance without weights to read them from.
 
     Attributes:
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
