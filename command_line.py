@@ -280,12 +280,15 @@ def bench_denoisers(
     names: Denoisers = (),
     runs: Runs = RUNS,
     size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")] = ("1280x720",),
-    threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default 1, and as many as PyTorch uses")] = (),
+    threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default as many as PyTorch uses")] = (),
+    every_way: Annotated[
+        bool, FlagCreatePairsOff, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
+    ] = False,
 ) -> None:
-    """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers."""
+    """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers as `onespp eval` runs them."""
     from eval.bench.denoisers import bench_denoisers as bench
 
-    print(bench(runs, names, size, threads))
+    print(bench(runs, names, size, threads, every_way=every_way))
 
 
 def bench_rendering(names: Scenes = (), runs: Runs = RUNS) -> None:

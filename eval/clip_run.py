@@ -1,6 +1,6 @@
-"""The way of denoisers, and of the reference that they are held to, through one clip."""
+"""Runs of denoisers and of the reference through one clip, measured frame by frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +21,7 @@ from eval.metrics import Values, measure, noise_floors, temporal_error_floor
 from eval.results import REFERENCE, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
+from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import with_error
 from models.wrappers.shrinkage import Shrunk
 from provenance import file_digest
@@ -29,98 +30,92 @@ METRICS_CHANNELS = ("motion", "dual_motion")
 
 
 @dataclass
-class Entrant:
-    """A denoiser to be evaluated, on however many clips.
+class NamedDenoiser:
+    """A denoiser to evaluate on any number of clips, under the name that results give it.
 
     Attributes:
-        name: what results call it.
-        precision: of its network: "float32", "bfloat16" or "float16".
-        weights: the file of its weights, None where it has none.
-        modules: of onespp, in which it is defined.
-        build: makes it, ready to use; called once, and only if results are missing.
-        tells_error: whether to keep maps of the error that it tells, where it is a NAME+js and frames have halves.
-        device: where it computes: "cpu" or "cuda".
+        saves_error: whether to store error maps, where it is a NAME+js and frames have two sample buffers.
     """
 
+    spec: DenoiserSpec
     name: str
-    signal: Signal
-    precision: str
-    weights: Path | None
-    modules: tuple[str, ...]
-    build: Callable[[], Denoiser]
-    tells_error: bool = False
-    device: str = "cpu"
+    saves_error: bool = False
+
+    @property
+    def signal(self) -> Signal:
+        return self.spec.returns
 
     @cached_property
     def denoiser(self) -> Denoiser:
-        return self.build()
+        """Built on first use: only if results are missing."""
+        return self.spec.build()
 
     @cached_property
     def weights_digest(self) -> str | None:
-        return file_digest(self.weights) if self.weights else None
+        return file_digest(self.spec.weights) if self.spec.weights else None
 
     def key(self, clip: Clip) -> str:
-        """A digest of all that its result on a clip follows from."""
+        """A digest of everything that determines its result on a clip."""
         facts = {
             "name": self.name,
             "signal": self.signal,
-            "precision": self.precision,
+            "precision": self.spec.precision,
             "weights": self.weights_digest,
-            "device": self.device,
+            "device": self.spec.device,
         }
-        return result_key(clip, [__name__, *self.modules], facts)
+        return result_key(clip, [__name__, *self.spec.modules], facts)
 
 
 @dataclass
-class ClipRun:
-    """One denoiser's way through one clip."""
+class DenoiserRun:
+    """One denoiser's run through one clip."""
 
-    entrant: Entrant
+    evaluated: NamedDenoiser
     state: State | None = None
     before: Luminances | None = None
     frames: list[Values] = field(default_factory=list)
     nonfinite: int = 0
-    error: Tensor | None = None  # that the last frame's samples tell, (1, H, W), in exposed radiance
+    error: Tensor | None = None  # estimated for the last frame, (1, H, W), in exposed radiance
 
     @property
     def name(self) -> str:
-        return self.entrant.name
+        return self.evaluated.name
 
     @property
     def signal(self) -> Signal:
-        return self.entrant.signal
+        return self.evaluated.signal
 
     @property
     def reads(self) -> tuple[str, ...]:
-        return self.entrant.denoiser.reads
+        return self.evaluated.denoiser.reads
 
     def key(self, clip: Clip) -> str:
-        return self.entrant.key(clip)
+        return self.evaluated.key(clip)
 
-    def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
+    def step(self, frame: Frame, reference_buffers: Tensor, exposure: float, still: bool) -> Tensor:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
-        denoiser = self.entrant.denoiser
+        denoiser = self.evaluated.denoiser
         moved = frame.to(denoiser.device)
-        if self.entrant.tells_error and isinstance(denoiser, Shrunk) and frame.has_buffers:
+        if self.evaluated.saves_error and isinstance(denoiser, Shrunk) and frame.has_buffers:
             output, self.state, estimate = with_error(denoiser, moved, self.state)
             self.error = exposure * estimate.radiance().cpu().square().mean(dim=1).sqrt()
         else:
             output, self.state = denoiser(moved, self.state)
         output = output.cpu()
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
-        comparison = Comparison(output, halves, exposure, hidden(frame), self.before, still)
+        comparison = Comparison(output, reference_buffers, exposure, disocclusions(frame), self.before, still)
         self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})
         self.before = comparison.luminances
         return output
 
     def result(self, clip: Clip) -> Result:
-        precision = self.entrant.precision
+        precision = self.evaluated.spec.precision
         return result_of(self, clip, means(self.frames), nonfinite=self.nonfinite, precision=precision)
 
 
 @dataclass
 class ReferenceRun:
-    """The reference's way through one clip: its noise floors, and where most comes into view."""
+    """The reference's run through one clip: its noise floors, and the crops with most disocclusions."""
 
     signal: Signal
     name: str = REFERENCE
@@ -132,12 +127,12 @@ class ReferenceRun:
     def key(self, clip: Clip) -> str:
         return result_key(clip, [__name__], {"name": self.name, "signal": self.signal})
 
-    def step(self, frame: Frame, halves: Tensor, exposure: float, still: bool) -> Tensor:
+    def step(self, frame: Frame, reference_buffers: Tensor, exposure: float, still: bool) -> Tensor:
         """Measure one frame's reference. Returns the radiance (1, 3, H, W)."""
-        reference = halves.mean(dim=0, keepdim=True)
-        disoccluded_pixels = hidden(frame)
-        comparison = Comparison(reference, halves, exposure, disoccluded_pixels, self.before, still)
-        crop = densest_crop(disoccluded_pixels[0, 0])
+        reference = reference_buffers.mean(dim=0, keepdim=True)
+        mask = disocclusions(frame)
+        comparison = Comparison(reference, reference_buffers, exposure, mask, self.before, still)
+        crop = densest_crop(mask[0, 0])
         if crop:
             self.crops.append({"frame": len(self.frames)} | crop._asdict())
         self.frames.append(noise_floors(comparison))
@@ -148,16 +143,16 @@ class ReferenceRun:
         return result_of(self, clip, mean_floor(self.frames), crops=self.crops)
 
 
-Run = ClipRun | ReferenceRun
+Run = DenoiserRun | ReferenceRun
 
 
 def result_of(run: Run, clip: Clip, metrics: Values, **facts: Any) -> Result:
-    """What a run through a clip ended with: its mean `metrics`, and `facts` by the names of Result's fields."""
+    """The result of a finished run: its mean `metrics`, and `facts` by the names of Result's fields."""
     return Result(run.key(clip), run.name, run.signal, clip.scene, clip.name, metrics, run.frames, **facts)
 
 
-def hidden(frame: Frame) -> Tensor:
-    """The pixels (1, 1, H, W) that were hidden in the frame before."""
+def disocclusions(frame: Frame) -> Tensor:
+    """The pixels (1, 1, H, W) that were hidden in the previous frame."""
     return disoccluded(frame.motion, frame.dual_motion)
 
 
@@ -169,20 +164,20 @@ def is_still(clip: Clip) -> bool:
 
 
 @torch.no_grad()
-def play(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool = False) -> None:
-    """Take all runs through a clip frame by frame, in memory that does not grow with its length; keep what they show.
+def run_clip(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool = False) -> None:
+    """Step all runs through a clip frame by frame and store their pictures, in memory independent of its length.
 
-    Each is held to the reference of the signal that it returns.
+    Each is compared with the reference of the signal that it returns.
     """
     channels = sorted({*METRICS_CHANNELS, *(channel for run in runs for channel in run.reads)})
     signals = {run.signal for run in runs}
     still = is_still(clip)
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
-        halves = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
+        buffers = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
         for run, folder in zip(runs, folders, strict=True):
-            output = run.step(frame, halves[run.signal], clip.exposure, still)
+            output = run.step(frame, buffers[run.signal], clip.exposure, still)
             image = display(finite(output), clip.exposure)
             save_picture(folder, index, image[0].permute(1, 2, 0).numpy())
-            if isinstance(run, ClipRun) and run.error is not None:
+            if isinstance(run, DenoiserRun) and run.error is not None:
                 save_error(folder, index, run.error[0].numpy())

@@ -1,4 +1,4 @@
-"""One frame of a denoiser beside its reference: all that a metric is a function of."""
+"""One frame of a denoiser beside its reference: the arguments of every metric."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,28 +11,28 @@ from models.operators import finite, image_luminance
 
 
 class Luminances(NamedTuple):
-    """Display luminance (1 or 2, 1, H, W) of one frame: what change over time is measured by."""
+    """Display luminance (1 or 2, 1, H, W) of one frame, from which temporal metrics are computed."""
 
     output: Tensor
     reference: Tensor
-    halves: Tensor
+    buffers: Tensor
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A denoised frame, its reference and the frame before it. Images are float64.
+    """A denoised frame, its reference and the previous frame. Images are float64.
 
     Attributes:
         denoised: radiance (1, 3, H, W). A pixel that is not finite counts as 0.
-        reference_halves: the two independent halves (2, 3, H, W) of the reference radiance.
+        reference_buffers: two independent sample buffers A and B (2, 3, H, W) of the reference radiance.
         exposure: the clip's.
-        disoccluded: the pixels (1, 1, H, W) that have just come into view; None where that is not known.
-        before: luminances of the frame before; None on the first one.
+        disoccluded: the pixels (1, 1, H, W) that were hidden in the previous frame; None where unknown.
+        before: luminances of the previous frame; None on the first one.
         still: whether nothing moves in the clip.
     """
 
     denoised: Tensor
-    reference_halves: Tensor
+    reference_buffers: Tensor
     exposure: float
     disoccluded: Tensor | None = None
     before: Luminances | None = None
@@ -43,55 +43,56 @@ class Comparison:
         return finite(self.denoised).double()
 
     @cached_property
-    def halves(self) -> Tensor:
-        return self.reference_halves.double()
+    def buffers(self) -> Tensor:
+        return self.reference_buffers.double()
 
     @cached_property
     def reference(self) -> Tensor:
-        """The mean of the halves, (1, 3, H, W)."""
-        return self.halves.mean(dim=0, keepdim=True)
+        """The mean of both buffers, (1, 3, H, W)."""
+        return self.buffers.mean(dim=0, keepdim=True)
 
     @cached_property
-    def shown(self) -> Tensor:
-        """The output as displayed."""
+    def displayed(self) -> Tensor:
+        """The output after exposure and tone mapping, in [0, 1]."""
         return display(self.output, self.exposure)
 
     @cached_property
-    def shown_reference(self) -> Tensor:
+    def displayed_reference(self) -> Tensor:
         return display(self.reference, self.exposure)
 
     @cached_property
-    def shown_halves(self) -> Tensor:
-        return display(self.halves, self.exposure)
+    def displayed_buffers(self) -> Tensor:
+        return display(self.buffers, self.exposure)
 
     @cached_property
-    def shown_noise(self) -> Tensor:
-        """(A - B) / 2 of the halves as displayed, (1, 3, H, W): as far off zero as the reference is off the truth."""
-        a, b = self.shown_halves.split(1)
+    def displayed_noise(self) -> Tensor:
+        """(A - B) / 2 of the displayed buffers, (1, 3, H, W): distributed as the error of the reference."""
+        a, b = self.displayed_buffers.split(1)
         return (a - b) / 2
 
     @cached_property
     def noise(self) -> Tensor:
-        """The same of exposed radiance, (3, H, W)."""
-        return self.exposure * (self.halves[0] - self.halves[1]) / 2
+        """(A - B) / 2 in exposed radiance, (3, H, W)."""
+        return self.exposure * (self.buffers[0] - self.buffers[1]) / 2
 
     @cached_property
     def mse(self) -> float:
-        """As displayed."""
-        return (self.shown - self.shown_reference).square().mean().item()
+        """Mean squared error of the displayed output."""
+        return (self.displayed - self.displayed_reference).square().mean().item()
 
     @cached_property
     def noise_mse(self) -> float:
         """The noise floor of `mse`."""
-        return self.shown_noise.square().mean().item()
+        return self.displayed_noise.square().mean().item()
 
     @cached_property
     def luminances(self) -> Luminances:
-        return Luminances(*(image_luminance(image) for image in (self.shown, self.shown_reference, self.shown_halves)))
+        images = (self.displayed, self.displayed_reference, self.displayed_buffers)
+        return Luminances(*(image_luminance(image) for image in images))
 
     @cached_property
     def change(self) -> Luminances | None:
-        """Change of the luminances since the frame before."""
+        """Change of the luminances since the previous frame."""
         if self.before is None:
             return None
         return Luminances(*(now - before for now, before in zip(self.luminances, self.before, strict=True)))

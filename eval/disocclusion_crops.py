@@ -1,4 +1,4 @@
-"""Where most comes into view at once: the places to look at for what denoisers make of disocclusions."""
+"""The windows of an image with most disocclusions."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ CROPS_A_SIDE = 4  # a crop is a quarter of the image's shorter side
 
 
 class Crop(NamedTuple):
-    """A square of an image, in pixels, and how many of them it is about."""
+    """A square of an image, in pixels, and how many disoccluded pixels it contains."""
 
     x: int
     y: int
@@ -19,10 +19,7 @@ class Crop(NamedTuple):
 
 
 def densest_crop(mask: Tensor) -> Crop | None:
-    """Of the windows that hold most pixels of a mask (H, W), one with them in its middle, as far as the border lets it.
-
-    None for an empty mask.
-    """
+    """The window with most pixels of a mask (H, W), centred on them within the image; None for an empty mask."""
     height, width = mask.shape
     shorter = min(height, width)
     size = min(shorter, max(SMALLEST_CROP, shorter // CROPS_A_SIDE))

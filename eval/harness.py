@@ -1,4 +1,4 @@
-"""The evaluation harness: every denoiser over every test clip, one streaming pass a clip."""
+"""The evaluation harness: every denoiser on every test clip, in one streaming pass per clip."""
 
 import math
 import multiprocessing
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.clip_run import ClipRun, Entrant, ReferenceRun, Run, play
+from eval.clip_run import DenoiserRun, NamedDenoiser, ReferenceRun, Run, run_clip
 from eval.results import (
     SIGNALS,
     ClipResults,
@@ -40,40 +40,34 @@ from provenance import device_in_words
 from timing import thread_count, threads_for
 
 COMPILED_SIZE = (32, 48)  # px: a frame on which denoisers are run to compile their kernels
-SMALLEST_SHARE = 500_000  # pixels of all frames: what is evaluated while another process starts
+SMALLEST_SHARE = 500_000  # pixels of all frames, evaluated in about the time in which another process starts
 
 
 def clips_of_one_spp(dataset: Dataset) -> list[Clip]:
-    """The test clips of one sample a pixel: those of more show the same frames again. Raises BadInput without any."""
+    """The test clips of 1 spp; those of more spp show the same frames. Raises BadInput without any."""
     clips = [clip for clip in dataset.clips("test") if clip.facts["noisy_spp"] == 1]
     if not clips:
         raise BadInput(f"{dataset.path} has no test clips of 1 spp: render another with `onespp dataset`")
     return clips
 
 
-def entrant(spec: DenoiserSpec, name: str | None = None, tells_error: bool = False) -> Entrant:
-    """The denoiser of a spec, under the name that results are to give it."""
-    name = name or spec.name
-    return Entrant(name, spec.returns, spec.precision, spec.weights, spec.modules, spec.build, tells_error, spec.device)
-
-
-def entrants_of(specs: Sequence[DenoiserSpec]) -> list[Entrant]:
-    """An entrant for each spec, and for the baselines of indirect light if that is denoised."""
-    return [entrant(spec, tells_error=True) for spec in with_indirect_baselines(specs)]
+def named_denoisers(specs: Sequence[DenoiserSpec]) -> list[NamedDenoiser]:
+    """The denoisers of all specs, and the baselines of indirect light if any spec returns that."""
+    return [NamedDenoiser(spec, spec.name, saves_error=True) for spec in with_indirect_baselines(specs)]
 
 
 class Pass(NamedTuple):
-    """One run through a clip: where its results belong, and whether they are there."""
+    """One run through a clip, the folder of its results, and whether these are complete."""
 
     run: Run
     folder: Path
     finished: bool
 
 
-def passes(clip: Clip, entrants: Sequence[Entrant], runs: Path) -> list[Pass]:
-    """Those of all entrants and of the references that they are held to."""
-    present = {entrant.signal for entrant in entrants}
-    all_runs: list[Run] = [ClipRun(entrant) for entrant in entrants]
+def passes(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path) -> list[Pass]:
+    """The passes of all denoisers, and of the references with which they are compared."""
+    present = {denoiser.signal for denoiser in denoisers}
+    all_runs: list[Run] = [DenoiserRun(denoiser) for denoiser in denoisers]
     all_runs += [ReferenceRun(signal) for signal in SIGNALS if signal in present]
     folders = [folder_of(runs, clip.scene, clip.name, run.name, run.signal) for run in all_runs]
     return [
@@ -81,23 +75,23 @@ def passes(clip: Clip, entrants: Sequence[Entrant], runs: Path) -> list[Pass]:
     ]
 
 
-def evaluate_clip(clip: Clip, entrants: Sequence[Entrant], runs: Path, quiet: bool = False) -> list[Result]:
-    """The results of all entrants and of their references: evaluated, where they are not there yet, and kept."""
-    everyone = passes(clip, entrants, runs)
-    waiting = [one for one in everyone if not one.finished]
-    for one in waiting:
-        shutil.rmtree(one.folder, ignore_errors=True)
-        one.folder.mkdir(parents=True)
-    if waiting:
+def evaluate_clip(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path, quiet: bool = False) -> list[Result]:
+    """The results of all denoisers and of their references; what is missing is evaluated and stored."""
+    all_passes = passes(clip, denoisers, runs)
+    missing = [each for each in all_passes if not each.finished]
+    for each in missing:
+        shutil.rmtree(each.folder, ignore_errors=True)
+        each.folder.mkdir(parents=True)
+    if missing:
         with thread_count(threads_for(clip.height, clip.width)):
-            play(clip, [one.run for one in waiting], [one.folder for one in waiting], quiet)
-    for one in waiting:
-        one.run.result(clip).save(runs)
-    return [load_result(one.folder) for one in everyone]
+            run_clip(clip, [each.run for each in missing], [each.folder for each in missing], quiet)
+    for each in missing:
+        each.run.result(clip).save(runs)
+    return [load_result(each.folder) for each in all_passes]
 
 
 class ClipJob(NamedTuple):
-    """A clip for a process of its own."""
+    """A clip to evaluate in a worker process."""
 
     path: Path
     specs: list[DenoiserSpec]
@@ -106,11 +100,11 @@ class ClipJob(NamedTuple):
 
     def work(self) -> None:
         torch.set_num_threads(self.threads)
-        evaluate_clip(Clip(self.path), entrants_of(self.specs), self.runs, quiet=True)
+        evaluate_clip(Clip(self.path), named_denoisers(self.specs), self.runs, quiet=True)
 
 
 def start_worker() -> None:
-    """An interrupt is the parent's to act on. Ended then, a worker must not leave behind a lock that bars share."""
+    """Ignore interrupts, which the parent handles, and keep the progress bars' lock within the process."""
     on_signal(SIGINT, SIG_IGN)
     set_up_process()
     tqdm.set_lock(threading.RLock())
@@ -118,7 +112,7 @@ def start_worker() -> None:
 
 @torch.inference_mode()
 def compile_kernels(spec: DenoiserSpec) -> None:
-    """Run a denoiser on small frames, so that its kernels are compiled and on disk for every process."""
+    """Denoise two small frames, so that the denoiser's kernels are in the cache on disk for every process."""
     denoiser = spec.build()
     state = None
     for index in range(2):
@@ -126,7 +120,7 @@ def compile_kernels(spec: DenoiserSpec) -> None:
 
 
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
-    """Evaluate clips side by side. First the processes share out the kernels: else each would compile all of them."""
+    """Evaluate clips in parallel, after compiling kernels in parallel: else each process would compile all of them."""
     threads = max(1, torch.get_num_threads() // processes)
     jobs = [ClipJob(clip.path, specs, runs, threads) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
@@ -137,7 +131,7 @@ def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs
 
 
 def save_strips(runs: Path, results: ClipResults) -> None:
-    """A PNG of a frame late in the clip as each denoiser shows it."""
+    """Write a PNG with the outputs of all denoisers for a frame at three quarters of the clip."""
     from eval.strip import save_strip
 
     index = len(results.reference.frames) * 3 // 4
@@ -156,23 +150,24 @@ def evaluate(
     device: str = "cpu",
     smallest_share: int = SMALLEST_SHARE,
 ) -> dict[str, Any]:
-    """Evaluate over the test clips of data sets; writes RUNS/eval: results.json, frames.csv, a PNG a clip and signal.
+    """Evaluate on the test clips of data sets; writes results.json, frames.csv and a PNG per clip and signal.
 
-    What has been evaluated before, of the same clips, weights and code, is kept. Returns the results. Strips of
-    indirect light have names that end in `-indirect`. Raises BadInput where two data sets have clips of one name.
+    These go to RUNS/eval; names of PNGs of indirect light end in `-indirect`. Earlier results of the same clips,
+    weights and code are reused. Returns the content of results.json. Raises BadInput where two data sets have clips
+    of one name.
     """
     clips = [clip for path in data for clip in Dataset(path).clips("test")]
     if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
         raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
     specs = evaluated(names, runs, budget, device)
-    entrants = entrants_of(specs)
+    denoisers = named_denoisers(specs)
     (runs / "eval").mkdir(parents=True, exist_ok=True)
-    waiting = [clip for clip in clips if not all(one.finished for one in passes(clip, entrants, runs))]
-    pixels = sum(clip.frames * clip.height * clip.width for clip in waiting)
-    processes = min(processes, len(waiting), math.ceil(pixels / smallest_share))
+    missing = [clip for clip in clips if not all(each.finished for each in passes(clip, denoisers, runs))]
+    pixels = sum(clip.frames * clip.height * clip.width for clip in missing)
+    processes = min(processes, len(missing), math.ceil(pixels / smallest_share))
     if processes > 1:
-        evaluate_in_processes(waiting, specs, runs, processes)
-    results = [result for clip in clips for result in evaluate_clip(clip, entrants, runs)]
+        evaluate_in_processes(missing, specs, runs, processes)
+    results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(device), results, weights)
     if can_draw():

@@ -1,4 +1,4 @@
-"""Means over frames and over clips, and what noise of the references leaves of them."""
+"""Means over frames and clips, and their noise floors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ def means(frames: list[Values]) -> Values:
 
 
 def mean_floor(frames: list[Values]) -> Values:
-    """Noise floors of means over frames, whose noise is independent: standard errors add up as variances."""
+    """Noise floors of means over frames with independent noise: the squares of standard errors add up."""
     floors = means(frames)
     for name, metric in METRICS.items():
         if metric.floor_is_error:
@@ -27,7 +27,7 @@ def mean_floor(frames: list[Values]) -> Values:
 
 
 def joint_floor(clips: Sequence[Values], floors: Sequence[Values]) -> Values:
-    """Noise floors of means over clips, where every clip is within its own: no clip's floor hides another's error."""
+    """Noise floors of means over clips; None unless every clip is within its own floor."""
 
     def near(metric: str) -> bool:
         pairs = [(clip.get(metric), floor.get(metric)) for clip, floor in zip(clips, floors, strict=True)]
@@ -37,7 +37,10 @@ def joint_floor(clips: Sequence[Values], floors: Sequence[Values]) -> Values:
 
 
 def compared_mean(metric: str, clips: Sequence[Values], floors: Sequence[Values]) -> float | None:
-    """What to compare means over clips by, in the digits shown: within its floor a clip counts as at its edge."""
+    """The mean over clips, in the digits shown, by which denoisers are ranked.
+
+    The value of a clip within its noise floor is replaced by the floor's edge. None where the metric is never defined.
+    """
     values = []
     for value, floor in ((c[metric], f.get(metric)) for c, f in zip(clips, floors, strict=True)):
         if value is not None:
@@ -48,7 +51,7 @@ def compared_mean(metric: str, clips: Sequence[Values], floors: Sequence[Values]
 
 @dataclass(frozen=True)
 class ClipScores:
-    """A denoiser's metrics on each of several clips, and the noise floors of their references."""
+    """A denoiser's metrics on several clips, and the noise floors of these."""
 
     values: list[Values]
     floors: list[Values]
@@ -62,11 +65,10 @@ class ClipScores:
         return joint_floor(self.values, self.floors)
 
     def compared(self, metric: str) -> float | None:
-        """What to compare the mean by; None where the metric is nowhere defined."""
         return compared_mean(metric, self.values, self.floors)
 
 
 def scores_of(clips: Sequence[ClipResults], denoiser: str) -> ClipScores:
-    """On those of the clips, all of one signal, for which there are results of the denoiser."""
+    """The denoiser's scores on those of the clips, all of one signal, that have results of it."""
     pairs = [(result, clip.reference) for clip in clips for result in clip.results if result.denoiser == denoiser]
     return ClipScores([result.metrics for result, _ in pairs], [reference.metrics for _, reference in pairs])

@@ -1,14 +1,13 @@
-"""The metrics: a row of METRICS each, with its noise floor. docs/evaluation.md says what they mean.
+"""The metrics, each a row of METRICS with its noise floor. docs/evaluation.md defines them.
 
-A noise floor is what the truth itself would score against a noisy reference. The mean of the two halves A and B is off
-the truth by as much as (A - B) / 2 is off zero: both have the same variance. With a and b the errors of the halves, the
-mean errs by (a + b) / 2, and (A - B) / 2 = (a - b) / 2. So floors of squared errors are exact in expectation, those of
-absolute ones as far as noise is as often too high as too low.
+A noise floor is the score of the true image against the noisy reference. The reference is the mean of two independent
+sample buffers A and B with errors a and b: its error (a + b) / 2 and (A - B) / 2 = (a - b) / 2 have the same variance.
+So floors of squared errors are exact in expectation, and floors of absolute errors where noise is symmetric.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import flip_evaluator
 import numpy as np
@@ -30,30 +29,27 @@ def twice(floor: float) -> float:
 
 
 def root_two_times(floor: float) -> float:
-    """Of absolute errors, the squares do."""
+    """The squares of absolute errors add up."""
     return math.sqrt(2) * floor
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """How numbers of a kind are shown: under which title, in which form."""
+class Metric:
+    """One metric.
+
+    Attributes:
+        title: its heading in tables.
+        form: the format of its values.
+        of: its value for a frame; None where it is undefined.
+        floor: the noise floor of a frame; None where noise of the reference has no effect.
+        edge: from the floor, the value at which noise of the reference is as large as the image's own error.
+        floor_is_error: the floor is a standard error around 0, because noise does not bias the metric.
+    """
 
     title: str
     form: str
     more_is_better: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metric(Quantity):
-    """One row of the table.
-
-    Attributes:
-        of: measures a frame; None where the metric is undefined.
-        floor: the noise floor of a frame; None where noise of the reference does not enter.
-        edge: from the floor, the value at which noise of the reference is as large as the image's own error.
-        floor_is_error: the floor is a standard error around 0, for noise does not bias the metric.
-    """
-
+    _: KW_ONLY
     of: Callable[[Comparison], float | None]
     floor: Callable[[Comparison], float | None] | None
     edge: Callable[[float], float] = root_two_times
@@ -73,23 +69,23 @@ def flip(x: Tensor, reference: Tensor) -> float:
 
 
 def flip_floor(c: Comparison) -> float:
-    """FLIP of the mean of the halves and one of them, which differ by (A - B) / 2."""
-    a, b = c.shown_halves.split(1)
+    """FLIP between the mean of the buffers and one of them, which differ by (A - B) / 2."""
+    a, b = c.displayed_buffers.split(1)
     return flip((a + b) / 2, a)
 
 
 def mse_unbiased(c: Comparison) -> float:
-    """E[(x - A)(x - B)] = E[(x - truth)²] of exposed linear radiance, for independent halves A and B; signed."""
+    """E[(x - A)(x - B)] = E[(x - truth)²] of exposed linear radiance, for independent buffers A and B; signed."""
     x = c.exposure * c.output
-    a, b = c.exposure * c.halves
+    a, b = c.exposure * c.buffers
     return float(((x - a) * (x - b)).mean())
 
 
 def mse_unbiased_error(c: Comparison) -> float:
-    """Its standard error for a perfect image, at most, if noise is Gaussian and pixels are independent.
+    """An upper bound of its standard error for a perfect image, with Gaussian noise and independent pixels.
 
-    With D = A - B, E|D|^4 >= 12 tr(S²) for the covariance S of a half's three channels, and tr(S²) / 9 is the variance
-    of the mean of a pixel's three products.
+    With D = A - B, E|D|^4 >= 12 tr(S²) for the covariance S of a buffer's three channels, and tr(S²) / 9 is the
+    variance of the mean of a pixel's three products.
     """
     variance = (2 * c.noise).square().sum(dim=0).square() / 12 / 9
     return variance.sum().sqrt().item() / variance.numel()
@@ -116,20 +112,20 @@ def relative_mse_floor(c: Comparison) -> float:
 
 
 def temporal_error(c: Comparison) -> float | None:
-    """How far the change of luminance is off the reference's, from the second frame on."""
+    """Mean absolute difference between the change of luminance and the reference's; None on the first frame."""
     return None if c.change is None else float((c.change.output - c.change.reference).abs().mean())
 
 
 def temporal_error_floor(c: Comparison) -> float | None:
-    """Half the temporal error between the halves."""
+    """Half the temporal error between the buffers."""
     if c.change is None:
         return None
-    a, b = c.change.halves
+    a, b = c.change.buffers
     return float((a - b).abs().mean()) / 2
 
 
 def flicker(c: Comparison) -> float | None:
-    """Change of luminance where nothing moves in the clip (Schied et al. 2017, §5.4)."""
+    """Mean absolute change of luminance in clips where nothing moves (Schied et al. 2017, §5.4)."""
     return float(c.change.output.abs().mean()) if c.change and c.still else None
 
 
@@ -159,14 +155,14 @@ METRICS = {
         "SSIM",
         "{:.4f}",
         more_is_better=True,
-        of=lambda c: ssim(c.shown, c.shown_reference),
-        floor=lambda c: ssim_floor(*c.shown_halves.split(1)),
+        of=lambda c: ssim(c.displayed, c.displayed_reference),
+        floor=lambda c: ssim_floor(*c.displayed_buffers.split(1)),
         edge=lambda floor: 1 - twice(1 - floor),
     ),
     "flip": Metric(
         "FLIP",
         "{:.4f}",
-        of=lambda c: flip(c.shown, c.shown_reference),
+        of=lambda c: flip(c.displayed, c.displayed_reference),
         floor=flip_floor,
     ),
     "mse_unbiased": Metric(
@@ -186,8 +182,8 @@ METRICS = {
     "disocclusion_l1": Metric(
         "disocclusion L1",
         "{:.4f}",
-        of=lambda c: where_disoccluded(c, (c.shown - c.shown_reference).abs()),
-        floor=lambda c: where_disoccluded(c, c.shown_noise.abs()),
+        of=lambda c: where_disoccluded(c, (c.displayed - c.displayed_reference).abs()),
+        floor=lambda c: where_disoccluded(c, c.displayed_noise.abs()),
     ),
     "flicker": Metric(
         "flicker",
@@ -198,8 +194,8 @@ METRICS = {
     "l1": Metric(
         "L1",
         "{:.4f}",
-        of=lambda c: (c.shown - c.shown_reference).abs().mean().item(),
-        floor=lambda c: c.shown_noise.abs().mean().item(),
+        of=lambda c: (c.displayed - c.displayed_reference).abs().mean().item(),
+        floor=lambda c: c.displayed_noise.abs().mean().item(),
     ),
     "mse": Metric(
         "MSE",
@@ -225,21 +221,21 @@ METRICS = {
 
 
 def measure(comparison: Comparison) -> Values:
-    """All metrics of one frame."""
+    """The values of all metrics for one frame."""
     return {name: metric.of(comparison) for name, metric in METRICS.items()}
 
 
 def noise_floors(comparison: Comparison) -> Values:
-    """The noise floors of all metrics that have one; the comparison's output does not enter."""
+    """The noise floors of all metrics that have one; they do not depend on the comparison's output."""
     return {name: metric.floor(comparison) for name, metric in METRICS.items() if metric.floor}
 
 
 def within_floor(metric: str, value: float | None, floor: float | None) -> bool:
-    """Whether a value says no more than that the image is at least as close to the truth as the reference is.
+    """Whether the image is at least as close to the truth as the reference is, as far as the value can tell.
 
-    Noise of the reference and error of the image add up: as variances, so up to twice the floor for squared errors and
-    for what SSIM lacks of 1, half of it for PSNR, and the square root of two times it for absolute ones. An unbiased
-    MSE is within two standard errors of 0.
+    Variances of the reference's noise and of the image's error add up. So the limit is twice the floor for squared
+    errors and 1 - SSIM, √2 times the floor for absolute errors, 3 dB below it for PSNR, and two standard errors from 0
+    for the unbiased MSE.
     """
     if value is None or floor is None or metric not in METRICS:
         return False

@@ -1,8 +1,9 @@
-"""Results on disk: a folder for each denoiser on each clip, complete or nothing, and the two files made of them all.
+"""Results on disk: a folder for each denoiser and clip, and two files that summarise all of them.
 
-RUNS/eval/clips/SCENE-CLIP/DENOISER/ holds `result.json`, written last, and `0000.webp` and so on: what it shows, frame
-by frame and lossless; of NAME+js, where frames have halves, `error-0000.webp` and so on: the error that these tell. The
-reference's folder beside them holds the noise floors. Folders of indirect light end in `-indirect`.
+RUNS/eval/clips/SCENE-CLIP/DENOISER/ contains `result.json`, written last, and the displayed output of each frame,
+`0000.webp` and so on, lossless. For NAME+js, where frames have two sample buffers, it also contains maps of the
+estimated error, `error-0000.webp` and so on. The folder `reference` contains the noise floors. Folders of indirect
+light end in `-indirect`.
 """
 
 import csv
@@ -27,9 +28,9 @@ from files import read_json, write_file, write_json
 from provenance import DENOISING, code_digest, versions
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
-REFERENCE = "reference"  # the name under which the reference's noise floors are kept
-FLOOR = "(noise floor)"  # what tables call them
-BRIGHTEST_ERROR = 0.25  # of exposed radiance
+REFERENCE = "reference"  # the folder of the noise floors
+FLOOR = "(noise floor)"  # their name in tables
+MAX_SHOWN_ERROR = 0.25  # of exposed radiance
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
 FRAMES_FILE = "frames.csv"
@@ -37,7 +38,7 @@ KEYS = ("denoiser", "signal", "scene", "clip")
 
 
 def result_key(clip: Clip, modules: Sequence[str], facts: Mapping[str, Any]) -> str:
-    """A digest of all that a result follows from: the clip, the code of `modules`, packages, and further facts."""
+    """A digest of everything that determines a result: the clip, the code of `modules`, packages, and `facts`."""
     everything = [clip.fingerprint, code_digest(*modules), versions(DENOISING), facts]
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
@@ -59,13 +60,13 @@ def error_path(folder: Path, index: int) -> Path:
 
 
 def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
-    """Keep an image (H, W, 3) in [0, 1], rounded to 8 bits; nothing without the extra `report`."""
+    """Store an image (H, W, 3) in [0, 1], rounded to 8 bits; does nothing without the extra `report`."""
     save_bytes(picture_path(folder, index), 255 * image + 0.5)
 
 
 def save_error(folder: Path, index: int, error: NDArray[np.floating]) -> None:
-    """Keep an error map (H, W) in exposed radiance, white from BRIGHTEST_ERROR on."""
-    save_bytes(error_path(folder, index), 255 * (error / BRIGHTEST_ERROR).clip(0, 1) + 0.5)
+    """Store an error map (H, W) in exposed radiance, white from MAX_SHOWN_ERROR on."""
+    save_bytes(error_path(folder, index), 255 * (error / MAX_SHOWN_ERROR).clip(0, 1) + 0.5)
 
 
 def save_bytes(path: Path, values: NDArray[np.floating]) -> None:
@@ -89,18 +90,18 @@ def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:
 
 @dataclass
 class Result:
-    """What is known of one denoiser (or the reference, with noise floors) on one clip and signal."""
+    """The result of one denoiser, or the noise floors of the reference, on one clip and signal."""
 
     key: str
     denoiser: str
     signal: Signal
     scene: str
     clip: str
-    metrics: Values  # means
-    frames: list[Values]  # of each frame
-    nonfinite: int = 0
+    metrics: Values  # means over the frames
+    frames: list[Values]
+    nonfinite: int = 0  # pixels, in all frames
     precision: str = "float32"
-    crops: list[dict[str, int]] | None = None  # of the reference: where most comes into view
+    crops: list[dict[str, int]] | None = None  # of the reference: the windows with most disocclusions
 
     @property
     def floor(self) -> bool:
@@ -119,7 +120,7 @@ def load_result(folder: Path) -> Result:
 
 
 def is_finished(folder: Path, wanted: str) -> bool:
-    """Whether the folder's result is complete, with pictures if these can be stored, and of the same key."""
+    """Whether the folder's result has the `wanted` key and is complete, with pictures if these can be stored."""
     try:
         result = load_result(folder)
     except BadInput:
@@ -159,7 +160,7 @@ def write_results(
 
 
 def frames_csv(results: list[Result]) -> str:
-    """A line a frame of each result; noise floors are those of a denoiser called "(noise floor)"."""
+    """One line per frame of each result; noise floors are the values of a denoiser named "(noise floor)"."""
     text = io.StringIO()
     lines = csv.DictWriter(text, [*KEYS, "frame", *METRICS], extrasaction="ignore", lineterminator="\n")
     lines.writeheader()
@@ -171,7 +172,7 @@ def frames_csv(results: list[Result]) -> str:
 
 @dataclass
 class ClipResults:
-    """All denoisers of one signal on one clip."""
+    """The results of all denoisers of one signal on one clip."""
 
     scene: str
     clip: str
@@ -189,13 +190,13 @@ class ClipResults:
 
 
 def folders_of(runs: Path, clip: ClipResults) -> dict[str, Path]:
-    """The folders with pictures of all denoisers, and of the reference."""
-    everyone = [*clip.results, clip.reference]
-    return {r.denoiser: folder_of(runs, r.scene, r.clip, r.denoiser, r.signal) for r in everyone}
+    """The folders of all denoisers and of the reference, by name."""
+    results = [*clip.results, clip.reference]
+    return {r.denoiser: folder_of(runs, r.scene, r.clip, r.denoiser, r.signal) for r in results}
 
 
 def by_clip(results: list[Result]) -> Iterator[ClipResults]:
-    """In the order of clips, signals and denoisers."""
+    """The results of each clip and signal, in their order."""
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         groups.setdefault((result.scene, result.clip), []).append(result)
@@ -208,13 +209,13 @@ def by_clip(results: list[Result]) -> Iterator[ClipResults]:
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
-    """In the order in which the signals come first."""
+    """The clips of each signal, in the order of their first clips."""
     signals = dict.fromkeys(clip.signal for clip in clips)
     return {signal: [clip for clip in clips if clip.signal == signal] for signal in signals}
 
 
 def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
-    """Without clips such as 000-4spp, which show the same frames again with other input: means do not mix them."""
+    """The clips without those such as 000-4spp, which show the same frames with other input."""
     return [clip for clip in clips if clip.noisy_spp == 1]
 
 
@@ -224,9 +225,9 @@ def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
 
 
 def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """What the last evaluation left: results.json and, of each of its rows, the folder.
+    """The content of results.json and the results of its rows, read from their folders.
 
-    Raises BadInput where there is none, or where files have changed since.
+    Raises BadInput where files are missing or have changed since results.json was written.
     """
     path = runs / "eval" / RESULTS_FILE
     if not path.exists():
@@ -240,7 +241,7 @@ def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
         ]
         ours, reference = (load_result(folder) for folder in folders)
         if ours.metrics != row["metrics"]:
-            raise BadInput(f"{folders[0]} is not what {path} says of {facts}: run `onespp eval` again")
+            raise BadInput(f"{folders[0]} differs from {path} for {facts}: run `onespp eval` again")
         if reference not in results:
             results.append(reference)
         results.append(ours)

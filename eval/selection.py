@@ -1,4 +1,4 @@
-"""Who can run, and why not: the one way in which commands choose denoisers."""
+"""Which denoisers a command runs, which weights they take, and why others cannot run."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -18,15 +18,15 @@ USUAL_BUDGET = "quick"  # of commands that do not ask for one
 Obstacle = Callable[[DenoiserName], str | None]  # why a denoiser cannot run, and the remedy
 
 
-def choose(names: Sequence[str], everyone: Iterable[DenoiserName], *obstacles: Obstacle) -> list[DenoiserName]:
-    """The named denoisers, or all of `everyone` in whose way nothing stands; prints which are skipped, and why.
+def choose(names: Sequence[str], default: Iterable[DenoiserName], *obstacles: Obstacle) -> list[DenoiserName]:
+    """The named denoisers, or those of `default` without an obstacle; prints which are skipped and why.
 
     Raises BadInput where a named one is unknown or cannot run.
     """
     chosen: list[DenoiserName] = []
     obstacles = obstacles if names else (*obstacles, takes_long)
     skipped: dict[str, list[DenoiserName]] = {}  # by the reason that they have in common
-    for name in dict.fromkeys(map(parse_name, names) if names else everyone):
+    for name in dict.fromkeys(map(parse_name, names) if names else default):
         reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
         if reason and names:
             raise BadInput(f"{name}: {reason}")
@@ -41,19 +41,19 @@ def choose(names: Sequence[str], everyone: Iterable[DenoiserName], *obstacles: O
 
 
 def takes_long(name: DenoiserName) -> str | None:
-    """Why a denoiser runs only where it is named."""
+    """Why a denoiser runs only if it is named; None where it takes less."""
     return "it takes seconds a frame: name it to run it" if prototype(name).offline else None
 
 
 def cannot_run(name: DenoiserName) -> str | None:
-    """Why a denoiser cannot run on this machine."""
+    """Why a denoiser cannot run on this machine; None where it can."""
     return prototype(name).unavailable()
 
 
 def weights_file(name: DenoiserName, runs: Path, budget: str) -> Path | None:
-    """Where the weights of a network are, or belong; None for a denoiser without.
+    """The path of a network's weights, whether they exist or not; None for a denoiser without weights.
 
-    Those of NAME@BUDGET are in RUNS; those of a name alone are shipped, or else in RUNS those of `budget`.
+    NAME@BUDGET has those in RUNS. NAME has the shipped ones, or where none are shipped those of `budget` in RUNS.
     """
     if not prototype(name).is_network:
         return None
@@ -62,7 +62,7 @@ def weights_file(name: DenoiserName, runs: Path, budget: str) -> Path | None:
 
 
 def untrained(runs: Path, budget: str, name: DenoiserName) -> str | None:
-    """Why a network has no weights yet, and the command that trains them."""
+    """That a network has no weights, with the command that trains them; None where it has or needs none."""
     path = weights_file(name, runs, budget)
     if path is None or path.exists():
         return None
@@ -71,15 +71,15 @@ def untrained(runs: Path, budget: str, name: DenoiserName) -> str | None:
 
 
 def weights_of(name: DenoiserName, runs: Path) -> Path | None:
-    """The weights of a denoiser that is named; None for one without. Raises BadInput where it has none yet."""
+    """The file of a denoiser's weights; None for one without weights. Raises BadInput where they are missing."""
     reason = untrained(runs, USUAL_BUDGET, name)
     if reason:
         raise BadInput(f"{name}: {reason}")
     return weights_file(name, runs, USUAL_BUDGET)
 
 
-def everyone(runs: Path, budget: str) -> Iterator[DenoiserName]:
-    """All denoisers, beside shipped weights those that RUNS holds; last those that are evaluated with wrappers."""
+def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
+    """All denoisers, then those with wrappers; networks with shipped weights and with those trained in `budget`."""
     plain = [DenoiserName(base) for base in DENOISERS]
     wrapped = [name.wrapped(wrapper) for name in plain for wrapper in prototype(name).evaluated_with]
     for name in (*plain, *wrapped):
@@ -90,19 +90,24 @@ def everyone(runs: Path, budget: str) -> Iterator[DenoiserName]:
 
 
 def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu") -> list[DenoiserSpec]:
-    """The named denoisers, or everyone who can run and is trained, as `onespp eval` runs them.
+    """The named denoisers, or all that can run and have weights, as `onespp eval` runs them.
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
-    chosen = choose(names, everyone(runs, budget), cannot_run, partial(untrained, runs, budget))
+    chosen = choose(names, evaluated_by_default(runs, budget), cannot_run, partial(untrained, runs, budget))
     return [
         DenoiserSpec(name, None, fastest_precision(name, device), weights_file(name, runs, budget), device=device)
         for name in chosen
     ]
 
 
+def baselines() -> tuple[str, ...]:
+    """The names of the denoisers with which those of total light are compared."""
+    return tuple(name for name in DENOISERS if "total" in prototype(name).baseline_for)
+
+
 def with_indirect_baselines(specs: Sequence[DenoiserSpec]) -> list[DenoiserSpec]:
-    """The specs, and beside one that returns indirect light alone the baselines among them on that, too."""
+    """The specs; if any returns indirect light alone, its baselines among them also with that signal."""
     if all(spec.returns == "total" for spec in specs):
         return [*specs]
-    return [*specs, *(replace(spec, signal="indirect") for spec in specs if spec.facts.is_baseline)]
+    return [*specs, *(replace(spec, signal="indirect") for spec in specs if "indirect" in spec.facts.baseline_for)]

@@ -12,6 +12,7 @@ from errors import BadInput
 from eval.metrics import METRICS
 from eval.report.table_rows import mean_rows
 from eval.results import FLOOR, RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
+from eval.selection import baselines
 from eval.text_table import LEGEND, PRINTED, floor_cell, value_cell
 from files import read_json, write_file, write_json
 from models.shipped_weights import require_shipped, shipped_names
@@ -19,7 +20,6 @@ from models.weights import read_metadata
 from provenance import file_digest
 
 LICENCE = "Apache-2.0"  # that of onespp
-BASELINES = ("noisy", "accumulated", "svgf", "oidn")  # on every card, beside its network
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
 LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
@@ -159,7 +159,7 @@ def version_list(versions: dict[str, str]) -> str:
 
 
 def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """The content of RUNS/eval/results.json, and of it the clips of the network, with its results and the BASELINES'.
+    """The content of RUNS/eval/results.json, and the results of the network and of its baselines.
 
     Raises BadInput unless the network was evaluated with the shipped weights as they are now.
     """
@@ -169,9 +169,9 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     found = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
     if not of_one_spp(found) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
-        command = f"onespp eval {' '.join((*BASELINES, name))} --runs {runs}"
+        command = f"onespp eval {' '.join((*baselines(), name))} --runs {runs}"
         raise BadInput(f"{path} has no results of {weights} as it is now, on clips at 1 spp: run `{command}`")
-    wanted = (*BASELINES, name)
+    wanted = (*baselines(), name)
     return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in found]
 
 

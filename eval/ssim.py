@@ -1,4 +1,4 @@
-"""Structural similarity (Wang et al. 2004), and what noise of the reference alone takes from it."""
+"""Structural similarity (Wang et al. 2004) and its noise floor."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ C2 = 0.03**2
 
 
 def local_mean(images: Tensor) -> Tensor:
-    """Means (B, 3, H - 10, W - 10) of images (B, 3, H, W) over the Gaussian windows that lie inside."""
+    """Gaussian-weighted means (B, 3, H - 10, W - 10) of images (B, 3, H, W) over all windows inside the image."""
     x = torch.arange(WINDOW, dtype=images.dtype) - WINDOW // 2
     weights = torch.softmax(-(x**2) / (2 * SIGMA**2), dim=0)
     rows = sum(weight * images[..., i : images.shape[-2] - WINDOW + 1 + i, :] for i, weight in enumerate(weights))
@@ -32,10 +32,11 @@ def ssim(x: Tensor, y: Tensor) -> float | None:
 
 
 def ssim_floor(a: Tensor, b: Tensor) -> float | None:
-    """SSIM of the truth and the mean of two halves (1, 3, H, W), as displayed; None for images smaller than a window.
+    """SSIM of the truth and the mean of two displayed sample buffers (1, 3, H, W).
 
-    The covariance of independent halves is the truth's own variance, and SSIM follows from that and the noise's:
-    comparing the halves, or one of them with the mean, would take noise for structure.
+    None for images smaller than a window. The covariance of independent buffers is the variance of the truth, from
+    which SSIM follows with the variance of the noise. SSIM between the buffers, or of one of them and their mean, would
+    count noise as structure.
     """
     if min(a.shape[-2:]) < WINDOW:
         return None

@@ -12,7 +12,7 @@ from plotting import DPI, TWO_LINE_CAPTION, enlargement, plt, save_figure
 def save_strip(
     path: Path, images: Mapping[str, NDArray[np.uint8]], errors: Mapping[str, Mapping[str, float | None]]
 ) -> None:
-    """A PNG of images (H, W, 3) side by side, each captioned with its name and, of its `errors`, RMSE and SSIM."""
+    """Write a PNG of images (H, W, 3) side by side, each captioned with its name and its RMSE and SSIM in `errors`."""
     height, width = next(iter(images.values())).shape[:2]
     zoom = enlargement(height, width) / DPI
     size = (len(images) * width * zoom, height * zoom + TWO_LINE_CAPTION)

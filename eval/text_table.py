@@ -1,4 +1,4 @@
-"""Results for people: numbers as text, marked where the reference's own noise decides them."""
+"""Results as text; values within their noise floor are marked."""
 
 from collections.abc import Sequence
 
@@ -8,15 +8,15 @@ from eval.metrics import METRICS, within_floor
 from eval.results import FLOOR, ClipResults
 
 PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
-NEAR = "≈"
-LEGEND = f"{NEAR} within the noise floor: as close to the truth as the reference; differences are not significant"
+NEAR_FLOOR = "≈"
+LEGEND = f"{NEAR_FLOOR} within the noise floor: as close to the truth as the reference; differences are not significant"
 
 
 def value_cell(metric: str, value: float | None, floor: float | None = None) -> str:
     """A number, marked if it is within its noise floor."""
     if value is None:
         return "-"
-    mark = NEAR if within_floor(metric, value, floor) else ""
+    mark = NEAR_FLOOR if within_floor(metric, value, floor) else ""
     return mark + METRICS[metric].form.format(value)
 
 
@@ -27,7 +27,7 @@ def floor_cell(metric: str, value: float | None) -> str:
 
 
 def results_table(clips: Sequence[ClipResults]) -> str:
-    """A row a clip, signal and denoiser, and the reference's own noise floor below each signal."""
+    """One row per clip, signal and denoiser, with the noise floor below each signal."""
     lines = []
     for clip in clips:
         name = f"{clip.scene}/{clip.clip}"
@@ -38,4 +38,4 @@ def results_table(clips: Sequence[ClipResults]) -> str:
         lines.append([name, FLOOR, clip.signal, *(floor_cell(metric, floors.get(metric)) for metric in PRINTED), ""])
     head = ["clip", "denoiser", "signal", *(METRICS[metric].title for metric in PRINTED), "non-finite"]
     text = tabulate(lines, head, disable_numparse=True)
-    return f"{text}\n{LEGEND}" if NEAR in text else text
+    return f"{text}\n{LEGEND}" if NEAR_FLOOR in text else text

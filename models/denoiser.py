@@ -56,7 +56,8 @@ class Denoiser(torch.nn.Module):
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
         convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
         separates_lights: whether it filters direct and indirect light apart.
-        is_baseline: whether it is compared with denoisers of indirect light alone, on indirect light.
+        has_kernels: whether compiled kernels do a part of its work.
+        baseline_for: the signals whose denoisers are compared with it, in evaluations, cards and trade-offs.
         evaluated_with: wrappers with which `onespp eval` runs it beside the denoiser itself.
         dispensable: channels that its network can do without where they do not vary, and its input for a value.
         inputs: the inputs of its network in order, and how many channels each has; channels by their names.
@@ -72,7 +73,8 @@ class Denoiser(torch.nn.Module):
     offline: bool = False
     convex: bool = False
     separates_lights: bool = False
-    is_baseline: bool = False
+    has_kernels: bool = True
+    baseline_for: tuple[Signal, ...] = ()
     evaluated_with: tuple[str, ...] = ()
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     precision: torch.dtype = torch.float32

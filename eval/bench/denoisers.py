@@ -1,4 +1,4 @@
-"""`onespp bench denoisers`: milliseconds and memory of a frame, next to OIDN in the same run."""
+"""`onespp bench denoisers`: milliseconds and memory per frame, next to OIDN in the same run."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,33 +13,31 @@ from tqdm import tqdm
 
 from datasets.frame import Frame
 from eval.bench.memory import alone, growth_mb
-from eval.bench.output import bench_folder
-from eval.bench.race import TIMED_FRAMES, Contender, Timing, network_of, race
-from eval.bench.sizes import Size, parse_size, size_name, thread_counts
+from eval.bench.sizes import Size, bench_folder, parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.selection import cannot_run, choose
+from eval.bench.timed import TIMED_FRAMES, TimedDenoiser, Timing, network_of, time_in_turns
+from eval.selection import cannot_run, choose, with_indirect_baselines
 from files import read_json, write_json
 from models.filters.oidn import OIDN
 from models.names import DenoiserName
-from models.registry import DENOISERS, create, parse_name, prototype
-from models.spec import DenoiserSpec, precisions_of
+from models.registry import DENOISERS, create, parse_name
+from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory
 from provenance import DENOISING, code_digest, device_in_words, versions
 from timing import thread_count
 
-BASELINE = "oidn"  # of the table
-ALSO_IN_PYTORCH = ("accumulated", "eaw", "svgf")  # filters that are measured without compiled kernels, too
+BASELINE = "oidn"  # the denoiser that times are divided by
 COUNTING_SIZE = 128  # px; a side that no network needs to pad
 
 
 @dataclass(frozen=True)
 class DenoiserCost(Timing):
-    """A row of results.json: times, memory in MB, and what the network is made of; None where there is no such thing.
+    """A row of results.json: times, memory in MB, and the size of the network; None where undefined or not measured.
 
     Attributes:
-        peak_mb: what two frames add to memory: the state and everything in between.
-        parameters: of the form that runs.
+        peak_mb: growth of memory during two frames: the state and all intermediate tensors.
+        parameters: of the network in its form for inference.
         prediction: the network's share of the time, between 0 and 1.
     """
 
@@ -50,30 +48,42 @@ class DenoiserCost(Timing):
 
     @property
     def conditions(self) -> tuple[int, int, int]:
-        """Height, width and threads, which the rows of one race have in common."""
+        """Height, width and threads."""
         return self.height, self.width, self.threads
 
 
-def ways(names: Sequence[str], device: str = "cpu") -> list[DenoiserSpec]:
-    """All ways to run the named denoisers and OIDN, or all that can run here.
+def timed_specs(names: Sequence[str], device: str = "cpu", every_way: bool = False) -> list[DenoiserSpec]:
+    """The named denoisers and OIDN, or all that can run here, as `onespp eval` runs them.
 
-    Raises BadInput where a named one is unknown or cannot run.
+    With `every_way` also in their other precisions, and in PyTorch where they have compiled kernels. Raises BadInput
+    where a named one is unknown or cannot run.
     """
-    baseline = [] if cannot_run(parse_name(BASELINE)) else [BASELINE]
-    found: list[DenoiserSpec] = []
-    named = [str(parse_name(name).with_budget(None)) for name in names]  # weights make no difference
-    for name in choose([*named, *baseline] if names else [], map(DenoiserName, DENOISERS), cannot_run):
-        found += [DenoiserSpec(name, precision=precision, device=device) for precision in precisions_of(name)]
-        if str(name) in ALSO_IN_PYTORCH and device == "cpu":  # elsewhere PyTorch is the only way
-            found.append(DenoiserSpec(name, compiled=False))
-        if prototype(name).is_baseline and not name.wrappers:
-            found.append(DenoiserSpec(name, signal="indirect", device=device))
-    return found
+    named = [str(parse_name(name).with_budget(None)) for name in names]  # weights do not change the time
+    if named and not cannot_run(parse_name(BASELINE)):
+        named.append(BASELINE)
+    chosen = choose(named, map(DenoiserName, DENOISERS), cannot_run)
+    specs = [DenoiserSpec(name, precision=fastest_precision(name, device), device=device) for name in chosen]
+    others = [other for spec in specs for other in other_ways(spec)] if every_way else []
+    return [*with_indirect_baselines(specs), *others]
+
+
+def other_ways(spec: DenoiserSpec) -> list[DenoiserSpec]:
+    """The same denoiser in other precisions, and in PyTorch where it has compiled kernels."""
+    precisions = precisions_of(spec.denoiser)
+    ways = [replace(spec, precision=precision) for precision in precisions if precision != spec.precision]
+    if spec.facts.has_kernels and spec.device == "cpu":
+        ways.append(replace(spec, precision="float32", compiled=False))
+    return ways
+
+
+def is_usual(spec: DenoiserSpec) -> bool:
+    """Whether `onespp eval` runs the denoiser in this way."""
+    return spec.compiled and spec.precision == fastest_precision(spec.denoiser, spec.device)
 
 
 @torch.inference_mode()
 def macs_per_pixel(spec: DenoiserSpec) -> float | None:
-    """Multiply-accumulates a pixel of the network's convolutions, in the form for inference; None without a network."""
+    """Multiply-accumulates per pixel in the convolutions of the network as it runs; None without a network."""
     denoiser = replace(spec, precision="float32", device="cpu").build()
     network = network_of(denoiser)
     if network is None:
@@ -83,7 +93,7 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
     def count(layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         nonlocal macs
         assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-        gathers = isinstance(layer, nn.Conv2d)  # a transposed one scatters: its inputs meet the weights
+        gathers = isinstance(layer, nn.Conv2d)  # a transposed one scatters: its inputs are multiplied
         macs += (output if gathers else inputs[0]).numel() * layer.weight[0].numel()
 
     for layer in network.modules():
@@ -95,21 +105,21 @@ def macs_per_pixel(spec: DenoiserSpec) -> float | None:
 
 @torch.inference_mode()
 def denoiser_peak_mb(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) -> float | None:
-    """What two frames of a sequence add to resident memory, or to the GPU's, in MB, in a fresh process.
+    """Growth of resident memory, or of the GPU's, during two frames, in MB; call it in a fresh process.
 
-    That is the state and everything in between, without the frame itself, the weights and the code.
+    It counts the state and all intermediate tensors, but not frames, weights and code.
     """
     keep_freed_memory()  # as commands do
     torch.set_num_threads(threads)
-    contender = Contender.of(spec)
-    contender.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE).to(spec.device))  # loads and compiles
-    contender.state = None
-    # What comes from another process is resident once touched.
+    timed = TimedDenoiser.of(spec)
+    timed.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE).to(spec.device))  # loads and compiles
+    timed.state = None
+    # Tensors from another process become resident when first read.
     frames = [frame.map(torch.clone).to(spec.device) for frame in frames]
 
     def play() -> None:
         for frame in frames:
-            contender.step(frame)
+            timed.step(frame)
 
     if spec.device == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -120,20 +130,20 @@ def denoiser_peak_mb(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) 
 
 
 def peaks(specs: Sequence[DenoiserSpec], size: Size, threads: int) -> list[float | None]:
-    """What each spec adds to memory, in MB, each in a process of its own; None where the system does not tell."""
+    """The peak memory of each spec, in MB, measured in separate processes; None where unknown, and for unusual ways."""
     frames = [synthetic_frame(index, *size) for index in range(2)]
-    return [alone(denoiser_peak_mb, spec, frames, threads) for spec in tqdm(specs, "memory", leave=False)]
+    progress = tqdm(specs, "memory", leave=False)
+    return [alone(denoiser_peak_mb, spec, frames, threads) if is_usual(spec) else None for spec in progress]
 
 
-def cost(contender: Contender, size: Size, peak_mb: float | None) -> DenoiserCost:
-    """What a race has shown of a contender, with the peak memory that was measured apart."""
-    spec = contender.spec
+def cost(timed: TimedDenoiser, size: Size, peak_mb: float | None) -> DenoiserCost:
+    """The row of a denoiser that was timed, with its peak memory."""
     return DenoiserCost(
-        **asdict(contender.timing(size)),
+        **asdict(timed.timing(size)),
         peak_mb=peak_mb,
-        parameters=None if isinstance(unwrapped(contender.denoiser), OIDN) else contender.denoiser.parameter_count(),
-        macs_per_pixel=macs_per_pixel(spec),
-        prediction=contender.share_of_network(),
+        parameters=None if isinstance(unwrapped(timed.denoiser), OIDN) else timed.denoiser.parameter_count(),
+        macs_per_pixel=macs_per_pixel(timed.spec),
+        prediction=timed.network_share(),
     )
 
 
@@ -142,7 +152,7 @@ def devices() -> list[str]:
 
 
 def results_file(runs: Path, device: str = "cpu") -> Path:
-    """Where the times on a device ("cpu" or "cuda") are kept."""
+    """The file of the times on a device, "cpu" or "cuda"."""
     return runs / "bench" / ("results.json" if device == "cpu" else f"results-{device}.json")
 
 
@@ -152,21 +162,23 @@ def bench_denoisers(
     sizes: Sequence[str] = ("1280x720",),
     threads: Sequence[int] = (),
     measured: int = TIMED_FRAMES,
+    every_way: bool = False,
 ) -> str:
-    """Measure the named denoisers, or all that can run here: a table, and RUNS/bench/results.json.
+    """Measure the named denoisers, or all that can run here. Returns a table and writes RUNS/bench/results.json.
 
-    On the CPU with each number of `threads`; then, where there is one, on the GPU, into RUNS/bench/results-cuda.json.
-    Goes on where the same call was interrupted. Raises BadInput for unknown names, sizes and numbers of threads.
+    By default each in the precision that `onespp eval` uses, with all threads; with `every_way` in all precisions, with
+    one thread and all, and in PyTorch. If there is a GPU, results on it go to RUNS/bench/results-cuda.json. An
+    interrupted call is resumed. Raises BadInput for unknown names, sizes and numbers of threads.
     """
     pixels = [parse_size(size) for size in dict.fromkeys(sizes)]
-    counts = thread_counts(threads)
-    specs = {device: ways(names, device) for device in devices()}
+    counts = thread_counts(threads or ((1, torch.get_num_threads()) if every_way else ()))
+    specs = {device: timed_specs(names, device, every_way) for device in devices()}
     tables = []
     for device, ours in specs.items():
         path = results_file(runs, device)
         unfinished = bench_folder(runs) / f"unfinished-{path.name}"
-        races = measure_races(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished, measured)
-        rows = [*chain.from_iterable(races)]
+        timed = measure_rows(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished, measured)
+        rows = [*chain.from_iterable(timed)]
         content = {
             "schema": 1,
             "device": device_in_words(device, counts[-1]),
@@ -179,16 +191,16 @@ def bench_denoisers(
     return "\n\n".join(tables)
 
 
-def measure_races(
+def measure_rows(
     specs: Sequence[DenoiserSpec],
     sizes: Sequence[Size],
     counts: Sequence[int],
     unfinished: Path,
     measured: int = TIMED_FRAMES,
 ) -> Iterator[list[DenoiserCost]]:
-    """Yields the rows of each race: size by size, and in each by rising numbers of threads.
+    """Yield the rows of each size and number of threads.
 
-    Each is kept in the file `unfinished`, and not run again where that is of the same denoisers, code and device.
+    They are stored in the file `unfinished` and reused if that is of the same denoisers, code and device.
     """
     modules = {module for spec in specs for module in spec.modules}
     call = {
@@ -207,14 +219,14 @@ def measure_races(
         for count in counts:
             if count in missing:
                 with thread_count(count):
-                    contenders = race(specs, size, measured)
-                    rows += [cost(contender, size, peak) for contender, peak in zip(contenders, memory, strict=True)]
+                    timed = time_in_turns(specs, size, measured)
+                    rows += [cost(denoiser, size, peak) for denoiser, peak in zip(timed, memory, strict=True)]
                 write_json(unfinished, {"call": call, "rows": [asdict(row) for row in rows]})
             yield [row for row in rows if row.conditions == (*size, count)]
 
 
 def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
-    """The rows for people: times next to OIDN's, and how they divide between the network and the rest."""
+    """The lines of the table: times, relative to OIDN's, and the shares of the network and of the rest."""
     baselines = {row.conditions: row.ms_median for row in rows if row.denoiser == BASELINE}
     for row in rows:
         baseline = baselines.get(row.conditions)
@@ -232,6 +244,6 @@ def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
             "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": None if share is None else create(row.denoiser).parameter_count(),
+            "as trained": None if share is None else create(row.denoiser.partition(" (")[0]).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

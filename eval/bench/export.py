@@ -11,10 +11,9 @@ from tabulate import tabulate
 from torch import Tensor
 
 from datasets.frame import Frame
-from eval.bench.output import bench_folder
-from eval.bench.race import TIMED_FRAMES, WARM_UP_FRAMES, Contender
-from eval.bench.sizes import Size, parse_size, threads_or_all
+from eval.bench.sizes import Size, bench_folder, parse_size, threads_or_all
 from eval.bench.synthetic_frames import synthetic_frame
+from eval.bench.timed import TIMED_FRAMES, WARM_UP_FRAMES, TimedDenoiser
 from files import write_json
 from models.export.package import largest_difference
 from models.export.playing import play
@@ -50,11 +49,11 @@ class TimedSequence:
             yield self.frame
 
     def ours(self, spec: DenoiserSpec) -> Play:
-        contender = Contender.of(spec)
+        timed = TimedDenoiser.of(spec)
 
         def next_frame() -> Tensor:
             with spec.running():
-                radiance, contender.state = contender.denoiser(self.frame, contender.state)
+                radiance, timed.state = timed.denoiser(self.frame, timed.state)
             return radiance
 
         return next_frame

@@ -11,7 +11,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean, psnr
-from eval.bench.output import bench_folder
+from eval.bench.sizes import bench_folder
 from eval.bench.stock import Render, stock_render
 from files import write_json
 from render.backend import VARIANT, dr

@@ -1,7 +1,8 @@
-"""Sizes of images and numbers of threads, as they are named on the command line."""
+"""Sizes and numbers of threads as given on the command line, and the folder of results."""
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 
@@ -11,7 +12,7 @@ Size = tuple[int, int]  # height, width
 
 
 def parse_size(text: str) -> Size:
-    """(height, width) in pixels of "1280x720". Raises BadInput for what is no such text."""
+    """(height, width) in pixels of "1280x720". Raises BadInput for other text."""
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if not match:
         raise BadInput(f"'{text}' is not a size such as 1280x720")
@@ -25,19 +26,20 @@ def size_name(size: Size) -> str:
 
 
 def thread_counts(threads: Sequence[int]) -> list[int]:
-    """The numbers of threads to measure with, rising; by default one, and as many as PyTorch takes.
-
-    Raises BadInput for a number that cannot work.
-    """
+    """The numbers of threads to measure with, rising; by default all of PyTorch's. Raises BadInput below 1."""
     for count in threads:
         if count < 1:
             raise BadInput(f"{count} threads cannot work: name at least 1")
-    return sorted({*threads} or {1, torch.get_num_threads()})
+    return sorted({*threads} or {torch.get_num_threads()})
 
 
 def threads_or_all(threads: int | None) -> int:
-    """The one number of threads to measure with, by default as many as PyTorch takes.
-
-    Raises BadInput for a number that cannot work.
-    """
+    """`threads`, by default all of PyTorch's. Raises BadInput below 1."""
     return thread_counts(() if threads is None else (threads,))[-1]
+
+
+def bench_folder(runs: Path) -> Path:
+    """RUNS/bench, which is created if missing."""
+    folder = runs / "bench"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -107,7 +107,7 @@ def noisy(rng: np.random.Generator, mean: Array, share: float) -> Array:
     return mean * np.where(rng.random(size) < share, heavy_tailed / share, 0)
 
 
-def halves_of(light: Mapping[str, Array], seed: tuple[int, ...]) -> dict[str, Array]:
+def split_into_buffers(light: Mapping[str, Array], seed: tuple[int, ...]) -> dict[str, Array]:
     """Halves (2, H, W, 3), by their channels, of which `light` (H, W, 3) is the mean: each pixel is in one of them."""
     rng = np.random.default_rng(seed)
     halves = {}
@@ -145,7 +145,7 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
     channels = {
         "direct": direct,
         "indirect": indirect,
-        **halves_of({"direct": direct, "indirect": indirect}, (SEED, index, 1)),
+        **split_into_buffers({"direct": direct, "indirect": indirect}, (SEED, index, 1)),
         "emission": np.where(hit, 0, [0.4, 0.6, 1.0]),
         "albedo": albedo,
         "normal": seen.normal,

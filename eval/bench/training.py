@@ -17,7 +17,7 @@ from tabulate import tabulate
 from torch.profiler import ProfilerActivity, profile, record_function
 from tqdm import tqdm
 
-from eval.bench.output import bench_folder
+from eval.bench.sizes import bench_folder
 from files import write_json
 from timing import device_clock, take_turns
 from train.data import in_parts, loader, micro_batches

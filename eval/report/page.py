@@ -62,7 +62,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
         legend=LEGEND,
         times=times,
         figures=figures(runs),
-        tells_error=any(clip.told for clip in pictures),
+        saves_error=any(clip.told for clip in pictures),
         data=data,
         style=Markup(page_file("style.css")),
         script=Markup(page_file("script.js")),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from eval.means import scores_of
 from eval.results import ClipResults, by_signal, of_one_spp
-from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.pareto import TimedScores, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
@@ -44,8 +44,8 @@ def trade_plot(times: Times, clips: Sequence[ClipResults], metric: str) -> Trade
     offers = {}
     for result in clips[0].results:
         spec = DenoiserSpec.named(result.denoiser, signal=result.signal, precision=result.precision)
-        offers[result.denoiser] = Offer(times.of(spec), scores_of(clips, result.denoiser))
-    beaten = beaten_by(offers, metric)
+        offers[result.denoiser] = TimedScores(times.of(spec), scores_of(clips, result.denoiser))
+    beaten = dominated_by_name(offers, metric)
     points = [
         PlotPoint(name, mean.ms, mean.quality, beaten[name])
         for name, offer in offers.items()

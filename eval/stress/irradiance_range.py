@@ -10,7 +10,7 @@ from models.denoiser import Denoiser
 from models.operators import finite
 
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
-DARKEST_LIMIT = 1e-30  # ends of the range below it are not divided by
+MIN_LIMIT = 1e-30  # ends of the range below it are not divided by
 
 
 class IrradianceRange:
@@ -38,8 +38,8 @@ class IrradianceRange:
             return 0.0
         low = self.low.sum(dim=0)
         high = self.high.sum(dim=0)
-        above = (irradiance.amax(dim=1) - high) / high.clamp(min=DARKEST_LIMIT)
-        below = (low - irradiance.amin(dim=1)) / low.clamp(min=DARKEST_LIMIT)
+        above = (irradiance.amax(dim=1) - high) / high.clamp(min=MIN_LIMIT)
+        below = (low - irradiance.amin(dim=1)) / low.clamp(min=MIN_LIMIT)
         return float(torch.maximum(above, below).max())
 
 

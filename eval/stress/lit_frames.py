@@ -8,7 +8,7 @@ import numpy as np
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS
 from datasets.frame import Frame, to_tensor
 from eval.bench.sizes import Size
-from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, halves_of, noisy, synthetic_frame
+from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, split_into_buffers, synthetic_frame
 from eval.stress.changes import FrameChange
 
 LIGHT_SHARES = {"direct": 0.7, "indirect": 0.3}  # of the irradiance
@@ -23,7 +23,7 @@ def lit(frame: Frame, seed: int | None) -> Frame:
     if seed is not None:
         rng = np.random.default_rng(seed)
         light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
-        halves = halves_of(light, (seed, 1))
+        halves = split_into_buffers(light, (seed, 1))
     else:
         halves = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
     channels = light | halves

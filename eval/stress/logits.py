@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from eval.bench.race import network_of
+from eval.bench.timed import network_of
 from models.denoiser import Denoiser
 
 SMALLEST_LOGIT = 1e-30  # is what logits that are all 0 are divided by

@@ -9,9 +9,9 @@ from datasets.frame import Signal
 from eval.means import scores_of
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.text_table import LEGEND, NEAR, value_cell
+from eval.text_table import LEGEND, NEAR_FLOOR, value_cell
 from eval.tradeoff.candidates import trained_epochs
-from eval.tradeoff.pareto import Offer, Point, beaten_by
+from eval.tradeoff.pareto import Point, TimedScores, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
@@ -55,11 +55,11 @@ class Trade:
 
 def trades(specs: Sequence[DenoiserSpec], clips: Sequence[ClipResults], times: Times) -> list[Trade]:
     """A row for each of the specs, whose labels name their results on the clips."""
-    offers: dict[Signal, dict[str, Offer]] = {}
+    offers: dict[Signal, dict[str, TimedScores]] = {}
     for signal, ours in by_signal(clips).items():
         alike = [spec for spec in specs if spec.returns == signal]
-        offers[signal] = {spec.label: Offer(times.of(spec), scores_of(ours, spec.label)) for spec in alike}
-    beaten = {(signal, metric): beaten_by(offers[signal], metric) for signal in offers for metric in TRADED}
+        offers[signal] = {spec.label: TimedScores(times.of(spec), scores_of(ours, spec.label)) for spec in alike}
+    beaten = {(signal, metric): dominated_by_name(offers[signal], metric) for signal in offers for metric in TRADED}
     rows = []
     for spec in specs:
         offer = offers[spec.returns][spec.label]
@@ -94,4 +94,4 @@ def front_table(rows: Sequence[Trade]) -> str:
         line |= {f"beaten in {METRICS[key].title.split()[0]} by": row.standing(key) for key in TRADED}
         lines.append(line)
     text = tabulate(lines, "keys", disable_numparse=True)
-    return f"{text}\n{LEGEND}" if NEAR in text else text
+    return f"{text}\n{LEGEND}" if NEAR_FLOOR in text else text

@@ -12,18 +12,19 @@ from datasets.channels import SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from eval.bench.sample_cost import Cost, sample_cost
-from eval.harness import entrant, evaluate_clip
+from eval.clip_run import NamedDenoiser
+from eval.harness import evaluate_clip
 from eval.results import ClipResults, Result, by_clip
-from eval.selection import with_indirect_baselines
+from eval.selection import baselines, with_indirect_baselines
 from eval.tradeoff.resampled_clips import Source, scene_of, source, with_samples
 from eval.tradeoff.samples import SampleTrade, sample_trades
 from eval.tradeoff.shrinkage import Gain, gains_of
 from eval.tradeoff.times import Times
+from models.shipped_weights import shipped_names
 from models.spec import DenoiserSpec, fastest_precision
 from render.clip import Options
 
 SPP_LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-SAMPLED = ("noisy", "accumulated", "svgf", "oidn", "rae", "wskp6", "ntd")  # unless denoisers are named
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,12 @@ def check_levels(levels: Sequence[int]) -> None:
 
 
 def sampled(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
-    """A few of the candidates, or all that were named, each in the precision that `onespp eval` takes here."""
+    """The named candidates, or baselines and networks with shipped weights, in the precision of `onespp eval`."""
+    usual = (*baselines(), *shipped_names())
     return [
         candidate
         for candidate in chosen
-        if (named or candidate.name in SAMPLED) and candidate.precision == fastest_precision(candidate.denoiser)
+        if (named or candidate.name in usual) and candidate.precision == fastest_precision(candidate.denoiser)
     ]
 
 
@@ -63,13 +65,13 @@ def results_by_spp(
     specs: Sequence[DenoiserSpec], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
 ) -> dict[int, list[ClipResults]]:
     """Results on the clips by samples a pixel. What is rendered and judged is kept in `folder`."""
-    entrants = [entrant(spec, spec.label) for spec in specs]
+    denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
     halves = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
         fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data", halves)
-        results[spp] += evaluate_clip(fed, entrants, folder)
+        results[spp] += evaluate_clip(fed, denoisers, folder)
     return {spp: list(by_clip(found)) for spp, found in results.items()}
 
 

@@ -21,7 +21,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Offer:
+class TimedScores:
     """What a denoiser offers: quality, for milliseconds a frame, or None where those were not measured."""
 
     ms: float | None
@@ -36,7 +36,7 @@ class Offer:
         return Point.of(self.ms, self.scores.compared(metric))
 
 
-def beaten_by(offers: Mapping[str, Offer], metric: str) -> dict[str, str | None]:
+def dominated_by_name(offers: Mapping[str, TimedScores], metric: str) -> dict[str, str | None]:
     """By which other each offer is beaten, None on the front. Offers without a time or value are left out."""
     points = {name: point for name, offer in offers.items() if (point := offer.compared(metric))}
     return dominators(points, METRICS[metric].more_is_better)

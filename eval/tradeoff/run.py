@@ -7,7 +7,8 @@ from pathlib import Path
 from datasets.clip import Dataset
 from eval.bench.sample_cost import RENDERER
 from eval.bench.sizes import parse_size
-from eval.harness import clips_of_one_spp, entrant, evaluate_clip
+from eval.clip_run import NamedDenoiser
+from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.results import by_clip
 from eval.selection import with_indirect_baselines
 from eval.tradeoff.candidates import candidates
@@ -47,8 +48,8 @@ def trade(
     chosen = candidates(names, runs, budget)
 
     specs = with_indirect_baselines(chosen)
-    entrants = [entrant(spec, spec.label) for spec in specs]
-    results = [result for clip in clips for result in evaluate_clip(clip, entrants, runs / "trade")]
+    denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
+    results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs / "trade")]
     rows = trades(specs, list(by_clip(results)), times)
     samples = by_samples(sampled(chosen, bool(names)), clips, dataset, levels, times, runs / "trade")
 

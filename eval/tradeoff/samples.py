@@ -11,7 +11,7 @@ from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
 from eval.text_table import value_cell
 from eval.tradeoff.denoisers import TRADED
-from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.pareto import TimedScores, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
@@ -69,14 +69,14 @@ def sample_trades(
 
     `render_ms` is the mean time in which so many samples are rendered.
     """
-    offers: dict[Signal, dict[str, Offer]] = {spec.returns: {} for spec in specs}
+    offers: dict[Signal, dict[str, TimedScores]] = {spec.returns: {} for spec in specs}
     for spp, clips in fed.items():
         ours = by_signal(clips)
         for spec in specs:
             filter_ms = times.of(spec)
             ms = None if filter_ms is None else render_ms[spp] + filter_ms
-            offers[spec.returns][name_of(spec.label, spp)] = Offer(ms, scores_of(ours[spec.returns], spec.label))
-    beaten = {signal: beaten_by(alike, "psnr") for signal, alike in offers.items()}
+            offers[spec.returns][name_of(spec.label, spp)] = TimedScores(ms, scores_of(ours[spec.returns], spec.label))
+    beaten = {signal: dominated_by_name(alike, "psnr") for signal, alike in offers.items()}
     rows = []
     for spp in fed:
         for spec in specs:

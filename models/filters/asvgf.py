@@ -56,7 +56,7 @@ class ASVGF(SVGF):
     """SVGF with α = (1 - λ) 0.2 + λ, for colour and moments alike."""
 
     reads: tuple[str, ...] = (*SVGF.reads, "gradient")
-    is_baseline = False
+    baseline_for = ()
 
     def change(self, frame: Frame) -> Tensor:
         return change_of_light(frame)

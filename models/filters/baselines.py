@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.history.accumulation import Accumulation, accumulate
 
@@ -15,7 +15,8 @@ class Noisy(Denoiser):
 
     reads = ("direct", "indirect", "emission")
     refuses = CLASSICAL
-    is_baseline = True
+    has_kernels = False
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return frame.radiance(self.signal), State(frame.moment)
@@ -44,7 +45,7 @@ class Accumulated(Accumulating):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
-    is_baseline = True
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))

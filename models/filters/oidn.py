@@ -88,6 +88,8 @@ class OIDN(Denoiser):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
+    has_kernels = False
+    baseline_for: tuple[Signal, ...] = ("total",)
 
     quality: OIDNQuality = "high"
 
@@ -129,12 +131,14 @@ class OIDN(Denoiser):
 class OIDNBalanced(OIDN):
     """OIDN in its quality "balanced"."""
 
+    baseline_for = ()
     quality = "balanced"
 
 
 class OIDNFast(OIDN):
     """OIDN in its quality "fast"."""
 
+    baseline_for = ()
     quality = "fast"
 
 
@@ -142,6 +146,8 @@ class OIDNAccumulated(Accumulating, OIDN):
     """Denoises temporally accumulated irradiance, re-modulated. The history is not filtered."""
 
     reads = Accumulated.reads
+    has_kernels = True
+    baseline_for = ()
     evaluated_with = ("adaptive",)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

@@ -223,7 +223,7 @@ class SVGF(Denoiser):
     refuses = CLASSICAL
     convex = True
     separates_lights = True
-    is_baseline = True
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def change(self, frame: Frame) -> Tensor | None:
         """How much of the history to give up, (B, 1, H, W) in [0, 1]; None for nothing anywhere."""

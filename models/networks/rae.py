@@ -107,6 +107,7 @@ class RAE(Denoiser):
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
     is_network = True
+    has_kernels = False
     dispensable: ClassVar = {"roughness": as_it_is}
 
     def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):

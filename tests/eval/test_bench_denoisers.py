@@ -11,15 +11,16 @@ import torch
 import eval.bench.denoisers
 from command_line import main
 from errors import BadInput
-from eval.bench.denoisers import bench_denoisers, cost, macs_per_pixel, measure_races, ways
-from eval.bench.race import FEWEST_FRAMES, TIMED_FRAMES, race
+from eval.bench.denoisers import bench_denoisers, cost, is_usual, macs_per_pixel, measure_rows, other_ways, timed_specs
 from eval.bench.sizes import parse_size, size_name, thread_counts
 from eval.bench.synthetic_frames import synthetic_frame
+from eval.bench.timed import FEWEST_FRAMES, TIMED_FRAMES, time_in_turns
 from eval.selection import cannot_run
+from models import compiled
 from models.compiled.one import INPUT_CHANNELS, STEPS, head_channels
 from models.networks.one import One
-from models.registry import create, parse_name
-from models.spec import DenoiserSpec
+from models.registry import DENOISERS, create, parse_name
+from models.spec import DenoiserSpec, fastest_precision
 from provenance import device_in_words
 
 FIELDS = [
@@ -40,8 +41,8 @@ FIELDS = [
 NOISY = DenoiserSpec.named("noisy")
 
 
-def test_results_have_the_agreed_form(tmp_path, capsys):
-    table = bench_denoisers(tmp_path, ["accumulated", "rae"], ["64x32"], threads=[1], measured=2)
+def test_results_have_the_agreed_form(tmp_path):
+    table = bench_denoisers(tmp_path, ["accumulated", "rae"], ["64x32"], threads=[1], measured=2, every_way=True)
     assert "times oidn" in table and "reconstruction" in table and "accumulated (PyTorch)" in table
     (path,) = (tmp_path / "bench").iterdir()  # nothing is left of what keeps unfinished races
     results = json.loads(path.read_text())
@@ -49,11 +50,13 @@ def test_results_have_the_agreed_form(tmp_path, capsys):
     assert (results["schema"], results["device"], results["threads"]) == (1, device_in_words(threads=1), 1)
     rows = results["rows"]
     assert all([*row] == FIELDS and (row["width"], row["height"]) == (64, 32) for row in rows)
-    labels = [(row["denoiser"], row["dtype"]) for row in rows]
-    accumulated = ("accumulated", "accumulated (PyTorch)", "accumulated (indirect)")
-    rae = [("rae", precision) for precision in ("float32", "bfloat16", "float16")]
+    usual = fastest_precision("rae")
     oidn = [] if cannot_run(parse_name("oidn")) else [("oidn", "float32")]  # the baseline
-    assert labels == [*((way, "float32") for way in accumulated), *rae, *oidn]
+    labels = [(row["denoiser"], row["dtype"]) for row in rows]
+    others = [("rae", precision) for precision in ("float32", "bfloat16", "float16") if precision != usual]
+    expected = [("accumulated", "float32"), ("rae", usual), *oidn, ("accumulated (PyTorch)", "float32"), *others]
+    assert labels == expected
+    assert [row["peak_mb"] is None for row in rows] == [False] * (2 + len(oidn)) + [True] * 3
     for row in rows:
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]
         counts = {"rae": 1_951_935, "oidn": None}
@@ -64,18 +67,18 @@ def test_results_have_the_agreed_form(tmp_path, capsys):
 
 
 def test_every_number_of_threads_has_its_rows(tmp_path):
-    races = measure_races([NOISY], [(8, 8), (8, 16)], [1, 2], tmp_path / "unfinished.json", measured=1)
+    races = measure_rows([NOISY], [(8, 8), (8, 16)], [1, 2], tmp_path / "unfinished.json", measured=1)
     seen = []
     for (row,) in races:
         assert row.denoiser == "noisy"
         seen.append((row.width, row.threads))  # the number that PyTorch took
     assert seen == [(8, 1), (8, 2), (16, 1), (16, 2)]
-    assert thread_counts(()) == sorted({1, torch.get_num_threads()})
+    assert thread_counts(()) == [torch.get_num_threads()]
     assert thread_counts((2, 1, 2)) == [1, 2]
 
 
 def test_the_head_of_results_is_of_the_most_threads(tmp_path, capsys):
-    main(["bench", "denoisers", "noisy", "--size", "8x4", "--threads", "2", "1", "--runs", str(tmp_path)])
+    main(["bench", "denoisers", "noisy", "ntd", "--size", "8x4", "--threads", "2", "1", "--runs", str(tmp_path)])
     assert "noisy (indirect)" in capsys.readouterr().out
     results = json.loads((tmp_path / "bench" / "results.json").read_text())
     assert results["threads"] == 2 and results["device"] == device_in_words(threads=2)
@@ -86,7 +89,7 @@ def test_an_interrupted_bench_goes_on(tmp_path):
     unfinished = tmp_path / "unfinished.json"
 
     def races(*specs, measured=1):
-        return measure_races(specs, [(4, 8)], [1, 2], unfinished, measured)
+        return measure_rows(specs, [(4, 8)], [1, 2], unfinished, measured)
 
     first = next(races(NOISY))  # and no further
     again = list(races(NOISY))
@@ -102,7 +105,7 @@ def test_an_interrupted_bench_goes_on(tmp_path):
 def test_a_bench_goes_on_where_the_same_call_was_interrupted(tmp_path):
     unfinished = tmp_path / "bench" / "unfinished-results.json"
     unfinished.parent.mkdir()
-    first = next(measure_races(ways(["noisy"]), [(4, 8)], [1, 2], unfinished, measured=1))
+    first = next(measure_rows(timed_specs(["noisy"]), [(4, 8)], [1, 2], unfinished, measured=1))
     bench_denoisers(tmp_path, ["noisy"], ["8x4"], [1, 2], measured=1)
     rows = json.loads((tmp_path / "bench" / "results.json").read_text())["rows"]
     assert [row for row in rows if row["threads"] == 1] == [asdict(row) for row in first]
@@ -113,19 +116,34 @@ def test_oidn_has_no_parameters_to_count():
     if cannot_run(parse_name("oidn")):
         pytest.skip("there is no OIDN here")
     for name in ("oidn", "oidn+taa"):
-        (contender,) = race([DenoiserSpec.named(name)], (8, 8), measured=1)
-        row = cost(contender, (8, 8), 1.0)
+        (timed,) = time_in_turns([DenoiserSpec.named(name)], (8, 8), measured=1)
+        row = cost(timed, (8, 8), 1.0)
         assert (row.peak_mb, row.parameters, row.macs_per_pixel, row.prediction) == (1.0, None, None, None)
 
 
 def test_a_race_that_takes_long_measures_fewer_frames():
-    (contender,) = race([NOISY], (4, 8), patience=0)
-    assert contender.timing((4, 8)).frames == FEWEST_FRAMES < TIMED_FRAMES
+    (timed,) = time_in_turns([NOISY], (4, 8), max_seconds=0)
+    assert timed.timing((4, 8)).frames == FEWEST_FRAMES < TIMED_FRAMES
 
 
 def test_weights_make_no_difference_to_times():
-    assert ways(["kp@quick", "kp"]) == ways(["kp"])
-    assert all(spec.compiled for spec in ways(["svgf"], "cuda"))
+    assert timed_specs(["kp@quick", "kp"]) == timed_specs(["kp"])
+    assert other_ways(DenoiserSpec.named("svgf", device="cuda")) == []
+
+
+def test_by_default_only_the_usual_way_is_timed():
+    assert all(map(is_usual, timed_specs(["rae", "svgf"])))
+    assert "svgf (PyTorch)" in [spec.way for spec in timed_specs(["svgf"], every_way=True)]
+
+
+@pytest.mark.parametrize("name", [name for name, kind in DENOISERS.items() if not kind.offline])
+def test_denoisers_declare_whether_they_have_kernels(name, monkeypatch):
+    calls = []
+    monkeypatch.setattr(compiled, "match_threads", lambda: calls.append(name))
+    if cannot_run(parse_name(name)):
+        pytest.skip(f"{name} cannot run here")
+    time_in_turns([DenoiserSpec.named(name)], (16, 24), measured=1)
+    assert bool(calls) == DENOISERS[name].has_kernels
 
 
 def test_multiply_accumulates_by_hand():
@@ -158,14 +176,14 @@ def test_repvgg_is_counted_as_it_runs():
 def test_what_is_measured(monkeypatch, capsys):
     gone = "gone fishing"
     monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: gone if name == "oidn" else None)
-    assert "oidn" not in {spec.name for spec in ways(())}
+    assert "oidn" not in {spec.name for spec in timed_specs(())}
     assert f"oidn: skipped, {gone}" in capsys.readouterr().out
-    assert "oidn" not in {spec.name for spec in ways(["noisy"])}
+    assert "oidn" not in {spec.name for spec in timed_specs(["noisy"])}
     with pytest.raises(BadInput, match=gone):
-        ways(["oidn"])
+        timed_specs(["oidn"])
     monkeypatch.undo()
     if not cannot_run(parse_name("oidn")):
-        assert [spec.way for spec in ways(["oidn"])] == ["oidn"]
+        assert [spec.way for spec in timed_specs(["oidn"])] == ["oidn"]
 
 
 def test_sizes_and_threads_that_cannot_be(tmp_path):

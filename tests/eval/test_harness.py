@@ -14,7 +14,7 @@ from PIL import Image
 from datasets.clip import Dataset
 from errors import BadInput
 from eval import selection
-from eval.harness import entrants_of, evaluate
+from eval.harness import evaluate, named_denoisers
 from eval.results import load_picture
 from files import read_json, write_json
 from models import registry
@@ -122,9 +122,9 @@ def test_strips_show_every_denoiser_and_the_reference(runs):
     ],
 )
 def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expected):
-    entrants = entrants_of([DenoiserSpec.named(name) for name in names])
-    assert {(entrant.name, entrant.denoiser.signal) for entrant in entrants} == expected
-    assert len(entrants) == len(expected)
+    denoisers = named_denoisers([DenoiserSpec.named(name) for name in names])
+    assert {(named_denoiser.name, named_denoiser.denoiser.signal) for named_denoiser in denoisers} == expected
+    assert len(denoisers) == len(expected)
 
 
 def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch, shipped):

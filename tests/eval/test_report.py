@@ -18,12 +18,12 @@ from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.disocclusion_crops import Crop, densest_crop
-from eval.harness import entrants_of, evaluate_clip
+from eval.harness import evaluate_clip, named_denoisers
 from eval.metrics import METRICS, flip_map
 from eval.report.page import report
 from eval.report.page_data import page_clip
 from eval.report.table_rows import TableRow, best_denoisers
-from eval.results import BRIGHTEST_ERROR, FLOOR, by_clip, folder_of, load_picture, load_result
+from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_picture, load_result
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.resampled_clips import with_samples
 from models.spec import DenoiserSpec
@@ -147,15 +147,15 @@ def test_errors_that_samples_tell_are_a_view_of_their_own(tiny, page, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
     fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", halves=True)
     specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw+js")]
-    (results,) = by_clip(evaluate_clip(fed, entrants_of(specs), tmp_path))
+    (results,) = by_clip(evaluate_clip(fed, named_denoisers(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
     assert list(shown.told) == ["eaw+js"] and len(shown.told["eaw+js"]) == len(shown.frames)
     shade = pixels(shown.told["eaw+js"][1])[..., 0]
     denoiser = specs[1].build()
     state = None
     for index in range(4):
-        _, state, told = with_error(denoiser, read_frame(fed, index, specs[1].kind.reads), state)
-    expected = (fed.exposure * told.radiance()[0].square().mean(dim=0).sqrt() / BRIGHTEST_ERROR).clamp(0, 1)
+        _, state, told = with_error(denoiser, read_frame(fed, index, specs[1].facts.reads), state)
+    expected = (fed.exposure * told.radiance()[0].square().mean(dim=0).sqrt() / MAX_SHOWN_ERROR).clamp(0, 1)
     assert shade.max() > 0
     assert np.abs(shade / 255 - expected.numpy()).max() <= 0.51 / 255
     assert all(clip["told"] == {} for clip in page.data["clips"])

@@ -51,13 +51,13 @@ def runs(once, tmp_path):
 def played(monkeypatch):
     """The denoisers that were run, clip by clip."""
     calls = []
-    play = harness.play
+    run_clip = harness.run_clip
 
     def watched(clip, tracks, folders, quiet=False):
         calls.append((clip.scene, sorted(track.name for track in tracks)))
-        play(clip, tracks, folders, quiet)
+        run_clip(clip, tracks, folders, quiet)
 
-    monkeypatch.setattr(harness, "play", watched)
+    monkeypatch.setattr(harness, "run_clip", watched)
     return calls
 
 
@@ -155,11 +155,10 @@ def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, m
 
 
 @pytest.mark.slow
-def test_side_by_side_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(harness, "SMALLEST_SHARE", 1)
+def test_parallel_evaluation_gives_the_same_results(once, tiny, tmp_path):
     runs = tmp_path / "runs"
     shutil.copytree(once / "train", runs / "train")
-    evaluate([tiny], runs, "tiny", NAMES, processes=2)
+    evaluate([tiny], runs, "tiny", NAMES, processes=2, smallest_share=1)
     for a, b in zip(read_results(runs)[1], read_results(once)[1], strict=True):
         for ours, theirs in zip([*a.results, a.reference], [*b.results, b.reference], strict=True):
             assert ours.key == theirs.key and ours.frames == [

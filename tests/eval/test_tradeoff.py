@@ -18,7 +18,7 @@ from eval.results import REFERENCE, ClipResults, Result, load_result
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.feeding import check_levels
-from eval.tradeoff.pareto import Offer, beaten_by
+from eval.tradeoff.pareto import TimedScores, dominated_by_name
 from eval.tradeoff.plots import draw_front, draw_samples
 from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
 from eval.tradeoff.run import trade
@@ -60,12 +60,12 @@ def test_fronts_by_brute_force(metric, sign):
     ms = rng.integers(1, 9, 40)  # with ties
     values = rng.integers(20, 30, 40)
     offers = {
-        str(i): Offer(float(a), ClipScores([{metric: float(b)}], [{}]))
+        str(i): TimedScores(float(a), ClipScores([{metric: float(b)}], [{}]))
         for i, (a, b) in enumerate(zip(ms, values, strict=True))
     }
-    offers["untimed"] = Offer(None, ClipScores([{metric: 0.0}], [{}]))
-    offers["undefined"] = Offer(0.0, ClipScores([{metric: None}], [{}]))
-    found = beaten_by(offers, metric)
+    offers["untimed"] = TimedScores(None, ClipScores([{metric: 0.0}], [{}]))
+    offers["undefined"] = TimedScores(0.0, ClipScores([{metric: None}], [{}]))
+    found = dominated_by_name(offers, metric)
     assert not {"untimed", "undefined"} & found.keys() and None in found.values() and len(set(found.values())) > 1
     for i, (a, b) in enumerate(zip(ms, values, strict=True)):
         better = {

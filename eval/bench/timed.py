@@ -1,4 +1,4 @@
-"""A race of denoisers: what a frame costs each of them, from noisy Frame to radiance."""
+"""Timing denoisers against each other, from noisy Frame to radiance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,12 +20,12 @@ from timing import device_clock, take_turns
 WARM_UP_FRAMES = 2
 TIMED_FRAMES = 10
 FEWEST_FRAMES = 5  # timed, where all denoisers together take longer than
-RACE_SECONDS = 240.0
+MAX_SECONDS = 240.0
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What a denoiser takes for a frame: median milliseconds, and how far they spread."""
+    """Milliseconds per frame of a denoiser: median, 10th and 90th percentile."""
 
     denoiser: str
     height: int
@@ -39,12 +39,12 @@ class Timing:
 
 
 @dataclass
-class Contender:
-    """A denoiser on its way through the sequence.
+class TimedDenoiser:
+    """A denoiser, its state, and the times that were measured.
 
     Attributes:
-        in_network: seconds that each frame spent in the network; empty without one.
-        seconds: of each frame that counts.
+        in_network: seconds of each frame in the network; empty without one.
+        seconds: of each frame after warm-up.
     """
 
     spec: DenoiserSpec
@@ -54,12 +54,12 @@ class Contender:
     seconds: list[float] = field(default_factory=list)
 
     @staticmethod
-    def of(spec: DenoiserSpec) -> "Contender":
-        contender = Contender(spec, spec.build())
-        if network := network_of(contender.denoiser):
-            network.register_forward_pre_hook(lambda *_: contender.enter_network())
-            network.register_forward_hook(lambda *_: contender.leave_network())
-        return contender
+    def of(spec: DenoiserSpec) -> "TimedDenoiser":
+        timed = TimedDenoiser(spec, spec.build())
+        if network := network_of(timed.denoiser):
+            network.register_forward_pre_hook(lambda *_: timed.enter_network())
+            network.register_forward_hook(lambda *_: timed.leave_network())
+        return timed
 
     def enter_network(self) -> None:
         self.in_network.append(-device_clock(self.spec.device))
@@ -74,21 +74,12 @@ class Contender:
 
     def timing(self, size: Size) -> Timing:
         p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(self.seconds, (10, 50, 90)))
-        height, width = size
         return Timing(
-            denoiser=self.spec.way,
-            height=height,
-            width=width,
-            dtype=self.spec.precision,
-            threads=torch.get_num_threads(),
-            frames=len(self.seconds),
-            ms_median=median,
-            ms_p10=p10,
-            ms_p90=p90,
+            self.spec.way, *size, self.spec.precision, torch.get_num_threads(), len(self.seconds), median, p10, p90
         )
 
-    def share_of_network(self) -> float | None:
-        """The part of a frame's time that the network takes, between 0 and 1; None without a network."""
+    def network_share(self) -> float | None:
+        """The network's share of a frame's time, between 0 and 1; None without a network."""
         if not self.in_network:
             return None
         timed = self.in_network[-len(self.seconds) :]
@@ -101,15 +92,15 @@ def network_of(denoiser: Denoiser) -> nn.Module | None:
 
 
 @torch.inference_mode()
-def race(
-    specs: Sequence[DenoiserSpec], size: Size, measured: int = TIMED_FRAMES, patience: float = RACE_SECONDS
-) -> list[Contender]:
+def time_in_turns(
+    specs: Sequence[DenoiserSpec], size: Size, measured: int = TIMED_FRAMES, max_seconds: float = MAX_SECONDS
+) -> list[TimedDenoiser]:
     """Time all specs, of one device, on one sequence: each frame by each of them in turn.
 
-    After `patience` seconds it ends with fewer than `measured` frames, but at least FEWEST_FRAMES.
+    After `max_seconds` it stops before `measured` frames, but not before FEWEST_FRAMES.
     """
-    release_memory()  # what earlier races took: all these states of 1920 x 1080 fill most of 24 GB
-    contenders = [Contender.of(spec) for spec in specs]
+    release_memory()  # of earlier calls: the states of all denoisers at 1920 x 1080 fill most of 24 GB
+    denoisers = [TimedDenoiser.of(spec) for spec in specs]
     device = specs[0].device
     frame: Frame
 
@@ -117,19 +108,19 @@ def race(
         nonlocal frame
         frame = synthetic_frame(index, *size).to(device)
 
-    def stepping(contender: Contender) -> Callable[[], None]:
-        return lambda: contender.step(frame)
+    def stepping(timed: TimedDenoiser) -> Callable[[], None]:
+        return lambda: timed.step(frame)
 
     seconds = take_turns(
-        {f"{contender.spec.way} {contender.spec.precision}": stepping(contender) for contender in contenders},
+        {f"{timed.spec.way} {timed.spec.precision}": stepping(timed) for timed in denoisers},
         measured,
         warm_up=WARM_UP_FRAMES,
         before_round=make_frame,
         fewest=FEWEST_FRAMES,
-        patience=patience,
+        patience=max_seconds,
         clock=partial(device_clock, device),
         label=size_name(size),
     )
-    for contender, spent in zip(contenders, seconds.values(), strict=True):
-        contender.seconds = spent
-    return contenders
+    for timed, spent in zip(denoisers, seconds.values(), strict=True):
+        timed.seconds = spent
+    return denoisers
