@@ -1,9 +1,11 @@
-"""Small files written so that a reader never sees half of one."""
+"""Small files, written so that a reader never gets a part of one."""
 
+import csv
 import fcntl
+import io
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ def cache_folder() -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path that takes the place of `path` at the end; whatever fails, what stood there still does."""
+    """A temporary path that replaces `path` at the end, or not at all if an exception is raised."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # of this process: others may write the same file
     try:
         yield temporary
@@ -38,6 +40,13 @@ def write_json(path: Path, content: Any) -> None:
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write atomically; None becomes an empty cell."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([header, *rows])
+    write_file(path, text.getvalue().encode())
+
+
 def read_json(path: Path, keys: Sequence[str] = ()) -> dict[str, Any]:
     """Raises BadInput where the file is missing, or is not a JSON object with all `keys`."""
     try:
@@ -53,14 +62,14 @@ def read_json(path: Path, keys: Sequence[str] = ()) -> dict[str, Any]:
 
 @contextmanager
 def locked(lock: Path) -> Iterator[bool]:
-    """Hold the lock file `lock` until the end, then remove it. Yields False, without it, where another process does.
+    """Hold the lock file `lock` until the end, then remove it. Yields False if another process has it.
 
-    The system lets go of the lock of a process that dies, so a file left behind locks nobody out.
+    The system releases the lock of a process that dies, so a file left behind does no harm.
     """
     with lock.open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            ours = lock.stat().st_ino == os.fstat(file.fileno()).st_ino  # else its last holder has just removed it
+            ours = lock.stat().st_ino == os.fstat(file.fileno()).st_ino  # else its last owner has just removed it
         except (BlockingIOError, FileNotFoundError):
             ours = False
         try:

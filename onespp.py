@@ -1,9 +1,9 @@
-"""onespp as a library: denoisers by name, data sets, frames of one's own. docs/library.md shows each in ten lines.
+"""onespp as a library: denoisers by name, datasets, your own frames. docs/library.md has an example of each.
 
 `python -m onespp` is the command line.
 """
 
-from __future__ import annotations  # what is only named in signatures is not loaded
+from __future__ import annotations  # so that types in signatures are not imported
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -30,9 +30,9 @@ def load(
 ) -> Denoiser:
     """A denoiser ready to use, by its name: svgf, wskp6+adaptive, oidn+taa, ...
 
-    The file of a network's `weights` is by default the one that is shipped (`onespp weights` lists them). `precision`
-    is by default the fastest on this machine. Raises errors.BadInput where the name is unknown, the file missing,
-    damaged or another network's, and for a network that has neither.
+    `weights` is the file of a network's weights, by default the shipped one (`onespp weights` lists them). `precision`
+    is by default the fastest on the device. Raises errors.BadInput where the name is unknown, the file missing, damaged
+    or of another network, for a network without weights, and where there is no such device.
     """
     from models.registry import parse_name
     from models.shipped_weights import shipped_weights
@@ -43,14 +43,14 @@ def load(
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """The data set in a folder; its `clips("test")` are those of a split. BadInput where there is none."""
+    """The dataset in a folder; `clips("test")` returns the clips of a split. Raises errors.BadInput without one."""
     from datasets.clip import Dataset
 
     return Dataset(Path(path))
 
 
 def read_frames(clip: Clip, denoiser: Denoiser, realisation: int = 0) -> Iterator[Frame]:
-    """The frames of a clip, tensors (1, C, H, W) straight from its memory maps, with what the denoiser reads.
+    """The frames of a clip, tensors (1, C, H, W) read from memory maps, with the channels that the denoiser reads.
 
     Raises errors.BadInput where the clip lacks a channel that the denoiser needs.
     """
@@ -72,22 +72,22 @@ def camera(K: ArrayLike, camera_to_world: ArrayLike) -> View:
 def frames(
     sequence: Iterable[Mapping[str, NDArray[np.floating] | View]], denoiser: Denoiser, spp: float = 1.0
 ) -> Iterator[Frame]:
-    """Frames from one's own arrays, a mapping for each frame; the colour has `spp` samples a pixel.
+    """Frames from your own arrays, a mapping for each frame; the colour has `spp` samples per pixel.
 
-    What may be in it, all (H, W, C), row 0 at the top:
+    Its arrays, all (H, W, C) with row 0 at the top; only "colour" is required:
 
-    - "colour", which must be there: noisy radiance, linear RGB
-    - "half": the same frame's colour by as many other samples; the frame is the mean of both
-    - "emission": light seen directly, part of the colour, which is not denoised
+    - "colour": noisy radiance, linear RGB
+    - "half": a second, independent sample buffer of the same size; the frame is the mean of both
+    - "emission": radiance of visible lights, part of the colour, which is not denoised
     - "albedo": reflectance in [0, 1]; without it radiance is filtered
     - "normal": in world space, of unit length
     - "depth" along the viewing axis, or "distance" along the ray, or "position" in the world; 0 for background
     - "motion": pixels, x right and y down, to where the surface was in the frame before
     - "roughness": GGX alpha
-    - "camera": what `camera` makes
+    - "camera": returned by `camera`
 
-    Without motion, depth and cameras tell it, as if nothing else moved; without those too there is no history.
-    Raises errors.BadInput, naming the frame, for what cannot be used.
+    Without motion it is derived from depth and cameras, as if nothing else moved; without those there is no history.
+    Raises errors.BadInput, naming the frame, for arrays that cannot be used.
     """
     from denoise.arrays import frames_of_arrays
 
@@ -95,7 +95,7 @@ def frames(
 
 
 def denoise(denoiser: Denoiser, sequence: Iterable[Frame]) -> Iterator[NDArray[np.float32]]:
-    """Denoised radiance (H, W, 3), linear RGB, of each frame of a sequence; history is carried along, but over cuts."""
+    """Denoised radiance (H, W, 3), linear RGB, of each frame of a sequence, with history except across cuts."""
     import torch
 
     state = None

@@ -1,4 +1,4 @@
-"""Where a result comes from: the packages, the device and the code that made it."""
+"""Provenance of results: the packages, the device and the code that made them."""
 
 import ast
 import hashlib
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent
 FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval", "denoise")
 BESIDE_THEM = ("errors", "extras", "files", "plotting", "process", "provenance", "timing")
 
-# What decides the bytes of a data set, and the numbers of whatever denoises it.
+# Packages that determine the bytes of a dataset, and those that determine results of denoising.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")
 DENOISING = ("onespp", "torch", "numpy", "numba", "flip-evaluator", "pyoidn")
 
@@ -29,8 +29,8 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 def device_in_words(kind: str = "cpu", threads: int | None = None) -> str:
-    """What computes: the GPU's name, or the processor's and its threads, by default all that PyTorch takes."""
-    import torch  # takes a second, which rendering must not wait for
+    """The name of the GPU, or of the processor with its number of threads, by default as many as PyTorch uses."""
+    import torch  # takes a second, which rendering does not wait for
 
     if kind == "cuda":
         return f"cuda, {torch.cuda.get_device_name()}"
@@ -74,7 +74,7 @@ def sources(*modules: str) -> dict[str, Path]:
 
 
 def source_of(module: str) -> Path | None:
-    """The file of one of onespp's modules; None for whatever else has a name."""
+    """The file of one of onespp's modules; None for other names."""
     path = ROOT.joinpath(*module.split("."))
     is_ours = module.split(".")[0] in FOLDERS + BESIDE_THEM
     files = (path / "__init__.py", path.with_suffix(".py"))
@@ -82,7 +82,7 @@ def source_of(module: str) -> Path | None:
 
 
 def imported_by(path: Path) -> Iterator[str]:
-    """Names that a source file imports: modules, and what may be a module or something in one."""
+    """Names that a source file imports: modules, and members that may be modules themselves."""
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

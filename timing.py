@@ -1,4 +1,4 @@
-"""One way to measure time: whatever is compared takes turns, so that drift of the machine hits all alike."""
+"""Timing: functions that are compared take turns, so that drift of the machine affects all of them equally."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -8,13 +8,13 @@ from math import inf
 import torch
 from tqdm import tqdm
 
-PIXELS_A_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
+PIXELS_PER_THREAD = 256 * 256  # with fewer, threads mostly wait for each other
 
 Clock = Callable[[], float]  # seconds
 
 
 def device_clock(device: str) -> float:
-    """Seconds, once the device ("cpu" or "cuda") has done all that it was given."""
+    """Seconds, once the device ("cpu" or "cuda") has finished its work."""
     if device == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -34,9 +34,9 @@ def take_turns(
 
     Args:
         measured: rounds that count, after `warm_up` rounds that do not.
-        before_round: is told the number of each round, from 0, before it begins; its time does not count.
-        fewest: rounds that count, at least, where all together take longer than `patience` seconds.
-        clock: waits for the device, where the work is done on one.
+        before_round: called with the number of each round, from 0, before it begins; its time does not count.
+        fewest: rounds that count, at least, if all rounds take longer than `patience` seconds.
+        clock: of a GPU, one that waits for it.
         label: of the progress bar; None for no bar.
     """
     seconds: dict[str, list[float]] = {name: [] for name in work}
@@ -58,7 +58,7 @@ def take_turns(
 
 @contextmanager
 def thread_count(threads: int) -> Iterator[None]:
-    """PyTorch takes `threads` threads within the context."""
+    """A context in which PyTorch uses `threads` threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -68,5 +68,5 @@ def thread_count(threads: int) -> Iterator[None]:
 
 
 def threads_for(height: int, width: int) -> int:
-    """How many of PyTorch's threads are worth sharing an image among."""
-    return max(1, min(torch.get_num_threads(), height * width // PIXELS_A_THREAD))
+    """How many of PyTorch's threads to share an image of this size among."""
+    return max(1, min(torch.get_num_threads(), height * width // PIXELS_PER_THREAD))

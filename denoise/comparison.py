@@ -1,7 +1,5 @@
 """How far denoised frames are from references of the same frames."""
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from denoise.sources import find_sources
 from errors import BadInput
 from eval.comparison import Comparison
 from eval.metrics import METRICS
-from files import write_file
+from files import write_csv
 
 MEASURED = ("rmse", "psnr", "ssim")
 FILE = "metrics.csv"
@@ -38,9 +36,7 @@ def compare(
             raise BadInput(f"{reference} is of another size than {out / files.name}")
         comparison = Comparison(denoised, reference_pair, exposure)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in MEASURED)])
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([["frame", *MEASURED], *rows])
-    write_file(out / FILE, text.getvalue().encode())
+    write_csv(out / FILE, ["frame", *MEASURED], rows)
     columns = zip(*(row[1:] for row in rows), strict=True)
     means = [None if None in column else float(np.mean(column)) for column in columns]
     cells = [

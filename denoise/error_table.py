@@ -1,15 +1,14 @@
 """error.csv: the estimated error of each denoised frame."""
 
 import csv
-import io
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from errors import BadInput
-from files import write_file
+from files import write_csv
 from models.wrappers.error_estimate import ErrorEstimate
 
 FILE = "error.csv"
@@ -69,11 +68,8 @@ class ErrorTable:
 
     def add(self, row: FrameError) -> None:
         self.rows[row.frame] = row
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, [field.name for field in fields(FrameError)])
-        writer.writeheader()
-        writer.writerows(asdict(self.rows[number]) for number in sorted(self.rows))
-        write_file(self.path, text.getvalue().encode())
+        rows = (astuple(self.rows[number]) for number in sorted(self.rows))
+        write_csv(self.path, [field.name for field in fields(FrameError)], rows)
 
     def has(self, frame: int, until: float | None) -> bool:
         """Whether there is a row of the frame for this relative error."""

@@ -96,7 +96,7 @@ def camera_conventions(first: ForeignFrame) -> InputConventions:
 
 
 class FrameBuilder:
-    """Makes the Frames between two cuts, one after another, keeping what the next one needs.
+    """Makes the Frames between two cuts, one after another, and keeps what the next one needs.
 
     Raises BadInput where `spp` is no number of samples per pixel.
     """

@@ -53,7 +53,7 @@ def test_help_names_every_profile_and_budget(capsys):
     assert "{" + ",".join(dict.fromkeys(budget for _, budget in RECIPES)) + "}" in help_of(capsys, "train")
 
 
-def test_a_bench_refuses_what_it_does_not_honour(capsys):
+def test_a_bench_refuses_unknown_options(capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["bench", "rendering", "room-3", "--threads", "1"])
     assert exit_.value.code == 2 and "--threads" in capsys.readouterr().err

@@ -1,14 +1,21 @@
 """Denoisers on another device than the CPU, as far as a machine without a GPU can show it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import onespp
+from datasets.clip import Dataset
+from denoise.job import Job
+from denoise.run import denoise
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
+from eval.harness import entrant, evaluate_clip
 from models.registry import DENOISERS
 from models.spec import DenoiserSpec
+from tests.helpers import foreign
 from tests.helpers.frames import run
 from tests.helpers.other_device import Other, other_device
 
@@ -35,6 +42,29 @@ def test_the_library_moves_frames_and_results():
     with other_device() as device:
         images = [*onespp.denoise(onespp.load("svgf", device=device), FRAMES)]
     np.testing.assert_allclose(images, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_denoise_and_its_error_estimate_on_a_device(tmp_path):
+    for which, folder in enumerate("ab"):
+        foreign.write_sequence(tmp_path / folder, [frame.buffer(which) for frame in FRAMES], foreign.blender)
+    patterns = [(str(tmp_path / folder / "*.exr"),) for folder in "ab"]
+    job = Job(patterns[0], "eaw+js", tmp_path / "cpu", half=patterns[1], error=True)
+    denoise(job)
+    with other_device() as device:
+        denoise(replace(job, out=tmp_path / "other", device=device))
+    for path in (tmp_path / "cpu").glob("*.exr"):
+        found = foreign.read(tmp_path / "other" / path.name)
+        for name, plane in foreign.read(path).items():
+            np.testing.assert_allclose(found[name], plane, rtol=1e-2, atol=1e-3)
+
+
+def test_evaluation_on_a_device(tiny, tmp_path):
+    clip = Dataset(tiny).clips("test")[0]
+    with other_device() as device:
+        specs = [DenoiserSpec.named("eaw", device=each) for each in ("cpu", device)]
+        results = [evaluate_clip(clip, [entrant(spec)], tmp_path, quiet=True)[0] for spec in specs]
+    assert results[0].key != results[1].key
+    assert results[1].metrics["rmse"] == pytest.approx(results[0].metrics["rmse"], rel=1e-4)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

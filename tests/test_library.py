@@ -26,7 +26,7 @@ def test_examples_run_as_written(example, tiny, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out
 
 
-def test_networks_have_the_weights_that_are_shipped(shipped, tmp_path):
+def test_networks_have_their_shipped_weights(shipped, tmp_path):
     with pytest.raises(BadInput, match="'wskp3' needs trained weights"):
         onespp.load("wskp3")
     for path in (shipped / "wskp3.safetensors", tmp_path / "others"):
@@ -60,17 +60,17 @@ def test_without_motion_and_cameras_there_is_no_history():
     np.testing.assert_allclose(last, arrays(2)["colour"], rtol=1e-6)
 
 
-def test_cameras_and_depth_tell_the_motion():
-    """A wall at depth 5 seen from 0.1 further right: it moves by focal length · 0.1 / 5 pixels."""
+def test_motion_from_cameras_and_depth():
+    """A wall at depth 5, its camera moved by 0.1 to the right: it moves by focal length · 0.1 / 5 pixels."""
     size = (24, 32)
     K = intrinsics(60.0, *size)
 
-    def seen(index: int) -> dict:
+    def wall(index: int) -> dict:
         eye = np.array([0.1 * index, 0.0, 0.0])
         camera = onespp.camera(K, look_at(eye, eye - [0.0, 0.0, 1.0]))
         return {"colour": arrays(index, size)["colour"], "depth": np.full((*size, 1), 5.0), "camera": camera}
 
-    first, second = onespp.frames(map(seen, range(2)), onespp.load("accumulated"))
+    first, second = onespp.frames(map(wall, range(2)), onespp.load("accumulated"))
     assert (first.motion == 0).all()
     np.testing.assert_allclose(second.motion[0, 0], -K[0, 0] * 0.1 / 5, rtol=1e-5)
     np.testing.assert_allclose(second.motion[0, 1], 0, atol=1e-5)
@@ -109,7 +109,7 @@ def test_unusable_arrays_are_named(changes, message):
 
 
 @pytest.mark.parametrize("spp", [0.0, -1.0, float("nan"), float("inf")])
-def test_frames_of_no_samples_are_refused(spp):
+def test_sample_counts_out_of_range_are_refused(spp):
     with pytest.raises(BadInput, match="is no number of samples"):
         next(onespp.frames([arrays(0)], onespp.load("noisy"), spp))
 

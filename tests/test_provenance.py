@@ -1,4 +1,4 @@
-"""What results are said to follow from."""
+"""Digests of code change with all code that a result depends on."""
 
 import subprocess
 import sys
@@ -26,13 +26,13 @@ def project(tmp_path, monkeypatch):
     code_digest.cache_clear()
 
 
-def test_sources_are_all_that_is_imported_directly_or_not(project):
+def test_sources_include_indirect_imports(project):
     assert set(sources("models.a")) == {"models", "models.a", "models.b"}
     assert set(sources("models.c", "numpy", "models.nowhere")) == {"models", "models.c"}
 
 
 @pytest.mark.parametrize(("changed", "same"), [("a", False), ("b", False), ("__init__", False), ("c", True)])
-def test_a_digest_changes_with_what_is_imported_and_with_nothing_else(project, changed, same):
+def test_a_digest_changes_with_its_imports_only(project, changed, same):
     before = code_digest("models.a")
     with (project / f"{changed}.py").open("a") as file:
         file.write("MORE = 3\n")
@@ -41,19 +41,19 @@ def test_a_digest_changes_with_what_is_imported_and_with_nothing_else(project, c
 
 
 @pytest.mark.parametrize("module", ["eval.clip_run", "models.filters.svgf"])
-def test_whatever_python_loads_is_among_the_sources(module):
+def test_all_modules_that_python_loads_are_sources(module):
     code = f"import sys, {module}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert {name for name in loaded.split() if provenance.source_of(name)} <= set(sources(module))
 
 
-def test_results_of_one_denoiser_do_not_follow_from_another():
+def test_results_do_not_depend_on_other_denoisers():
     assert "models.networks.rae" not in sources("eval.clip_run", "models.filters.svgf")
     assert "models.filters.svgf" not in sources("eval.clip_run", "models.networks.rae")
     assert {"eval.metrics", "eval.results", "datasets.frame"} <= set(sources("eval.clip_run"))
 
 
-def test_kernels_on_disk_follow_from_all_that_they_take():
+def test_the_digest_of_kernels_includes_their_imports():
     modules = [f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))]
     assert code_digest(*modules) == KERNELS
     assert {"models.operators", "models.compiled.exponential", "datasets.channels"} <= set(sources(*modules))

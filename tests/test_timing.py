@@ -7,7 +7,7 @@ from timing import take_turns, thread_count
 
 
 class Clock:
-    """Seconds that pass only where `work` says so."""
+    """A clock that only `work` advances."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -24,7 +24,7 @@ class Clock:
         return self.now
 
 
-def test_all_take_turns_and_the_first_rounds_do_not_count():
+def test_functions_take_turns_and_warm_up_does_not_count():
     clock = Clock()
     rounds = []
     work = {"a": clock.work("a", 1.0), "b": clock.work("b", 2.0)}
@@ -33,7 +33,7 @@ def test_all_take_turns_and_the_first_rounds_do_not_count():
     assert seconds == {"a": [1.0] * 3, "b": [2.0] * 3}
 
 
-def test_what_happens_before_a_round_does_not_count():
+def test_preparation_of_a_round_does_not_count():
     clock = Clock()
     seconds = take_turns(
         {"a": clock.work("a", 1.0)}, measured=2, before_round=lambda _: clock.work("-", 9.0)(), clock=clock
@@ -42,13 +42,13 @@ def test_what_happens_before_a_round_does_not_count():
 
 
 @pytest.mark.parametrize(("patience", "rounds"), [(0.0, 2), (1e9, 10)])
-def test_patience_ends_it_after_the_fewest_rounds(patience, rounds):
+def test_patience_ends_after_the_minimum_of_rounds(patience, rounds):
     clock = Clock()
     seconds = take_turns({"a": clock.work("a", 1.0)}, measured=10, fewest=2, patience=patience, clock=clock)
     assert len(seconds["a"]) == rounds
 
 
-def test_threads_are_given_back_even_after_an_error():
+def test_the_thread_count_is_restored_after_an_error():
     before = torch.get_num_threads()
     with pytest.raises(KeyError), thread_count(1):
         assert torch.get_num_threads() == 1

@@ -39,7 +39,7 @@ def spheres() -> list[Frame]:
 
 
 def as_foreign(frame: Frame) -> Frame:
-    """What is left of a frame where a renderer tells neither meshes nor direct light apart."""
+    """A frame as a renderer gives it that separates neither meshes nor direct light."""
     surface = (frame.depth > 0).float()
     changed = {
         "direct": (frame.direct + frame.indirect) * surface,

@@ -1,4 +1,4 @@
-"""Cameras are recovered from positions and headers, and not where they cannot be."""
+"""Cameras are recovered from positions and headers, or not at all."""
 
 import numpy as np
 import pytest
@@ -30,12 +30,12 @@ def assert_same(found: View | None, view: View, tolerance: float = 1e-3) -> None
 
 
 @given(st.integers(0, 10**6))
-def test_positions_tell_the_camera(seed):
+def test_positions_determine_the_camera(seed):
     view = some_view(seed)
     assert_same(view_of_positions(points_of(view), SURFACE), view)
 
 
-def test_a_few_wrong_positions_do_no_harm():
+def test_a_few_wrong_positions_are_ignored():
     view = some_view(1)
     positions = points_of(view)
     positions[::9, ::7] = 100
@@ -43,7 +43,7 @@ def test_a_few_wrong_positions_do_no_harm():
     assert_same(view_of_positions(positions, SURFACE), view)
 
 
-def test_positions_rounded_to_half_tell_the_camera():
+def test_positions_in_half_precision_determine_the_camera():
     view = some_view(6)
     assert_same(view_of_positions(points_of(view).astype(np.float16).astype(np.float32), SURFACE), view, 1e-2)
 
@@ -58,7 +58,7 @@ def test_left_handed_worlds_project_alike():
     np.testing.assert_allclose(identity, np.eye(4), atol=1e-9)
 
 
-def test_what_leaves_the_camera_open_tells_none():
+def test_positions_that_do_not_determine_a_camera():
     view = some_view(3)
     wall = unproject(pixel_centres(HEIGHT, WIDTH), np.full((HEIGHT, WIDTH), 3.0), view)  # a plane
     noise = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3))
@@ -77,7 +77,7 @@ def ndc(view: View, from_zero: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("from_zero", [True, False])
-def test_headers_tell_the_camera(from_zero):
+def test_cameras_of_headers(from_zero):
     view = some_view(4)
     assert_same(view_of_header({"worldToNDC": ndc(view, from_zero)}, HEIGHT, WIDTH), view, 1e-4)
     assert view_of_header({}, HEIGHT, WIDTH) is None

@@ -1,4 +1,4 @@
-"""Frames made of foreign pixels hold what the renderer's own would: given, derived or done without."""
+"""Frames of foreign files have the channels of our own: given, derived or replaced."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_depth_and_the_headers_camera_give_motion_and_normals(box, tmp_path, kin
     assert second.follows(first.moment) and not first.follows(second.moment)
 
 
-def test_positions_give_the_same_cameras_as_ours(box, tmp_path):
+def test_positions_give_our_cameras(box, tmp_path):
     foreign.write_sequence(tmp_path, box, foreign.pbrt)
     for found, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
         torch.testing.assert_close(found.now.camera_to_world, frame.now.camera_to_world, rtol=0, atol=1e-4)
@@ -62,8 +62,8 @@ def test_positions_give_the_same_cameras_as_ours(box, tmp_path):
         torch.testing.assert_close(found.view_normal(), frame.view_normal(), rtol=0, atol=1e-2)
 
 
-def test_a_dolly_moves_the_camera_that_stands_far_away(box, tmp_path):
-    """Without cameras, depths of the previous frame are expected where the median has moved."""
+def test_a_dolly_moves_the_parallel_camera(box, tmp_path):
+    """Without cameras, the parallel view moves by the median change of depth."""
     foreign.write_sequence(tmp_path, box, foreign.blender)
     found = frames_of(tmp_path)
     for before, now in pairwise(found):
@@ -99,7 +99,7 @@ def test_what_is_background(tmp_path):
         assert (frame.normal[0].norm(dim=0) == there).all()
 
 
-def test_emission_is_set_apart_on_surfaces(spheres, tmp_path):
+def test_emission_of_surfaces_is_separated(spheres, tmp_path):
     lamp = np.zeros((40, 56, 3))
     lamp[30:35, 10:20] = 7
     layers = foreign.blender(spheres[0]) | {"ViewLayer.Emit.RGB": lamp}
@@ -110,7 +110,7 @@ def test_emission_is_set_apart_on_surfaces(spheres, tmp_path):
     torch.testing.assert_close(frame.direct[0, :, 32, 15], (spheres[0].direct + spheres[0].indirect)[0, :, 32, 15])
 
 
-def test_albedo_is_clamped_and_bad_motion_is_none(spheres, tmp_path):
+def test_albedo_is_clamped_and_bad_motion_is_zero(spheres, tmp_path):
     layers = foreign.blender(spheres[1])
     layers["ViewLayer.Denoising Albedo.RGB"][30, 20] = [-1, 0.5, 3]
     layers["ViewLayer.Vector.XYZW"][30, 20] = np.inf
@@ -121,14 +121,14 @@ def test_albedo_is_clamped_and_bad_motion_is_none(spheres, tmp_path):
     assert frame.motion[0, :, 30, 20].tolist() == [0, 0]
 
 
-def test_cameras_are_taken_from_positions_before_the_header(box, tmp_path):
+def test_positions_are_preferred_to_the_headers_camera(box, tmp_path):
     foreign.write(tmp_path / "1.exr", foreign.pbrt(box[0]), header_of(box[1]))
     files = sequence_of({"colour": [str(tmp_path / "1.exr")]})
     pixels, _ = read_foreign_frame(files[0], find_sources(open_passes(files[0]), {}))
     assert camera_conventions(pixels).cameras == "positions"
 
 
-def test_a_camera_without_depth_makes_up_no_motion(box, tmp_path):
+def test_a_camera_without_depth_gives_no_motion(box, tmp_path):
     for index, frame in enumerate(box[:2]):
         foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)}, header_of(frame))
     files = sequence_of({"colour": [str(tmp_path / "*.exr")]})

@@ -1,4 +1,4 @@
-"""Layers by the names in use, whatever stands before them, and by what the user states."""
+"""Layers are recognised by common names after any prefix, and by names that the user gives."""
 
 import pytest
 from hypothesis import given
@@ -37,7 +37,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("quantity", "layer", "prefix"), CASES)
-def test_names_in_use_are_found(quantity, layer, prefix):
+def test_common_names_are_recognised(quantity, layer, prefix):
     names = channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer)
     found = candidates(quantity, names)
     assert len(found) == 1 and set(found[0].channels) <= set(channels(prefix + layer))
@@ -61,7 +61,7 @@ def test_order_of_channels_in_the_file_does_not_matter():
     assert candidates("normal", ["N.Z", "N.Y", "N.X"])[0].channels == ("N.X", "N.Y", "N.Z")
 
 
-def test_what_the_user_states():
+def test_layers_that_the_user_names():
     names = channels("My.AOV.RGB", "uv.UV", "A.XYZW")
     assert named_layer("albedo", "My.AOV", names, "f").channels == ("My.AOV.R", "My.AOV.G", "My.AOV.B")
     assert named_layer("motion", "A.Z,A.W", names, "f").channels == ("A.Z", "A.W")
@@ -75,7 +75,7 @@ def test_what_the_user_states():
 
 
 @given(st.lists(st.text(max_size=12), max_size=8))
-def test_any_names_can_be_looked_through(names):
+def test_any_names_are_possible(names):
     for quantity in QUANTITIES:
         for layer in candidates(quantity, names):
             assert set(layer.channels) <= set(names)

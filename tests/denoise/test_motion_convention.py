@@ -1,4 +1,4 @@
-"""What motion vectors mean is found for every convention there is, and doubt is admitted."""
+"""Every convention of motion vectors is detected, and doubt is reported."""
 
 from dataclasses import replace
 
@@ -17,8 +17,10 @@ HEIGHT, WIDTH = 90, 160
 FAST = 12  # of the sequence's frames between two of these: a step of several pixels
 
 
-def said_as(convention: MotionConvention, to_previous: np.ndarray, to_next: np.ndarray, components: int) -> np.ndarray:
-    """Vectors in a renderer's own terms; the pair that is not meant holds those to the next frame."""
+def encoded_as(
+    convention: MotionConvention, to_previous: np.ndarray, to_next: np.ndarray, components: int
+) -> np.ndarray:
+    """Vectors in a renderer's convention; the other pair has those to the next frame."""
     size = {"pixels": (1, 1), "fractions": (WIDTH, HEIGHT), "half-fractions": (WIDTH / 2, HEIGHT / 2)}[convention.unit]
     scale = [SIGNS[convention.x], SIGNS[convention.y]] / np.array(size)
     vectors = np.zeros((HEIGHT, WIDTH, components))
@@ -44,13 +46,13 @@ def moving():
 
 
 @pytest.mark.parametrize("components", [2, 4])
-def test_every_convention_is_found(moving, components):
+def test_every_convention_is_detected(moving, components):
     before, now, to_previous, to_next = moving
     tried = conventions(components)
     assert len(tried) == 12 * components // 2
     for convention in tried:
         detector = ConventionDetector(components)
-        detector.add(now, before, said_as(convention, to_previous, to_next, components))
+        detector.add(now, before, encoded_as(convention, to_previous, to_next, components))
         detection = detector.detection()
         assert detection.convention == convention and detection.certain, detection.reason
         assert str(convention) in detection.reason
@@ -67,7 +69,7 @@ def test_moving_objects_before_a_moving_camera():
         detector = ConventionDetector(2)
         for index in (1, 2, 3):
             motion = image(synthetic_frame(index, HEIGHT, WIDTH), "motion")
-            detector.add(guides(index), guides(index - 1), said_as(convention, motion, motion, 2))
+            detector.add(guides(index), guides(index - 1), encoded_as(convention, motion, motion, 2))
         assert detector.detection().convention == convention
 
 
@@ -77,13 +79,13 @@ def test_steady_motion_is_read_from_the_first_pair():
     now, before = (blurred(np.ascontiguousarray(texture[:, start : start + WIDTH])) for start in (10, 6))
     step = np.broadcast_to([4.0, 0.0], (HEIGHT, WIDTH, 2))
     detector = ConventionDetector(4)
-    detector.add(now, before, said_as(MotionConvention("XY", "+", "-"), step, -step, 4))
+    detector.add(now, before, encoded_as(MotionConvention("XY", "+", "-"), step, -step, 4))
     detection = detector.detection()
     assert detection.convention.pair == "XY" and detection.convention.x == "+"
     assert not detection.certain  # nothing moves up or down
 
 
-def test_no_motion_and_senseless_motion_are_said():
+def test_no_motion_and_random_motion_are_uncertain():
     still = guides(0)
     detector = ConventionDetector(2)
     detector.add(still, still, np.zeros((HEIGHT, WIDTH, 2), np.float32))
@@ -95,18 +97,18 @@ def test_no_motion_and_senseless_motion_are_said():
 
 
 @given(st.sampled_from(conventions(4)))
-def test_words_lead_back(convention):
+def test_parsing_inverts_str(convention):
     assert MotionConvention.parse(str(convention)) == convention
 
 
-def test_other_words_are_refused():
+def test_other_texts_are_refused():
     for text in ("", "XY", "XY,+x,+y,inches", "AB,+x,+y,pixels"):
         with pytest.raises(BadInput, match=", ".join(UNITS)):
             MotionConvention.parse(text)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1)])
-def test_tiny_images_and_numbers_that_are_none(size):
+def test_tiny_images_and_nan(size):
     detector = ConventionDetector(4)
     motion = np.full((*size, 4), np.nan, np.float32)
     motion[..., 1] = np.inf

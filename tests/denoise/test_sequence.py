@@ -49,7 +49,7 @@ def test_passes_are_matched_by_number(folder):
     assert len(sequence_of({"colour": ["hdr/*"], "normal": ["nrm/*"]}, "1-1")) == 1
 
 
-def test_what_is_not_there_is_named(folder):
+def test_missing_files_and_frames_are_named(folder):
     folder("1.exr")
     with pytest.raises(BadInput, match=r"no file matches 'x\*'"):
         sequence_of({"colour": ["x*"]})
