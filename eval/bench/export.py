@@ -1,4 +1,4 @@
-"""`onespp bench export`: an exported denoiser under onnxruntime next to ours."""
+"""`onespp bench export`: milliseconds of an exported denoiser under onnxruntime, next to onespp."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,7 +34,7 @@ Play = Callable[[], Tensor]  # the radiance of the sequence's next frame
 
 
 class TimedSequence:
-    """A sequence that all play in step: `frame` is the one that is played now."""
+    """A sequence that several denoisers process in turn: `frame` is the current one."""
 
     frame: Frame
 
@@ -71,11 +71,10 @@ def bench_export(
     threads: int | None = None,
     measured: int = TIMED_FRAMES,
 ) -> str:
-    """Milliseconds of a frame in float32, in turns: a table, and RUNS/bench/export.json.
+    """Measure milliseconds per frame in float32. Returns a table and writes RUNS/bench/export.json.
 
-    Weights are fresh: they do not matter for the time. With the warp outside, its time is that of our reprojection.
-    With `threads`, by default as many as PyTorch takes. Raises BadInput for a denoiser that cannot be exported, missing
-    packages, and what is no size or number of threads.
+    Weights are random. The time with the warp outside includes onespp's reprojection. Raises BadInput for a denoiser
+    that cannot be exported, missing packages, and an invalid size or number of threads.
     """
     check_exportable(name)
     check_installed("onnx")

@@ -1,4 +1,4 @@
-"""Memory that a process takes, measured in processes of their own."""
+"""Memory of a process, measured in separate processes."""
 
 import ctypes
 import gc
@@ -12,17 +12,17 @@ from typing import Any
 
 
 def release_memory() -> None:
-    """Hand memory that nobody needs any more back to the system."""
+    """Return unused memory to the system."""
     gc.collect()
     with suppress(OSError, AttributeError):  # glibc only
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def growth_mb(run: Callable[[], object]) -> float | None:
-    """How far resident memory rises while `run` is called, in MB; None where the system does not tell."""
-    release_memory()  # or the rise would fit unseen into what was freed
+    """Growth of resident memory while `run` is called, in MB; None where the system does not report it."""
+    release_memory()  # memory that was freed but not returned would hide the growth
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     except OSError:
         return None
     before = status_mb("VmRSS")
@@ -32,20 +32,20 @@ def growth_mb(run: Callable[[], object]) -> float | None:
 
 
 def status_mb(field: str) -> float | None:
-    """A field of /proc/self/status, such as VmRSS, in MB; None where the system does not tell: only Linux does."""
+    """A field of /proc/self/status, such as VmRSS, in MB; None on systems other than Linux."""
     path = Path("/proc/self/status")
     match = re.search(rf"{field}:\s*(\d+) kB", path.read_text()) if path.exists() else None
     return int(match[1]) * 1024 / 1e6 if match else None
 
 
 def alone(function: Callable[..., Any], *arguments: Any) -> Any:
-    """What `function` returns in a process that has done nothing yet but import its module.
+    """The result of `function` in a new process that has imported only its module.
 
-    The process ends by itself. One that is killed, as those of a multiprocessing.Pool are, cannot clean up: of Numba's
-    lock, at the latest, Python would say at the end that it has leaked.
+    The process exits normally: after one that is killed, as those of multiprocessing.Pool are, Python would report
+    Numba's lock as leaked.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([function.__module__])  # imported once for all that follow
-    # What was imported stays: to go through all of it would take most of the time of a small measurement.
+    context.set_forkserver_preload([function.__module__])  # imported once for all later calls
+    # Without gc.freeze, collecting the imported modules would dominate small measurements.
     with ProcessPoolExecutor(1, mp_context=context, initializer=gc.freeze) as process:
         return process.submit(function, *arguments).result()

@@ -1,4 +1,4 @@
-"""`onespp bench rendering`: seconds to a noise floor, next to stock Mitsuba on the same frames in the same run."""
+"""`onespp bench rendering`: seconds to a noise floor, next to stock Mitsuba on the same frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -24,7 +24,7 @@ BENCH_SCENES = ("cornell_box", "cornell_box_moving", *(f"room-{number}" for numb
 SCENE_FRAMES = 24
 FRAME = 8  # the one that is rendered
 FIRST_SPP = 32
-MOST_SPP = 512
+MAX_SPP = 512
 TIMED_RENDERS = 3
 TARGET_DB = 40.0
 STOCK = "stock path, independent"
@@ -33,15 +33,16 @@ ONESPP = "onespp"
 
 @dataclass(frozen=True)
 class TimeToFloor:
-    """How a renderer did on a frame.
+    """The speed of a renderer on a frame.
 
     Attributes:
-        spp: samples a pixel with which the noise was first down to the target, or MOST_SPP.
-        samples_per_second: paths from the camera.
-        floor: PSNR in dB, as displayed, of the mean of two halves of the samples.
-        seconds: to the target. Where `spp` was not enough, they are extrapolated: noise falls as 1 / spp.
-        ratio: of stock Mitsuba's seconds.
-        kernels, compiling: see Compilations; None for stock Mitsuba, whose first frame is not looked at.
+        spp: the fewest samples per pixel, doubling, that reach the target, or MAX_SPP.
+        samples_per_second: camera paths.
+        floor: PSNR in dB of the displayed mean of two independent sample buffers.
+        seconds: to the target, by the law that noise falls as 1 / spp.
+        extrapolated: whether `spp` was not enough.
+        ratio: to the seconds of stock Mitsuba.
+        kernels, compiling: see Compilations; None for stock Mitsuba.
     """
 
     scene: str
@@ -56,29 +57,29 @@ class TimeToFloor:
     compiling: float | None = None  # seconds
 
 
-def displayed_noise(render: Render, exposure: float, spp: int) -> float:
-    """Mean squared error of the mean of two halves of so many samples, as displayed."""
-    a, b = (display(render(1 + half, spp // 2), exposure) for half in (0, 1))
+def noise_mse(render: Render, exposure: float, spp: int) -> float:
+    """Mean squared error of the displayed mean of two buffers of `spp` / 2 samples each."""
+    a, b = (display(render(seed, spp // 2), exposure) for seed in (1, 2))
     return noise_of_mean(a, b)
 
 
 def samples_needed(render: Render, exposure: float, target: float) -> tuple[int, float]:
-    """(samples a pixel, noise) where the noise is first down to `target`, or at MOST_SPP."""
+    """(samples per pixel, noise) where the noise first reaches `target`, or at MAX_SPP."""
     spp = FIRST_SPP
-    while (noise := displayed_noise(render, exposure, spp)) > target and spp < MOST_SPP:
+    while (noise := noise_mse(render, exposure, spp)) > target and spp < MAX_SPP:
         spp *= 2
     return spp, noise
 
 
 class Compilations(NamedTuple):
-    """Kernels that a scene needed for its first frame and that nothing in this process had compiled before."""
+    """Kernels that a scene's first frame needed and that this process had not compiled before."""
 
     kernels: int
-    compiling: float  # seconds, 0 where they lay on disk
+    compiling: float  # seconds; 0 if they were cached on disk
 
 
 def first_frame(scene: str, size: int) -> tuple[Shot, Compilations]:
-    """A frame of `size` x `size` pixels, ready to be sampled, and what it took to compile."""
+    """A frame of `size` x `size` pixels, ready to be sampled, and the compilations that it needed."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         shot = Shot(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
@@ -88,8 +89,8 @@ def first_frame(scene: str, size: int) -> tuple[Shot, Compilations]:
     return shot, Compilations(len(new), sum(kernel["backend_time"] for kernel in new) / 1e3)
 
 
-def rendering_halves(render: Render, spp: int) -> Callable[[], None]:
-    """A function that renders both halves of so many samples, with other seeds at every call."""
+def rendering_buffers(render: Render, spp: int) -> Callable[[], None]:
+    """A function that renders two buffers of `spp` / 2 samples each, with different seeds at every call."""
     seeds = count(step=100)
 
     def work() -> None:
@@ -101,21 +102,20 @@ def rendering_halves(render: Render, spp: int) -> Callable[[], None]:
 
 
 def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
-    """How both renderers do on a frame of `size` x `size` pixels, stock Mitsuba first.
+    """The rows of both renderers for a frame of `size` x `size` pixels, stock Mitsuba first.
 
-    Both share the exposure of ours. Raises BadInput for an unknown scene.
+    Both use the same exposure. Raises BadInput for an unknown scene.
     """
     shot, compiled = first_frame(scene, size)
     renders: dict[str, Render] = {STOCK: stock_render(shot), ONESPP: shot.radiance}
     exposure = clip_exposure(luminance(shot.radiance(9, 256)))
     target = 10 ** (-TARGET_DB / 10)
     reached = {renderer: samples_needed(render, exposure, target) for renderer, render in renders.items()}
-    work = {renderer: rendering_halves(render, reached[renderer][0]) for renderer, render in renders.items()}
-    spent = take_turns(work, measured, warm_up=0, label=scene)  # to find the samples was warm-up enough
+    work = {renderer: rendering_buffers(render, reached[renderer][0]) for renderer, render in renders.items()}
+    spent = take_turns(work, measured, warm_up=0, label=scene)  # the search for spp was the warm-up
     rows: list[TimeToFloor] = []
     for renderer, (spp, noise) in reached.items():
         seconds = median(spent[renderer])
-        # Where the target is passed, fewer samples would have done, by the same law.
         to_target = seconds * noise / target
         row = TimeToFloor(
             scene=scene,
@@ -136,9 +136,9 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
 def bench_rendering(
     runs: Path, scenes: Sequence[str] = BENCH_SCENES, size: int = 96, measured: int = TIMED_RENDERS
 ) -> str:
-    """Samples a second and seconds to 40 dB on a frame of each scene: a table, and RUNS/bench/rendering.json.
+    """Measure samples per second and seconds to 40 dB on a frame of `size` x `size` pixels of each scene.
 
-    A frame has `size` x `size` pixels. Raises BadInput for an unknown scene.
+    Returns a table and writes RUNS/bench/rendering.json. Raises BadInput for an unknown scene.
     """
     names = tqdm(scenes or BENCH_SCENES, "scenes", leave=False)
     rows = [asdict(row) for name in names for row in times_to_floor(name, size, measured)]

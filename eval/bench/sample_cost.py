@@ -1,4 +1,4 @@
-"""What samples cost: milliseconds of path tracing a frame."""
+"""Milliseconds of path tracing per frame and per sample."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,11 +17,11 @@ from timing import take_turns
 
 RENDERER = VARIANT.partition("_")[0].replace("llvm", "cpu")  # the device that renders: cpu or cuda
 TIMED_SPP = (1, 2, 4, 8)
-TIMED_FRAMES_EACH = 3  # besides a first one, which compiles
+TIMED_FRAMES_EACH = 3  # after a first one, which compiles kernels
 
 
 class Cost(NamedTuple):
-    """Milliseconds of a frame: those that come with any number of samples (rays, first hits), and of each sample."""
+    """Milliseconds of a frame: a constant part (rays, first hits) and a part per sample."""
 
     frame_ms: float
     sample_ms: float
@@ -32,7 +32,7 @@ class Cost(NamedTuple):
 
 @contextmanager
 def render_threads(threads: int) -> Iterator[None]:
-    """Dr.Jit takes so many threads within the context."""
+    """Dr.Jit uses `threads` threads within the context."""
     before = dr.thread_count()
     dr.set_thread_count(threads)
     try:
@@ -48,7 +48,7 @@ def fit_cost(spp: Sequence[int], ms: Sequence[float]) -> Cost:
 
 
 def tracing(tracer: PathTracer, ray: Any, spp: int) -> Callable[[], None]:
-    """A function that traces so many samples a pixel, with another seed at every call."""
+    """A function that traces `spp` samples per pixel, with a different seed at every call."""
     seeds = count()
 
     def trace() -> None:
@@ -58,7 +58,7 @@ def tracing(tracer: PathTracer, ray: Any, spp: int) -> Callable[[], None]:
 
 
 def sample_cost(scene: Scene, height: int, width: int, threads: int, options: Options) -> Cost:
-    """Measured on the scene's first frame, without its G-buffer, which costs the same whatever the samples."""
+    """The cost of the scene's first frame, without its G-buffer, whose time does not depend on samples."""
     stage = Stage(scene, height, width)
     stage.pose(0)
     ray = stage.rays(stage.view(0))

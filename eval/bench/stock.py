@@ -1,4 +1,4 @@
-"""Stock Mitsuba: the `path` integrator and the `independent` sampler, on a frame that onespp renders as well."""
+"""Stock Mitsuba with its `path` integrator and `independent` sampler, on a frame of onespp."""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,7 +35,7 @@ def stock_sensor(stage: Stage, view: View) -> Any:
 
 
 def stock_render(shot: Shot) -> Render:
-    """`mi.render` of a shot: all radiance; non-finite pixels are 0."""
+    """`mi.render` for a shot: radiance with emission; pixels that are not finite are 0."""
     integrator = mi.load_dict({"type": "path", "max_depth": shot.stage.scene.max_depth})
     sensor = stock_sensor(shot.stage, shot.view)
 

@@ -1,4 +1,4 @@
-"""A moving sequence made without a renderer, for measuring speed: shapes, motion and noise as those of real frames."""
+"""A procedural moving sequence for measuring speed, with shapes, motion and noise similar to rendered frames."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -19,14 +19,14 @@ PLANES = (GROUND, BACK_WALL, SIDE_WALL)
 WALL_HEIGHT = 1.7  # y at which the walls end; above them is sky
 SPHERES = 10
 TO_LIGHT = np.array([0.5, 0.8, 0.33])  # nearly of length 1
-# Shares of the pixels whose one sample finds any light.
+# Shares of the pixels whose sample has any light.
 HIT_DIRECT = 0.5
 HIT_INDIRECT = 0.2
 SEED = 0
 
 
 class FirstHits(NamedTuple):
-    """What rays meet first."""
+    """The first hits of rays."""
 
     depth: Array  # (...,), along the viewing axis, 0 for sky
     mesh_id: NDArray[np.int64]  # (...,), 0 for sky
@@ -36,7 +36,7 @@ class FirstHits(NamedTuple):
 def spheres(index: int) -> tuple[Array, Array]:
     """Centres (N, 3) and radii (N,) in frame `index`.
 
-    Every other sphere circles, so that it covers what is behind it and uncovers it again.
+    Every second sphere moves in a circle, which causes occlusions and disocclusions.
     """
     rng = np.random.default_rng(SEED)
     centres = rng.uniform((-3.5, -1.2, -5.5), (3.5, 1.5, -1.0), (SPHERES, 3))
@@ -46,10 +46,7 @@ def spheres(index: int) -> tuple[Array, Array]:
 
 
 def view(index: int, height: int, width: int) -> View:
-    """What projects frame `index`: the camera slides and turns, planes stand still.
-
-    The rest pose of a sphere has its centre in the origin.
-    """
+    """The view of frame `index`: camera and spheres move, planes are static; a sphere's rest pose is at the origin."""
     eye = np.array([0.02 * index - 0.5, 0.3, 3.0])
     poses = np.tile(np.eye(4), (len(PLANES) + SPHERES, 1, 1))
     poses[len(PLANES) :, :3, 3] = spheres(index)[0]
@@ -57,7 +54,7 @@ def view(index: int, height: int, width: int) -> View:
 
 
 def cast(pixels: Array, index: int, view: View) -> FirstHits:
-    """What rays through `pixels` (..., 2) meet in frame `index`, whose view is `view`."""
+    """First hits of rays through `pixels` (..., 2) in frame `index`, whose view is `view`."""
     eye = view.camera_to_world[:3, 3]
     ray = directions(pixels, view)  # of length 1 along the viewing axis: t is the depth
     depth = np.full(ray.shape[:-1], np.inf)
@@ -65,7 +62,7 @@ def cast(pixels: Array, index: int, view: View) -> FirstHits:
     normal = np.zeros_like(ray)
 
     def meet(mesh: int, t: Array, n: Array) -> None:
-        """Note a mesh that the rays meet at t (...,), with normals n that broadcast to (..., 3), where it is nearer."""
+        """Store a mesh hit at t (...,), with normals n that broadcast to (..., 3), where it is nearest so far."""
         nearer = (t > 0) & (t < depth)
         depth[nearer] = t[nearer]
         mesh_id[nearer] = mesh
@@ -84,61 +81,61 @@ def cast(pixels: Array, index: int, view: View) -> FirstHits:
     return FirstHits(np.where(mesh_id > 0, depth, 0), mesh_id, normal)
 
 
-def synthetic_dual_motion(pixels: Array, index: int, seen: FirstHits, motion: Array, now: View, before: View) -> Array:
-    """Dual motion vectors (H, W, 2) of NTD §3.2; where nothing was covered they are `motion`.
+def synthetic_dual_motion(pixels: Array, index: int, hits: FirstHits, motion: Array, now: View, before: View) -> Array:
+    """Dual motion vectors (H, W, 2) of NTD §3.2; `motion` where nothing was occluded.
 
-    Where another surface was seen at y = x + motion in the previous frame, they lead to x_prev = y + x - z: z is where
-    that surface is in this frame.
+    Where another surface was visible at y = x + motion in the previous frame, they point to x_prev = y + x - z, with z
+    the position of that surface in this frame.
     """
     height, width = pixels.shape[:2]
     y = pixels + motion
     covering = cast(y, index - 1, before)
-    # y + x - z - x, with z - y the forward vector of what was seen at y.
+    # y + x - z - x, with z - y the forward vector of the surface visible at y.
     dual = -motion_vectors(y, covering.depth, covering.mesh_id, before, now)
     ends = np.stack([y, pixels + dual])
     inside = ((ends >= 0) & (ends <= (width, height))).all(axis=(0, -1))
-    return np.where((inside & (covering.mesh_id != seen.mesh_id))[..., None], dual, motion)
+    return np.where((inside & (covering.mesh_id != hits.mesh_id))[..., None], dual, motion)
 
 
 def noisy(rng: np.random.Generator, mean: Array, share: float) -> Array:
-    """One sample a pixel of light `mean` (H, W, 3): black but in a `share` of the pixels, and a firefly in a few."""
+    """One sample per pixel of light `mean` (H, W, 3): zero outside a `share` of the pixels, log-normal inside."""
     size = (*mean.shape[:2], 1)
     heavy_tailed = rng.lognormal(-0.5, 1.0, size)  # of mean 1
     return mean * np.where(rng.random(size) < share, heavy_tailed / share, 0)
 
 
 def split_into_buffers(light: Mapping[str, Array], seed: tuple[int, ...]) -> dict[str, Array]:
-    """Halves (2, H, W, 3), by their channels, of which `light` (H, W, 3) is the mean: each pixel is in one of them."""
+    """Sample buffers (2, H, W, 3) by channel, of mean `light` (H, W, 3): each pixel is non-zero in one of them."""
     rng = np.random.default_rng(seed)
-    halves = {}
+    buffers = {}
     for name, mean in light.items():
         in_first = rng.random((*mean.shape[:2], 1)) < 0.5
-        halves[SAMPLE_BUFFERS[name]] = 2 * mean * np.stack([in_first, ~in_first])
-    return halves
+        buffers[SAMPLE_BUFFERS[name]] = 2 * mean * np.stack([in_first, ~in_first])
+    return buffers
 
 
-def met(rng: np.random.Generator, hit: NDArray[np.bool_], share: float) -> Array:
-    """Distances (H, W) that a `share` of the surfaces' samples meet something at; 0 for the others."""
+def sampled_distances(rng: np.random.Generator, hit: NDArray[np.bool_], share: float) -> Array:
+    """Hit distances (H, W) of a `share` of the surfaces' samples; 0 for the others."""
     return np.where(hit & (rng.random(hit.shape) < share), rng.lognormal(0.0, 0.5, hit.shape), 0)
 
 
 def synthetic_frame(index: int, height: int, width: int) -> Frame:
-    """Frame `index` of an endless sequence, with all channels but references. The same bytes whenever it is made."""
+    """Frame `index` of an endless deterministic sequence, with all channels but references."""
     pixels = pixel_centres(height, width)
     now = view(index, height, width)
     before = view(max(index - 1, 0), height, width)
-    seen = cast(pixels, index, now)
-    motion = motion_vectors(pixels, seen.depth, seen.mesh_id, now, before)
-    dual = synthetic_dual_motion(pixels, index, seen, motion, now, before) if index else motion
+    hits = cast(pixels, index, now)
+    motion = motion_vectors(pixels, hits.depth, hits.mesh_id, now, before)
+    dual = synthetic_dual_motion(pixels, index, hits, motion, now, before) if index else motion
 
-    point = now.camera_to_world[:3, 3] + seen.depth[..., None] * directions(pixels, now)
-    centred = point - np.concatenate([np.zeros((1, 3)), now.object_to_world[:, :3, 3]])[seen.mesh_id]
+    point = now.camera_to_world[:3, 3] + hits.depth[..., None] * directions(pixels, now)
+    centred = point - np.concatenate([np.zeros((1, 3)), now.object_to_world[:, :3, 3]])[hits.mesh_id]
     checker = np.floor(3 * centred + 1e-6).sum(axis=-1) % 2
     rng = np.random.default_rng(SEED)
-    colour = rng.uniform(0.2, 0.9, (1 + len(now.object_to_world), 3))[seen.mesh_id]
-    hit = (seen.mesh_id > 0)[..., None]
+    colour = rng.uniform(0.2, 0.9, (1 + len(now.object_to_world), 3))[hits.mesh_id]
+    hit = (hits.mesh_id > 0)[..., None]
     albedo = np.where(hit, colour * (0.6 + 0.4 * checker[..., None]), 1)
-    lit = np.where(hit, albedo * (seen.normal @ TO_LIGHT).clip(0)[..., None], 0)
+    lit = np.where(hit, albedo * (hits.normal @ TO_LIGHT).clip(0)[..., None], 0)
     rng = np.random.default_rng((SEED, index))
     direct = noisy(rng, 2 * lit, HIT_DIRECT)
     indirect = noisy(rng, np.where(hit, 0.3 * albedo, 0), HIT_INDIRECT)
@@ -148,17 +145,17 @@ def synthetic_frame(index: int, height: int, width: int) -> Frame:
         **split_into_buffers({"direct": direct, "indirect": indirect}, (SEED, index, 1)),
         "emission": np.where(hit, 0, [0.4, 0.6, 1.0]),
         "albedo": albedo,
-        "normal": seen.normal,
-        "depth": seen.depth[..., None],
-        "roughness": np.where(seen.mesh_id % 3 == 2, 0.2, 1.0)[..., None],
-        "mesh_id": seen.mesh_id[..., None],
+        "normal": hits.normal,
+        "depth": hits.depth[..., None],
+        "roughness": np.where(hits.mesh_id % 3 == 2, 0.2, 1.0)[..., None],
+        "mesh_id": hits.mesh_id[..., None],
         "motion": motion,
         "dual_motion": dual,
         "shadow_motion": motion,
         "reflection_motion": motion,
         "gradient": np.zeros_like(motion),
-        "hit_distance": np.stack([met(rng, hit[..., 0], 1.0), met(rng, hit[..., 0], 0.3)], axis=-1),
-        "light_distance": np.zeros_like(seen.depth)[..., None],
+        "hit_distance": np.stack([sampled_distances(rng, hit[..., 0], share) for share in (1.0, 0.3)], axis=-1),
+        "light_distance": np.zeros_like(hits.depth)[..., None],
         "light_angle": np.where(hit, 0.05, 0),
     }
     tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}

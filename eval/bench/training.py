@@ -1,4 +1,4 @@
-"""`onespp bench training`: how long a training step takes, in both precisions, and where the time goes."""
+"""`onespp bench training`: milliseconds of a training step in both precisions, and the share of each part."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ from train.recipes import ONE_A_PAPER
 from train.registry import task_for
 from train.training import Training
 
-TIMED_STEPS = 5  # in each precision, besides a first one that warms up; the median counts
+TIMED_STEPS = 5  # in each precision, after one warm-up step
 
 # The parts of a step.
 CONVOLUTIONS = "convolutions"
@@ -51,7 +51,7 @@ class StepTimes:
         return FLOAT32 if self.full_ms <= self.mixed_ms else BFLOAT16
 
     def line(self) -> dict[str, Any]:
-        """As it stands in the table and in training.json."""
+        """The row of the table and of training.json."""
         return {
             "network": self.network,
             f"{FLOAT32} ms": self.full_ms,
@@ -62,24 +62,24 @@ class StepTimes:
 
 @dataclass(frozen=True)
 class StepShares:
-    """Where the time of a step goes, in the faster precision: the share of each part, between 0 and 1."""
+    """The share of each part in the time of a step, between 0 and 1, in the faster precision."""
 
     network: str
     precision: str
     shares: Mapping[str, float]
 
     def line(self) -> dict[str, Any]:
-        """As it stands in training.json."""
+        """The row of training.json."""
         return {"network": self.network, "precision": self.precision, **self.shares}
 
     def percent(self) -> dict[str, str]:
-        """As it stands in the table."""
+        """The row of the table."""
         shares = {part: f"{share:.1%}" for part, share in self.shares.items()}
         return {"network": self.network, "precision": self.precision, **shares}
 
 
 def bench_training(data: Path, runs: Path, budget: str, names: Sequence[str] = (), measured: int = TIMED_STEPS) -> str:
-    """Measure steps of the named networks, by default one a paper: tables, and RUNS/bench/training.json.
+    """Measure steps of the named networks, by default one per paper: tables, and RUNS/bench/training.json.
 
     Raises BadInput for unusable data or an unknown name or budget.
     """
@@ -113,7 +113,7 @@ def training_device() -> str:
 
 
 def step_ms(trainings: Mapping[str, Training], measured: int) -> dict[str, float]:
-    """Median milliseconds of a whole step, loading included, of trainings that take turns."""
+    """Median milliseconds of a whole step, including loading, of several trainings in turn."""
 
     def stepping(training: Training) -> Callable[[], object]:
         numbers = count()
@@ -125,13 +125,13 @@ def step_ms(trainings: Mapping[str, Training], measured: int) -> dict[str, float
 
 
 def one_step(training: Training, number: int) -> dict[str, float]:
-    """Take the step with the items of step `number`; returns what the training notes of it."""
+    """Train on the items of step `number`. Returns the training's record of the step."""
     batches = micro_batches(number, number + 1, training.recipe.batch, training.micro_batch)
     return training.step(next(in_parts(loader(training.items, batches), training.parts)))
 
 
 def named(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, which the profiler sees under `name`."""
+    """`function`, recorded by the profiler under `name`."""
 
     def recorded(*args: Any) -> Any:
         with record_function(name):
@@ -141,7 +141,7 @@ def named(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def step_shares(training: Training) -> dict[str, float]:
-    """The share of each part in the time of a step on the CPU: what it does forward and what on the way back."""
+    """The share of each part in the time of a step on the CPU, forward and backward."""
     loss = training.loss.module
     with ExitStack() as stack:
         for method in ("predict", "filter"):
@@ -158,7 +158,7 @@ def step_shares(training: Training) -> dict[str, float]:
 
 
 def attribute(events: list[Any]) -> dict[str, float]:
-    """Microseconds by part of the step. A backward operation belongs to the part of its forward operation."""
+    """Microseconds by part of the step. A backward operation is attributed to the part of its forward operation."""
     forward: dict[int, str] = {}
     for event in events:
         if event.sequence_nr >= 0 and (part := region(event, {})) in (NETWORK, LOSS):
@@ -173,7 +173,7 @@ def attribute(events: list[Any]) -> dict[str, float]:
 
 
 def region(event: Any, forward: dict[int, str]) -> str:
-    """The part of the step that an event belongs to, by what called it."""
+    """The part of the step to which an event belongs, according to its callers."""
     while event is not None:
         if event.name in (NETWORK, LOSS):
             return str(event.name)

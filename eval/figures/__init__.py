@@ -1,1 +1,1 @@
-"""Pictures of scenes, clips and estimators, to look at and for the docs."""
+"""Pictures of scenes and clips."""

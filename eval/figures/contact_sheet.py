@@ -1,4 +1,4 @@
-"""A contact sheet of scenes, to look at before rendering hours of them."""
+"""A contact sheet of scenes."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Grids of captioned images: a column for each thing that is compared, a row for each frame."""
+"""Grids of captioned images: one column per subject, one row per frame."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""`onespp show`: a clip as every denoiser shows it, what each of them carries along, and where it errs."""
+"""`onespp show`: the outputs, states and errors of denoisers on a clip."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,8 +22,8 @@ from models.operators import finite
 from models.registry import create
 from plotting import save_figure
 
-SHOWN_FRAMES = 4  # the first and the last of the clip among them
-LARGEST_DIFFERENCE = 0.25  # as displayed; what is more looks the same
+SHOWN_FRAMES = 4  # including the first and the last of the clip
+MAX_DIFFERENCE = 0.25  # of displayed values; larger ones have the same colour
 
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
@@ -33,18 +33,18 @@ def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
 
 
 def reference_of(frame: Frame, signal: Signal) -> Tensor:
-    """Reference radiance (1, 3, H, W) of a signal: the mean of its halves, with emission for "total"."""
+    """Reference radiance (1, 3, H, W) of a signal: the mean of its buffers, with emission for "total"."""
     return frame.remodulate(frame.reference_irradiance(signal), signal)
 
 
 @dataclass
 class DenoiserView:
-    """One denoiser on its way through a clip, and what is shown of it.
+    """One denoiser, its state, and its panels.
 
     Attributes:
-        images: what it makes of each shown frame.
-        differences: how far those are off the reference; empty where the clip has none.
-        pictures: those of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W).
+        images: its output for each shown frame.
+        differences: from the reference; empty where the clip has none.
+        pictures: of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W).
     """
 
     name: str
@@ -60,7 +60,7 @@ class DenoiserView:
         return output
 
     def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
-        """Keep what is shown of the frame that was just denoised to `output`."""
+        """Add the panels of `frame`, which was denoised to `output`."""
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
@@ -68,7 +68,7 @@ class DenoiserView:
             difference = image - as_displayed(reference_of(frame, signal), exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
-            self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=LARGEST_DIFFERENCE))
+            self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=MAX_DIFFERENCE))
         self.images.append(Panel(image, caption))
         assert self.state
         for name, picture in self.state.pictures().items():
@@ -77,7 +77,7 @@ class DenoiserView:
             self.pictures.setdefault(name, []).append(shown)
 
     def state_columns(self) -> list[Column]:
-        """A column for each of the state's pictures; numbers in the same colours in all frames."""
+        """A column for each picture of the state, with one colour scale for all frames."""
         columns = []
         for name, images in self.pictures.items():
             low = float(np.min(images))
@@ -87,7 +87,7 @@ class DenoiserView:
 
 
 def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[str, Denoiser]:
-    """The noisy frame, and the named denoisers or all that have weights and find what they read in the clip.
+    """`noisy`, and the named denoisers or all that have weights and whose channels the clip contains.
 
     Raises BadInput where a named one is unknown, cannot run or has no weights.
     """
@@ -96,7 +96,7 @@ def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[
         denoiser = spec.build()
         missing = [channel for channel in denoiser.reads if channel not in clip.channels]
         if missing and not names:
-            print(f"{spec.name}: skipped, the clip holds no {' and no '.join(missing)}")
+            print(f"{spec.name}: skipped, the clip has no {' and no '.join(missing)}")
             continue
         ready[spec.name] = denoiser
     return ready
@@ -136,9 +136,9 @@ def grids_of(views: Sequence[DenoiserView], references: Column) -> dict[str, lis
 def show(path: Path, out: Path, runs: Path, budget: str, names: Sequence[str] = ()) -> list[Path]:
     """Write PNGs of a clip's denoised frames to the folder `out`; returns their paths.
 
-    `sheet.png`: columns of denoisers between the noisy frames and the reference; `differences.png`: where each is off
-    the reference as displayed, in colours up to 0.25; `state-DENOISER.png`: what it carries from frame to frame.
-    Raises BadInput where there is no clip at `path`, and for denoisers that are named but cannot run.
+    `sheet.png`: outputs beside the noisy frames and the reference; `differences.png`: displayed differences from the
+    reference; `state-DENOISER.png`: its state. Raises BadInput where there is no clip at `path`, and for named
+    denoisers that cannot run.
     """
     if not is_clip(path):
         raise BadInput(f"there is no clip at {path}: name the folder of one, such as data/quick/test/cornell_box/000")

@@ -10,20 +10,20 @@ from files import replacing
 from plotting import Image, ImageDraw, ImageFont, enlargement
 
 BEST_SHOWN = 2  # denoisers
-MOST_FRAMES = 240
+MAX_FRAMES = 240
 MILLISECONDS = 83  # that each frame is shown
 BANNER = 22  # px above the panels, for their names
 
 
 def panel_names(clip: ClipResults) -> list[str]:
-    """What stands side by side: the noisy frame, the best denoisers by FLIP, the reference."""
+    """The panels from left to right: the noisy frame, the best denoisers by FLIP, the reference."""
     flips = {result.denoiser: result.metrics["flip"] or 0.0 for result in clip.results if result.denoiser != "noisy"}
     noisy = [result.denoiser for result in clip.results if result.denoiser == "noisy"]
     return [*noisy, *sorted(flips, key=flips.__getitem__)[:BEST_SHOWN], clip.reference.denoiser]
 
 
 def side_by_side(folders: Sequence[Path], names: Sequence[str], index: int) -> Image.Image:
-    """Frame `index` of what is in each of the folders, under its name."""
+    """Frame `index` of each of the folders, side by side, with names above."""
     images = [load_picture(folder, index) for folder in folders]
     zoom = enlargement(*images[0].shape[:2])
     panels = Image.fromarray(np.concatenate([image.repeat(zoom, 0).repeat(zoom, 1) for image in images], axis=1))
@@ -36,13 +36,13 @@ def side_by_side(folders: Sequence[Path], names: Sequence[str], index: int) -> I
 
 
 def save_animation(runs: Path, clip: ClipResults) -> Path:
-    """Write RUNS/report/SCENE-CLIP.webp, an endless loop over the clip; of a long clip, its beginning.
+    """Write RUNS/report/SCENE-CLIP.webp, a loop over at most MAX_FRAMES frames of the clip.
 
     Returns its path. Raises BadInput for missing and damaged pictures.
     """
     names = panel_names(clip)
     folders = [folders_of(runs, clip)[name] for name in names]
-    count = min(MOST_FRAMES, len(clip.reference.frames))
+    count = min(MAX_FRAMES, len(clip.reference.frames))
     frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in range(count))
     path = runs / "report" / f"{signal_label(f'{clip.scene}-{clip.clip}', clip.signal)}.webp"
     first = next(frames)

@@ -1,4 +1,4 @@
-"""`onespp report`: one page, in one file, of all that was measured."""
+"""`onespp report`: one HTML file with all results."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -28,7 +28,7 @@ with requires_extra("report"):
 
 
 def figures(runs: Path) -> list[dict[str, str]]:
-    """PNGs that other commands left in RUNS/report/figures."""
+    """The PNGs in RUNS/report/figures, written by other commands."""
     paths = sorted((runs / "report" / "figures").glob("*.png"))
     return [{"name": path.stem.replace("-", " "), "uri": data_uri(path.read_bytes(), "png")} for path in paths]
 
@@ -62,7 +62,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
         legend=LEGEND,
         times=times,
         figures=figures(runs),
-        saves_error=any(clip.told for clip in pictures),
+        has_error_maps=any(clip.errors for clip in pictures),
         data=data,
         style=Markup(page_file("style.css")),
         script=Markup(page_file("script.js")),
@@ -70,13 +70,13 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
 
 
 def report(runs: Path, megabytes: float = 24) -> list[Path]:
-    """Write RUNS/report/index.html, and an animated WebP a clip; returns their paths.
+    """Write RUNS/report/index.html and an animated WebP per clip; returns their paths.
 
-    The page's pictures take about `megabytes` at most: where all frames do not fit, it shows every n-th.
-    Raises BadInput where nothing has been evaluated, and where what was is damaged.
+    Pictures take about `megabytes` at most: if all frames do not fit, the page shows every n-th. Raises BadInput
+    without results and where they are damaged.
     """
     if megabytes <= 0:
-        raise BadInput(f"{megabytes} megabytes hold no page: name more than 0")
+        raise BadInput(f"{megabytes} megabytes are too few for a page: name more than 0")
     results, clips = read_results(runs)
     if not clips:
         raise BadInput(f"{runs / 'eval' / 'results.json'} has no rows: run `onespp eval` again")

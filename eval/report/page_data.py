@@ -1,4 +1,4 @@
-"""What the report's page shows of a clip: pictures as data URIs, curves, crops."""
+"""The data of a clip on the report page: pictures as data URIs, curves, crops."""
 
 import base64
 import io
@@ -26,13 +26,13 @@ class PageClip:
     """A clip on the page.
 
     Attributes:
-        count: of all its frames.
-        frames: which of them have pictures.
-        images: data URIs of each denoiser's pictures and of the reference's.
-        flips: of each denoiser's FLIP maps.
-        told: of the maps of the errors that denoisers tell, of those that do.
-        curves: each metric, frame by frame (all of them), of each denoiser, and of the reference its noise floor.
-        crops: where most comes into view.
+        count: number of its frames.
+        frames: those with pictures.
+        images: data URIs of the pictures of each denoiser and of the reference.
+        flips: data URIs of each denoiser's FLIP maps.
+        errors: data URIs of the maps of estimated errors, of denoisers that have them.
+        curves: each metric in all frames, of each denoiser, and as the reference's its noise floor.
+        crops: the windows with most disocclusions.
     """
 
     name: str
@@ -42,7 +42,7 @@ class PageClip:
     width: int
     images: dict[str, list[str]]
     flips: dict[str, list[str]]
-    told: dict[str, list[str]]
+    errors: dict[str, list[str]]
     curves: dict[str, dict[str, list[float | None]]]
     crops: list[dict[str, int]]
 
@@ -63,13 +63,13 @@ def four_digits(value: float | None) -> float | None:
 
 
 def step_for(runs: Path, clips: Sequence[ClipResults], size: float) -> int:
-    """One of how many frames is shown, so that all pictures take about `size` bytes."""
+    """The n of "every n-th frame" with which all pictures take about `size` bytes."""
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
     return max(1, math.ceil(sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64 / size))
 
 
 def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int]]:
-    """The crops with the most disoccluded pixels, in frames that are shown and not next to each other."""
+    """The crops with most disoccluded pixels, in shown frames that are not next to each other."""
     apart = max(1, len(clip.reference.frames) // 8)
     chosen: list[dict[str, int]] = []
     for crop in sorted(clip.reference.crops or [], key=lambda crop: -crop["pixels"]):
@@ -80,7 +80,7 @@ def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int
 
 
 def curves_of(clip: ClipResults) -> dict[str, dict[str, list[float | None]]]:
-    """Of each metric that is defined in any frame: the values of the denoisers, and the reference's noise floors."""
+    """The values of all denoisers and the noise floors, for each metric that is defined in any frame."""
     defined = [
         metric
         for metric in METRICS
@@ -95,14 +95,14 @@ def curves_of(clip: ClipResults) -> dict[str, dict[str, list[float | None]]]:
     }
 
 
-def told_maps(folder: Path, frames: Sequence[int]) -> list[str]:
-    """Data URIs of the error maps that a denoiser left for those frames; none unless it left all."""
+def error_maps(folder: Path, frames: Sequence[int]) -> list[str]:
+    """Data URIs of a denoiser's maps of the estimated error; empty unless there is one for each of `frames`."""
     paths = [error_path(folder, index) for index in frames]
     return [data_uri(path.read_bytes(), "webp") for path in paths] if all(path.exists() for path in paths) else []
 
 
 def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
-    """The clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
+    """The data of a clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
     folders = folders_of(runs, clip)
     count = len(clip.reference.frames)
     frames = range(0, count, step)
@@ -126,7 +126,7 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
         width=width,
         images=images,
         flips=flips,
-        told={name: maps for name, folder in folders.items() if (maps := told_maps(folder, frames))},
+        errors={name: maps for name, folder in folders.items() if (maps := error_maps(folder, frames))},
         curves=curves_of(clip),
         crops=chosen_crops(clip, frames),
     )

@@ -1,4 +1,4 @@
-"""The report's table: denoisers, clip by clip and on average, with noise floors."""
+"""The report's table: means over clips and each clip, with noise floors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ class TableRow:
     """A denoiser on a clip, or the noise floor.
 
     Attributes:
-        best: the metrics by which it is the best of its clip and signal.
+        best: the metrics in which it is the best of its clip and signal.
     """
 
     clip: str
@@ -45,7 +45,7 @@ class TableRow:
 
 
 def table_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
-    """Means over the clips of one sample a pixel, if there are several, and then clip by clip."""
+    """Means over the clips of 1 spp, if there are several, then the rows of each clip."""
     groups = [mean_rows(ours) for ours in by_signal(of_one_spp(clips)).values() if len(ours) > 1]
     groups += [clip_rows(clip) for clip in clips]
     return [row for rows in groups for row in with_best(rows)]
@@ -72,13 +72,13 @@ def mean_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
 
 
 def with_best(rows: Sequence[TableRow]) -> list[TableRow]:
-    """The rows of one clip and signal, each with the metrics by which it is the best of them."""
+    """The rows of one clip and signal, with `best` set."""
     best = {metric: best_denoisers(rows, metric) for metric in METRICS}
     return [replace(row, best=frozenset(key for key in METRICS if row.denoiser in best[key])) for row in rows]
 
 
 def best_denoisers(rows: Sequence[TableRow], metric: str) -> set[str]:
-    """Who has the best value; where that is within its noise floor, whose digits mean nothing, all that are."""
+    """The denoisers with the best value, and if that is within its noise floor, all others within theirs."""
     values = {row.denoiser: row.values.get(metric) for row in rows if not row.is_floor}
     more = METRICS[metric].more_is_better
     ranks = {name: -value if more else abs(value) for name, value in values.items() if value is not None}

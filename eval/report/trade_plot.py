@@ -9,12 +9,12 @@ from eval.tradeoff.pareto import TimedScores, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
-PLOTTED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the first is shown at first
+PLOTTED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # the page opens with the first
 
 
 @dataclass(frozen=True)
 class PlotPoint:
-    """A denoiser: milliseconds a frame, the mean of a metric, and by whom it is beaten; None on the Pareto front."""
+    """Milliseconds per frame, the mean of a metric, and the denoiser that dominates it; None on the Pareto front."""
 
     name: str
     ms: float
@@ -24,7 +24,7 @@ class PlotPoint:
 
 @dataclass(frozen=True)
 class TradePlot:
-    """Points of one signal and metric, fastest first; `missing` are the denoisers without."""
+    """Points of one signal and metric, fastest first; `missing` are the denoisers without a time or value."""
 
     signal: str
     metric: str
@@ -34,7 +34,7 @@ class TradePlot:
 
 
 def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[TradePlot]:
-    """A plot for each signal and metric, over the clips of 1 spp; without those that would be empty."""
+    """A plot for each signal and metric, over the clips of 1 spp, without empty ones."""
     plots = [trade_plot(times, ours, metric) for ours in by_signal(of_one_spp(clips)).values() for metric in PLOTTED]
     return [plot for plot in plots if plot.points]
 

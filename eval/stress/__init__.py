@@ -1,1 +1,1 @@
-"""Every denoiser at the extremes, and whether it keeps what is required there."""
+"""Denoisers on extreme input, and the requirements that they must keep."""

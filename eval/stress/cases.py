@@ -1,4 +1,4 @@
-"""The stress cases, as data: each says how it changes an ordinary sequence of frames, or the denoiser."""
+"""The stress cases, as data: how each changes an ordinary sequence of frames, or the denoiser."""
 
 import math
 from collections.abc import Iterator
@@ -25,25 +25,25 @@ from eval.stress.lit_frames import NOISE_PERIOD, lit_frame
 CASE_SIZE: Size = (32, 48)
 CASE_FRAMES = 10
 EVEN_FRAMES = 4  # of these, at the start
-SPOILED_FRAME = 2  # index of the one with a bad pixel
+SPOILED_FRAME = 2  # index of the frame with a bad pixel
 RECOVERY_LIMIT = 60  # frames after it: a second or two
 
 
 @dataclass(frozen=True)
 class StressCase:
-    """A sequence of frames to denoise, how they or the denoiser are changed, and what the output is compared with.
+    """A sequence of frames, how they or the denoiser are changed, and the expected output.
 
-    The sequence shows the surfaces of a moving scene under light of irradiance 1, even at first, then noisy.
+    The sequence shows a moving scene under light of irradiance 1, free of noise at first, then noisy.
 
     Attributes:
-        surfaces: how surfaces are changed before light falls on them.
-        change: how lit frames are changed, all or `only` the one of that index.
-        frame_count: of the sequence; the first `even_frames` of them are in even light.
-        still: the camera and everything else stand still.
-        compare_with: "truth", which is known in even light; "own", the denoiser's output without `change`, times
-            `gain`; "float32", its output in that precision; "past", its output for the same noise half a long
-            sequence earlier.
-        logits: what the largest output of a kernel predictor's last layers is scaled to.
+        surfaces: change of the surfaces before they are lit.
+        change: change of the lit frames, of all or `only` of that index.
+        frame_count: of the sequence; the first `even_frames` of them are free of noise.
+        still: neither the camera nor anything else moves.
+        compare_with: "truth", in frames free of noise; "own", the denoiser's output without `change`, times `gain`;
+            "float32", its output in that precision; "past", its output for the same noise half a long sequence
+            earlier.
+        logits: the value to which the largest output of a kernel predictor's last layers is scaled.
         precision: the denoiser's, a key of PRECISIONS.
     """
 
@@ -70,12 +70,12 @@ class StressCase:
 
     @property
     def poison(self) -> PixelChange | None:
-        """The change, where it is a pixel that is not finite."""
+        """The change, if it sets a pixel that is not finite."""
         return self.change if isinstance(self.change, PixelChange) and not math.isfinite(self.change.value) else None
 
 
 def bad_pixel(name: str, value: float, channels: tuple[str, ...]) -> StressCase:
-    """One bad pixel in one frame, in even light and without motion: nothing else makes it forgotten."""
+    """One bad pixel in one frame, without noise or motion, so that nothing but the denoiser removes it."""
     frame_count = SPOILED_FRAME + 1 + RECOVERY_LIMIT
     return StressCase(
         name,

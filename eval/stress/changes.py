@@ -1,4 +1,4 @@
-"""Ways to change a frame: its light, its surfaces, its units, or one pixel of it."""
+"""Changes of a frame: of its light, its surfaces, its units, or one pixel."""
 
 import math
 from collections.abc import Callable
@@ -23,14 +23,14 @@ def unchanged(frame: Frame) -> Frame:
 
 
 def light_times(factor: float) -> FrameChange:
-    """All light times `factor`."""
+    """Multiply all light by `factor`."""
     return lambda frame: replace(
         frame, channels=frame.channels | {name: factor * frame.channels[name] for name in LIGHT_CHANNELS}
     )
 
 
 def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
-    """The named channels at the same value in all pixels; a tuple gives each component its own."""
+    """Set channels to a constant; a tuple has one value per component."""
 
     def change(frame: Frame) -> Frame:
         tensors = {name: torch.zeros_like(frame.channels[name]) for name in values}
@@ -42,7 +42,7 @@ def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
 
 
 def ramp(frame: Frame, low: float, high: float) -> Tensor:
-    """From `low` at the left to `high` at the right, evenly in the logarithm, (W,)."""
+    """(W,) values from `low` at the left to `high` at the right, evenly spaced in the logarithm."""
     return torch.logspace(math.log10(low), math.log10(high), frame.size[1])
 
 
@@ -53,13 +53,13 @@ def dim_to_bright(frame: Frame) -> Frame:
 
 
 def near_to_far(frame: Frame) -> Frame:
-    """Depth from 1e-4 to 1e6 across the image. The cameras stay, so what moves is not where they expect it."""
+    """Depth from 1e-4 to 1e6 across the image, without changing the cameras: reprojection meets other depths."""
     depth = torch.where(frame.depth > 0, ramp(frame, 1e-4, 1e6), 0)
     return replace(frame, channels=frame.channels | {"depth": depth})
 
 
 def lengths_times(factor: float) -> FrameChange:
-    """The same scene in other units: depth and the positions of cameras and meshes times `factor`."""
+    """Change units of length: multiply depth and the positions of cameras and meshes by `factor`."""
 
     def cameras(at: Cameras) -> Cameras:
         factors = torch.ones(4, 4, dtype=torch.float64)
@@ -77,7 +77,7 @@ def lengths_times(factor: float) -> FrameChange:
 
 @dataclass(frozen=True)
 class PixelChange:
-    """The pixel in the middle of the image at `value`, in all components of the named channels."""
+    """Set the pixel in the middle of the image to `value`, in all components of the named channels."""
 
     value: float
     channels: tuple[str, ...]

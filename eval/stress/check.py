@@ -1,4 +1,4 @@
-"""One denoiser in one stress case: what comes of it, and which requirements it breaks."""
+"""One denoiser in one stress case: its errors, and the requirements that it breaks."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -17,16 +17,16 @@ from eval.stress.outcome import StressOutcome
 from models.denoiser import Denoiser
 from models.spec import PRECISIONS
 
-FORGOTTEN = 1e-3  # of the brightest pixel: what changes none by more has no effect any more
-ROUNDINGS = 10  # of half precision are no effect either: networks amplify them, RAE by its power of 5 alone
-ORDINARY_VALUES = (0.0, 1.0)  # that a pixel may well have: they tell which others see it
+MAX_RESIDUE = 1e-3  # of the brightest pixel: smaller changes count as none
+ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by its power of 5 alone
+ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
 BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
 REQUIREMENTS = {
-    "finite": "what comes of finite pixels is finite",
+    "finite": "outputs are finite where inputs are finite",
     "range": "convex filters stay within the range of irradiance since the last reset; no other goes below 0",
-    "spread": "a pixel that is not finite changes none that could not see it in that frame",
-    "recovery": f"{RECOVERY_LIMIT} frames later it changes none by more than {FORGOTTEN:.1%} of the brightest, or "
-    f"{ROUNDINGS} times the rounding of half precision",
+    "spread": "a pixel that is not finite changes only pixels that depend on it in that frame",
+    "recovery": f"{RECOVERY_LIMIT} frames later it changes no pixel by more than {MAX_RESIDUE:.1%} of the brightest, "
+    f"or {ROUNDINGS} times the rounding of half precision",
 }
 
 
@@ -41,34 +41,30 @@ def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
 
 
 def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
-    """Where all the named channels are finite, (H, W)."""
-    finite = [torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]  # halves are images, too
+    """Where all the named channels, and both buffers of each, are finite, (H, W)."""
+    finite = [torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]
     return torch.cat(finite).all(dim=0)
 
 
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
-    """Absolute differences (3, H, W), each over the brightest pixel of the frame expected, unless that is black."""
+    """Absolute differences (3, H, W), relative to the brightest expected pixel of the frame unless that is black."""
     pairs = zip(outputs, expected, strict=True)
     return [(a - b).abs() / (float(b.max()) if b.max() > BLACK_BELOW else 1) for a, b in pairs]
 
 
 def largest_finite(errors: Iterable[Tensor]) -> float | None:
-    """The largest of all values that are finite; None where none is."""
+    """The largest finite value; None without any."""
     found = [error[torch.isfinite(error)] for error in errors]
     return max((float(error.max()) for error in found if len(error)), default=None)
 
 
-def forgotten_below(precision: str) -> float:
-    """The largest change, over the brightest pixel, that counts as none in a precision, a key of PRECISIONS."""
-    return max(FORGOTTEN, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
+def max_residue(precision: str) -> float:
+    """The largest change, relative to the brightest pixel, that counts as none in a precision of PRECISIONS."""
+    return max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
 
 
 class StressCheck:
-    """A denoiser's run through a stress case.
-
-    `build` makes it in a given precision, a key of PRECISIONS, always with the same weights. It must compute in the
-    case's.
-    """
+    """A denoiser's run through a stress case. `build` makes it in a precision of PRECISIONS, with the same weights."""
 
     def __init__(self, build: Callable[[str], Denoiser], case: StressCase):
         self.build = build
@@ -79,31 +75,31 @@ class StressCheck:
             self.outputs = denoise(self.denoiser, self.frames)
 
     def errors(self) -> list[Tensor]:
-        """Differences (3, H, W) from what the case compares with, of the frames of which that is known."""
+        """Differences (3, H, W) from the case's expected output, of the frames for which there is one."""
         if self.case.compare_with == "truth":
             even = self.frames[: self.case.even_frames]
             return differences(self.outputs[: len(even)], [frame.radiance(self.denoiser.signal)[0] for frame in even])
         if self.case.compare_with == "past":
-            half = len(self.outputs) // 2  # by then what averages has all but converged
+            half = len(self.outputs) // 2  # averages have converged by then
             return differences(self.outputs[-NOISE_PERIOD:], self.outputs[half - NOISE_PERIOD : half])
         other = self.denoiser if self.case.compare_with == "own" else self.build("float32")
         expected = denoise(other, self.case.frames(unchanged))
         return differences(self.outputs, [self.case.gain * output for output in expected])
 
     def spreads(self, pixel: PixelChange) -> bool:
-        """Whether the spoiled frame differs where no ordinary value of the pixel changes anything."""
+        """Whether the bad pixel changes its frame where no ordinary value of that pixel does."""
 
         def spoiled_output(change: FrameChange) -> Tensor:
             return denoise(self.denoiser, list(self.case.frames(change))[: SPOILED_FRAME + 1])[-1]
 
         clean = spoiled_output(unchanged)
-        seen = [(spoiled_output(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY_VALUES]
+        depends = [(spoiled_output(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY_VALUES]
         changed = (self.outputs[SPOILED_FRAME] != clean).any(dim=0)  # NaN is a change, too
-        return bool((changed & ~torch.stack(seen).any(dim=0)).any())
+        return bool((changed & ~torch.stack(depends).any(dim=0)).any())
 
     def recovery(self, errors: Sequence[Tensor]) -> int | None:
-        """Frames from the spoiled one until nothing shows it any more; None if that is not reached."""
-        limit = forgotten_below(self.case.precision)
+        """Frames from the bad pixel until its last effect; None for more than RECOVERY_LIMIT."""
+        limit = max_residue(self.case.precision)
         changed = [index for index, error in enumerate(errors) if not (error <= limit).all()]  # NaN is a change, too
         frames = changed[-1] + 1 - SPOILED_FRAME if changed else 0
         return frames if frames <= RECOVERY_LIMIT else None

@@ -1,4 +1,4 @@
-"""The range that a denoiser's output must stay within: of convex filters, the irradiance that they have seen."""
+"""The range within which a denoiser's output must stay: for convex filters, that of all irradiance so far."""
 
 from collections.abc import Iterable, Sequence
 
@@ -14,9 +14,9 @@ MIN_LIMIT = 1e-30  # ends of the range below it are not divided by
 
 
 class IrradianceRange:
-    """The range of the irradiance of surfaces since a convex filter began, for each colour.
+    """The range of surfaces' irradiance since the first frame, for each colour.
 
-    Of a filter that `separates_lights` the limits are sums of those of direct and of indirect light.
+    For a filter that `separates_lights`, the limits are the sums of those of direct and indirect light.
     """
 
     def __init__(self, separates_lights: bool):
@@ -24,12 +24,12 @@ class IrradianceRange:
         self.low = torch.tensor(torch.inf)
         self.high = torch.tensor(-torch.inf)
 
-    def see(self, frame: Frame) -> None:
+    def add(self, frame: Frame) -> None:
         parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
-        seen = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
+        irradiance = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
         surface = frame.depth > 0
-        self.low = torch.minimum(self.low, torch.where(surface, seen, torch.inf).amin((2, 3)))
-        self.high = torch.maximum(self.high, torch.where(surface, seen, -torch.inf).amax((2, 3)))
+        self.low = torch.minimum(self.low, torch.where(surface, irradiance, torch.inf).amin((2, 3)))
+        self.high = torch.maximum(self.high, torch.where(surface, irradiance, -torch.inf).amax((2, 3)))
 
     def violation(self, frame: Frame, output: Tensor) -> float:
         """How far radiance `output` (3, H, W) of surfaces is outside, relative to the limit; at most 0 inside."""
@@ -44,16 +44,16 @@ class IrradianceRange:
 
 
 def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
-    """How far a sequence leaves the range at most, 0 where it does not.
+    """The largest distance of `outputs` (3, H, W) from their range; 0 inside.
 
-    Relative to the range's end for a convex filter, absolute below 0 for any other denoiser. What is not finite counts
-    as 0, in frames and in `outputs` (3, H, W) alike.
+    Relative to the range's end for a convex filter; for others the absolute value below 0. Values that are not finite
+    count as 0.
     """
     if not denoiser.convex:
         return max(0.0, *(-float(finite(output).min()) for output in outputs))
-    seen = IrradianceRange(denoiser.separates_lights)
+    irradiance_range = IrradianceRange(denoiser.separates_lights)
     largest = 0.0
     for frame, output in zip(frames, outputs, strict=True):
-        seen.see(frame.finite())
-        largest = max(largest, seen.violation(frame.finite(), output))
+        irradiance_range.add(frame.finite())
+        largest = max(largest, irradiance_range.violation(frame.finite(), output))
     return largest

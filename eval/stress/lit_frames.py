@@ -1,4 +1,4 @@
-"""The frames that stress cases change: a moving scene under light of irradiance 1."""
+"""The frames of stress cases: a moving scene under light of irradiance 1."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -17,21 +17,21 @@ NOISE_PERIOD = 100  # frames until the noise of a long sequence repeats
 
 
 def lit(frame: Frame, seed: int | None) -> Frame:
-    """The frame, its surfaces under light of irradiance 1: as one sample a pixel finds it, or even without a seed."""
+    """The frame under light of irradiance 1: with the noise of one sample per pixel, or without noise if no seed."""
     reflected = (frame.divisor * (frame.depth > 0))[0].permute(1, 2, 0).double().numpy()
     light = {name: share * reflected for name, share in LIGHT_SHARES.items()}
     if seed is not None:
         rng = np.random.default_rng(seed)
         light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
-        halves = split_into_buffers(light, (seed, 1))
+        buffers = split_into_buffers(light, (seed, 1))
     else:
-        halves = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
-    channels = light | halves
+        buffers = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
+    channels = light | buffers
     tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
     return replace(frame, channels=frame.channels | tensors)
 
 
 @lru_cache(maxsize=4 * NOISE_PERIOD)
 def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -> Frame:
-    """Frame `index` of the synthetic sequence, its surfaces changed by `surfaces` before light falls on them."""
+    """Frame `index` of the synthetic sequence, with surfaces changed before they are lit."""
     return lit(surfaces(synthetic_frame(index, *size)), seed)

@@ -1,4 +1,4 @@
-"""The logits of kernel predictors: where they come from, and how to make them large."""
+"""The logits of kernel predictors, and how to scale them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from eval.bench.timed import network_of
 from models.denoiser import Denoiser
 
-SMALLEST_LOGIT = 1e-30  # is what logits that are all 0 are divided by
+MIN_LOGIT_SCALE = 1e-30  # divisor of logits that are all 0
 
 
 def last_layers(denoiser: Denoiser) -> list[nn.Module]:
-    """The layers of a kernel predictor whose outputs are its logits; none of other denoisers."""
+    """The layers of a kernel predictor whose outputs are its logits; empty for other denoisers."""
     network = network_of(denoiser)
     if isinstance(network, nn.Sequential):
         return [network[-1]]
@@ -29,7 +29,7 @@ def largest_logits(denoiser: Denoiser, size: float | None) -> Iterator[None]:
 
     def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
         logits = output.float()  # the factor may overflow half precision
-        return (logits * (size / logits.abs().max().clamp(min=SMALLEST_LOGIT))).to(output.dtype)
+        return (logits * (size / logits.abs().max().clamp(min=MIN_LOGIT_SCALE))).to(output.dtype)
 
     hooks = [layer.register_forward_hook(scale) for layer in last_layers(denoiser)]
     try:

@@ -1,22 +1,22 @@
-"""What a stress check finds, and the form in which results.json keeps it."""
+"""Results of stress checks, as results.json contains them."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
 
-FRESH = "fresh"  # stands for the file of weights that are not trained
+FRESH = "fresh"  # instead of a file: random weights
 
 
 @dataclass(frozen=True)
 class StressOutcome:
-    """What came of a denoiser in a stress case.
+    """The result of a denoiser in a stress case.
 
     Attributes:
-        error: the largest, over the brightest pixel of what the output is compared with, absolute where that is black;
-            None where no pixel is finite.
-        nonfinite: output pixels, of all frames.
-        violation: how far the output leaves its range, over the range's end (convex filters), or below 0 (others).
-        recovery: frames until a bad pixel is forgotten, 0 where nothing shows it; None where that never happens, and
-            in cases without one.
+        error: the largest, relative to the brightest expected pixel, absolute if that is black; None where no pixel is
+            finite.
+        nonfinite: output pixels that are not finite, in all frames.
+        violation: largest distance from the range, relative to its end (convex filters), or below 0 (others).
+        recovery: frames until the effect of a bad pixel ends, 0 if it has none; None if it does not end, and in cases
+            without a bad pixel.
         broken: the requirements that are not kept, keys of REQUIREMENTS.
     """
 
@@ -29,10 +29,7 @@ class StressOutcome:
 
 @dataclass(frozen=True)
 class StressRow:
-    """A row of results.json, which holds the outcome's attributes beside these.
-
-    `weights` is their file, or FRESH; None for a denoiser that has none. `extreme` is the case's name.
-    """
+    """A row of results.json. `weights` is a file, FRESH, or None for a denoiser without; `extreme` the case's name."""
 
     denoiser: str
     weights: str | None

@@ -1,4 +1,4 @@
-"""`onespp stress`: every denoiser in every stress case, and whether it keeps what is required there."""
+"""`onespp stress`: every denoiser in every stress case, and the requirements that it breaks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ from timing import thread_count
 
 
 def stressed(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
-    """The named denoisers, or all that can run here, with trained weights where there are any, else fresh ones.
+    """The named denoisers, or all that can run here, with trained weights if there are any, else random ones.
 
     Raises BadInput where a named one is unknown or cannot run, and for NAME@BUDGET without its weights.
     """
@@ -49,14 +49,14 @@ def weights_label(spec: DenoiserSpec) -> str | None:
 
 
 def applies(case: StressCase, spec: DenoiserSpec) -> bool:
-    """Whether the denoiser computes in the case's precision, and has logits where these are to be scaled."""
+    """Whether the denoiser computes in the case's precision, and has logits if the case scales them."""
     return case.precision in precisions_of(spec.denoiser) and (
         case.logits is None or bool(last_layers(create(spec.denoiser)))
     )
 
 
 def cases_in(precision: str, long: bool) -> list[StressCase]:
-    """All cases, LONG_CASE only if `long`; in half precision without those that compare precisions."""
+    """All cases, with LONG_CASE if `long`; in half precision without those that compare precisions."""
     cases = [*STRESS_CASES, LONG_CASE] if long else [*STRESS_CASES]
     if precision == "float32":
         return cases
@@ -69,7 +69,7 @@ def build_in(spec: DenoiserSpec, precision: str) -> Denoiser:
 
 @torch.no_grad()
 def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> list[StressRow]:
-    """Every denoiser in every case that applies to it. One thread: on images this small others would only wait."""
+    """Run every denoiser in every case that applies to it, on one thread, for images are too small for more."""
     applying = {spec: [case for case in cases if applies(case, spec)] for spec in specs}
     rows = []
     with thread_count(1), tqdm(total=sum(map(len, applying.values())), desc="stress", leave=False) as progress:
@@ -86,10 +86,10 @@ def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> lis
 def stress(
     runs: Path, names: Sequence[str] = (), budget: str = "quick", long: bool = False, precision: str = "float32"
 ) -> bool:
-    """Put the named denoisers, or all that can run here, to the extremes; 10 000 frames as well if `long`.
+    """Run the stress cases of the named denoisers, or of all that can run here; with 10 000 frames if `long`.
 
     Prints tables and writes RUNS/stress/results.json, table.md and errors.png. Returns whether all requirements are
-    kept. Raises BadInput for an unknown denoiser, damaged weights, and where none takes the precision.
+    kept. Raises BadInput for an unknown denoiser, damaged weights, and where none computes in the precision.
     """
     specs = [spec for spec in stressed(names, runs, budget) if precision in precisions_of(spec.denoiser)]
     if not specs:

@@ -1,4 +1,4 @@
-"""What the stress bench found, for people: tables, a picture, and the requirements that are broken."""
+"""Tables and a picture of stress results."""
 
 from collections.abc import Sequence
 
@@ -12,21 +12,21 @@ from plotting import Figure, plt
 
 
 def short(value: float | None) -> str:
-    """A number in few digits."""
+    """A number with two digits."""
     if value is None:
         return "-"
     return "0" if value == 0 else f"{value:.1e}"
 
 
 def recovery_time(row: StressRow, case: StressCase) -> str:
-    """Frames until the case's bad pixel is forgotten."""
+    """Frames until the effect of the case's bad pixel ends."""
     if case.only is None:
         return "-"
     return f"> {RECOVERY_LIMIT}" if row.outcome.recovery is None else str(row.outcome.recovery)
 
 
 def error_cell(row: StressRow | None) -> str:
-    """The worst error, with a ! where a requirement is broken; nothing where the case does not apply."""
+    """The largest error, with a ! where a requirement is broken; empty where the case does not apply."""
     if row is None:
         return ""
     return short(row.outcome.error) + (" !" if row.outcome.broken else "")
@@ -39,7 +39,7 @@ def weights_cell(weights: str | None) -> str:
 
 
 def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
-    """A column a denoiser: its error in each case, and the rest in few lines."""
+    """One column per denoiser: its error in each case, and a summary of the rest."""
     weights = {row.denoiser: row.weights for row in rows}
     found = {(row.denoiser, row.extreme): row for row in rows}
     outcomes = {name: [row.outcome for row in rows if row.denoiser == name] for name in weights}
@@ -49,7 +49,7 @@ def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
     for case in cases:
         if case.only is not None:
             times = [recovery_time(found[name, case.name], case) for name in weights]
-            lines.append([f"frames until forgotten: {case.name}", *times])
+            lines.append([f"frames until recovery: {case.name}", *times])
     nonfinite = [sum(outcome.nonfinite for outcome in of) for of in outcomes.values()]
     lines.append(["pixels that are not finite", *map(str, nonfinite)])
     violations = [max(outcome.violation for outcome in of) for of in outcomes.values()]
@@ -58,7 +58,7 @@ def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
 
 
 def details(rows: Sequence[StressRow], cases: Sequence[StressCase], form: str = "simple") -> str:
-    """A line a row, with all that was measured. `form` is one of tabulate's."""
+    """One line per row, with all values. `form` is one of tabulate's."""
     by_name = {case.name: case for case in cases}
     lines = [
         {
@@ -77,7 +77,7 @@ def details(rows: Sequence[StressRow], cases: Sequence[StressCase], form: str = 
 
 
 def verdict_text(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
-    """Which requirements are broken, and where; or that all are kept."""
+    """The requirements that are broken, and where; or that all are kept."""
     broken = [row for row in rows if row.outcome.broken]
     if not broken:
         return "All requirements are kept."
@@ -87,7 +87,7 @@ def verdict_text(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
 
 
 def heat_map(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> Figure:
-    """The worst errors, a row a denoiser and a column a case, with a cross where a requirement is broken."""
+    """The largest errors, one row per denoiser and one column per case, with a cross where a requirement is broken."""
     names = list(dict.fromkeys(row.denoiser for row in rows))
     columns = [case.name for case in cases]
     errors = np.full((len(names), len(columns)), np.nan)

@@ -30,27 +30,27 @@ from provenance import device_in_words
 from render.clip import Sampling
 from scenes.registry import build_scene
 
-DENOISERS = ("one+js", "oidn+js", "svgf+js")
-SCENES = ("cornell_box", "cornell_box_moving", "room-2002", "room-2004")
-SIZE = (12, 128, 128)  # frames, height, width
-SAMPLING = Sampling(realisations=64, noisy_spp=2, reference_spp=1024)
+DEFAULT_DENOISERS = ("one+js", "oidn+js", "svgf+js")
+CLIP_SCENES = ("cornell_box", "cornell_box_moving", "room-2002", "room-2004")
+CLIP_SIZE = (12, 128, 128)  # frames, height, width
+CLIP_SAMPLING = Sampling(realisations=64, noisy_spp=2, reference_spp=1024)
 SURFACES = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
-CHANNELS = (*NOISY_CHANNELS, *REFERENCE_CHANNELS, *SURFACES, *CAMERA_CHANNELS)
-LEVELS = (128, 64, 16, 4)  # samples a pixel; the first one's error is what samples are asked for
-BLOCK = 64  # px: squared errors are compared in means over such blocks and all frames
-BAND = (0.8, 1.25)  # of told over true
-SHOWN = ("room-2002", 16)  # scene and samples of the picture
+CLIP_CHANNELS = (*NOISY_CHANNELS, *REFERENCE_CHANNELS, *SURFACES, *CAMERA_CHANNELS)
+LEVELS = (128, 64, 16, 4)  # samples per pixel; the error at the first is the target of predicted sample counts
+BLOCK_PIXELS = 64  # side of the blocks over which, and over all frames, squared errors are averaged
+BAND = (0.8, 1.25)  # estimated over true squared error
+SHOWN = ("room-2002", 16)  # scene and samples per pixel of the picture
 
 
 @dataclass(frozen=True)
-class Told:
-    """One denoiser on one clip: squared errors in radiance, a number a block, and relative errors of the whole clip.
+class ErrorComparison:
+    """One denoiser on one clip: squared errors in radiance of each block, and relative errors of the whole clip.
 
     Attributes:
-        true: by the reference, whose halves' noise is independent.
-        estimated: by the halves of the samples.
-        mapped: by what the error map shows, which is smoothed and never below 0.
-        samples: asked for to have as small an error as with LEVELS[0]; the median of the frames.
+        true: from the two sample buffers of the reference.
+        estimated: from the two sample buffers of the input.
+        mapped: from the error map, which is smoothed and never below 0.
+        samples: predicted to reach the error with LEVELS[0]; the median over frames.
     """
 
     denoiser: str
@@ -65,40 +65,42 @@ class Told:
 
 
 def clip_of(scene: str, folder: Path) -> Clip:
-    """The clip of a scene."""
-    return own_clip(folder, scene, lambda: build_scene(scene, SEED, SIZE[0]), SIZE, SAMPLING, CHANNELS)
+    """The clip of a scene, rendered if missing."""
+    return own_clip(
+        folder, scene, lambda: build_scene(scene, SEED, CLIP_SIZE[0]), CLIP_SIZE, CLIP_SAMPLING, CLIP_CHANNELS
+    )
 
 
-def fed(clip: Clip, index: int, spp: int, reads: Sequence[str]) -> Frame:
-    """A frame with `spp` samples a pixel in two halves, of realisations whose noise is independent."""
+def frame_with_samples(clip: Clip, index: int, spp: int, reads: Sequence[str]) -> Frame:
+    """A frame with `spp` samples per pixel in two buffers, averaged from independent realisations."""
     frame = read_frame(clip, index, [name for name in reads if name not in NOISY_CHANNELS])
     realisations = range(spp // clip.facts["noisy_spp"])
     channels = dict(frame.channels)
     for name in NOISY_CHANNELS:
         drawn = np.stack([clip.read(name, index, realisation=i).astype(np.float32) for i in realisations])
-        halves = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
-        channels |= {name: to_tensor(halves.mean(axis=0)), SAMPLE_BUFFERS[name]: to_tensor(halves, has_buffers=True)}
+        buffers = np.stack([part.mean(axis=0) for part in np.split(drawn, 2)])
+        channels |= {name: to_tensor(buffers.mean(axis=0)), SAMPLE_BUFFERS[name]: to_tensor(buffers, has_buffers=True)}
     return replace(frame, channels=channels, spp=torch.full((1, 1, 1, 1), float(spp)))
 
 
-def played(denoiser: Shrunk, clip: Clip, spp: int) -> Iterator[tuple[Tensor, ErrorEstimate, Tensor]]:
-    """Radiance, the estimate of its error, and both halves (2, 3, H, W) of the reference, frame by frame."""
+def run_denoiser(denoiser: Shrunk, clip: Clip, spp: int) -> Iterator[tuple[Tensor, ErrorEstimate, Tensor]]:
+    """Radiance, its error estimate, and the reference's sample buffers (2, 3, H, W), frame by frame."""
     state: State | None = None
     for index in range(clip.frames):
-        output, state, estimate = with_error(denoiser, fed(clip, index, spp, denoiser.reads), state)
+        output, state, estimate = with_error(denoiser, frame_with_samples(clip, index, spp, denoiser.reads), state)
         yield output, estimate, to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
 
 
-def told(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None) -> Told:
-    """Compare one denoiser's errors on a clip; without a `target`, its own error is what samples are asked for."""
+def compare_errors(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None) -> ErrorComparison:
+    """Compare estimated and true errors on a clip; sample counts are predicted for `target`, by default its error."""
     squares: list[Tensor] = []  # of each frame true, estimated and mapped, (3, blocks)
     relative: list[tuple[float, float]] = []
     estimates = []
-    for output, estimate, halves in played(denoiser, clip, spp):
-        true = (output - halves[:1]) * (output - halves[1:])
+    for output, estimate, buffers in run_denoiser(denoiser, clip, spp):
+        true = (output - buffers[:1]) * (output - buffers[1:])
         scale = estimate.scale
         images = torch.cat([true, estimate.squared * scale.square(), estimate.radiance().square()])
-        squares.append(avg_pool2d(images.mean(dim=1, keepdim=True), BLOCK).flatten(1))
+        squares.append(avg_pool2d(images.mean(dim=1, keepdim=True), BLOCK_PIXELS).flatten(1))
         over_unit = true / scale.square().clamp(min=1e-30)
         relative.append((estimate.over_surfaces(over_unit), estimate.over_surfaces(estimate.squared)))
         estimates.append(estimate)
@@ -107,17 +109,17 @@ def told(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None
     wanted = true_relative if target is None else target
     samples = float(np.median([estimate.samples_for(wanted) for estimate in estimates]))
     errors = true_blocks, estimated, mapped, float(true_relative), float(estimated_relative)
-    return Told(name, clip.scene, spp, *errors, samples)
+    return ErrorComparison(name, clip.scene, spp, *errors, samples)
 
 
-def in_band(rows: Sequence[Told], kind: str) -> float:
-    """The share of the blocks in which `kind`, "estimated" or "mapped", over the true error is within BAND."""
+def in_band(rows: Sequence[ErrorComparison], kind: str) -> float:
+    """The share of blocks in which the ratio of `kind`, "estimated" or "mapped", to the true error is within BAND."""
     ratios = np.concatenate([np.array(getattr(row, kind)) / np.array(row.true) for row in rows])
     return float(((ratios >= BAND[0]) & (ratios <= BAND[1])).mean())
 
 
-def table_of(rows: Sequence[Told]) -> str:
-    """Of each denoiser and number of samples, over all clips."""
+def table_of(rows: Sequence[ErrorComparison]) -> str:
+    """One row per denoiser and number of samples, over all clips."""
     lines = []
     for denoiser, spp in dict.fromkeys((row.denoiser, row.spp) for row in rows):
         ours = [row for row in rows if (row.denoiser, row.spp) == (denoiser, spp)]
@@ -126,12 +128,15 @@ def table_of(rows: Sequence[Told]) -> str:
         shares = [in_band(ours, kind) for kind in ("estimated", "mapped")]
         asked = "; ".join(f"{row.samples:.0f}" for row in ours)
         lines.append([denoiser, spp, *(f"{mean:.2f}" for mean in means), *(f"{share:.0%}" for share in shares), asked])
-    heads = ["denoiser", "spp", "told / true", "map / true", "blocks in band", "of the map", f"asked for {LEVELS[0]}"]
+    heads = [
+        *("denoiser", "spp", "estimate / true", "map / true", "blocks in band", "map's blocks in band"),
+        f"predicted spp ({LEVELS[0]} needed)",
+    ]
     return tabulate(lines, heads, tablefmt="github", disable_numparse=True)
 
 
-def draw_errors(axis: Axes, rows: Sequence[Told]) -> None:
-    """Told against true errors of all blocks of one denoiser, and the band that they should be in."""
+def draw_errors(axis: Axes, rows: Sequence[ErrorComparison]) -> None:
+    """Estimated against true errors of all blocks of one denoiser, and BAND."""
     for spp in LEVELS[::-1]:
         true, estimated = (
             np.sqrt(np.maximum(np.concatenate([getattr(row, kind) for row in rows if row.spp == spp]), 1e-10))
@@ -143,25 +148,25 @@ def draw_errors(axis: Axes, rows: Sequence[Told]) -> None:
     axis.plot(line, line, color="grey", lw=0.8)
     axis.fill_between(line, *(line * np.sqrt(bound) for bound in BAND), color="grey", alpha=0.2)
     axis.set(xscale="log", yscale="log", title=rows[0].denoiser)
-    axis.set(xlabel="true error of a block, radiance", ylabel="told")
+    axis.set(xlabel="true error of a block, radiance", ylabel="estimated")
     axis.legend(fontsize=8)
 
 
-def draw_samples(axis: Axes, rows: Sequence[Told]) -> None:
-    """Samples asked for against those taken, of all denoisers."""
+def draw_samples(axis: Axes, rows: Sequence[ErrorComparison]) -> None:
+    """Predicted sample counts against those of the input, for all denoisers."""
     for name in dict.fromkeys(row.denoiser for row in rows):
         ours = [row for row in rows if row.denoiser == name and row.spp != LEVELS[0]]
         axis.plot([row.spp for row in ours], [row.samples for row in ours], "o", ms=4, label=name)
     axis.axhline(LEVELS[0], color="grey", lw=0.8)
-    axis.set(xscale="log", yscale="log", title=f"samples asked for, {LEVELS[0]} needed", xlabel="samples taken")
+    axis.set(xscale="log", yscale="log", title=f"predicted spp, {LEVELS[0]} needed", xlabel="spp of the input")
     for ticks, place in ((LEVELS[1:], axis.set_xticks), ((32, 64, 128, 256, 512), axis.set_yticks)):
         place(ticks, map(str, ticks))
     axis.minorticks_off()
     axis.legend(fontsize=8)
 
 
-def calibration_figure(rows: Sequence[Told]) -> Figure:
-    """A panel of errors for each denoiser, and one of the samples asked for."""
+def calibration_figure(rows: Sequence[ErrorComparison]) -> Figure:
+    """A panel of errors for each denoiser, and one of predicted sample counts."""
     names = list(dict.fromkeys(row.denoiser for row in rows))
     figure, axes = plt.subplots(1, len(names) + 1, figsize=(3.4 * (len(names) + 1), 3.6), dpi=DPI, layout="constrained")
     for axis, name in zip(axes[:-1], names, strict=True):
@@ -171,14 +176,14 @@ def calibration_figure(rows: Sequence[Told]) -> Figure:
 
 
 def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
-    """The last frame: what is shown, the error that is told, and the true one, averaged over 5 x 5 pixels."""
-    *_, (output, estimate, halves) = played(denoiser, clip, spp)
-    true = avg_pool2d((output - halves[:1]) * (output - halves[1:]), 5, 1, 2, count_include_pad=False)
+    """The last frame: denoised image, estimated error, and true error, averaged over 5 x 5 pixels."""
+    *_, (output, estimate, buffers) = run_denoiser(denoiser, clip, spp)
+    true = avg_pool2d((output - buffers[:1]) * (output - buffers[1:]), 5, 1, 2, count_include_pad=False)
     errors = [image.mean(dim=1)[0].clamp(min=0).sqrt() for image in (estimate.radiance().square(), true)]
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.5), dpi=DPI, layout="constrained")
     axes[0].imshow(display(output, clip.exposure)[0].permute(1, 2, 0))
     axes[0].set_title(f"denoised, {spp} spp")
-    for axis, error, title in zip(axes[1:], errors, ("error told", "true error"), strict=True):
+    for axis, error, title in zip(axes[1:], errors, ("estimated error", "true error"), strict=True):
         picture = axis.imshow(error, cmap="magma", vmin=0, vmax=float(torch.quantile(errors[1], 0.99)))
         axis.set_title(title)
     figure.colorbar(picture, ax=axes[1:], label="radiance")
@@ -187,40 +192,40 @@ def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
     return figure
 
 
-def tellers(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
-    """The named denoisers, or those of DENOISERS that can run, ready to use.
+def error_estimators(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
+    """The named denoisers, or those of DEFAULT_DENOISERS that can run, ready to use.
 
-    Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is no NAME+js.
+    Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is not a NAME+js.
     """
     found = {}
-    for name in choose(names, map(parse_name, DENOISERS), cannot_run):
+    for name in choose(names, map(parse_name, DEFAULT_DENOISERS), cannot_run):
         denoiser = DenoiserSpec(name, "total", fastest_precision(name), weights_of(name, runs)).build()
         if not isinstance(denoiser, Shrunk):
-            raise BadInput(f"{name} does not tell its error, {name}+js does")
+            raise BadInput(f"{name} does not estimate its error, {name}+js does")
         found[str(name)] = denoiser
     return found
 
 
 @torch.inference_mode()
 def study_error(runs: Path, names: Sequence[str]) -> str:
-    """Judge the named denoisers' errors: RUNS/study/error gets clips, table.md, calibration.png, map.png, results.json.
+    """Compare estimated and true errors; writes clips, table.md, two PNGs and results.json to RUNS/study/error.
 
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     folder = runs / "study" / "error"
-    denoisers = tellers(names, runs)
-    clips = [clip_of(scene, folder) for scene in tqdm(SCENES, "clips", unit="clip")]
-    rows: list[Told] = []
+    denoisers = error_estimators(names, runs)
+    clips = [clip_of(scene, folder) for scene in tqdm(CLIP_SCENES, "clips", unit="clip")]
+    rows: list[ErrorComparison] = []
     with tqdm(total=len(denoisers) * len(clips) * len(LEVELS), desc="errors", unit="clip") as progress:
         for (name, denoiser), clip in product(denoisers.items(), clips):
             target = None
             for spp in LEVELS:
-                rows.append(told(denoiser, name, clip, spp, target))
+                rows.append(compare_errors(denoiser, name, clip, spp, target))
                 target = target or rows[-1].true_relative
                 progress.update()
     save_figure(folder / "calibration.png", calibration_figure(rows))
     scene, spp = SHOWN
-    save_figure(folder / "map.png", map_figure(next(iter(denoisers.values())), clips[SCENES.index(scene)], spp))
+    save_figure(folder / "map.png", map_figure(next(iter(denoisers.values())), clips[CLIP_SCENES.index(scene)], spp))
     table = table_of(rows)
     write_file(folder / "table.md", f"{table}\n".encode())
     write_json(

@@ -28,13 +28,13 @@ from scenes.registry import build_scene
 
 CHANGE = 8  # the first frame in the new light
 AFTER = (0, 1, 2, 4, 8)  # frames after it that the table shows
-SIZE = (CHANGE + AFTER[-1] + 1, 128, 128)  # frames, height, width
-SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=1024)
-SCENE = "cornell_box"
-STILL = "still"
-# What the lamp was like before the change: its brightness, times that after it, and where it was.
+LIGHT_CLIP_SIZE = (CHANGE + AFTER[-1] + 1, 128, 128)  # frames, height, width
+LIGHT_CLIP_SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=1024)
+LIGHT_SCENE = "cornell_box"
+UNCHANGED = "still"
+# The lamp before the change: the factor of its radiance, and its displacement.
 BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
-    STILL: (1.0, (0.0, 0.0, 0.0)),
+    UNCHANGED: (1.0, (0.0, 0.0, 0.0)),
     "switched-on": (0.05, (0.0, 0.0, 0.0)),
     "switched-down": (8.0, (0.0, 0.0, 0.0)),
     "moved": (1.0, (0.6, 0.0, -0.5)),
@@ -43,26 +43,28 @@ BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
 
 @dataclass(frozen=True)
 class Lag:
-    """One denoiser: PSNR in dB of every frame, by the name of the change."""
+    """PSNR in dB of every frame of one denoiser, by the name of the change."""
 
     denoiser: str
     psnr: dict[str, list[float]]
 
-    def behind(self, after: int) -> float:
-        """By how many dB the worst change is behind light that never changed, `after` frames after it."""
+    def loss(self, after: int) -> float:
+        """The largest loss of PSNR against unchanged light, in dB, `after` frames after the change."""
         frame = CHANGE + after
-        return max(self.psnr[STILL][frame] - values[frame] for name, values in self.psnr.items() if name != STILL)
+        return max(
+            self.psnr[UNCHANGED][frame] - values[frame] for name, values in self.psnr.items() if name != UNCHANGED
+        )
 
 
 def stepped(before: Array, after: Array) -> Track:
-    """From one value to the other between two frames."""
+    """A step from one value to another between two frames."""
     times = np.array([CHANGE - 1.0, CHANGE])
     return KeyframedTrack(np.array([before, after]), times=times, straight=True)
 
 
 def changed(change: str) -> Scene:
-    """The Cornell box whose lamp becomes what it is in the clip `cornell_box` in the frame CHANGE."""
-    scene = build_scene(SCENE, SEED, SIZE[0])
+    """The Cornell box, whose lamp has its usual radiance and position from frame CHANGE on."""
+    scene = build_scene(LIGHT_SCENE, SEED, LIGHT_CLIP_SIZE[0])
     *others, lamp = scene.shapes
     gain, shift = BEFORE[change]
     assert lamp.radiance is not None and isinstance(lamp.motion, RigidMotion)
@@ -74,43 +76,51 @@ def changed(change: str) -> Scene:
 
 
 def clip_of(change: str, folder: Path) -> Clip:
-    """The clip of a change."""
+    """The clip of a change, rendered if missing."""
     made_of = CHANGE, BEFORE[change]
-    return own_clip(folder, f"{SCENE}-{change}", lambda: changed(change), SIZE, SAMPLING, tuple(CHANNELS), made_of)
+    return own_clip(
+        folder,
+        f"{LIGHT_SCENE}-{change}",
+        lambda: changed(change),
+        LIGHT_CLIP_SIZE,
+        LIGHT_CLIP_SAMPLING,
+        tuple(CHANNELS),
+        made_of,
+    )
 
 
 @torch.inference_mode()
 def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[float]:
-    """PSNR in dB of each frame of the light that the denoiser returns, displayed."""
-    found = []
+    """PSNR in dB of each displayed frame, for the signal that the denoiser returns."""
+    values = []
     state: State | None = None
     for index in range(clip.frames):
         output, state = denoiser(read_frame(clip, index, denoiser.reads), state)
         reference = to_tensor(clip.reference(index, denoiser.signal).mean(axis=0))
         error = display(finite(output), exposure) - display(reference, exposure)
-        found.append(psnr(error.square().mean().item()))
-    return found
+        values.append(psnr(error.square().mean().item()))
+    return values
 
 
 def lag_of(spec: DenoiserSpec, clips: dict[str, Clip]) -> Lag:
-    """All clips are displayed as the one whose light never changes."""
+    """PSNR of a denoiser on all clips, at the exposure of the one whose light does not change."""
     denoiser = spec.build()
-    exposure = clips[STILL].exposure
+    exposure = clips[UNCHANGED].exposure
     return Lag(spec.name, {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()})
 
 
 def lag_table(lags: Sequence[Lag]) -> str:
-    """Fewest dB behind first, once all frames have passed."""
-    heads = ["denoiser", f"still light, frame {SIZE[0] - 1}", *(f"behind, {n} after" for n in AFTER)]
+    """One row per denoiser, sorted by the loss in the last column."""
+    heads = ["denoiser", f"steady light, frame {LIGHT_CLIP_SIZE[0] - 1}", *(f"loss {n} frames after" for n in AFTER)]
     rows = [
-        [lag.denoiser, f"{lag.psnr[STILL][-1]:.1f} dB", *(f"{lag.behind(n):.1f} dB" for n in AFTER)]
-        for lag in sorted(lags, key=lambda lag: lag.behind(AFTER[-1]))
+        [lag.denoiser, f"{lag.psnr[UNCHANGED][-1]:.1f} dB", *(f"{lag.loss(n):.1f} dB" for n in AFTER)]
+        for lag in sorted(lags, key=lambda lag: lag.loss(AFTER[-1]))
     ]
     return tabulate(rows, heads, tablefmt="github", disable_numparse=True)
 
 
 def lag_figure(lags: Sequence[Lag]) -> Figure:
-    """PSNR of every frame; a panel for each change, beside light that never changes."""
+    """PSNR of every frame, in a panel for each change."""
     figure, axes = plt.subplots(
         1, len(BEFORE), figsize=(3 * len(BEFORE), 4), dpi=DPI, layout="constrained", sharey=True
     )
@@ -126,7 +136,7 @@ def lag_figure(lags: Sequence[Lag]) -> Figure:
 
 
 def study_light(runs: Path, names: Sequence[str], budget: str) -> str:
-    """Judge the named denoisers, or all that can run: RUNS/study/light gets clips, table.md, plot.png, results.json.
+    """Measure the lag of denoisers, by default of all that can run; writes RUNS/study/light.
 
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """

@@ -1,4 +1,4 @@
-"""Clips that a bench renders for itself, and keeps."""
+"""Clips that studies render and store."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -22,9 +22,9 @@ def own_clip(
     channels: Sequence[str],
     made_of: object = None,
 ) -> Clip:
-    """The clip `name` of a scene, of `size` (frames, height, width), rendered unless it is there.
+    """The clip `name` of a scene, of `size` (frames, height, width), rendered if missing.
 
-    Its folder is named by all that it follows from, `made_of` among it: what the scene is made of beside its name.
+    The name of its folder is a digest of everything that determines it; `made_of` describes the scene beside its name.
     """
     digest = zlib.crc32(repr((GENERATOR, name, SEED, size, sampling, *channels, made_of)).encode())
     path = folder / f"{digest:08x}" / name / "000"

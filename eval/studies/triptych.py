@@ -1,4 +1,4 @@
-"""One large frame in three strips under slanting cuts: as rendered, denoised, and the reference."""
+"""One large frame in three slanted strips: noisy, denoised, and reference."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +32,7 @@ Picture = NDArray[np.float64]
 
 @torch.inference_mode()
 def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
-    """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all others."""
+    """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all frames."""
     state: State | None = None
     for index in range(clip.frames):
         frame = read_frame(clip, index, (*network.reads, "direct", "indirect", "emission"))
@@ -42,7 +42,7 @@ def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
 
 
 def in_strips(pictures: tuple[Picture, Picture, Picture]) -> Picture:
-    """The left, the middle and the right of three pictures (H, W, 3), with white lines between."""
+    """The left, the middle and the right of three pictures (H, W, 3), separated by white lines."""
     height, width = pictures[0].shape[:2]
     x = np.arange(width) + SLANT * (np.arange(height)[:, None] - height / 2)
     picture = pictures[0]

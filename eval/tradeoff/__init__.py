@@ -1,1 +1,1 @@
-"""What quality costs: denoisers, precisions and samples a pixel against milliseconds."""
+"""Quality against milliseconds, by denoiser, precision and samples per pixel."""

@@ -1,4 +1,4 @@
-"""What can be traded: every denoiser, in each precision and size of network that there are weights for."""
+"""The denoisers of the trade-off: all that can run and have weights, in each of their precisions."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -25,7 +25,7 @@ def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSp
 
 
 def trained_epochs(spec: DenoiserSpec) -> int | None:
-    """How long the network was trained; None where its weights do not say so or there are none."""
+    """The epochs of the network's training; None where its weights do not record them or there are none."""
     if spec.weights is None:
         return None
     recipe = read_metadata(spec.weights).get("recipe", {})

@@ -1,4 +1,4 @@
-"""Quality against time, by denoiser, precision and size of network: the rows of trade.json and their tables."""
+"""Quality against time by denoiser and precision: the rows of trade.json and their table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ TRADED = ("psnr", "ssim", "rmse")
 
 @dataclass(frozen=True)
 class Trade:
-    """A denoiser in one precision, beside all others that return the same signal.
+    """A denoiser in one precision, compared with all others that return the same signal.
 
     Attributes:
-        label: its name among them.
+        label: its unique name.
         dtype: the precision, a key of PRECISIONS.
-        epochs: of its training; None where that is not known, or there is none.
-        ms: milliseconds of a frame; None where they were not measured.
+        epochs: of its training; None where unknown, or without training.
+        ms: milliseconds per frame; None where not measured.
         metrics: means over the clips.
         floors: noise floors of means that are within them.
-        compared: what each of TRADED is compared by.
-        dominated_by: by whom it is beaten in each of TRADED; None on the front, and without a time or value.
+        compared: the values of TRADED by which it is ranked.
+        dominated_by: the denoiser that dominates it in each of TRADED; None on the front, and without a time or value.
     """
 
     label: str
@@ -45,16 +45,16 @@ class Trade:
     dominated_by: dict[str, str | None]
 
     def point(self, metric: str) -> Point | None:
-        """Where plots show it."""
+        """Its position in plots."""
         return Point.of(self.ms, self.metrics[metric])
 
     def standing(self, metric: str) -> str:
-        """By whom it is beaten, in words."""
+        """The denoiser that dominates it, "front", or "-" without a time or value."""
         return (self.dominated_by[metric] or "front") if self.point(metric) else "-"
 
 
 def trades(specs: Sequence[DenoiserSpec], clips: Sequence[ClipResults], times: Times) -> list[Trade]:
-    """A row for each of the specs, whose labels name their results on the clips."""
+    """One row per spec, whose label is the name of its results on the clips."""
     offers: dict[Signal, dict[str, TimedScores]] = {}
     for signal, ours in by_signal(clips).items():
         alike = [spec for spec in specs if spec.returns == signal]
@@ -81,7 +81,7 @@ def trades(specs: Sequence[DenoiserSpec], clips: Sequence[ClipResults], times: T
 
 
 def front_table(rows: Sequence[Trade]) -> str:
-    """Fastest first. Who is on the front of a metric is marked so, who is not is told by whom it is beaten."""
+    """One line per row, fastest first, with the denoiser that dominates it in each metric or "front"."""
     lines = []
     for row in sorted(rows, key=lambda row: (row.ms is None, row.ms)):
         line = {
@@ -91,7 +91,7 @@ def front_table(rows: Sequence[Trade]) -> str:
             "ms": "-" if row.ms is None else f"{row.ms:.4g}",
         }
         line |= {METRICS[key].title: value_cell(key, row.metrics[key], row.floors.get(key)) for key in TRADED}
-        line |= {f"beaten in {METRICS[key].title.split()[0]} by": row.standing(key) for key in TRADED}
+        line |= {f"dominated in {METRICS[key].title.split()[0]} by": row.standing(key) for key in TRADED}
         lines.append(line)
     text = tabulate(lines, "keys", disable_numparse=True)
     return f"{text}\n{LEGEND}" if NEAR_FLOOR in text else text

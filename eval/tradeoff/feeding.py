@@ -1,4 +1,4 @@
-"""Denoisers fed more samples a pixel: whether milliseconds are better spent on samples or on the filter."""
+"""Denoisers with more samples per pixel: whether milliseconds are better spent on samples or on the filter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ SPP_LEVELS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 @dataclass(frozen=True)
 class SampleTrades:
-    """What trade.json says of samples a pixel.
+    """The part of trade.json on samples per pixel.
 
     Attributes:
         levels: the numbers of samples.
-        sources: how each clip's input was made.
-        render_ms: the cost of samples in each clip's scene.
-        shrinkage: what NAME+js gains.
+        sources: how the input of each clip was made.
+        render_ms: the cost of samples in the scene of each clip.
+        shrinkage: the gains of NAME+js.
     """
 
     levels: list[int]
@@ -64,19 +64,19 @@ def sampled(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
 def results_by_spp(
     specs: Sequence[DenoiserSpec], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
 ) -> dict[int, list[ClipResults]]:
-    """Results on the clips by samples a pixel. What is rendered and judged is kept in `folder`."""
+    """Results on the clips by samples per pixel; clips and results are stored in `folder`."""
     denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
-    halves = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
+    with_buffers = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
-        fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data", halves)
+        fed = with_samples(clip, dataset, spp, source(clip, levels[-1]), folder / "data", with_buffers)
         results[spp] += evaluate_clip(fed, denoisers, folder)
     return {spp: list(by_clip(found)) for spp, found in results.items()}
 
 
 def costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[str, Cost]:
-    """What samples of each clip's scene cost at the size and with the threads of the bench."""
+    """The cost of samples in the scene of each clip, at the size and with the threads of the bench."""
     options = Options(**dataset.facts["options"])
     return {
         f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads, options)
@@ -92,7 +92,7 @@ def by_samples(
     times: Times,
     folder: Path,
 ) -> SampleTrades:
-    """Feed the chosen denoisers the clips with each number of samples a pixel of `levels`, and weigh the results."""
+    """Evaluate the chosen denoisers on the clips with each number of samples per pixel of `levels`."""
     specs = with_indirect_baselines(chosen)
     fed = results_by_spp(specs, clips, dataset, levels, folder)
     cost = costs(clips, dataset, times)

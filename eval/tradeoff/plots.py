@@ -1,4 +1,4 @@
-"""The plots of the trade: quality against milliseconds, and against samples a pixel."""
+"""Plots of quality against milliseconds, and against samples per pixel."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ def plain_ticks(axis: Axes) -> None:
 
 
 def draw_front(rows: Sequence[Trade], metric: str, title: str) -> Figure:
-    """A metric against milliseconds, a panel a signal: the front as a line, what it dominates hollow."""
+    """A metric against milliseconds, one panel per signal: the front as a line, dominated points hollow."""
     signals = list(dict.fromkeys(row.signal for row in rows))
     size = (9, 5.5 * len(signals))
     figure, axes = plt.subplots(len(signals), 1, figsize=size, dpi=DPI, layout="constrained", squeeze=False)
@@ -33,10 +33,9 @@ def draw_front(rows: Sequence[Trade], metric: str, title: str) -> Figure:
 
 
 def draw_panel(axis: Axes, rows: Sequence[tuple[Trade, Point]], metric: str) -> None:
-    """The rows of one signal, and where they stand."""
-    unbeaten = [point for row, point in rows if row.dominated_by[metric] is None]
-    front = sorted(unbeaten, key=lambda point: point.ms)
-    # What a budget of milliseconds buys at best: it rises where the next one of the front can be afforded.
+    """The rows of one signal and their front."""
+    front = sorted((point for row, point in rows if row.dominated_by[metric] is None), key=lambda point: point.ms)
+    # The best quality within a number of milliseconds: steps at the points of the front.
     axis.step([point.ms for point in front], [point.quality for point in front], where="post", lw=1, color="C0")
     for row, point in rows:
         on_front = row.dominated_by[metric] is None
@@ -67,7 +66,7 @@ def draw_panel(axis: Axes, rows: Sequence[tuple[Trade, Point]], metric: str) -> 
 
 
 def draw_samples(rows: Sequence[SampleTrade], title: str) -> Figure:
-    """PSNR against samples a pixel, and against milliseconds of rendering and filtering together; a row a signal."""
+    """PSNR against samples per pixel, and against milliseconds of rendering and filtering; one row per signal."""
     signals = list(dict.fromkeys(row.signal for row in rows))
     size = (11, 4.5 * len(signals))
     figure, axes = plt.subplots(len(signals), 2, figsize=size, dpi=DPI, layout="constrained", squeeze=False)

@@ -1,4 +1,4 @@
-"""Clips with more samples a pixel: a data set's clips with other noisy input, rendered or averaged, kept on disk."""
+"""Clips with more samples per pixel: a dataset's clips with other noisy input, rendered or averaged, and stored."""
 
 import zlib
 from collections.abc import Iterator
@@ -26,9 +26,9 @@ NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS (H, W,
 
 
 def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
-    """The scene that a clip of the data set shows, and the clip's seed.
+    """The scene and the seed of a clip.
 
-    Raises BadInput where this version or other packages would make another scene of them.
+    Raises BadInput where this version or other packages would render it differently.
     """
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
@@ -39,43 +39,41 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     return scene_of_clip(clip.path, profile, dataset.facts["seed"])
 
 
-def averaged(clip: Clip, count: int, halves: bool) -> Iterator[NoisyFrame]:
-    """Frame by frame the mean of the clip's first `count` noise realisations, which are independent."""
+def averaged(clip: Clip, count: int, with_buffers: bool) -> Iterator[NoisyFrame]:
+    """The mean of the clip's first `count` independent noise realisations, frame by frame."""
     for frame in range(clip.frames):
         noisy = {}
         for name in NOISY_CHANNELS:
             drawn = np.stack([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)])
             noisy[name] = drawn.mean(axis=0)
-            if halves:
-                noisy[SAMPLE_BUFFERS[name]] = np.stack([half.mean(axis=0) for half in np.split(drawn, 2)])
+            if with_buffers:
+                noisy[SAMPLE_BUFFERS[name]] = np.stack([part.mean(axis=0) for part in np.split(drawn, 2)])
         yield noisy
 
 
-def rendered(clip: Clip, dataset: Dataset, spp: int, halves: bool) -> Iterator[NoisyFrame]:
-    """Frame by frame what the renderer makes of `spp` stratified samples: the bytes of a clip such as 000-4spp.
+def rendered(clip: Clip, dataset: Dataset, spp: int, with_buffers: bool) -> Iterator[NoisyFrame]:
+    """Noisy frames rendered with `spp` stratified samples, the same as those of a clip such as 000-4spp.
 
-    Raises BadInput as `scene_of` does.
+    Raises BadInput as `scene_of`.
     """
     scene, seed = scene_of(clip, dataset)
-    sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # nothing is kept of the reference
-    channels = (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values()) if halves else NOISY_CHANNELS
+    sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # the reference is not used
+    channels = (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values()) if with_buffers else NOISY_CHANNELS
     for arrays, _ in render_clip(scene, clip.frames, clip.height, clip.width, sampling, seed, channels):
         yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in channels}
 
 
 def source(clip: Clip, most: int) -> Source:
-    """How a clip gets input of up to `most` samples a pixel: always in one way, so that it can be compared."""
+    """How the input of a clip is made for all numbers of samples per pixel up to `most`."""
     return "averaged" if clip.realisations * clip.facts["noisy_spp"] >= most else "rendered"
 
 
-def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path, halves: bool = False) -> Clip:
-    """`clip` with `spp` samples a pixel as its noisy input: a clip of one realisation below the folder `root`.
+def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path, with_buffers: bool = False) -> Clip:
+    """`clip` with `spp` samples per pixel as its noisy input: a clip of one realisation below the folder `root`.
 
-    With `halves` it has those of its samples too, where these are an even number of the clip's own.
-
-    It is made unless it is there already, of what `clip` is now. Its other channels are the files of `clip`.
-    Raises BadInput where `spp` is no multiple of the clip's own samples, or more than its sampler has; where another
-    process is making it; and as `scene_of` does.
+    `with_buffers` adds two sample buffers, if `spp` is an even multiple of the clip's own. The clip is made if missing
+    or out of date; its other channels are the files of `clip`. Raises BadInput where `spp` is no multiple of the clip's
+    own samples or more than its sampler has, where another process is making it, and as `scene_of`.
     """
     own = clip.facts["noisy_spp"]
     if spp == own:
@@ -87,12 +85,12 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     if spp % own:
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"
-    halves = halves and spp // own % 2 == 0
+    with_buffers = with_buffers and spp // own % 2 == 0
     made_of = {
         "clip": str(clip.path.resolve()),
         "crc32": clip.fingerprint,
         "how": how,
-        "halves": halves,
+        "halves": with_buffers,
     }
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)
@@ -100,17 +98,17 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     with locked(path.with_name(f".{path.name}.lock")) as ours:
         if not ours:
             raise BadInput(f"another process is making {path}: wait for it")
-        frames = averaged(clip, spp // own, halves) if how == "averaged" else rendered(clip, dataset, spp, halves)
+        count = spp // own
+        frames = (
+            averaged(clip, count, with_buffers) if how == "averaged" else rendered(clip, dataset, spp, with_buffers)
+        )
         progress = tqdm(frames, f"{clip.scene}/{path.name}", clip.frames, unit="frame", leave=False)
         write_resampled(path, clip, list(progress), {"noisy_spp": spp, "made_of": made_of})
     return Clip(path)
 
 
 def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dict[str, Any]) -> None:
-    """Store `frames` as the noisy input of a clip that is otherwise `clip`, but for `facts` of its clip.json.
-
-    That file, which makes it a clip, is written last.
-    """
+    """Store a copy of `clip` with `frames` as its noisy input and `facts` in its clip.json, which is written last."""
     (path / "clip.json").unlink(missing_ok=True)
     entries = {
         name: entry | {"file": str((clip.path / entry["file"]).resolve())} if "file" in entry else entry

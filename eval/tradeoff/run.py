@@ -1,4 +1,4 @@
-"""`onespp trade`: what quality costs in milliseconds, by denoiser, precision, size of network and samples a pixel."""
+"""`onespp trade`: quality against milliseconds, by denoiser, precision and samples per pixel."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,16 +15,14 @@ from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import TRADED, Trade, front_table, trades
 from eval.tradeoff.feeding import SPP_LEVELS, SampleTrades, by_samples, check_levels, sampled
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.samples import generalisation, samples_table
+from eval.tradeoff.samples import samples_table
 from eval.tradeoff.shrinkage import gains_table
 from eval.tradeoff.times import Times
 from files import write_json
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions
 
-FRONTS = (
-    "On fronts a clip within its noise floor counts as at its edge: so a mean can be beaten by one that looks worse."
-)
+FRONTS = "Fronts count a clip within its noise floor as at the floor's edge: a worse mean can dominate a better one."
 
 
 def trade(
@@ -36,10 +34,10 @@ def trade(
     threads: int | None = None,
     levels: Sequence[int] = SPP_LEVELS,
 ) -> str:
-    """Judge all that can be traded on the test clips: tables, RUNS/report/trade.json and figures beside it.
+    """Evaluate all candidates on the test clips. Returns tables, writes RUNS/report/trade.json and figures.
 
-    Times are those of RUNS/bench at `size` and `threads`. What was judged or rendered before is kept in RUNS/trade.
-    Raises BadInput where there are no times or clips, for a bad size or numbers of samples, and as `candidates` does.
+    Times are those of RUNS/bench at `size` and `threads`. Clips and results are stored in RUNS/trade and reused.
+    Raises BadInput where there are no times or clips, for a bad size or numbers of samples, and as `candidates`.
     """
     check_levels(levels)
     dataset = Dataset(data)
@@ -76,15 +74,14 @@ def trade(
 
 
 def tables(rows: Sequence[Trade], samples: SampleTrades, title: str, times: Times) -> str:
-    """What `onespp trade` prints."""
+    """The output of `onespp trade`."""
     parts = [title, FRONTS]
     for signal in dict.fromkeys(row.signal for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row.signal == signal])}")
     if untimed := [row.label for row in rows if row.ms is None]:
-        parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command}`.")
-    parts.append(f"samples a pixel\n{samples_table(samples.rows)}")
+        parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command} --all`.")
+    parts.append(f"samples per pixel\n{samples_table(samples.rows)}")
     if samples.shrinkage:
-        words = "what shrinkage gains on the better of noise and denoiser, dB: mean of the clips (worst)"
-        parts.append(f"{words}\n{gains_table(samples.shrinkage)}")
-    parts.append(f"trained on 1 spp, fed more (after RAE, Fig. 9 and 11)\n{generalisation(samples.rows)}")
+        heading = "gain of shrinkage over the better of noisy frame and denoiser, dB: mean of the clips (worst)"
+        parts.append(f"{heading}\n{gains_table(samples.shrinkage)}")
     return "\n\n".join(parts)

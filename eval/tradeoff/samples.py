@@ -1,4 +1,4 @@
-"""Quality against samples a pixel, and against milliseconds of rendering and filter: rows of trade.json and tables."""
+"""Quality against samples per pixel and milliseconds: rows of trade.json and their table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,31 +7,26 @@ from tabulate import tabulate
 
 from datasets.frame import Signal
 from eval.means import scores_of
-from eval.metrics import METRICS, Values
+from eval.metrics import Values
 from eval.results import ClipResults, by_signal
 from eval.text_table import value_cell
-from eval.tradeoff.denoisers import TRADED
 from eval.tradeoff.pareto import TimedScores, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
-# The table after RAE §5.4: who is compared, fed how many samples a pixel.
-GENERALISED = ("noisy", "accumulated", "svgf", "rae")
-FED = (1, 4, 256)
-
 
 @dataclass(frozen=True)
 class SampleTrade:
-    """A denoiser fed `spp` samples a pixel, beside all that return the same signal, fed whatever.
+    """A denoiser with `spp` samples per pixel, compared with all denoisers of the same signal at all levels.
 
     Attributes:
-        label: its name among the denoisers.
+        label: its unique name.
         dtype: its precision, a key of PRECISIONS.
-        ms: of rendering and filtering a frame; None, as `filter_ms` is, where the filter was not timed.
+        ms: of rendering and filtering a frame; None, like `filter_ms`, where the filter was not timed.
         metrics: means over the clips.
         floors: noise floors of means that are within them.
-        compared: what PSNR is compared by.
-        dominated_by: by whom it is beaten in PSNR, "LABEL, N spp"; None on the front, and without a time.
+        compared: the PSNR by which it is ranked.
+        dominated_by: the name that dominates it in PSNR, "LABEL, N spp"; None on the front, and without a time.
     """
 
     label: str
@@ -65,9 +60,9 @@ def sample_trades(
     render_ms: Mapping[int, float],
     times: Times,
 ) -> list[SampleTrade]:
-    """A row for each of the specs at each number of samples a pixel, from what it made of the clips `fed` with those.
+    """One row per spec and number of samples per pixel.
 
-    `render_ms` is the mean time in which so many samples are rendered.
+    `fed` has the results on the clips, and `render_ms` the mean time of rendering, by number of samples.
     """
     offers: dict[Signal, dict[str, TimedScores]] = {spec.returns: {} for spec in specs}
     for spp, clips in fed.items():
@@ -102,26 +97,15 @@ def sample_trades(
 
 
 def samples_table(rows: Sequence[SampleTrade]) -> str:
-    """PSNR of each denoiser at each number of samples, and below what is on the front of PSNR and milliseconds."""
+    """PSNR of each denoiser at each number of samples, and the front of PSNR against milliseconds."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
         line = lines.setdefault((row.signal, row.label), {"signal": row.signal, "denoiser": row.label})
         line[f"{row.spp} spp"] = row.cell("psnr")
     text = f"PSNR dB\n{tabulate([*lines.values()], 'keys', disable_numparse=True)}"
     for signal in dict.fromkeys(row.signal for row in rows):
-        unbeaten = [row for row in rows if (row.signal, row.dominated_by) == (signal, None)]
-        front = sorted(((row.ms, row) for row in unbeaten if row.ms is not None), key=lambda step: step[0])
+        front_rows = [row for row in rows if (row.signal, row.dominated_by) == (signal, None)]
+        front = sorted(((row.ms, row) for row in front_rows if row.ms is not None), key=lambda step: step[0])
         steps = (f"{row.name} ({ms:.4g} ms, {row.cell('psnr')} dB)" for ms, row in front)
-        text += f"\n\nWorth the time, {signal} light: {'; '.join(steps)}"
+        text += f"\n\nPareto front, {signal} light: {'; '.join(steps)}"
     return text
-
-
-def generalisation(rows: Sequence[SampleTrade]) -> str:
-    """What RAE, trained on 1 spp, makes of more, beside filters that are not trained (RAE §5.4)."""
-    ours = [row for row in rows if row.signal == "total" and row.denoiser in GENERALISED and row.spp in FED]
-    lines = [
-        [row.label, row.spp, *(row.cell(metric) for metric in TRADED)]
-        for row in sorted(ours, key=lambda row: (row.spp, GENERALISED.index(row.denoiser)))
-    ]
-    head = ["denoiser", "spp", *(METRICS[metric].title for metric in TRADED)]
-    return tabulate(lines, head, disable_numparse=True)

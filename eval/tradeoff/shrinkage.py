@@ -1,4 +1,4 @@
-"""What NAME+js gains on the better of noise and NAME, clip by clip: it must never lose by more than chance."""
+"""The gain of NAME+js over the better of NAME and the noisy frame, clip by clip; it should never be negative."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,15 +11,15 @@ from eval.metrics import METRICS, Values, within_floor
 from eval.results import ClipResults
 
 SHRINKING = "+js"
-INPUT = "noisy"  # the denoiser that returns what it is given
+INPUT = "noisy"  # the denoiser that returns its input
 
 
 @dataclass(frozen=True)
 class Gain:
-    """Of one denoiser fed `spp` samples a pixel: dB on the better of noise and what it shrinks to.
+    """The gain of one denoiser with `spp` samples per pixel, in dB.
 
     Attributes:
-        metric: "psnr" or "mse_unbiased"; what is within the noise floor counts as at its edge.
+        metric: "psnr" or "mse_unbiased"; a value within the noise floor counts as at the floor's edge.
         clips: the gain on each clip, SCENE/CLIP.
     """
 
@@ -30,7 +30,7 @@ class Gain:
 
 
 def decibels(metric: str, values: Values, floors: Values) -> float:
-    """A metric in dB, more is better."""
+    """A metric in dB, where more is better."""
     value, floor = values[metric], floors[metric]
     assert value is not None and floor is not None
     if within_floor(metric, value, floor):
@@ -39,7 +39,7 @@ def decibels(metric: str, values: Values, floors: Values) -> float:
 
 
 def gains_of(fed: Mapping[int, Sequence[ClipResults]]) -> Iterator[Gain]:
-    """Those of all NAME+js that were fed beside NAME and `noisy`, where there are two samples or more."""
+    """The gains of all NAME+js with results of NAME and `noisy`, for two samples per pixel or more."""
     for spp, clips in fed.items():
         names = sorted({result.denoiser for clip in clips for result in clip.results if SHRINKING in result.denoiser})
         for name, metric in product(names, ("psnr", "mse_unbiased")):
@@ -49,7 +49,7 @@ def gains_of(fed: Mapping[int, Sequence[ClipResults]]) -> Iterator[Gain]:
 
 
 def clip_gains(clips: Sequence[ClipResults], metric: str, name: str) -> Iterator[tuple[str, float]]:
-    """The gain on each clip that has results of all three."""
+    """The gain on each clip with results of all three."""
     others = {name.replace(SHRINKING, ""), INPUT}
     for clip in clips:
         found = {
@@ -62,7 +62,7 @@ def clip_gains(clips: Sequence[ClipResults], metric: str, name: str) -> Iterator
 
 
 def gains_rows(gains: Sequence[Gain]) -> list[dict[str, str]]:
-    """Means over the clips, and the worst clip, by samples a pixel: a row a denoiser and metric."""
+    """Means over the clips, and the worst clip, by samples per pixel: one row per denoiser and metric."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for gain in gains:
         line = lines.setdefault(

@@ -1,4 +1,4 @@
-"""What a frame takes, from what `onespp bench denoisers` left."""
+"""Milliseconds per frame, read from the results of `onespp bench denoisers`."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ from models.spec import DenoiserSpec
 
 
 class Times:
-    """Milliseconds of a frame of `size`, measured with `threads`, by default as many as the bench had last.
+    """Milliseconds per frame of `size`, measured with `threads`, by default the most of the bench.
 
-    `device` is "cpu" or "cuda". Raises BadInput where nothing was measured like that.
+    `device` is "cpu" or "cuda". Raises BadInput where the bench has no such rows.
     """
 
     def __init__(self, runs: Path, size: Size, threads: int | None = None, device: str = "cpu"):
@@ -25,11 +25,11 @@ class Times:
         bench = read_json(path, ("device", "threads", "rows"))
         self.device: str = bench["device"]
         self.threads: int = threads or bench["threads"]
-        # By denoiser, as the bench calls it, and precision. Rows of old files are all of the threads at the top.
+        # By the bench's name of the denoiser, and precision.
         self.ms: dict[tuple[str, str], float] = {
             (row["denoiser"], row["dtype"]): row["ms_median"]
             for row in bench["rows"]
-            if (row["height"], row["width"], row.get("threads", bench["threads"])) == (*size, self.threads)
+            if (row["height"], row["width"], row["threads"]) == (*size, self.threads)
         }
         if not self.ms:
             raise BadInput(
@@ -43,7 +43,7 @@ class Times:
 
 
 def times_of_first_size(runs: Path) -> Times | None:
-    """What the bench has measured on the CPU at the first of its sizes; None where it has measured nothing."""
+    """The times on the CPU at the bench's first size; None without any."""
     path = results_file(runs)
     rows = read_json(path, ("rows",))["rows"] if path.exists() else []
     return Times(runs, (rows[0]["height"], rows[0]["width"])) if rows else None

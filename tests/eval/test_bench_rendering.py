@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from errors import BadInput
-from eval.bench.rendering import MOST_SPP, bench_rendering
+from eval.bench.rendering import MAX_SPP, bench_rendering
 from eval.bench.stock import stock_render
 from render.shot import Shot
 from render.stage import Stage
@@ -50,7 +50,7 @@ def test_bench_of_references(tmp_path):
     assert theirs["kernels"] is None and ours["kernels"] >= 0 and ours["compiling"] >= 0
     for row in facts["rows"]:
         assert row["extrapolated"] == (row["floor"] < 40)
-        assert not row["extrapolated"] or row["spp"] == MOST_SPP
+        assert not row["extrapolated"] or row["spp"] == MAX_SPP
     assert ours["spp"] < theirs["spp"]  # stratified
     for row in facts["rows"]:
         seconds = row["seconds"] * 10 ** ((row["floor"] - 40) / 10)  # of the samples that were timed

@@ -143,22 +143,22 @@ def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
     assert set(clip["flips"]) == set(clip["images"]) - {"reference"}
 
 
-def test_errors_that_samples_tell_are_a_view_of_their_own(tiny, page, tmp_path):
+def test_estimated_errors_have_their_own_view(tiny, page, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
-    fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", halves=True)
+    fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", with_buffers=True)
     specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw+js")]
     (results,) = by_clip(evaluate_clip(fed, named_denoisers(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
-    assert list(shown.told) == ["eaw+js"] and len(shown.told["eaw+js"]) == len(shown.frames)
-    shade = pixels(shown.told["eaw+js"][1])[..., 0]
+    assert list(shown.errors) == ["eaw+js"] and len(shown.errors["eaw+js"]) == len(shown.frames)
+    shade = pixels(shown.errors["eaw+js"][1])[..., 0]
     denoiser = specs[1].build()
     state = None
     for index in range(4):
-        _, state, told = with_error(denoiser, read_frame(fed, index, specs[1].facts.reads), state)
-    expected = (fed.exposure * told.radiance()[0].square().mean(dim=0).sqrt() / MAX_SHOWN_ERROR).clamp(0, 1)
+        _, state, estimate = with_error(denoiser, read_frame(fed, index, specs[1].facts.reads), state)
+    expected = (fed.exposure * estimate.radiance()[0].square().mean(dim=0).sqrt() / MAX_SHOWN_ERROR).clamp(0, 1)
     assert shade.max() > 0
     assert np.abs(shade / 255 - expected.numpy()).max() <= 0.51 / 255
-    assert all(clip["told"] == {} for clip in page.data["clips"])
+    assert all(clip["errors"] == {} for clip in page.data["clips"])
 
 
 def test_curves_are_the_frames(page, evaluated):

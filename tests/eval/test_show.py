@@ -119,7 +119,7 @@ def test_clip_without_reference_or_some_channel(tiny, tmp_path, capsys, shipped)
         show(copy, tmp_path / "out", tmp_path, "tiny", ["accumulated"])
     show(copy, tmp_path / "out", tmp_path, "tiny")
     out = capsys.readouterr().out
-    assert re.search(r"(?m)^accumulated\b.*: skipped, the clip holds no motion", out)
+    assert re.search(r"(?m)^accumulated\b.*: skipped, the clip has no motion", out)
     assert re.search(r"(?m)^rae\b.*: skipped, it has no weights", out)
 
 

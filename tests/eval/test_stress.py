@@ -14,7 +14,7 @@ from command_line import main
 from errors import BadInput
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
 from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
-from eval.stress.check import FORGOTTEN, StressCheck
+from eval.stress.check import MAX_RESIDUE, StressCheck
 from eval.stress.irradiance_range import IrradianceRange
 from eval.stress.lit_frames import NOISE_PERIOD
 from eval.stress.logits import largest_logits, last_layers
@@ -238,7 +238,7 @@ def test_nan_is_found(check):
     bright = ["a firefly of 65504", "radiance 6e4", "radiance 1e-7 to 6e4"]
     assert broken_in(rows) == all_break(bright, "finite")
     text = verdict_text(rows, STRESS_CASES)
-    assert "finite: what comes of finite pixels is finite" in text and "recovery: " not in text
+    assert "finite: outputs are finite where inputs are finite" in text and "recovery: " not in text
 
 
 def test_spreading_is_found(check):
@@ -279,7 +279,7 @@ def test_recovery_is_counted_in_frames():
     frames = list(case.frames())
     whole = frames[0].radiance("total")
     lost = float((whole - frames[SPOILED_FRAME].finite().radiance("total")).abs().max() / whole.max())
-    expected = next(n for n in range(100) if lost * 0.5 ** (n + 1) <= FORGOTTEN)
+    expected = next(n for n in range(100) if lost * 0.5 ** (n + 1) <= MAX_RESIDUE)
     assert outcome.recovery == expected and outcome.error == pytest.approx(lost / 2)
 
 
@@ -367,10 +367,10 @@ def test_the_range_is_of_every_colour_and_of_what_svgf_adds_up():
     }
     frame = replace(frame, channels=tensors)
     for separates_lights, low, high in ((False, 3.0, 3.0), (True, 1.0, 5.0)):
-        seen = IrradianceRange(separates_lights)
-        seen.see(frame)
+        limits = IrradianceRange(separates_lights)
+        limits.add(frame)
         for level, outside in ((low, 0), (high, 0), (high * 1.01, 0.01), (low * 0.99, 0.01)):
-            assert max(0, seen.violation(frame, torch.full((3, 1, 2), level))) == pytest.approx(outside, abs=1e-6)
+            assert max(0, limits.violation(frame, torch.full((3, 1, 2), level))) == pytest.approx(outside, abs=1e-6)
         red = torch.full((3, 1, 2), low)
         red[0] = 2 * high
-        assert seen.violation(frame, red) == pytest.approx(1)
+        assert limits.violation(frame, red) == pytest.approx(1)

@@ -1,10 +1,10 @@
-"""The bench of light: its scenes end alike, and who has no memory is never behind."""
+"""The study of changing light: all scenes end alike, and a denoiser without history has no lag."""
 
 import numpy as np
 import pytest
 
 from eval.studies import light
-from eval.studies.light import AFTER, BEFORE, CHANGE, STILL, changed, study_light
+from eval.studies.light import AFTER, BEFORE, CHANGE, UNCHANGED, changed, study_light
 from files import read_json
 from render.clip import Sampling
 
@@ -19,19 +19,19 @@ def lamp(change: str, frame: int) -> np.ndarray:
 @pytest.mark.parametrize("change", BEFORE)
 def test_all_scenes_end_in_the_same_light(change):
     for frame in range(CHANGE):
-        assert np.allclose(lamp(change, frame), lamp(STILL, frame)) == (change == STILL)
+        assert np.allclose(lamp(change, frame), lamp(UNCHANGED, frame)) == (change == UNCHANGED)
     for frame in range(CHANGE, CHANGE + AFTER[-1] + 1):
-        assert np.array_equal(lamp(change, frame), lamp(STILL, frame))
+        assert np.array_equal(lamp(change, frame), lamp(UNCHANGED, frame))
 
 
 def test_what_has_no_memory_is_never_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(light, "SIZE", (light.SIZE[0], 24, 32))
-    monkeypatch.setattr(light, "SAMPLING", Sampling(realisations=1, noisy_spp=1, reference_spp=8))
+    monkeypatch.setattr(light, "LIGHT_CLIP_SIZE", (light.LIGHT_CLIP_SIZE[0], 24, 32))
+    monkeypatch.setattr(light, "LIGHT_CLIP_SAMPLING", Sampling(realisations=1, noisy_spp=1, reference_spp=8))
     table = study_light(tmp_path, ("noisy", "accumulated"), "quick")
-    assert "behind, 8 after" in table and (tmp_path / "study" / "light" / "plot.png").exists()
+    assert "loss 8 frames after" in table and (tmp_path / "study" / "light" / "plot.png").exists()
     rows = {row["denoiser"]: row["psnr"] for row in read_json(tmp_path / "study" / "light" / "results.json")["rows"]}
     for change in BEFORE:
-        assert rows["noisy"][change][CHANGE:] == rows["noisy"][STILL][CHANGE:]
-        if change != STILL:
-            assert rows["accumulated"][change][CHANGE] < rows["accumulated"][STILL][CHANGE] - 1
-            assert rows["accumulated"][change][-1] < rows["accumulated"][STILL][-1]
+        assert rows["noisy"][change][CHANGE:] == rows["noisy"][UNCHANGED][CHANGE:]
+        if change != UNCHANGED:
+            assert rows["accumulated"][change][CHANGE] < rows["accumulated"][UNCHANGED][CHANGE] - 1
+            assert rows["accumulated"][change][-1] < rows["accumulated"][UNCHANGED][-1]

@@ -179,10 +179,10 @@ function paintNumbers(context, number, clip) { // number(pixel index * 4) in [0,
 const view = { clip: 0, left: "", right: REFERENCE, frame: 0, mode: "slider", split: 50, flipped: false, zoom: 1, metric: "rmse", hidden: new Set(), timer: 0, draws: 0 };
 const clipNow = () => data.clips[view.clip];
 const MODES = [...byId("views").children].map(button => button.dataset.view);
-const MAPS = { map: "flips", told: "told" }; // views of one picture
+const MAPS = { map: "flips", error: "errors" }; // views of one picture
 const mappedOf = { // whose picture that is
   map: () => (view.left === REFERENCE ? view.right : view.left),
-  told: clip => (view.left in clip.told ? view.left : view.right),
+  error: clip => (view.left in clip.errors ? view.left : view.right),
 };
 
 async function paint() {
@@ -221,8 +221,8 @@ function describe() {
     slider: "", flip: `Shown: ${view.flipped ? view.right : view.left}; press space. `,
     difference: `Mean difference of ${view.left} and ${view.right}: black 0, brightest 0.25 and more. `,
     map: `FLIP of ${mappedOf.map()} against the reference: black 0, brightest 1. `,
-    told: mappedOf.told(clip) in clip.told
-      ? `Error that the samples of ${mappedOf.told(clip)} tell, in exposed radiance: black 0, brightest 0.25 and more. `
+    error: mappedOf.error(clip) in clip.errors
+      ? `Estimated error of ${mappedOf.error(clip)}, in exposed radiance: black 0, brightest 0.25 and more. `
       : "Neither tells its error: NAME+js does, where frames have halves of their samples. ",
   };
   byId("caption").textContent = texts[view.mode] + [...new Set([view.left, view.right])].map(measured).join("; ");
