@@ -19,7 +19,7 @@ from models.shipped_weights import require_shipped, shipped_names
 from models.weights import read_metadata
 from provenance import file_digest
 
-LICENCE = "Apache-2.0"  # that of onespp
+WEIGHTS_LICENCE = "Apache-2.0"  # that of onespp
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
 LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
@@ -61,7 +61,7 @@ def line(name: str) -> dict[str, Any]:
         "step": recipe["step"],
         "validation loss": f"{recipe['validation']:.4g}",
         "SHA-256": file_digest(path)[:12],
-        "licence": LICENCE,
+        "licence": WEIGHTS_LICENCE,
     }
 
 
@@ -127,7 +127,7 @@ def facts(name: str) -> str:
         parameters=recipe["parameters"],
         bytes=weights.stat().st_size,
         digest=file_digest(weights),
-        licence=LICENCE,
+        licence=WEIGHTS_LICENCE,
         budget=recipe["profile"],
         seed=recipe["seed"],
         data=Path(data["profile"]).name,
