@@ -78,6 +78,7 @@ class Channel:
 RADIANCE = "W sr^-1 m^-2"
 LENGTH = "world units"
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (ITU-R BT.709)
+STRATUM = 3  # px, the side of the squares of which each has one sample of the channel gradient
 ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
 REALISATIONS = ("F", "S", "H", "W")

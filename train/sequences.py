@@ -12,7 +12,7 @@ from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, Signal, read_frame
 from errors import BadInput
-from models.history.running_scale import measure
+from models.history.running_scale import log_luminance_and_depth
 from train.augmentation import Augmentation, averaged
 
 
@@ -54,7 +54,7 @@ class WholeFrames:
             light = ("indirect",) if self.signal == "indirect" else NOISY_CHANNELS
             frame = read_frame(clip, index, (*light, "albedo", "depth"), realisation)
             radiance = frame.irradiance(self.signal).clamp(min=0) * frame.divisor
-            self.measured[key] = measure(radiance, frame.depth)
+            self.measured[key] = log_luminance_and_depth(radiance, frame.depth)
         return self.measured[key]
 
 

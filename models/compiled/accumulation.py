@@ -20,7 +20,7 @@ from models.compiled.reprojection import (
     find_row,
     new_search,
 )
-from models.history.surfaces import Surfaces
+from models.history.geometry import GBuffer
 
 MIN_ALPHA = 0.2  # SVGF §4.1: weight of the newest frame in a long history
 
@@ -71,7 +71,7 @@ def accumulate_image(
 
 
 def accumulate_samples(
-    frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, surfaces: Surfaces
+    frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, gbuffer: GBuffer
 ) -> tuple[Tensor, Tensor]:
     """See models.history.accumulation.accumulate_samples."""
     irradiance = torch.empty_like(noisy, memory_format=torch.contiguous_format)
@@ -83,6 +83,6 @@ def accumulate_samples(
             array(noisy[item]),
             array(past_irradiance[item]),
             array(past_length[item, 0]),
-            *Past.of(frame, surfaces, item),
+            *Past.of(frame, gbuffer, item),
         )
     return irradiance, length

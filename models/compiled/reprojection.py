@@ -16,7 +16,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_reciprocals
 from models.compiled.lines import add_product
-from models.history.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
+from models.history.geometry import BACKGROUND_ID, GBuffer, to_previous_camera
 
 PLANE_TOLERANCE = 0.01  # of the depth: largest distance of a tap's surface from the point's plane
 NORMAL_TOLERANCE = 0.9  # smallest cosine of the angle between a tap's normal and the point's
@@ -28,15 +28,15 @@ BLOCK_ROWS = 8  # that share one piece of scratch memory
 
 
 class Buffers(NamedTuple):
-    """What one item of Surfaces holds."""
+    """What one item of GBuffer holds."""
 
     depth: NDArray[np.float32]  # (H, W)
     normal: NDArray[np.float32]  # (3, H, W)
     mesh_id: NDArray[np.float32]  # (H, W)
 
     @staticmethod
-    def of(surfaces: Surfaces, item: int) -> "Buffers":
-        return Buffers(array(surfaces.depth[item, 0]), array(surfaces.normal[item]), array(surfaces.mesh_id[item, 0]))
+    def of(gbuffer: GBuffer, item: int) -> "Buffers":
+        return Buffers(array(gbuffer.depth[item, 0]), array(gbuffer.normal[item]), array(gbuffer.mesh_id[item, 0]))
 
 
 class Views(NamedTuple):
@@ -70,9 +70,9 @@ class Past(NamedTuple):
     views: Views
 
     @staticmethod
-    def of(frame: Frame, surfaces: Surfaces, item: int) -> "Past":
-        now = Buffers.of(Surfaces.of(frame), item)
-        return Past(array(frame.motion[item]), now, Buffers.of(surfaces, item), Views.of(frame, item))
+    def of(frame: Frame, gbuffer: GBuffer, item: int) -> "Past":
+        now = Buffers.of(GBuffer.of(frame), item)
+        return Past(array(frame.motion[item]), now, Buffers.of(gbuffer, item), Views.of(frame, item))
 
 
 class Search(NamedTuple):
@@ -442,12 +442,12 @@ def fetch_image(fetched: Any, found: Any, history: Any, motion: Any, now: Buffer
             found[y] = search.found > 0
 
 
-def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
+def reproject(frame: Frame, history: Tensor, gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
     """See models.history.reprojection.reproject."""
     fetched = torch.empty_like(history, memory_format=torch.contiguous_format)
     found = torch.empty((len(history), 1, *frame.size), dtype=torch.bool)
     for item in range(len(history)):
-        past = Past.of(frame, surfaces, item)
+        past = Past.of(frame, gbuffer, item)
         fetch_image(fetched[item].numpy(), found[item, 0].numpy(), array(history[item]), *past)
     return fetched, found
 
@@ -497,9 +497,9 @@ def give_back_image(given: Any, gradient: Any, motion: Any, now: Buffers, then: 
             give_back(given[c], gradient[c, y], y, search)
 
 
-def reproject_back(gradient: Tensor, frame: Frame, surfaces: Surfaces) -> Tensor:
+def reproject_back(gradient: Tensor, frame: Frame, gbuffer: GBuffer) -> Tensor:
     """The gradient of the history from that of what was fetched of it, both (B, C, H, W)."""
     given = torch.zeros_like(gradient, memory_format=torch.contiguous_format)
     for item in range(len(gradient)):
-        give_back_image(given[item].numpy(), array(gradient[item]), *Past.of(frame, surfaces, item))
+        give_back_image(given[item].numpy(), array(gradient[item]), *Past.of(frame, gbuffer, item))
     return given

@@ -29,7 +29,7 @@ from models.compiled.jit import (
 from models.compiled.lines import copy_line
 from models.compiled.reprojection import BLOCK_ROWS, ONE, Buffers, Past, Views, fetch, find_row, new_search
 from models.filters.atrous import B3_SPLINE, RADIUS
-from models.history.surfaces import Surfaces
+from models.history.geometry import GBuffer
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 ALPHA = 0.2  # §4.1: weight of the newest sample
@@ -133,7 +133,7 @@ def integrate_samples(
     past_colour: Tensor,
     past_moments: Tensor,
     past_length: Tensor,
-    surfaces: Surfaces,
+    gbuffer: GBuffer,
     change: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See models.filters.svgf.integrate_samples."""
@@ -150,7 +150,7 @@ def integrate_samples(
             array(past_moments[item]),
             array(past_length[item, 0]),
             plane_or_empty(change, item),
-            *Past.of(frame, surfaces, item),
+            *Past.of(frame, gbuffer, item),
         )
     return colour, moments, length
 

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models.export.step import Step, Tensors
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from models.history.surfaces import Surfaces
 
 Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, of inputs by name
 
@@ -15,7 +15,7 @@ Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, o
 def warped(step: Step, state: dict[str, Tensor], frame: Frame, before: Frame) -> dict[str, Tensor]:
     """The state moved along with the surfaces, as far as that is left to the caller."""
     moved = {
-        each.port.name: reproject(frame, state[each.port.name], Surfaces.of(before))[0]
+        each.port.name: reproject(frame, state[each.port.name], GBuffer.of(before))[0]
         for each in step.carried
         if each.warped
     }

@@ -9,7 +9,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import MAX_MAGNITUDE, Frame
 from models.export.reprojection import View, expectation, fetch, places, table_of
 from models.export.step import MESHES, Carried, Port, Step, Warp, image
-from models.history.surfaces import to_previous_camera
+from models.history.geometry import to_previous_camera
 
 PORTS = {
     port.name: port

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models.compiled.reprojection import NORMAL_TOLERANCE, PLANE_TOLERANCE
-from models.history.surfaces import BACKGROUND_ID
+from models.history.geometry import BACKGROUND_ID
 
 NOWHERE = -1.0  # mesh id around the image
 

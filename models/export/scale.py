@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.history.running_scale import LUMINANCE_BLOCK, MEDIAN_GRID, MIDDLE_GREY, SLOWEST_RATE
+from models.history.running_scale import LUMINANCE_BLOCK, MEDIAN_GRID, MIDDLE_GREY, MIN_RATE
 from models.operators import image_luminance
 
 LEAST_LUMINANCE = 1e-37  # normal in float32
@@ -63,7 +63,7 @@ def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tenso
     new, valid = (torch.cat(both) for both in zip(luminance, measured_depth(padded, *depth.shape[-2:]), strict=True))
     mean, count = state.split(2)
     count = count + valid
-    rate = (1 / count.clamp(min=1)).clamp(min=SLOWEST_RATE) * valid
+    rate = (1 / count.clamp(min=1)).clamp(min=MIN_RATE) * valid
     mean = mean + rate * (new - mean)
     grey_over_luminance, depth_scale = torch.exp(mean * torch.tensor([-1.0, 1.0])).split(1)
     return torch.cat([mean, count]), Scale(grey_over_luminance, depth_scale)

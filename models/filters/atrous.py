@@ -1,18 +1,19 @@
-"""Windows with holes: what the edge-avoiding à-trous filters EAW and SVGF share (Dammertz et al. 2010).
+"""Windows with holes (à trous), which the edge-avoiding filters share (Dammertz et al. 2010).
 
-Images are (..., H, W). Taps outside the image are left out, so that weights are normalised over the others.
+Images are (..., C, H, W). Taps outside the image are skipped, and weights normalised over the others.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from types import EllipsisType
 
+import torch
 from torch import Tensor
 
 from models.operators import STRIP_ROWS
 
-ATROUS_LEVELS = 5
+ATROUS_STEPS = (1, 2, 4, 8, 16)  # px from tap to tap, level by level
 B3_SPLINE = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)  # h, separable
 RADIUS = len(B3_SPLINE) // 2
 CENTRE = B3_SPLINE[RADIUS] ** 2
@@ -22,7 +23,7 @@ Region = tuple[EllipsisType, slice, slice]
 
 @dataclass(frozen=True)
 class Tap:
-    """One place q = p + (dx, dy) of a window, for the pixels p of a strip whose q lies in the image."""
+    """An offset (dx, dy) of a window, with the pixels p of a strip whose q = p + (dx, dy) lies in the image."""
 
     dx: int
     dy: int
@@ -31,7 +32,7 @@ class Tap:
 
 
 def strip_taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]:
-    """A window of (2 radius + 1)² places `step` pixels apart, without its centre, strip by strip of an image (H, W)."""
+    """The taps of windows of (2 radius + 1)² pixels, `step` apart, without the centre, by strips of (H, W)."""
     height, width = size
     offsets = range(-radius * step, radius * step + 1, step)
     for start in range(0, height, STRIP_ROWS):
@@ -47,7 +48,7 @@ def strip_taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]
 
 
 class WindowSum:
-    """The sum of an image's values over every pixel's window, weighted; begun with the pixel itself."""
+    """Weighted sums of an image over the window of every pixel, starting with `centre` times the pixel itself."""
 
     def __init__(self, image: Tensor, centre: float):
         self.image = image
@@ -57,6 +58,17 @@ class WindowSum:
         self.sum[tap.p].addcmul_(weight, self.image[tap.q])
 
 
+def window_mean(image: Tensor, centre: float, taps: Iterable[Tap], weight: Callable[[Tap], Tensor]) -> Tensor:
+    """Means of an image (..., C, H, W) over windows, of `centre` times the pixel itself and `weight` (..., 1, h, w)."""
+    total = WindowSum(torch.ones_like(image[..., :1, :, :]), centre)
+    weighted = WindowSum(image, centre)
+    for tap in taps:
+        tap_weight = weight(tap)
+        total.add(tap, tap_weight)
+        weighted.add(tap, tap_weight)
+    return weighted.sum / total.sum
+
+
 def b3_spline(tap: Tap, step: int) -> float:
-    """h(q), the weight of one tap of a level whose taps are `step` pixels apart."""
+    """h(q), the weight of a tap on a level whose taps are `step` pixels apart."""
     return B3_SPLINE[RADIUS + tap.dx // step] * B3_SPLINE[RADIUS + tap.dy // step]

@@ -1,4 +1,4 @@
-"""The two baselines that every denoiser must beat: nothing, and temporal accumulation alone."""
+"""The two baselines that every denoiser must beat: no denoising, and temporal accumulation alone."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ class Noisy(Denoiser):
 
     reads = ("direct", "indirect", "emission")
     refuses = CLASSICAL
+    convex = True
     has_kernels = False
     baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
@@ -31,20 +32,21 @@ class AccumulatedState(State):
 
 
 class Accumulating(Denoiser):
-    """A denoiser that begins with temporal accumulation, which models.wrappers.adaptive replaces."""
+    """A denoiser whose input is accumulated irradiance; models.wrappers.adaptive replaces `accumulation`."""
 
     accumulation: Callable[[Frame, Tensor, Accumulation | None], Accumulation] = staticmethod(accumulate)
 
-    def accumulated(self, frame: Frame, before: AccumulatedState | None) -> Accumulation:
-        """The history with the frame's irradiance."""
-        return self.accumulation(frame, frame.irradiance(self.signal), before.history if before else None)
+    def accumulated(self, frame: Frame, previous: AccumulatedState | None) -> Accumulation:
+        """The frame's irradiance, blended into its history."""
+        return self.accumulation(frame, frame.irradiance(self.signal), previous.history if previous else None)
 
 
 class Accumulated(Accumulating):
-    """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), no spatial filter."""
+    """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), without a spatial filter."""
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
+    convex = True
     baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

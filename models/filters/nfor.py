@@ -30,7 +30,7 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame
 from models.denoiser import CLASSICAL, Denoiser, State
-from models.filters.neighbours import mesh_means, shifted
+from models.filters.neighbours import mesh_means, taps_3x3, taps_on_mesh
 from models.operators import MIN_DIVISOR
 
 REACH = 9  # R, px: windows of 19 x 19
@@ -119,8 +119,8 @@ def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float
 
 def checkerboard_buffers(colour: Tensor, mesh_id: Tensor) -> Tensor:
     """Sample buffers A and B (B, 2, 3, H, W): each has every other pixel of colour (B, 3, H, W), between them means."""
-    beside = shifted(colour, 1)[:, :, 1::2]
-    same = shifted(mesh_id + 1, 1)[:, :, 1::2] == mesh_id[:, :, None] + 1
+    beside = taps_3x3(colour, 1)[:, :, 1::2]
+    same = taps_on_mesh(mesh_id, 1)[:, :, 1::2]
     count = same.sum(dim=2)
     mean = torch.where(count > 0, torch.where(same, beside, 0).sum(dim=2) / count.clamp(min=1), colour)
     height, width = colour.shape[-2:]

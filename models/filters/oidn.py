@@ -1,4 +1,4 @@
-"""OIDN: Intel Open Image Denoise, the denoiser that renderers ship, to compare with."""
+"""OIDN: Intel Open Image Denoise, the denoiser that renderers ship, for comparison."""
 
 import weakref
 from typing import Any, Literal
@@ -17,7 +17,7 @@ IMAGES = ("color", "albedo", "normal", "output")
 
 
 def open_device(threads: int) -> Any:
-    """A committed CPU device of pyoidn. Raises BadInput, with what to install, where there is none to be had."""
+    """A committed CPU device of pyoidn. Raises BadInput, with what to install, where OIDN does not run."""
     try:
         import pyoidn
 
@@ -42,8 +42,8 @@ def release_native(device: Any, filter_: Any) -> None:
 class RayTracingFilter:
     """OIDN's filter "RT" for images of one size. OIDN reads and writes the tensors of `images` in place.
 
-    Settings are those that OIDN's documentation recommends for the best image: HDR; albedo and normals as auxiliary
-    images, here free of noise and said to be so (`cleanAux`); the exposure left to OIDN (`inputScale` not set).
+    Settings are those that OIDN's documentation recommends for the best quality: HDR; noise-free albedo and normals as
+    auxiliary images (`cleanAux`); automatic exposure (`inputScale` not set).
     """
 
     def __init__(self, height: int, width: int, threads: int, quality: OIDNQuality):
@@ -52,8 +52,8 @@ class RayTracingFilter:
 
         self.device = device
         self.filter = pyoidn.Filter(device)
-        self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at exit at the latest
-        with torch.inference_mode(False):  # else they could not be written to outside of it
+        self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at the latest at exit
+        with torch.inference_mode(False):  # else they could not be written outside of it
             self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
         for name, image in self.images.items():
             self.filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
@@ -74,16 +74,15 @@ class RayTracingFilter:
             self.images[name].copy_(value.permute(1, 2, 0))
         self.filter.execute()
         self.check()
-        return (
-            self.images["output"].permute(2, 0, 1).to(colour.device, memory_format=torch.contiguous_format, copy=True)
-        )
+        output = self.images["output"].permute(2, 0, 1)
+        return output.to(colour.device, memory_format=torch.contiguous_format, copy=True)
 
 
 class OIDN(Denoiser):
-    """Denoises each noisy frame by itself; reflected radiance only: emission, free of noise, is added afterwards.
+    """Denoises reflected radiance frame by frame; noise-free emission is added afterwards.
 
-    Runs on CPU threads, as many as PyTorch has. `quality` is "high" (OIDN's default, for final frames), "balanced" or
-    "fast" (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
+    Runs on as many CPU threads as PyTorch. `quality` is "high" (OIDN's default, for final frames), "balanced" or "fast"
+    (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
     """
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
@@ -95,7 +94,7 @@ class OIDN(Denoiser):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.key: tuple[int, int, int] | None = None  # (H, W, threads) that the filter was made for
+        self.key: tuple[int, int, int] | None = None  # (H, W, threads) of the filter
 
     def unavailable(self) -> str | None:
         try:
@@ -109,7 +108,7 @@ class OIDN(Denoiser):
         open_device(torch.get_num_threads()).release()
 
     def filter_for(self, height: int, width: int) -> RayTracingFilter:
-        """The filter of the last frame, or a new one where size or threads have changed: making one takes long."""
+        """The filter of the last frame, or a new one if size or threads have changed: creating one is slow."""
         key = (height, width, torch.get_num_threads())
         if key != self.key:
             self.filter = RayTracingFilter(*key, self.quality)
@@ -143,7 +142,7 @@ class OIDNFast(OIDN):
 
 
 class OIDNAccumulated(Accumulating, OIDN):
-    """Denoises temporally accumulated irradiance, re-modulated. The history is not filtered."""
+    """Denoises temporally accumulated irradiance, remodulated. The history is not filtered."""
 
     reads = Accumulated.reads
     has_kernels = True

@@ -1,22 +1,22 @@
-"""SBF: SURE-based filtering (Li et al. 2012), without its adaptive sampling: of a bank of filters the best at a pixel.
+"""SBF: SURE-based filtering (Li et al. 2012) without its adaptive sampling: at each pixel the best of a filter bank.
 
-The bank are cross-bilateral filters, whose Gaussians are of different widths in the image. Stein's unbiased risk
-estimate (SURE) tells the squared error of each from the noisy image c alone, (F(c) - c)² + 2 σ² dF/dc - σ², where σ²
-is the variance of the noise.
+The bank consists of cross-bilateral filters with spatial Gaussians of different widths. Stein's unbiased risk estimate
+(SURE) gives the squared error of each from the noisy image c alone, (F(c) - c)² + 2 σ² dF/dc - σ², where σ² is the
+variance of the noise.
 
 Where the paper leaves it open, we choose:
 
-- The filters have no range term on colour (σ_r = ∞), nor has the authors' code, which says that results are noisy with
-  one. So they are linear in colours, and dF/dc is the pixel's share of its own weights.
-- Distances of features are not divided by their variances: ours are free of noise, for which the authors advise so
-  (Schied et al. 2017, §5.1). Depth counts in units of the frame's largest, as in the authors' code.
+- The filters have no range term on colour (σ_r = ∞), as in the authors' code, which reports noisy results with one. So
+  they are linear in colours, and dF/dc is the share of the pixel in its own weights.
+- Distances of features are not divided by their variances: ours are free of noise, for which the authors recommend this
+  (Schied et al. 2017, §5.1). Depth is divided by the frame's maximum, as in the authors' code.
 - σ_f are its defaults, 0.8 for normals, 0.25 for albedo, 0.6 for depth; windows end at 2 σ_s.
-- It filters irradiance, with albedo still among the features. The paper filters radiance; but with one sample a pixel
-  σ² has to come from other pixels, among which texture would count as noise.
-- σ² is how far each colour spreads over 9 x 9 pixels of the own mesh. That is the variance of the pixel as it is,
-  however many samples it is the mean of.
-- A filter's risk is the mean over colours; it is smoothed as by a filter of the bank, of σ_s = 8, before the choice.
-- Background lies far from all surfaces in its features, so that no surface gathers from it.
+- It filters irradiance, with albedo among the features. The paper filters radiance; but with one sample per pixel σ²
+  has to be estimated from other pixels, where texture would count as noise.
+- σ² is the variance of each colour over 9 x 9 pixels of the same mesh: that of the pixel as it is, whatever its number
+  of samples.
+- The risk of a filter is the mean over colours, smoothed by a filter of the bank's kind with σ_s = 8.
+- The features of background are far from those of all surfaces, so that no surface gathers from it.
 """
 
 import math
@@ -37,13 +37,13 @@ BANK = tuple(2 ** (i / 2) for i in range(7))  # px; σ_s from 1 to 8
 RISK_SIGMA = 8.0  # px
 SIGMA_NORMAL = 0.8
 SIGMA_ALBEDO = 0.25
-SIGMA_DEPTH = 0.6  # of the frame's largest
-FAR_AWAY = 1e3  # what background has in place of a depth; what is outside the image lies as far on the other side
-GATHERED_ROWS = 16  # that are worked on at once: all taps along a row are gathered
+SIGMA_DEPTH = 0.6  # of the frame's maximum
+BACKGROUND_DEPTH = 1e3  # in σ; outside the image it is the negative of this
+GATHERED_ROWS = 16  # filtered at once: all taps along a row are gathered
 
 
 def gaussians(sigmas: Sequence[float]) -> Tensor:
-    """Gaussians of offsets along an axis, each cut off at 2 σ: (2 radius + 1, S), with the radius of the widest."""
+    """Gaussians of offsets along an axis, each truncated at 2 σ: (2 radius + 1, S), with the radius of the widest."""
     widths = torch.tensor(sigmas)
     radii = (2 * widths).round()
     radius = int(radii.max())
@@ -52,9 +52,9 @@ def gaussians(sigmas: Sequence[float]) -> Tensor:
 
 
 def guides(frame: Frame) -> Tensor:
-    """Features f (B, 7, H, W), so scaled that exp(-|f(p) - f(q)|²) is the product of their Gaussians."""
-    furthest = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
-    depth = torch.where(frame.depth > 0, frame.depth / furthest / SIGMA_DEPTH, FAR_AWAY)
+    """Features f (B, 7, H, W), scaled such that exp(-|f(p) - f(q)|²) is the product of their Gaussians."""
+    max_depth = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
+    depth = torch.where(frame.depth > 0, frame.depth / max_depth / SIGMA_DEPTH, BACKGROUND_DEPTH)
     return torch.cat([frame.normal / SIGMA_NORMAL, frame.albedo / SIGMA_ALBEDO, depth], dim=1) / math.sqrt(2)
 
 
@@ -62,23 +62,22 @@ def guides(frame: Frame) -> Tensor:
 def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
     """Sums (B, S, C, H, W) over windows of an image (B, C, H, W), with the weights of S cross-bilateral filters.
 
-    A weight is exp(-|f(p) - f(q)|²) of `guides` f (B, F, H, W), times one of `gaussians` (2 radius + 1, S) along each
-    axis.
+    A weight is exp(-|f(p) - f(q)|²) of `guides` f (B, F, H, W), times `gaussians` (2 radius + 1, S) along each axis.
     """
     taps = len(gaussians)
-    around = (taps // 2,) * 4
-    padded_image = F.pad(image, around)
-    padded_guides = F.pad(guides, around, value=-FAR_AWAY)
+    padding = (taps // 2,) * 4
+    padded_image = F.pad(image, padding)
+    padded_guides = F.pad(guides, padding, value=-BACKGROUND_DEPTH)
     batch, channels, height, width = image.shape
     strips = []
     for top in range(0, height, GATHERED_ROWS):
         bottom = min(top + GATHERED_ROWS, height)
-        here = guides[:, :, top:bottom, :, None]
+        centre = guides[:, :, top:bottom, :, None]
         sums = image.new_zeros(batch, channels, bottom - top, width, gaussians.shape[1])
         for dy in range(taps):
             rows = (..., slice(top + dy, bottom + dy), slice(None))
-            there = padded_guides[rows].unfold(-1, taps, 1)
-            weight = (there - here).square_().sum(dim=1, keepdim=True).neg_().exp_()
+            row_guides = padded_guides[rows].unfold(-1, taps, 1)
+            weight = (row_guides - centre).square_().sum(dim=1, keepdim=True).neg_().exp_()
             sums += (weight * padded_image[rows].unfold(-1, taps, 1)) @ (gaussians * gaussians[dy])
         strips.append(sums)
     return torch.cat(strips, dim=2).movedim(-1, 1)
@@ -87,27 +86,27 @@ def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
 def filter_with_risk(
     colour: Tensor, variance: Tensor, guides: Tensor, sigmas: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
-    """What each filter makes of colour (B, 3, H, W), and its risk: both (B, S, 3, H, W).
+    """Colour (B, 3, H, W) by each filter, and its risk: both (B, S, 3, H, W).
 
-    `variance` (B, 3, H, W) is that of the colour's noise, `sigmas` are the filters' σ_s.
+    `variance` (B, 3, H, W) is that of the noise, `sigmas` are the filters' σ_s.
     """
     ones = torch.ones_like(colour[:, :1])
     sums = window_sums(torch.cat([colour, ones], dim=1), guides, gaussians(sigmas).to(colour))
     filtered = sums[:, :, :3] / sums[:, :, 3:]
-    derivative = 1 / sums[:, :, 3:]  # the weight of a pixel for itself is 1
+    derivative = 1 / sums[:, :, 3:]  # a pixel's own weight is 1
     return filtered, (filtered - colour[:, None]).square() + (2 * derivative - 1) * variance[:, None]
 
 
 def best_filtered(colour: Tensor, variance: Tensor, guides: Tensor) -> Tensor:
-    """Colour (B, 3, H, W), at each pixel by the filter of BANK whose risk is the least around it."""
+    """Colour (B, 3, H, W), at each pixel by the filter of BANK with the smallest smoothed risk."""
     filtered, risk = filter_with_risk(colour, variance, guides, BANK)
-    smoothed = window_sums(risk.mean(dim=2), guides, gaussians([RISK_SIGMA]).to(colour))  # times the same for all
+    smoothed = window_sums(risk.mean(dim=2), guides, gaussians([RISK_SIGMA]).to(colour))  # up to a factor
     best = smoothed.argmin(dim=2, keepdim=True)
     return filtered.take_along_dim(best, dim=1)[:, 0]
 
 
 class SBF(Denoiser):
-    """Filters each frame by itself, within the range of its irradiance."""
+    """Filters frame by frame, within the range of its irradiance."""
 
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id")
     refuses = CLASSICAL

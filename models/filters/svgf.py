@@ -2,14 +2,14 @@
 
 Where the paper is silent, we choose:
 
-- A sample's history length counts the sample itself; "< 4 frames" (§4.2) compares it, rounded, with 4.
-- The temporal variance, that of single samples, is the first level's as it is, although integration has averaged it.
-- Depths are along the viewing axis (clip-space depth is affine in them). ∇z takes, along each axis, the smaller of the
-  differences to the two neighbours of the same mesh, so that it never sees across a silhouette; 0 without any.
+- The history length of a sample includes the sample; "< 4 frames" (§4.2) compares it, rounded, with 4.
+- The temporal variance of single samples enters the first level unscaled, although integration has averaged it.
+- Depths are along the viewing axis (clip-space depth is affine in them). ∇z is, along each axis, the smaller difference
+  to the two neighbours of the same mesh, so that it never crosses a silhouette; 0 without any.
 - ε of Eq. 3 is relative to the depth, so that the scene's scale cancels; ε of Eq. 5 is below any radiance's square.
-- The spatial estimate (§4.2) averages the integrated moments over its 7 × 7 pixels with the weights w_z · w_n.
-- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis, over the pixels that show surfaces.
-- Background has no normal: its weight is 0 except for itself, so it is neither filtered nor mixed with surfaces.
+- The spatial estimate (§4.2) averages the integrated moments over 7 × 7 pixels with the weights w_z · w_n.
+- The 3 × 3 Gaussian is (1/4, 1/2, 1/4) along each axis, over pixels that show surfaces.
+- Background has no normal: it has weight 0 for all other pixels, so it is neither filtered nor mixed with surfaces.
 """
 
 from collections.abc import Sequence
@@ -24,26 +24,22 @@ from models import compiled
 from models.compiled import svgf as kernels
 from models.compiled.svgf import ALPHA, EPSILON_L, EPSILON_Z, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
-from models.filters.atrous import ATROUS_LEVELS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
+from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from models.history.surfaces import Surfaces
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 
-ATROUS_STEPS = tuple(2**level for level in range(ATROUS_LEVELS))  # px from tap to tap
-RELIABLE = 4  # §4.2: frames of history from which on the temporal variance is trusted
+MIN_TEMPORAL_LENGTH = 4  # §4.2: frames of history from which on the temporal variance is used
 
 
 @dataclass(frozen=True)
 class Integrated:
-    """The temporally integrated samples of S signals, which are the next frame's history (§4.1, §4.2).
+    """Temporally integrated samples of S signals, the history of the next frame (§4.1, §4.2)."""
 
-    colour (B, S, 3, H, W): irradiance; moments (B, S, 2, H, W): raw moments of its luminance; length (B, 1, H, W).
-    """
-
-    colour: Tensor
-    moments: Tensor
-    length: Tensor
-    surfaces: Surfaces
+    colour: Tensor  # (B, S, 3, H, W), irradiance
+    moments: Tensor  # (B, S, 2, H, W), raw moments of its luminance
+    length: Tensor  # (B, 1, H, W), frames
+    gbuffer: GBuffer
 
 
 def luminance_moments(colour: Tensor) -> Tensor:
@@ -59,35 +55,35 @@ def integrate_samples(
     past_colour: Tensor,
     past_moments: Tensor,
     past_length: Tensor,
-    surfaces: Surfaces,
+    gbuffer: GBuffer,
     change: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`integrate` with a history, whose G-buffer is `surfaces`: colour, moments and length of Integrated."""
-    before = [past_colour.flatten(1, 2), past_moments.flatten(1, 2), past_length]
-    past, found = reproject(frame, torch.cat(before, dim=1), surfaces)
+    """`integrate` where there is a previous frame, with `gbuffer`: colour, moments and length of Integrated."""
+    past = [past_colour.flatten(1, 2), past_moments.flatten(1, 2), past_length]
+    history, has_history = reproject(frame, torch.cat(past, dim=1), gbuffer)
     change = torch.zeros_like(past_length) if change is None else change
-    alpha = torch.where(found, (1 - change) * ALPHA + change, 1)
-    colour, moments, length = past.split([part.shape[1] for part in before], dim=1)
+    alpha = torch.where(has_history, (1 - change) * ALPHA + change, 1)
+    colour, moments, length = history.split([image.shape[1] for image in past], dim=1)
     return (
         torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
         torch.lerp(moments.view_as(past_moments), luminance_moments(noisy), alpha[:, None]),
-        torch.where(found, length * (1 - change) + 1, 1),
+        torch.where(has_history, length * (1 - change) + 1, 1),
     )
 
 
-def integrate(frame: Frame, colour: Tensor, history: Integrated | None, change: Tensor | None = None) -> Integrated:
+def integrate(frame: Frame, colour: Tensor, previous: Integrated | None, change: Tensor | None = None) -> Integrated:
     """Blend a frame's irradiance (B, S, 3, H, W) into its history: C' = C where it has none (§4.1).
 
-    `change` (B, 1, H, W) in [0, 1] is how much of the history to give up (see models.filters.asvgf), by default none.
+    `change` (B, 1, H, W) in [0, 1] is the share of the history to discard (see models.filters.asvgf), by default none.
     """
-    if history is None:
-        return Integrated(colour, luminance_moments(colour), torch.ones_like(frame.depth), Surfaces.of(frame))
-    past = history.colour, history.moments, history.length, history.surfaces
-    return Integrated(*integrate_samples(frame, colour, *past, change), Surfaces.of(frame))
+    if previous is None:
+        return Integrated(colour, luminance_moments(colour), torch.ones_like(frame.depth), GBuffer.of(frame))
+    past = previous.colour, previous.moments, previous.length, previous.gbuffer
+    return Integrated(*integrate_samples(frame, colour, *past, change), GBuffer.of(frame))
 
 
 def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
-    """Change of depth per pixel along `dim`, from the nearer in depth of the two neighbours on the same mesh."""
+    """Change of depth per pixel along `dim`: the smaller of the differences to the two neighbours on the same mesh."""
     depth = depth.movedim(dim, -1)
     mesh_id = mesh_id.movedim(dim, -1)
     step = torch.where(mesh_id[..., 1:] == mesh_id[..., :-1], depth.diff(dim=-1), torch.inf)
@@ -99,7 +95,7 @@ def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
 
 @compiled.by(kernels.pack_geometry)
 def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
-    """What stops the filters at the edges of surfaces, (B, 1, 7, H, W).
+    """The geometry that edge-stopping functions compare, (B, 1, 7, H, W).
 
     Unit normal (3; 0 for background), depth, σ_z ∇z (2: along x and y, per pixel), ε of Eq. 3.
     """
@@ -110,7 +106,7 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
 
 
 def geometry_weight(p: Tensor, q: Tensor, dx: int, dy: int) -> Tensor:
-    """w_z · w_n (Eq. 3 and 4) of q = p + (dx, dy), like one channel of the geometry (..., 7, h, w) at p and q."""
+    """w_z · w_n (Eq. 3 and 4), (..., 1, h, w), of q = p + (dx, dy), from the geometry (..., 7, h, w) at p and q."""
     x, y, z, depth, along_x, along_y, epsilon = p.split(1, dim=-3)
     to_x, to_y, to_z, to_depth = q.split(1, dim=-3)[:4]
     w_n = (x * to_x).addcmul_(y, to_y).addcmul_(z, to_z).clamp_(min=0)
@@ -124,22 +120,21 @@ def geometry_weight(p: Tensor, q: Tensor, dx: int, dy: int) -> Tensor:
 def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
     """Variance (B, S, 1, H, W) of luminance, replaced `where` (B, 1, H, W) by a 7 x 7 bilateral estimate (§4.2).
 
-    `variance` and `mean` (B, S, 1, H, W) are of the integrated moments. The estimate is the mean of the variances plus
-    the variance of the means about the window's centre: the number that the averaged moments give, without their
-    cancellation.
+    `variance` and `mean` (B, S, 1, H, W) are those of the integrated moments. The estimate is the mean of the variances
+    plus the variance of the means about the window's centre: that of the averaged moments, without their cancellation.
     """
     total = WindowSum(torch.ones_like(geometry[:, :, :1]), 1)
-    spread = WindowSum(variance, 1)
+    variances = WindowSum(variance, 1)
     first = torch.zeros_like(mean)
     second = torch.zeros_like(mean)
     for tap in strip_taps(mean.shape[-2:], SPATIAL_RADIUS):
         weight = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
-        off = mean[tap.q] - mean[tap.p]
+        difference = mean[tap.q] - mean[tap.p]
         total.add(tap, weight)
-        spread.add(tap, weight)
-        first[tap.p].addcmul_(weight, off)
-        second[tap.p].addcmul_(weight, off.square_())
-    estimate = (spread.sum + second) / total.sum - (first / total.sum).square()
+        variances.add(tap, weight)
+        first[tap.p].addcmul_(weight, difference)
+        second[tap.p].addcmul_(weight, difference.square_())
+    estimate = (variances.sum + second) / total.sum - (first / total.sum).square()
     return torch.where(where[:, None], estimate.clamp(min=0), variance)
 
 
@@ -147,12 +142,12 @@ def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
     """Variance (B, S, 1, H, W) of luminance: temporal, or spatial while the history is short (§4.2)."""
     mean, square = integrated.moments.split(1, dim=2)
     variance = (square - mean.square()).clamp(min=0)
-    short = integrated.length.round() < RELIABLE  # interpolated from whole numbers, not always exactly
+    short = integrated.length.round() < MIN_TEMPORAL_LENGTH  # interpolated from whole numbers, not always exactly
     return spatial_variance(variance, mean, geometry, short) if short.any() else variance
 
 
 def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
-    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W); g takes pixels that show a `surface` (B, 1, 1, H, W)."""
+    """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W); g covers pixels that show a `surface` (B, 1, 1, H, W)."""
     total = WindowSum(surface.to(variance), 1 / 4)
     mean = WindowSum(variance * surface, 1 / 4)
     for tap in strip_taps(variance.shape[-2:], 1):
@@ -171,22 +166,22 @@ def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) ->
     scale = edge_scale(variance, geometry[:, :, 3:4] > 0)
     total = WindowSum(torch.ones_like(variance), CENTRE)
     mean = WindowSum(colour, CENTRE)
-    spread = WindowSum(variance, CENTRE**2)
+    variances = WindowSum(variance, CENTRE**2)
     for tap in strip_taps(variance.shape[-2:], RADIUS, step):
         w_l = (y[tap.p] - y[tap.q]).abs_().mul_(scale[tap.p]).neg_().exp_()
         w_zn = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
         weight = w_l.mul_(w_zn.mul_(b3_spline(tap, step)))
         total.add(tap, weight)
         mean.add(tap, weight)
-        spread.add(tap, weight.square_())
-    return mean.sum / total.sum, spread.sum / total.sum.square()
+        variances.add(tap, weight.square_())
+    return mean.sum / total.sum, variances.sum / total.sum.square()
 
 
 @compiled.by(kernels.svgf_levels)
 def svgf_levels(
     colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Level after level of the à-trous transform, with those steps: the first colour, the last colour and variance."""
+    """Levels of the à-trous transform, with these steps: the colour of the first, colour and variance of the last."""
     first, variance = svgf_level(colour, variance, geometry, steps[0])
     colour = first
     for step in steps[1:]:
@@ -196,7 +191,7 @@ def svgf_levels(
 
 @dataclass(frozen=True)
 class SVGFState(State):
-    """What is integrated in the next frame, and the estimated variance (B, S, 1, H, W) of this one."""
+    """The history of the next frame, and the estimated variance (B, S, 1, H, W) of this one."""
 
     history: Integrated
     variance: Tensor
@@ -208,16 +203,13 @@ class SVGFState(State):
 
 
 def irradiances(frame: Frame, signal: Signal) -> Tensor:
-    """Noisy demodulated direct and indirect, (B, 2, 3, H, W), or indirect alone, (B, 1, 3, H, W)."""
+    """Noisy direct and indirect irradiance, (B, 2, 3, H, W), or indirect alone, (B, 1, 3, H, W)."""
     parts = [frame.direct, frame.indirect] if signal == "total" else [frame.indirect]
     return torch.stack([part / frame.divisor for part in parts], dim=1)
 
 
 class SVGF(Denoiser):
-    """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset.
-
-    Their sum so stays within the sums of these limits.
-    """
+    """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset."""
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
@@ -226,15 +218,15 @@ class SVGF(Denoiser):
     baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def change(self, frame: Frame) -> Tensor | None:
-        """How much of the history to give up, (B, 1, H, W) in [0, 1]; None for nothing anywhere."""
+        """The share of the history to discard, (B, 1, H, W) in [0, 1]; None for none."""
         return None
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = matching_state(state, SVGFState, frame)
-        history = before.history if before else None
+        previous = matching_state(state, SVGFState, frame)
+        history = previous.history if previous else None
         integrated = integrate(frame, irradiances(frame, self.signal), history, self.change(frame))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
-        estimated = estimate_variance(integrated, geometry)
-        first, colour, _ = svgf_levels(integrated.colour, estimated, geometry, ATROUS_STEPS)
+        variance = estimate_variance(integrated, geometry)
+        first, colour, _ = svgf_levels(integrated.colour, variance, geometry, ATROUS_STEPS)
         history = replace(integrated, colour=first)  # §4.3: the first level's output
-        return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, estimated)
+        return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, variance)

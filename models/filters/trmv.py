@@ -1,20 +1,19 @@
-"""TRMV: temporally reliable motion vectors (Zeng et al. 2021): SVGF that finds history by what causes light.
+"""TRMV: temporally reliable motion vectors (Zeng et al. 2021): SVGF with motion vectors for each cause of light.
 
-"Temporally Reliable Motion Vectors for Real-time Ray Tracing". A shadow moves with its blocker, a reflection with what
-is reflected, and what was hidden resembles what was beside the occluder: so light's history is not where the surface's
-is. The renderer follows blockers and reflected points (render/tracking.py) and hidden surfaces (dual motion).
+"Temporally Reliable Motion Vectors for Real-time Ray Tracing". Shadows move with the blocker, reflections with what is
+reflected, and what was hidden resembles what was beside the occluder. The renderer tracks blockers and reflected points
+(render/tracking.py) and hidden surfaces (dual motion).
 
-We do not have the paper's text; its abstract, and what Zeng et al. say of it in their later paper (NTD §3.2, §6), tell
-the three kinds of vectors. What we choose:
+We do not have the paper's text; the three kinds of vectors follow its abstract and the authors' later paper (NTD §3.2,
+§6). We choose:
 
-- Everything but where history is looked for is SVGF's: its tests, its blending, its filter. Direct and indirect light
-  have histories of their own.
-- One sample a pixel meets a blocker or does not, and by chance one of several. So shadows move by the mean of all
-  samples over 9 × 9 pixels of the own mesh whose blocker moved, where these are SHADED of the window.
-- Reflections move as what the pixel's own sample hit, where surfaces are smoother than GLOSSY and most samples of the
-  window left them as by a mirror: plastic, of whose light the most part is its base's, moves as a surface. Direct
-  light is a reflection there, too, of the lamp.
-- Where neither holds, history is that of dual motion.
+- All but the motion vectors is SVGF's: validation, blending, filter. Direct and indirect light have separate histories.
+- One sample per pixel hits one of several blockers, by chance, or none. So shadows move by the mean of all samples over
+  9 × 9 pixels of the same mesh whose blocker moved, where these are MIN_SHADOWED of the window.
+- Reflections move with the hit point of the pixel's own sample, on surfaces smoother than MAX_GLOSSY_ALPHA where most
+  samples of the window were mirror-like: plastic, dominated by its diffuse base, moves as a surface. There, direct
+  light is the reflection of the lamp.
+- Elsewhere, motion vectors are dual.
 """
 
 from dataclasses import dataclass, replace
@@ -24,49 +23,40 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models.denoiser import State, matching_state
-from models.filters.neighbours import mesh_sums
-from models.filters.svgf import (
-    ATROUS_STEPS,
-    SVGF,
-    Integrated,
-    estimate_variance,
-    integrate,
-    irradiances,
-    pack_geometry,
-    svgf_levels,
-)
+from models.filters.atrous import ATROUS_STEPS
+from models.filters.neighbours import mesh_sums_9x9
+from models.filters.svgf import SVGF, Integrated, estimate_variance, integrate, irradiances, pack_geometry, svgf_levels
 
-MOVED = 1 / 64  # px; what is closer together counts as the same place
-SHADED = 1 / 8
-MIRRORING = 1 / 2
-GLOSSY = 0.25  # GGX alpha
+MIN_OFFSET = 1 / 64  # px; smaller offsets count as none
+MIN_SHADOWED = 1 / 8
+MIN_MIRRORED = 1 / 2
+MAX_GLOSSY_ALPHA = 0.25  # GGX
 
 
-def offset_around(vectors: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
-    """How much farther than their surfaces things move, by `vectors` (B, 2, H, W), around each pixel.
+def mean_offset(vectors: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
+    """The mean offset (B, 2, H, W) of `vectors` (B, 2, H, W) from surface motion, over 9 x 9 pixels of the same mesh.
 
-    The mean offset (B, 2, H, W) of those that do move farther, of 9 x 9 pixels of the own mesh, and their share of
-    these, (B, 1, H, W).
+    Only pixels with an offset count; also returned is their share of the window, (B, 1, H, W).
     """
     offset = vectors - frame.motion
-    farther = offset.abs().amax(dim=1, keepdim=True) > MOVED
-    counted = torch.cat([torch.where(farther, offset, 0), farther, torch.ones_like(frame.depth)], dim=1)
-    offsets, votes, pixels = mesh_sums(mesh_sums(counted, frame.mesh_id, 1), frame.mesh_id, 3).split([2, 1, 1], dim=1)
-    return offsets / votes.clamp(min=1), votes / pixels
+    moves = offset.abs().amax(dim=1, keepdim=True) > MIN_OFFSET
+    summands = torch.cat([torch.where(moves, offset, 0), moves, torch.ones_like(frame.depth)], dim=1)
+    offsets, count, pixels = mesh_sums_9x9(summands, frame.mesh_id).split([2, 1, 1], dim=1)
+    return offsets / count.clamp(min=1), count / pixels
 
 
 def reliable_vectors(frame: Frame) -> list[Tensor]:
-    """Where the history of direct and of indirect light is, (B, 2, H, W) each, in pixels."""
-    _, mirroring = offset_around(frame.reflection_motion, frame)
-    shadow, shaded = offset_around(frame.shadow_motion, frame)
-    glossy = (frame.roughness < GLOSSY) & (mirroring > MIRRORING)
+    """Motion vectors of direct and of indirect light, (B, 2, H, W) each, in pixels."""
+    _, mirrored = mean_offset(frame.reflection_motion, frame)
+    offset, shadowed = mean_offset(frame.shadow_motion, frame)
+    glossy = (frame.roughness < MAX_GLOSSY_ALPHA) & (mirrored > MIN_MIRRORED)
     indirect = torch.where(glossy, frame.reflection_motion, frame.dual_motion)
-    return [torch.where(~glossy & (shaded > SHADED), frame.motion + shadow, indirect), indirect]
+    return [torch.where(~glossy & (shadowed > MIN_SHADOWED), frame.motion + offset, indirect), indirect]
 
 
 @dataclass(frozen=True)
 class TRMVState(State):
-    """What is integrated in the next frame, a history for each signal."""
+    """The histories of the next frame, one for each signal."""
 
     histories: list[Integrated]
 
@@ -81,18 +71,16 @@ class TRMV(SVGF):
     reads: tuple[str, ...] = (*SVGF.reads, "roughness", "dual_motion", "shadow_motion", "reflection_motion")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        before = matching_state(state, TRMVState, frame)
+        previous = matching_state(state, TRMVState, frame)
         signals = irradiances(frame, self.signal).split(1, dim=1)
-        histories = before.histories if before else [None] * len(signals)
-        integrated = [
-            integrate(replace(frame, channels=frame.channels | {"motion": vectors}), signal, history)
-            for vectors, signal, history in zip(
-                reliable_vectors(frame)[-len(signals) :], signals, histories, strict=True
-            )
-        ]
+        histories = previous.histories if previous else [None] * len(signals)
+        integrated = []
+        for vectors, signal, history in zip(reliable_vectors(frame)[-len(signals) :], signals, histories, strict=True):
+            moved = replace(frame, channels=frame.channels | {"motion": vectors})
+            integrated.append(integrate(moved, signal, history))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         variance = torch.cat([estimate_variance(part, geometry) for part in integrated], dim=1)
         colour = torch.cat([part.colour for part in integrated], dim=1)
         first, colour, _ = svgf_levels(colour, variance, geometry, ATROUS_STEPS)
-        kept = [replace(part, colour=own) for part, own in zip(integrated, first.split(1, dim=1), strict=True)]
+        kept = [replace(part, colour=level) for part, level in zip(integrated, first.split(1, dim=1), strict=True)]
         return frame.remodulate(colour.sum(dim=1), self.signal), TRMVState(frame.moment, kept)

@@ -1,1 +1,1 @@
-"""What is carried from frame to frame: reprojection, accumulation, and the scale of a sequence."""
+"""What is carried from frame to frame: G-buffers, reprojection, accumulation, and the scale of a sequence."""

@@ -1,4 +1,4 @@
-"""Causal estimates of how bright and how deep a sequence is: what networks use instead of the clip's exposure."""
+"""Causal estimates of a sequence's brightness and depth, which networks normalise by in place of a clip's exposure."""
 
 import math
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ from torch.nn import functional as F
 
 from models.operators import image_luminance
 
-MIDDLE_GREY = 0.18  # what the geometric mean of luminance is exposed to
-SLOWEST_RATE = 0.1  # weight of the newest frame in running estimates, once they have settled
+MIDDLE_GREY = 0.18  # the exposed geometric mean of luminance
+MIN_RATE = 0.1  # weight of the newest frame in running estimates, once they have settled
 MEDIAN_GRID = 64  # the median depth of large images is taken from about as many rows and columns
 LUMINANCE_BLOCK = 16  # px; the logarithm of a mean over a block is far less biased than that of single samples
 
@@ -25,7 +25,7 @@ class RunningMean:
     def update(self, new: Tensor, valid: Tensor) -> "RunningMean":
         """With one more frame's `new` (B,), where `valid` (B,)."""
         count = self.count + valid
-        rate = (1 / count.clamp(min=1)).clamp(min=SLOWEST_RATE)
+        rate = (1 / count.clamp(min=1)).clamp(min=MIN_RATE)
         return RunningMean(torch.where(valid, torch.lerp(self.value, new, rate), self.value), count)
 
 
@@ -38,7 +38,7 @@ class RunningScale:
 
     @staticmethod
     def neutral(like: Tensor) -> "RunningScale":
-        """Exposure 1 and depth scale 1 for a batch of `like` (B, ...), until a frame tells better."""
+        """Exposure 1 and depth scale 1 for a batch of `like` (B, ...), before the first valid frame."""
         zero = like.new_zeros(len(like))
         return RunningScale(RunningMean(zero + math.log(MIDDLE_GREY), zero), RunningMean(zero, zero))
 
@@ -64,16 +64,15 @@ def block_luminances(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     return y / torch.where(share > 0, share, 1), share > 0
 
 
-def measure(radiance: Tensor, depth: Tensor) -> Tensor:
-    """What one frame tells: the logarithms of its luminance and of its median depth, (B, 2).
+def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
+    """Logarithms of one frame's mean luminance and of its median depth, both of surfaces alone: (B, 2).
 
-    `radiance` (B, 3, H, W) is noisy direct + indirect light. Background counts in neither. NaN where a frame is all
-    black, or has no surface.
+    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is black, or has no surface.
     """
-    y, seen = block_luminances(radiance, depth)
-    blocks = seen.sum(dim=1).clamp(min=1)
+    y, has_surface = block_luminances(radiance, depth)
+    blocks = has_surface.sum(dim=1).clamp(min=1)
     mean = y.sum(dim=1) / blocks
-    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)) * seen
+    log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)) * has_surface
     log_y = (log_y.sum(dim=1) / blocks).to(radiance.dtype)
     stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
     depths = depth[..., ::stride_y, ::stride_x].flatten(1)
@@ -84,16 +83,16 @@ def measure(radiance: Tensor, depth: Tensor) -> Tensor:
 
 
 def running_scale(
-    radiance: Tensor, depth: Tensor, before: RunningScale | None, whole: Tensor | None = None
+    radiance: Tensor, depth: Tensor, previous: RunningScale | None, whole: Tensor | None = None
 ) -> RunningScale:
-    """Update the estimates with what `measure` says of one frame, or `whole` of the frame that this one is a crop of.
+    """Update the estimates with one frame, see `log_luminance_and_depth`; where that is NaN, they stay.
 
-    The logarithms of each frame's estimates are averaged. A frame that is all black, or has no surface, does not count.
+    Of a training crop, `whole` (B, 2) are the logarithms of the frame that it was cut from.
     """
-    before = before or RunningScale.neutral(radiance)
-    new = (measure(radiance, depth) if whole is None else whole).to(radiance)
+    previous = previous or RunningScale.neutral(radiance)
+    new = (log_luminance_and_depth(radiance, depth) if whole is None else whole).to(radiance)
     log_luminance, log_depth = new.unbind(dim=1)
     return RunningScale(
-        before.log_luminance.update(log_luminance, ~log_luminance.isnan()),
-        before.log_depth.update(log_depth, ~log_depth.isnan()),
+        previous.log_luminance.update(log_luminance, ~log_luminance.isnan()),
+        previous.log_depth.update(log_depth, ~log_depth.isnan()),
     )

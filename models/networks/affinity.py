@@ -8,7 +8,7 @@ from torch import Tensor
 from models import compiled
 from models.compiled import affinity as kernels
 from models.compiled.affinity import MIN_LOGIT
-from models.filters.neighbours import shifted
+from models.filters.neighbours import taps_3x3
 from models.operators import MIN_DIVISOR
 
 
@@ -17,7 +17,7 @@ def plain_level(
 ) -> Tensor:
     """See affinity_level: the way that PyTorch takes."""
     count = features.shape[1]
-    taps = shifted(torch.cat([features, importance, surface, image], dim=1), step)
+    taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
     exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
     weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]

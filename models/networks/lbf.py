@@ -27,9 +27,9 @@ from torch import Tensor, nn
 from datasets.frame import Frame, Signal
 from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.denoiser import Denoiser, State, matching_state
-from models.filters.neighbours import mesh_means, mesh_variance, shifted
+from models.filters.neighbours import mesh_means, mesh_variance, taps_3x3
+from models.history.geometry import positions_around_eye, ray_axes
 from models.history.running_scale import RunningScale, running_scale
-from models.history.surfaces import positions_around_eye, ray_axes
 from models.networks.cross_bilateral import Pixels, cross_bilateral
 from models.networks.secondary_features import SECONDARY, secondary_features
 from models.operators import MAX_LUMINANCE
@@ -64,8 +64,8 @@ def remove_spikes(image: Tensor, surface: Tensor) -> Tensor:
     A pixel is a spike if one of its colours is more than SPIKE standard deviations from the mean of its neighbours'.
     Only pixels with a `surface` (B, 1, H, W) count; of two in the middle, the median is the larger.
     """
-    taps = shifted(image, 1)
-    shown = shifted(surface, 1)
+    taps = taps_3x3(image, 1)
+    shown = taps_3x3(surface, 1)
     beside = shown.clone()
     beside[:, :, 4] = 0
     count = beside.sum(dim=2)

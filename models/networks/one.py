@@ -27,9 +27,9 @@ from models.compiled.one import (
 )
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
-from models.history.surfaces import Surfaces
 from models.networks.affinity import affinity_level
 from models.networks.convolution import ConvReLU
 from models.operators import pad_to_multiple
@@ -89,7 +89,7 @@ class OneState(State):
     accumulated: Tensor  # (B, 3, H, W)
     length: Tensor  # (B, 1, H, W), samples
     latent: Tensor  # (B, LATENT, H, W)
-    surfaces: Surfaces
+    gbuffer: GBuffer
     scale: RunningScale
     alpha: Tensor  # (B, 2, H, W), of accumulation and output; for debugging
 
@@ -228,7 +228,7 @@ class One(Denoiser):
         history = has_history.expand(-1, sum(HISTORY), -1, -1)
         if before is not None:
             carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
-            history, valid = reproject(frame, carried, before.surfaces)
+            history, valid = reproject(frame, carried, before.gbuffer)
             has_history = valid.to(noisy) * surface
         return PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
 
@@ -259,7 +259,7 @@ class One(Denoiser):
             decoded.accumulated,
             decoded.length,
             decoded.latent,
-            Surfaces.of(frame),
+            GBuffer.of(frame),
             scale,
             decoded.alpha.detach(),
         )

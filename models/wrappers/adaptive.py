@@ -27,9 +27,9 @@ from models.filters.atrous import Tap, WindowSum, strip_taps
 from models.filters.baselines import Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from models.history.strata import middles, repeated, sums
-from models.history.surfaces import Surfaces
+from models.history.strata import repeat_strata, strata_centres, strata_sums
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
 
@@ -49,10 +49,10 @@ class Neighbourhoods:
     """
 
     def __init__(self, frame: Frame):
-        mesh_id = middles(frame.mesh_id)
-        geometry = pack_geometry(middles(frame.depth), middles(frame.normal), mesh_id)[:, 0]
+        mesh_id = strata_centres(frame.mesh_id)
+        geometry = pack_geometry(strata_centres(frame.depth), strata_centres(frame.normal), mesh_id)[:, 0]
         self.size = frame.size
-        self.members = (frame.depth > 0) & (frame.mesh_id == repeated(mesh_id, frame.size))
+        self.members = (frame.depth > 0) & (frame.mesh_id == repeat_strata(mesh_id, frame.size))
         self.taps: list[tuple[Tap, Tensor]] = [
             (tap, geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy))
             for tap in strip_taps(geometry.shape[-2:], RADIUS)
@@ -60,7 +60,7 @@ class Neighbourhoods:
 
     def sums(self, image: Tensor, power: int = 1) -> Tensor:
         """Sums (B, C, h, w) over each window of an image (B, C, H, W), weighted by w^power."""
-        window = WindowSum(sums(image), 1)
+        window = WindowSum(strata_sums(image), 1)
         for tap, weight in self.taps:
             window.add(tap, weight**power)
         return window.sum
@@ -69,7 +69,7 @@ class Neighbourhoods:
         """Means (B, C, H, W) over the members of each window of an image (B, C, H, W), weighted by w; else 0."""
         members = self.members.to(image)
         total, count = self.sums(torch.cat([image * members, members], dim=1)).split([image.shape[1], 1], dim=1)
-        return repeated(total / count.clamp(min=1), self.size) * members
+        return repeat_strata(total / count.clamp(min=1), self.size) * members
 
 
 def brightest(expected: Tensor, around: Neighbourhoods) -> Tensor:
@@ -105,7 +105,7 @@ def gain(newest: Tensor, past: Tensor, cut: Tensor, limit: Tensor, around: Neigh
     factor = torch.ones_like(past)
     for _ in range(GAIN_STEPS):
         ratio = (around.sums(torch.minimum(newest, limit * factor)) + MIN_DIVISOR) / then_cut
-        factor = repeated(ratio.clamp(whole.clamp(max=1), whole.clamp(min=1)) ** believed, around.size)
+        factor = repeat_strata(ratio.clamp(whole.clamp(max=1), whole.clamp(min=1)) ** believed, around.size)
     return factor
 
 
@@ -130,9 +130,9 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
         limit = brightest(luminance, around)
         cut = torch.minimum(luminance, limit)
         shared = bounded(irradiance, limit, around)
-        return AdaptiveAccumulation(shared, torch.ones_like(cut), Surfaces.of(frame), cut)
+        return AdaptiveAccumulation(shared, torch.ones_like(cut), GBuffer.of(frame), cut)
     before = torch.cat([history.irradiance, history.length, history.cut], dim=1)
-    fetched, found = reproject(frame, before, history.surfaces)
+    fetched, found = reproject(frame, before, history.gbuffer)
     past, n, past_cut = fetched.split([3, 1, 1], dim=1)
     past_luminance = luminance_of(past)
     limit = brightest(torch.where(found, past_luminance, luminance), around)
@@ -143,7 +143,7 @@ def accumulate_adaptively(frame: Frame, irradiance: Tensor, history: Accumulatio
     return AdaptiveAccumulation(
         torch.lerp(past * factor, bounded(irradiance, limit, around), alpha),
         torch.where(found, n + 1, 1),
-        Surfaces.of(frame),
+        GBuffer.of(frame),
         torch.lerp(past_cut * factor, torch.minimum(luminance, limit), alpha),
     )
 

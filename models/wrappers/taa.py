@@ -9,9 +9,9 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame
 from models.denoiser import State, matching_state
+from models.history.geometry import GBuffer, pixel_centres
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
-from models.history.surfaces import Surfaces
 from models.wrappers.wrapper import Wrapper
 
 NEWEST = 0.1  # weight of the current frame
@@ -49,10 +49,10 @@ def fetch_bicubic(history: Tensor, motion: Tensor) -> Tensor:
     `motion` (B, 2, H, W) is in pixels.
     """
     height, width = history.shape[-2:]
-    y, x = torch.meshgrid(torch.arange(height).to(motion), torch.arange(width).to(motion), indexing="ij")
+    x, y = pixel_centres(height, width, motion)
     # Far outside the image an index would overflow; any place outside is as good.
-    x = (x + 0.5 + motion[:, 0]).clamp(-1, width + 1) * (2 / width) - 1
-    y = (y + 0.5 + motion[:, 1]).clamp(-1, height + 1) * (2 / height) - 1
+    x = (x + motion[:, 0]).clamp(-1, width + 1) * (2 / width) - 1
+    y = (y + motion[:, 1]).clamp(-1, height + 1) * (2 / height) - 1
     grid = torch.stack([x, y], dim=-1)
     return F.grid_sample(history, grid, "bicubic", "border", align_corners=False).clamp(min=0)
 
@@ -83,7 +83,7 @@ class AntialiasedState(State):
 
     inner: State
     output: Tensor
-    surfaces: Surfaces
+    gbuffer: GBuffer
     scale: RunningScale
 
     def pictures(self) -> dict[str, Tensor]:
@@ -108,7 +108,7 @@ class Antialiased(Wrapper):
         scale = running_scale(output, frame.depth, before.scale if before else None)
         if before:
             exposure = scale.exposure()
-            _, found = reproject(frame, before.surfaces.mesh_id, before.surfaces)
+            _, found = reproject(frame, before.gbuffer.mesh_id, before.gbuffer)
             past = compress(fetch_bicubic(before.output, frame.motion) * exposure)
             output = expand(resolve(compress(output * exposure), past, found)) / exposure
-        return output, AntialiasedState(frame.moment, inner, output, Surfaces.of(frame), scale)
+        return output, AntialiasedState(frame.moment, inner, output, GBuffer.of(frame), scale)

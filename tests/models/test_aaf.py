@@ -15,7 +15,7 @@ from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
 from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, pixel_size, positions, widths
-from models.filters.neighbours import mesh_least
+from models.filters.neighbours import mesh_min
 from scenes.camera import View, pixel_centres, unproject
 from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
@@ -112,7 +112,7 @@ def test_the_least_counts_of_what_the_own_mesh_met():
     expected[1:4, 1:4] = 0.5
     expected[1:4, 5:7] = 0.1
     torch.testing.assert_close(found, expected)
-    assert mesh_least(torch.full((1, 1, 1, 1), 3.0), torch.zeros(1, 1, 1, 1)).item() == 3
+    assert mesh_min(torch.full((1, 1, 1, 1), 3.0), torch.zeros(1, 1, 1, 1)).item() == 3
 
 
 def test_positions_are_where_the_camera_s_rays_end():

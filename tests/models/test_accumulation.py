@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from models.history.accumulation import Accumulation, accumulate
-from models.history.surfaces import Surfaces
+from models.history.geometry import GBuffer
 from tests.helpers.frames import flat_frame
 
 
@@ -30,7 +30,7 @@ def test_accumulation_starts_anew_where_disoccluded():
     mesh = torch.ones(1, 1, 4, 6)
     mesh[..., 3:] = 2
     before = Accumulation(
-        torch.zeros(1, 3, 4, 6), torch.full((1, 1, 4, 6), 7.0), Surfaces.of(flat_frame(4, 6, mesh_id=mesh))
+        torch.zeros(1, 3, 4, 6), torch.full((1, 1, 4, 6), 7.0), GBuffer.of(flat_frame(4, 6, mesh_id=mesh))
     )
     history = accumulate(frame, frame.irradiance("total"), before)
     assert (history.length[..., 4:] == 1).all() and (history.irradiance[..., 4:] == 2).all()

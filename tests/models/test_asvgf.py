@@ -6,7 +6,7 @@ import torch
 
 from models.filters.asvgf import ASVGF, change_of_light
 from models.filters.svgf import ALPHA, SVGF, SVGFState
-from models.history.strata import STRATUM, middles, repeated, sums
+from models.history.strata import STRATUM, repeat_strata, strata_centres, strata_sums
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 24
@@ -85,7 +85,9 @@ def test_strata_and_back(size):
     whole = np.zeros((-(-size[0] // 3) * 3, -(-size[1] // 3) * 3), np.float32)
     whole[: size[0], : size[1]] = image[0, 0]
     expected = whole.reshape(whole.shape[0] // 3, 3, -1, 3).sum(axis=(1, 3))
-    np.testing.assert_array_equal(sums(image)[0, 0], expected)
-    assert repeated(sums(image), size).shape == image.shape
-    np.testing.assert_array_equal(repeated(middles(image), size)[0, 0, ::3, ::3], middles(image)[0, 0])
-    assert middles(image)[0, 0, 0, 0] == image[0, 0, min(1, size[0] - 1), min(1, size[1] - 1)]
+    np.testing.assert_array_equal(strata_sums(image)[0, 0], expected)
+    assert repeat_strata(strata_sums(image), size).shape == image.shape
+    np.testing.assert_array_equal(
+        repeat_strata(strata_centres(image), size)[0, 0, ::3, ::3], strata_centres(image)[0, 0]
+    )
+    assert strata_centres(image)[0, 0, 0, 0] == image[0, 0, min(1, size[0] - 1), min(1, size[1] - 1)]

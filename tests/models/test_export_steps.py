@@ -29,8 +29,8 @@ from models.export.registry import STEPS, load_step
 from models.export.reprojection import View, expectation, fetch, places, table_of
 from models.export.runtime import run_onnx, run_pt2
 from models.filters import neighbours
+from models.history.geometry import GBuffer, to_previous_camera
 from models.history.reprojection import reproject
-from models.history.surfaces import Surfaces, to_previous_camera
 from models.networks.affinity import plain_level
 from models.registry import create
 from models.spec import load
@@ -196,7 +196,7 @@ def test_taps_are_those_of_our_reprojection(height, width, dx, dy, seed):
     torch.manual_seed(seed)
     meshes = [torch.randint(0, 4, (1, 1, height, width)) for _ in range(2)]
     frame = flat_frame(height, width, (dx, dy), mesh_id=meshes[0])
-    surfaces = replace(Surfaces.of(frame), mesh_id=meshes[1].float())
+    surfaces = replace(GBuffer.of(frame), mesh_id=meshes[1].float())
     history = torch.rand(1, 4, height, width)
     expected, found = reproject(frame, history, surfaces)
     pixels = places(height, width)

@@ -12,7 +12,6 @@ from datasets.frame import Frame, read_frame
 from models import compiled
 from models.compiled.one import FEATURES
 from models.history.reprojection import reproject
-from models.history.surfaces import Surfaces
 from models.networks.one import One
 from tests.helpers.frames import chain, flat_frame, play, run
 
@@ -84,7 +83,7 @@ def test_where_nothing_was_found_history_has_no_weight(tiny, fresh):
     clip = Dataset(tiny).clips("test")[1]
     first, later = read_frame(clip, 0, fresh.reads), read_frame(clip, 7, fresh.reads, previous=0)
     _, before = play(fresh, [first])
-    _, found = reproject(later, before.output, Surfaces.of(first))
+    _, found = reproject(later, before.output, GBuffer.of(first))
     _, after = play(fresh, [first, later])
     lost = ~found & (later.depth > 0)
     assert lost.any() and found.any()

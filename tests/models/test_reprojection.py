@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from models.history.surfaces import Surfaces
 from tests.helpers.frames import flat_frame
 
 
@@ -23,7 +23,7 @@ def ramp(height: int, width: int) -> torch.Tensor:
 def test_bilinear_inside_a_plane_is_exact(motion):
     """A linear ramp is reproduced exactly where all taps are inside the image."""
     frame = flat_frame(6, 8, motion)
-    history, found = reproject(frame, ramp(6, 8), Surfaces.of(frame))
+    history, found = reproject(frame, ramp(6, 8), GBuffer.of(frame))
     y, x = np.mgrid[0:6, 0:8].astype(float)
     px = x + motion[0]
     py = y + motion[1]
@@ -82,7 +82,7 @@ def test_reprojection_equals_the_naive_version(height, width, dx, dy, seed):
     frame = flat_frame(height, width, (dx, dy), mesh_id=torch.from_numpy(now)[None, None])
     before = flat_frame(height, width, mesh_id=torch.from_numpy(then)[None, None])
     values = rng.uniform(0, 1, (height, width))
-    history, found = reproject(frame, torch.from_numpy(values).float()[None, None], Surfaces.of(before))
+    history, found = reproject(frame, torch.from_numpy(values).float()[None, None], GBuffer.of(before))
     expected, expected_found = naive_reproject(frame, values, then)
     np.testing.assert_array_equal(found[0, 0].numpy(), expected_found)
     np.testing.assert_allclose(history[0, 0].numpy(), expected, atol=1e-5)
@@ -91,19 +91,19 @@ def test_reprojection_equals_the_naive_version(height, width, dx, dy, seed):
 def test_taps_on_other_depth_or_normal_are_refused():
     frame = flat_frame(5, 5)
     nearer = flat_frame(5, 5, depth=1.9)
-    _, found = reproject(frame, ramp(5, 5), Surfaces.of(nearer))
+    _, found = reproject(frame, ramp(5, 5), GBuffer.of(nearer))
     assert not found.any()
     turned = flat_frame(5, 5)
     turned.channels["normal"] = turned.normal.roll(1, dims=1)
-    _, found = reproject(frame, ramp(5, 5), Surfaces.of(turned))
+    _, found = reproject(frame, ramp(5, 5), GBuffer.of(turned))
     assert not found.any()
 
 
 def test_background_finds_background_only():
     sky = flat_frame(4, 4, depth=0.0, mesh_id=torch.zeros(1, 1, 4, 4))
     sky.channels["normal"] = torch.zeros(1, 3, 4, 4)
-    assert reproject(sky, ramp(4, 4), Surfaces.of(sky))[1].all()
-    assert not reproject(flat_frame(4, 4), ramp(4, 4), Surfaces.of(sky))[1].any()
+    assert reproject(sky, ramp(4, 4), GBuffer.of(sky))[1].all()
+    assert not reproject(flat_frame(4, 4), ramp(4, 4), GBuffer.of(sky))[1].any()
 
 
 def test_reprojection_follows_a_mesh_that_moves(tiny):
@@ -115,13 +115,13 @@ def test_reprojection_follows_a_mesh_that_moves(tiny):
         position = frame.motion + torch.stack(torch.meshgrid(torch.arange(64), torch.arange(64), indexing="xy"))[None]
         inside = ((position >= 0) & (position <= 63)).all(dim=1, keepdim=True)
         hidden = (frame.dual_motion - frame.motion).abs().amax(dim=1, keepdim=True) > 1 / 64
-        history, found = reproject(frame, before.mesh_id, Surfaces.of(before))
+        history, found = reproject(frame, before.mesh_id, GBuffer.of(before))
         assert found[inside & ~hidden].float().mean() > 0.99
         torch.testing.assert_close(history[found], frame.mesh_id[found])
     # Seven frames at once: strips too wide for any tap to bridge come into view.
     last = read_frame(clip, 7, names[:-1], previous=0)
     first = read_frame(clip, 0, names[:-1])
-    history, found = reproject(last, first.mesh_id, Surfaces.of(first))
+    history, found = reproject(last, first.mesh_id, GBuffer.of(first))
     torch.testing.assert_close(history[found], last.mesh_id[found])
     assert 0.005 < (~found).float().mean() < 0.3
 
@@ -133,9 +133,9 @@ def test_compiled_reprojection_equals_pytorch_s(tiny):
     for index in range(1, clip.frames):
         frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
         history = torch.cat([before.irradiance("total"), before.depth], dim=1)
-        fast, found = reproject(frame, history, Surfaces.of(before))
+        fast, found = reproject(frame, history, GBuffer.of(before))
         with compiled.disabled():
-            slow, expected = reproject(frame, history, Surfaces.of(before))
+            slow, expected = reproject(frame, history, GBuffer.of(before))
         assert (found != expected).float().mean() < 1e-3
         close = torch.isclose(fast, slow, rtol=1e-3, atol=1e-3).all(dim=1)
         assert close.float().mean() > 0.999
@@ -148,7 +148,7 @@ def test_the_gradient_is_the_transpose(tiny):
     generator = torch.Generator().manual_seed(0)
     for index, previous in ((1, 0), (4, 3), (7, 0)):
         frame = read_frame(clip, index, names, previous=previous)
-        then = Surfaces.of(read_frame(clip, previous, names))
+        then = GBuffer.of(read_frame(clip, previous, names))
         history = torch.randn(1, 2, 64, 64, generator=generator, requires_grad=True)
         other = torch.randn(1, 2, 64, 64, generator=generator)
         weight = torch.randn(1, 2, 64, 64, generator=generator)

@@ -16,8 +16,8 @@ from models.filters import eaw, svgf
 from models.filters.baselines import Accumulated
 from models.filters.eaw import EAW
 from models.filters.svgf import SVGF, Integrated
+from models.history.geometry import GBuffer
 from models.history.running_scale import running_scale
-from models.history.surfaces import Surfaces
 from tests.helpers.frames import flat_frame, play, run
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])
@@ -187,7 +187,7 @@ def integrated(rng, depth, lengths):
     square = mean**2 + rng.random(mean.shape)
     moments = to_torch(np.stack([mean, square], axis=1), 1, 2, 2, *depth.shape)
     nothing = torch.zeros(1, 1, *depth.shape)
-    where = Surfaces(nothing, nothing, nothing)
+    where = GBuffer(nothing, nothing, nothing)
     return Integrated(torch.zeros(1, 2, 3, *depth.shape), moments, to_torch(lengths), where)
 
 
@@ -482,4 +482,4 @@ def test_eaw_s_features(monkeypatch):
         y, x = torch.nonzero(hit, as_tuple=True)
         torch.testing.assert_close(pixel[0] / pixel[2], x + 0.5, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(pixel[1] / pixel[2], y + 0.5, rtol=1e-4, atol=1e-3)
-        assert (features[0, 6:, ~hit] == eaw.FAR_AWAY).all()
+        assert (features[0, 6:, ~hit] == eaw.BACKGROUND_POSITION).all()

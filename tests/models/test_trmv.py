@@ -8,7 +8,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from eval.bench.synthetic_frames import synthetic_frame
 from models import registry
-from models.filters.trmv import offset_around, reliable_vectors
+from models.filters.trmv import mean_offset, reliable_vectors
 from tests.helpers.frames import chain, flat_frame, run
 
 SIZE = 36
@@ -70,7 +70,7 @@ def test_offsets_are_means_over_the_own_mesh():
     offset[:, :, 12, 12] = torch.tensor([5.0, 1])
     offset[:, :, 10, 22] = 100
     frame = with_channels(flat_frame(SIZE, SIZE, mesh_id=mesh), motion=motion)
-    around, share = offset_around(motion + offset, frame)
+    around, share = mean_offset(motion + offset, frame)
     torch.testing.assert_close(around[0, :, 11, 11], torch.tensor([4.0, 0]))
     torch.testing.assert_close(share[0, 0, 11, 11], torch.tensor(2 / 81))
     torch.testing.assert_close(around[0, :, 10, 18], torch.tensor([0.0, 0]))  # beside another mesh
