@@ -16,10 +16,10 @@ We know the papers by their abstracts, others' accounts and, of the second, the 
 - s and z are minima over 3 x 3 pixels of the same mesh: those of a single sample are too noisy, and would make filters
   narrower the darker the sample. Minima over more pixels would make filters narrower than light requires.
 - μ, by which filters narrow as samples increase, is 1.
-- The papers leave direct light unfiltered where nothing blocks it: there it is free of noise. Ours is noisy, so a lamp
-  is treated as a surface that indirect light comes from: z = d₁, or less by a shadow.
-- For direct light, a tap is weighted by the narrower Gaussian of both pixels, so that shadows, whose filters are narrow,
-  do not leak to where filters are wide; for indirect light, by that of the receiving pixel, as in the paper.
+- The papers leave direct light unfiltered where nothing blocks it: there it is free of noise. Ours is noisy, so a
+  lamp is treated as a surface that indirect light comes from: z = d₁, or less by a shadow.
+- For direct light, a tap is weighted by the narrower Gaussian of both pixels, so that shadows, whose filters are
+  narrow, do not leak to where filters are wide; for indirect light, by that of the receiving pixel, as in the paper.
 - GGX roughness α corresponds to Phong's m = (1/α² - 1) / 2. All light of a surface is filtered by the width of its
   roughness, since lobes are not stored separately.
 - Filters of direct light have the edge-stopping functions of indirect ones, with the z of the same width.

@@ -9,9 +9,9 @@ Differences from the authors' code:
 
 - Both accumulations use the reprojection of all denoisers here (history/reprojection.py).
 - Positions are along the world's axes, relative to the camera, and scaled to [0, 1] in each block before they are
-  squared; the authors scale only extents above one unit. The span of 1, positions and squares does not depend on the
-  origin, but far from it noise hides the difference between positions and their squares.
-- An axis along which a block is flat, to 10^-3 of its largest extent, is scaled by that: rounding errors are no feature.
+  squared; the authors scale only extents above one unit. The span of 1, positions and squares does not depend on
+  the origin, but far from it noise hides the difference between positions and their squares.
+- An axis along which a block is flat, to 10^-3 of its largest extent, is scaled by that: rounding is no feature.
 - Light and features of background are 0, the constant too, except for the noise. So blocks with few surfaces are
   regularised as strongly as full ones and have full rank. Blocks without any surface are skipped.
 - The grid's offsets are the first 16 points of the R2 sequence. Noise is the same for all blocks of a frame, and drawn

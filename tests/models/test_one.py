@@ -11,6 +11,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from models import compiled
 from models.compiled.one import FEATURES
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.networks.one import One
 from tests.helpers.frames import chain, flat_frame, play, run
