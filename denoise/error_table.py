@@ -39,7 +39,7 @@ class FrameError:
             frame,
             float(estimate.frame.samples.mean()),
             estimate.relative_error(),
-            estimate.most_relative_error(),
+            estimate.max_relative_error(),
             until,
             None if until is None else np.ceil(estimate.samples_for(until)).item(),
         )

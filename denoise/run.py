@@ -34,8 +34,8 @@ from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN, OIDNQuality
 from models.registry import parse_name
 from models.spec import DenoiserSpec, fastest_precision
-from models.wrappers.error_estimate import with_error
-from models.wrappers.shrinkage import Shrunk
+from models.wrappers.error_estimate import denoise_with_error
+from models.wrappers.shrinkage import JamesStein
 from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, file_digest, versions
 
@@ -89,7 +89,7 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
 
 def check_error_estimate(job: Job, denoiser: Denoiser, sources: Sources, first: FrameFiles) -> None:
     """Raise BadInput for a denoiser or frames that do not allow an error estimate, and for an error out of range."""
-    if not isinstance(denoiser, Shrunk):
+    if not isinstance(denoiser, JamesStein):
         raise BadInput(f"{job.denoiser} does not estimate its error: use {job.denoiser}+js")
     image = ExrImage(first.passes[COLOUR], header_only=True)
     if not (has_two_buffers(image) if sources.is_ours else sources.has("half")):
@@ -241,16 +241,16 @@ class SequenceDenoiser:
         """The denoised frame and the next state; the error of a new frame goes into the table and its image."""
         if not (self.estimator and is_new):
             return self.denoiser(frame, state)
-        output, state, estimate = with_error(self.estimator, frame, state)
+        output, state, estimate = denoise_with_error(self.estimator, frame, state)
         self.errors.add(FrameError.of(files.number, estimate, self.job.until))
         if self.job.error:
-            image.add(ERROR_LAYER, image_of(estimate.radiance()), self.sources.target[0])
+            image.add(ERROR_LAYER, image_of(estimate.radiance_error()), self.sources.target[0])
         return output, state
 
     @cached_property
-    def estimator(self) -> Shrunk | None:
+    def estimator(self) -> JamesStein | None:
         """The denoiser, where it is to estimate its error."""
-        return self.denoiser if self.job.estimates_error and isinstance(self.denoiser, Shrunk) else None
+        return self.denoiser if self.job.estimates_error and isinstance(self.denoiser, JamesStein) else None
 
     @cached_property
     def errors(self) -> ErrorTable:

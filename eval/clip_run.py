@@ -22,8 +22,8 @@ from eval.results import REFERENCE, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.spec import DenoiserSpec
-from models.wrappers.error_estimate import with_error
-from models.wrappers.shrinkage import Shrunk
+from models.wrappers.error_estimate import denoise_with_error
+from models.wrappers.shrinkage import JamesStein
 from provenance import file_digest
 
 METRICS_CHANNELS = ("motion", "dual_motion")
@@ -96,9 +96,9 @@ class DenoiserRun:
         """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
         denoiser = self.evaluated.denoiser
         moved = frame.to(denoiser.device)
-        if self.evaluated.saves_error and isinstance(denoiser, Shrunk) and frame.has_buffers:
-            output, self.state, estimate = with_error(denoiser, moved, self.state)
-            self.error = exposure * estimate.radiance().cpu().square().mean(dim=1).sqrt()
+        if self.evaluated.saves_error and isinstance(denoiser, JamesStein) and frame.has_buffers:
+            output, self.state, estimate = denoise_with_error(denoiser, moved, self.state)
+            self.error = exposure * estimate.radiance_error().cpu().square().mean(dim=1).sqrt()
         else:
             output, self.state = denoiser(moved, self.state)
         output = output.cpu()

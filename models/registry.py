@@ -26,8 +26,8 @@ from models.networks.one import One
 from models.networks.rae import RAE
 from models.networks.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
 from models.wrappers.adaptive import Adaptive
-from models.wrappers.shrinkage import Shrunk
-from models.wrappers.taa import Antialiased
+from models.wrappers.shrinkage import JamesStein
+from models.wrappers.taa import TAA
 from models.wrappers.wrapper import Wrapper
 
 DENOISERS: dict[str, type[Denoiser]] = {
@@ -59,7 +59,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "ntd-mean": NTDMean,
     "one": One,
 }
-WRAPPERS: dict[str, type[Wrapper]] = {"adaptive": Adaptive, "taa": Antialiased, "js": Shrunk}
+WRAPPERS: dict[str, type[Wrapper]] = {"adaptive": Adaptive, "taa": TAA, "js": JamesStein}
 
 
 def create(name: str | DenoiserName, signal: Signal | None = None) -> Denoiser:

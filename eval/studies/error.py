@@ -23,8 +23,8 @@ from files import write_file, write_json
 from models.denoiser import State
 from models.registry import parse_name
 from models.spec import DenoiserSpec, fastest_precision
-from models.wrappers.error_estimate import ErrorEstimate, with_error
-from models.wrappers.shrinkage import Shrunk
+from models.wrappers.error_estimate import ErrorEstimate, denoise_with_error
+from models.wrappers.shrinkage import JamesStein
 from plotting import DPI, Axes, Figure, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling
@@ -83,26 +83,26 @@ def frame_with_samples(clip: Clip, index: int, spp: int, reads: Sequence[str]) -
     return replace(frame, channels=channels, spp=torch.full((1, 1, 1, 1), float(spp)))
 
 
-def run_denoiser(denoiser: Shrunk, clip: Clip, spp: int) -> Iterator[tuple[Tensor, ErrorEstimate, Tensor]]:
+def run_denoiser(denoiser: JamesStein, clip: Clip, spp: int) -> Iterator[tuple[Tensor, ErrorEstimate, Tensor]]:
     """Radiance, its error estimate, and the reference's sample buffers (2, 3, H, W), frame by frame."""
     state: State | None = None
     for index in range(clip.frames):
-        output, state, estimate = with_error(denoiser, frame_with_samples(clip, index, spp, denoiser.reads), state)
+        output, state, estimate = denoise_with_error(denoiser, frame_with_samples(clip, index, spp, denoiser.reads), state)
         yield output, estimate, to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
 
 
-def compare_errors(denoiser: Shrunk, name: str, clip: Clip, spp: int, target: float | None) -> ErrorComparison:
+def compare_errors(denoiser: JamesStein, name: str, clip: Clip, spp: int, target: float | None) -> ErrorComparison:
     """Compare estimated and true errors on a clip; sample counts are predicted for `target`, by default its error."""
     squares: list[Tensor] = []  # of each frame true, estimated and mapped, (3, blocks)
     relative: list[tuple[float, float]] = []
     estimates = []
     for output, estimate, buffers in run_denoiser(denoiser, clip, spp):
         true = (output - buffers[:1]) * (output - buffers[1:])
-        scale = estimate.scale
-        images = torch.cat([true, estimate.squared * scale.square(), estimate.radiance().square()])
+        scale = estimate.radiance_scale
+        images = torch.cat([true, estimate.squared_error * scale.square(), estimate.radiance_error().square()])
         squares.append(avg_pool2d(images.mean(dim=1, keepdim=True), BLOCK_PIXELS).flatten(1))
         over_unit = true / scale.square().clamp(min=1e-30)
-        relative.append((estimate.over_surfaces(over_unit), estimate.over_surfaces(estimate.squared)))
+        relative.append((estimate.surface_mean(over_unit), estimate.surface_mean(estimate.squared_error)))
         estimates.append(estimate)
     true_relative, estimated_relative = np.sqrt(np.maximum(np.mean(relative, axis=0), 0))
     true_blocks, estimated, mapped = torch.stack(squares).mean(dim=0).tolist()
@@ -175,11 +175,11 @@ def calibration_figure(rows: Sequence[ErrorComparison]) -> Figure:
     return figure
 
 
-def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
+def map_figure(denoiser: JamesStein, clip: Clip, spp: int) -> Figure:
     """The last frame: denoised image, estimated error, and true error, averaged over 5 x 5 pixels."""
     *_, (output, estimate, buffers) = run_denoiser(denoiser, clip, spp)
     true = avg_pool2d((output - buffers[:1]) * (output - buffers[1:]), 5, 1, 2, count_include_pad=False)
-    errors = [image.mean(dim=1)[0].clamp(min=0).sqrt() for image in (estimate.radiance().square(), true)]
+    errors = [image.mean(dim=1)[0].clamp(min=0).sqrt() for image in (estimate.radiance_error().square(), true)]
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.5), dpi=DPI, layout="constrained")
     axes[0].imshow(display(output, clip.exposure)[0].permute(1, 2, 0))
     axes[0].set_title(f"denoised, {spp} spp")
@@ -192,7 +192,7 @@ def map_figure(denoiser: Shrunk, clip: Clip, spp: int) -> Figure:
     return figure
 
 
-def error_estimators(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
+def error_estimators(names: Sequence[str], runs: Path) -> dict[str, JamesStein]:
     """The named denoisers, or those of DEFAULT_DENOISERS that can run, ready to use.
 
     Raises BadInput for an unknown one, one that cannot run or is not trained, and one that is not a NAME+js.
@@ -200,7 +200,7 @@ def error_estimators(names: Sequence[str], runs: Path) -> dict[str, Shrunk]:
     found = {}
     for name in choose(names, map(parse_name, DEFAULT_DENOISERS), cannot_run):
         denoiser = DenoiserSpec(name, "total", fastest_precision(name), weights_of(name, runs)).build()
-        if not isinstance(denoiser, Shrunk):
+        if not isinstance(denoiser, JamesStein):
             raise BadInput(f"{name} does not estimate its error, {name}+js does")
         found[str(name)] = denoiser
     return found

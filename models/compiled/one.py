@@ -24,7 +24,6 @@ LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
 STEPS = (32, 16, 8, 4, 2, 1)  # px between taps of each filter level: the last ones smooth the first ones' pattern
 MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
-MAX_IRRADIANCE = 1e30  # sums with weights of exp(10) must stay finite
 MAX_LOGIT = 10.0  # of the weights of taps
 SIDE_MULTIPLE = 8  # of the sides of the network's images
 MIN_LENGTH = 1e-3  # samples of a history, to divide by

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.compiled.one import MAX_EXPOSED, MAX_IRRADIANCE, SIDE_MULTIPLE
+from models.compiled.one import MAX_EXPOSED, SIDE_MULTIPLE
 from models.export.neighbours import affinity_level, mesh_sums
 from models.export.recurrent import RecurrentStep, demodulation
 from models.export.scale import Scale, updated_scale
@@ -21,6 +21,7 @@ from models.networks.one import (
     per_pixel_inputs,
     surface_inputs,
 )
+from models.operators import MAX_IRRADIANCE
 
 READS = (
     "noisy",

@@ -13,7 +13,7 @@ from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 
 OIDNQuality = Literal["high", "balanced", "fast"]
 
-IMAGES = ("color", "albedo", "normal", "output")
+OIDN_IMAGES = ("color", "albedo", "normal", "output")
 
 
 def open_device(threads: int) -> Any:
@@ -54,7 +54,7 @@ class RayTracingFilter:
         self.filter = pyoidn.Filter(device)
         self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at the latest at exit
         with torch.inference_mode(False):  # else they could not be written outside of it
-            self.images = {name: torch.zeros(height, width, 3) for name in IMAGES}
+            self.images = {name: torch.zeros(height, width, 3) for name in OIDN_IMAGES}
         for name, image in self.images.items():
             self.filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
         self.filter.set_bool("hdr", True)
@@ -70,7 +70,7 @@ class RayTracingFilter:
 
     def __call__(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """Denoised radiance (3, H, W) from `colour` >= 0, `albedo` in [0, 1] and `normal` in [-1, 1], all (3, H, W)."""
-        for name, value in zip(IMAGES, (colour, albedo, normal), strict=False):
+        for name, value in zip(OIDN_IMAGES, (colour, albedo, normal), strict=False):
             self.images[name].copy_(value.permute(1, 2, 0))
         self.filter.execute()
         self.check()

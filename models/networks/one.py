@@ -16,7 +16,6 @@ from models.compiled.one import (
     INPUTS,
     LATENT,
     MAX_EXPOSED,
-    MAX_IRRADIANCE,
     MAX_LOGIT,
     MIN_LENGTH,
     SIDE_MULTIPLE,
@@ -32,7 +31,7 @@ from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.affinity import affinity_level
 from models.networks.convolution import ConvReLU
-from models.operators import pad_to_multiple
+from models.operators import MAX_IRRADIANCE, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2

@@ -1,22 +1,22 @@
-"""A denoiser that converges: NAME+js. James and Stein's shrinkage of noise to the denoised image (Gu et al. 2022).
+"""NAME+js: a denoiser that converges, by James and Stein's shrinkage of noise to the denoised image (Gu et al. 2022).
 
-A denoised image O has less noise than the mean N of a frame's samples, but an error that more samples do not take away.
-Of the images O + ρ (N - O) the one of least squared error has ρ = (Σ (N - O)² - v) / Σ (N - O)² over the pixels of a
-window, where v is the variance of N, and the noise of a pixel has little to do with O there. With two independent
-halves A and B of the samples, (A - B)² / 4 estimates v without bias. So more samples end at the truth, whatever the
-denoiser does, and few of them at the denoiser.
+A denoised image O has less noise than the mean N of a frame's samples, but an error that more samples do not reduce. Of
+the images O + ρ (N - O) the one of least squared error has ρ = (Σ (N - O)² - v) / Σ (N - O)² over the pixels of a
+window, where v is the variance of N and the noise of a pixel hardly depends on O there. From two independent sample
+buffers A and B, (A - B)² / 4 estimates v without bias. So many samples converge to the truth, whatever the denoiser
+does, and few of them to the denoiser's image.
 
-What is ours, by measurement (docs/experiments.md, Shrinkage):
+Our own choices, by measurement:
 
-- Irradiance is compared, relative to what is denoised: a window's bright pixels must not speak for the others.
-- Windows are 27 x 27 and 9 x 9 pixels of the own mesh. The wider one counts, less STANDARD_ERRORS, and the other so
-  far as it differs by more than as many: where noise is large, chance would let it through. The error is that of
-  Σ a b for noise a and b of two halves, sqrt(Σ 2 v²). All samples of a window may have missed the same light, and then
-  seem to have no noise: so there is added what SCARCE / samples pixels have for distance, and RARE pixels for variance
-  in the 81 x 81 of the own mesh around, where rare light was found.
-- ρ is averaged over 3 x 3 pixels of the own mesh.
+- Irradiance is compared relative to the denoised one: a window's bright pixels must not outweigh the others.
+- Windows are 27 x 27 and 9 x 9 pixels of the same mesh. The estimate is that of the wider, less STANDARD_ERRORS,
+  corrected by that of the smaller where they differ by more than as many: where noise is large, chance would pass for
+  signal. The standard error is that of Σ a b for the noise a and b of two buffers, sqrt(Σ 2 v²). Where all samples of a
+  window have missed some light, it seems free of noise; so the error also includes the distance of SCARCE_SAMPLES /
+  samples pixels, and the variance of RARE_PIXELS pixels of the surrounding 81 x 81 of the same mesh.
+- ρ is averaged over 3 x 3 pixels of the same mesh.
 
-Without halves, as at one sample a pixel, it is the denoiser itself.
+Without sample buffers, as at one sample per pixel, it is the denoiser itself.
 """
 
 from collections.abc import Sequence
@@ -28,113 +28,108 @@ from torch import Tensor
 from datasets.channels import SAMPLE_BUFFERS
 from datasets.frame import Frame, Signal
 from models.denoiser import State
-from models.filters.neighbours import mesh_sums
+from models.filters.neighbours import mesh_sums, mesh_sums_9x9
 from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
 
 STANDARD_ERRORS = 3.0
-SCARCE = 16.0  # samples a pixel
-RARE = 2.0  # pixels
-LARGEST_RATIO = 1e6  # of noise to what is denoised; the square of a square must stay finite
-COMPARED_BY = ("albedo", "depth", "mesh_id")
-DARKEST = 0.01  # of the mean luminance: what is darker is not compared relative to itself
+SCARCE_SAMPLES = 16.0  # per pixel
+RARE_PIXELS = 2.0
+MAX_RATIO = 1e6  # of noise to denoised irradiance; the square of a square must stay finite
+MIN_RELATIVE_LUMINANCE = 0.01  # of the mean luminance: added to what irradiance is divided by
+COMPARED_CHANNELS = ("albedo", "depth", "mesh_id")
 
 
-class Window(NamedTuple):
-    """Means over a window around each pixel, (B, 3, H, W)."""
+class WindowMeans(NamedTuple):
+    """Means over the window of each pixel, (B, 3, H, W)."""
 
     excess: Tensor  # (N - O)² - v: the denoiser's own squared error
     distance: Tensor  # (N - O)²
     error: Tensor  # standard error of `excess`
 
+    @staticmethod
+    def of(sums: Tensor, rare: Tensor, samples: Tensor) -> "WindowMeans":
+        """From sums (B, 13, H, W) of excess, distance, 2 v², v and 1, and the sum `rare` of light possibly missed."""
+        pixels = sums[:, 12:]
+        excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
+        error = (squares / pixels).sqrt() + (SCARCE_SAMPLES / samples * distance + rare) / pixels
+        return WindowMeans(excess, distance.clamp(min=MIN_DIVISOR), error)
 
-def windows(distance: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> tuple[Window, Window]:
-    """Those of 9 x 9 and of 27 x 27 pixels of the own mesh, from squares (B, 3, H, W) of `samples` (B, 1, 1, 1)."""
+
+def window_means(
+    distance: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor
+) -> tuple[WindowMeans, WindowMeans]:
+    """Those of 9 x 9 and of 27 x 27 pixels of the same mesh, from squares (B, 3, H, W) of `samples` (B, 1, 1, 1)."""
     squares = [distance - variance, distance, 2 * variance.square(), variance]
-    counted = torch.cat([*squares, torch.ones_like(mesh_id)], dim=1)
-    small = mesh_sums(mesh_sums(counted, mesh_id, 1), mesh_id, 3)
-    wide = mesh_sums(small, mesh_id, 9)
-    around = mesh_sums(wide[:, 9:], mesh_id, 27)
-    rare = RARE * around[:, :3] / around[:, 3:]
-    return window_of(small, rare, samples), window_of(wide, rare, samples)
+    sums_9x9 = mesh_sums_9x9(torch.cat([*squares, torch.ones_like(mesh_id)], dim=1), mesh_id)
+    sums_27x27 = mesh_sums(sums_9x9, mesh_id, 9)
+    sums_81x81 = mesh_sums(sums_27x27[:, 9:], mesh_id, 27)
+    rare = RARE_PIXELS * sums_81x81[:, :3] / sums_81x81[:, 3:]
+    return WindowMeans.of(sums_9x9, rare, samples), WindowMeans.of(sums_27x27, rare, samples)
 
 
-def window_of(sums: Tensor, rare: Tensor, samples: Tensor) -> Window:
-    """From sums (B, 13, H, W) of the four and of the number of pixels, and the sum that light not found may have."""
-    pixels = sums[:, 12:]
-    excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
-    error = (squares / pixels).sqrt() + (SCARCE / samples * distance + rare) / pixels
-    return Window(excess, distance.clamp(min=MIN_DIVISOR), error)
-
-
-def share_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
-    """ρ (B, 3, H, W) in [0, 1], from N - O and the variance of N, relative to what is denoised."""
-    small, wide = windows(difference.square(), variance, mesh_id, samples)
+def weight_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
+    """ρ (B, 3, H, W) in [0, 1] from N - O and the variance of N, both relative to the denoised irradiance."""
+    small, wide = window_means(difference.square(), variance, mesh_id, samples)
     overall = ((wide.excess - STANDARD_ERRORS * wide.error) / wide.distance).clamp(0, 1)
-    off = small.excess - overall * small.distance
-    rho = (overall + believed(off, small.error) * off / small.distance).clamp(0, 1)
-    return mesh_means_of(rho, mesh_id)
+    correction = small.excess - overall * small.distance
+    rho = (overall + significant_part(correction, small.error) * correction / small.distance).clamp(0, 1)
+    return mesh_mean_3x3(rho, mesh_id)
 
 
-def believed(difference: Tensor, error: Tensor) -> Tensor:
-    """How much of a difference is no chance, in [0, 1], from its standard error."""
-    doubt = STANDARD_ERRORS * error
-    return 1 - (doubt / difference.abs().clamp(min=MIN_DIVISOR)).square().clamp(max=1)
+def significant_part(difference: Tensor, error: Tensor) -> Tensor:
+    """The part of a difference that is not chance, in [0, 1], given its standard error."""
+    chance = STANDARD_ERRORS * error
+    return 1 - (chance / difference.abs().clamp(min=MIN_DIVISOR)).square().clamp(max=1)
 
 
-def mesh_means_of(image: Tensor, mesh_id: Tensor) -> Tensor:
-    """Means (B, C, H, W) over 3 x 3 pixels of the own mesh."""
+def mesh_mean_3x3(image: Tensor, mesh_id: Tensor) -> Tensor:
+    """Means (B, C, H, W) over 3 x 3 pixels of the same mesh."""
     sums = mesh_sums(torch.cat([image, torch.ones_like(mesh_id)], dim=1), mesh_id, 1)
     return sums[:, :-1] / sums[:, -1:]
 
 
 def denoised_irradiance(output: Tensor, frame: Frame, signal: Signal) -> Tensor:
-    """What a denoiser made of the frame's irradiance, (B, 3, H, W), from the radiance that it returned."""
+    """The irradiance (B, 3, H, W) of a denoiser's output radiance."""
     reflected = output - frame.emission if signal == "total" else output
     return (reflected / frame.divisor).clamp(min=0)
 
 
-def share_let_in(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
-    """ρ (B, 3, H, W) of a frame that has halves, for denoised irradiance (B, 3, H, W)."""
-    a, b = (frame.buffer(which).irradiance(signal) for which in (0, 1))
-    luminance = mesh_means_of(image_luminance(denoised), frame.mesh_id)
-    unit = unit_of(luminance)
-    off_a, off_b = (relative(half - denoised, unit) for half in (a, b))
-    return share_of_noise((off_a + off_b) / 2, (off_a - off_b).square() / 4, frame.mesh_id, frame.samples)
-
-
-def unit_of(luminance: Tensor) -> Tensor:
-    """What irradiance is compared by, from the luminance around each pixel, (B, 1, H, W): it is never 0."""
-    darkest = DARKEST * luminance.mean(dim=(1, 2, 3), keepdim=True)
-    return (luminance + darkest).clamp(min=MIN_DIVISOR)
+def comparison_unit(luminance: Tensor) -> Tensor:
+    """What irradiance is divided by to be compared, from the mean luminance near each pixel, (B, 1, H, W); never 0."""
+    offset = MIN_RELATIVE_LUMINANCE * luminance.mean(dim=(1, 2, 3), keepdim=True)
+    return (luminance + offset).clamp(min=MIN_DIVISOR)
 
 
 def relative(difference: Tensor, unit: Tensor) -> Tensor:
-    """A difference of irradiance (B, 3, H, W) over a unit (B, 1, H, W), within bounds."""
-    return (difference / unit).clamp(-LARGEST_RATIO, LARGEST_RATIO)
+    """A difference of irradiance (B, 3, H, W) over a unit (B, 1, H, W), clamped."""
+    return (difference / unit).clamp(-MAX_RATIO, MAX_RATIO)
 
 
-def mixture(frame: Frame, denoised: Tensor, share: Tensor, signal: Signal) -> Tensor:
-    """Denoised irradiance (B, 3, H, W) with a share of the frame's own let in."""
-    return torch.lerp(denoised, frame.irradiance(signal), share).clamp(min=0)
+def shrinkage_weight(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
+    """ρ (B, 3, H, W) for a frame with sample buffers and its denoised irradiance (B, 3, H, W)."""
+    a, b = (frame.buffer(which).irradiance(signal) for which in (0, 1))
+    unit = comparison_unit(mesh_mean_3x3(image_luminance(denoised), frame.mesh_id))
+    error_a, error_b = (relative(buffer - denoised, unit) for buffer in (a, b))
+    return weight_of_noise((error_a + error_b) / 2, (error_a - error_b).square() / 4, frame.mesh_id, frame.samples)
 
 
-def shrunk(frame: Frame, denoised: Tensor, signal: Signal) -> Tensor:
-    """The shrinkage of a frame that has halves to denoised irradiance (B, 3, H, W), as irradiance."""
-    return mixture(frame, denoised, share_let_in(frame, denoised, signal), signal)
+def blend(frame: Frame, denoised: Tensor, rho: Tensor, signal: Signal) -> Tensor:
+    """O + ρ (N - O), irradiance (B, 3, H, W)."""
+    return torch.lerp(denoised, frame.irradiance(signal), rho).clamp(min=0)
 
 
-class Shrunk(Wrapper):
-    """Shrinkage to a denoiser's output, where frames have halves. Its state is the inner one's."""
+class JamesStein(Wrapper):
+    """Shrinkage of noise to a denoiser's output, where frames have sample buffers. Its state is the inner one's."""
 
     def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
-        """With the halves of those that have any, and what shrinkage compares them by."""
         buffers = (SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)
-        return tuple(dict.fromkeys((*reads, *buffers, *COMPARED_BY)))
+        return tuple(dict.fromkeys((*reads, *buffers, *COMPARED_CHANNELS)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.forward(frame, state)
         if not frame.has_buffers:
             return output, after
         denoised = denoised_irradiance(output, frame, self.signal)
-        return frame.remodulate(shrunk(frame, denoised, self.signal), self.signal), after
+        rho = shrinkage_weight(frame, denoised, self.signal)
+        return frame.remodulate(blend(frame, denoised, rho, self.signal), self.signal), after

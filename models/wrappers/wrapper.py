@@ -1,4 +1,4 @@
-"""What all wrappers have in common: a denoiser around another one, whose name gets a suffix."""
+"""The base class of wrappers: denoisers that change the input or output of another one."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,7 +8,7 @@ from models.denoiser import Denoiser
 
 
 class Wrapper(Denoiser):
-    """A denoiser that changes the input or output of another one, with whose facts it begins."""
+    """A denoiser that wraps another one and takes over its attributes, apart from those of its output's light."""
 
     def __init__(self, inner: Denoiser):
         super().__init__(signal=inner.signal)
@@ -32,7 +32,7 @@ class Wrapper(Denoiser):
 
 
 def layers_of(denoiser: Denoiser) -> Iterator[Denoiser]:
-    """The denoiser, and what it is wrapped around, outermost first."""
+    """The denoiser and those that it wraps, outermost first."""
     yield denoiser
     while isinstance(denoiser, Wrapper):
         denoiser = denoiser.inner

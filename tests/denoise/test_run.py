@@ -389,8 +389,8 @@ def test_two_sample_buffers_give_the_error(buffers, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["denoise", *buffers, "--denoiser", "svgf+js", "--spp", "4", "--png"]
     main([*words, "--out", str(tmp_path / "plain")])
-    with_error = [*words, "--out", str(out), "--error", "--until", "0.02"]
-    main(with_error)
+    denoise_with_error = [*words, "--out", str(out), "--error", "--until", "0.02"]
+    main(denoise_with_error)
     expected = "0 of 4 frames have a relative error of at most 0.02; the others need"
     assert expected in capsys.readouterr().out
     for image, plain in zip(images_in(out), images_in(tmp_path / "plain"), strict=True):
@@ -405,17 +405,17 @@ def test_two_sample_buffers_give_the_error(buffers, tmp_path, capsys):
 
     before = contents(out)
     (out / "0003.exr").unlink()
-    main(with_error)
+    main(denoise_with_error)
     assert contents(out) == before
     (out / "error.csv").write_bytes(b"".join(before["error.csv"].splitlines(keepends=True)[:-1]))
-    main(with_error)
+    main(denoise_with_error)
     assert contents(out) == before
 
     capsys.readouterr()
-    main([*with_error[:-1], "5"])  # another relative error: the frames stay as they are, the table follows
+    main([*denoise_with_error[:-1], "5"])  # another relative error: the frames stay as they are, the table follows
     assert "4 of 4 frames have a relative error of at most 5" in capsys.readouterr().out
     assert contents(out, "*.exr").items() <= before.items()
-    main(with_error[:-2])
+    main(denoise_with_error[:-2])
     with (out / "error.csv").open() as file:
         assert all(row["until"] == row["samples"] == "" for row in csv.DictReader(file))
 

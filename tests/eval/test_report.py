@@ -27,7 +27,7 @@ from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_pictur
 from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.resampled_clips import with_samples
 from models.spec import DenoiserSpec
-from models.wrappers.error_estimate import with_error
+from models.wrappers.error_estimate import denoise_with_error
 
 NAMES = ["noisy", "accumulated", "eaw", "ntd"]
 
@@ -154,8 +154,8 @@ def test_estimated_errors_have_their_own_view(tiny, page, tmp_path):
     denoiser = specs[1].build()
     state = None
     for index in range(4):
-        _, state, estimate = with_error(denoiser, read_frame(fed, index, specs[1].facts.reads), state)
-    expected = (fed.exposure * estimate.radiance()[0].square().mean(dim=0).sqrt() / MAX_SHOWN_ERROR).clamp(0, 1)
+        _, state, estimate = denoise_with_error(denoiser, read_frame(fed, index, specs[1].facts.reads), state)
+    expected = (fed.exposure * estimate.radiance_error()[0].square().mean(dim=0).sqrt() / MAX_SHOWN_ERROR).clamp(0, 1)
     assert shade.max() > 0
     assert np.abs(shade / 255 - expected.numpy()).max() <= 0.51 / 255
     assert all(clip["errors"] == {} for clip in page.data["clips"])

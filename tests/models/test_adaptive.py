@@ -9,13 +9,13 @@ from models import registry
 from models.filters.baselines import Accumulated
 from models.history.accumulation import accumulate
 from models.wrappers.adaptive import (
-    BRIGHTEST,
-    LARGEST_GAIN,
-    Neighbourhoods,
+    FIREFLY_RATIO,
+    MAX_GAIN,
+    SurfaceNeighbourhoods,
     accumulate_adaptively,
-    bounded,
-    brightest,
-    gain,
+    firefly_limit,
+    history_gain,
+    spread_fireflies,
 )
 from models.wrappers.wrapper import unwrapped
 from tests.helpers.frames import chain, flat_frame, play, run
@@ -42,10 +42,10 @@ def play_noise(monkeypatch, frames: int, firefly: float, every: int) -> tuple[fl
     factors = []
 
     def listening(*arguments):
-        factors.append(gain(*arguments))
+        factors.append(history_gain(*arguments))
         return factors[-1]
 
-    monkeypatch.setattr(models.wrappers.adaptive, "gain", listening)
+    monkeypatch.setattr(models.wrappers.adaptive, "history_gain", listening)
     generator = torch.Generator().manual_seed(1)
     history = None
     shown = []
@@ -81,14 +81,14 @@ def test_a_firefly_is_no_change(monkeypatch):
     light[..., 20, 20] = 65504
     after = accumulate_adaptively(flat_frame(SIZE, SIZE, irradiance=light), light, history)
     mean = float(even.direct.mean())
-    share = ((65504 - BRIGHTEST * mean) / 441 + (BRIGHTEST - 1) * mean) / 5  # at its own pixel, which keeps the limit
+    share = ((65504 - FIREFLY_RATIO * mean) / 441 + (FIREFLY_RATIO - 1) * mean) / 5  # at its own pixel, which keeps the limit
     assert (after.irradiance - history.irradiance).abs().max() == pytest.approx(share, rel=0.01)
     plain = accumulate(even, light, history)
     assert plain.irradiance.max() > 400 * after.irradiance.max() / 5
 
 
 def test_bounding_loses_no_energy_at_the_edges_of_surfaces():
-    """The mean of many bounded frames, beside an edge and at the border: what is cut off comes back."""
+    """The mean of many spread_fireflies frames, beside an edge and at the border: what is cut off comes back."""
     generator = torch.Generator().manual_seed(0)
     mesh_id = torch.ones(1, 1, SIZE, SIZE)
     mesh_id[..., 20:] = 2
@@ -99,8 +99,8 @@ def test_bounding_loses_no_energy_at_the_edges_of_surfaces():
         frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
         frame.channels["depth"] = 2.0 * mesh_id
         frame.channels["normal"][:, :, :, 20:] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
-        around = Neighbourhoods(frame)
-        total += bounded(light, brightest(mesh_id.clamp(max=1), around), around)
+        near = SurfaceNeighbourhoods(frame)
+        total += spread_fireflies(light, firefly_limit(mesh_id.clamp(max=1), near), near)
     mean = total[0, 0] / 600
     assert (mean[:, 40:] == 0).all()
     for columns in (slice(0, 3), slice(3, 17), slice(17, 20), slice(20, 23), slice(23, 37), slice(37, 40)):
@@ -112,10 +112,10 @@ def test_a_firefly_is_shared_out_around_it():
     light = torch.ones(1, 3, SIZE, SIZE)
     light[..., 20, 20] = 1000
     frame = flat_frame(SIZE, SIZE, irradiance=light)
-    around = Neighbourhoods(frame)
-    result = bounded(light, brightest(torch.ones(1, 1, SIZE, SIZE), around), around)
-    rest = 1000 - BRIGHTEST
-    assert result[0, 0, 20, 20] == pytest.approx(BRIGHTEST + rest / 441, rel=1e-3)  # 7 x 7 strata of 9 pixels
+    near = SurfaceNeighbourhoods(frame)
+    result = spread_fireflies(light, firefly_limit(torch.ones(1, 1, SIZE, SIZE), near), near)
+    rest = 1000 - FIREFLY_RATIO
+    assert result[0, 0, 20, 20] == pytest.approx(FIREFLY_RATIO + rest / 441, rel=1e-3)  # 7 x 7 strata of 9 pixels
     assert result[0, 0, 25, 14] == pytest.approx(1 + rest / 441, rel=1e-3)
     assert result[0, 0, 40, 20] == 1
 
@@ -127,8 +127,8 @@ def test_no_light_crosses_to_another_mesh():
     light[..., 20, 20] = 1000
     frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
     frame.channels["normal"][:, :, :, 23:] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
-    around = Neighbourhoods(frame)
-    result = bounded(light, brightest(torch.ones(1, 1, SIZE, SIZE), around), around)
+    near = SurfaceNeighbourhoods(frame)
+    result = spread_fireflies(light, firefly_limit(torch.ones(1, 1, SIZE, SIZE), near), near)
     assert (result[..., 23:] == 1).all() and result[0, 0, 20, 22] > 2
 
 
@@ -190,7 +190,7 @@ def test_a_gain_is_bounded():
     light = [torch.full((1, 3, SIZE, SIZE), level) for level in (1.0, 100.0)]
     frames = [flat_frame(SIZE, SIZE, irradiance=level) for level in light]
     output = run(create_adaptive(), frames)[1]
-    torch.testing.assert_close(output, torch.full_like(output, (LARGEST_GAIN + 100) / 2))
+    torch.testing.assert_close(output, torch.full_like(output, (MAX_GAIN + 100) / 2))
 
 
 def test_brightness_does_not_matter():

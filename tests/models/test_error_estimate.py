@@ -12,8 +12,8 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from errors import BadInput
 from models.denoiser import Denoiser, State
-from models.wrappers.error_estimate import ErrorEstimate, estimated, with_error
-from models.wrappers.shrinkage import Shrunk
+from models.wrappers.error_estimate import ErrorEstimate, denoise_with_error, estimate_error
+from models.wrappers.shrinkage import JamesStein
 from tests.helpers.frames import flat_frame
 from tests.helpers.halves import noisy_halves, with_halves
 
@@ -39,7 +39,7 @@ def waves(length: float) -> Tensor:
 
 def judged(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
     a, b = noisy_halves(truth, deviation)
-    output, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b), None)
+    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b), None)
     return output, estimate
 
 
@@ -49,12 +49,14 @@ def test_it_is_the_true_error(length, deviation):
     truth = waves(length)
     output, estimate = judged(truth, deviation)
     true = (output - truth).square().mean().item()
-    told = (estimate.squared * estimate.scale.square()).mean().item()
+    told = (estimate.squared_error * estimate.radiance_scale.square()).mean().item()
     chance = 3 * 2 * deviation**2 / 2 / (3 * SIZE[0] * SIZE[1]) ** 0.5
     assert told == pytest.approx(true, rel=0.08, abs=chance)
-    mapped = estimate.radiance().square().mean().item()  # never below what is known for sure, so chance only adds to it
+    mapped = (
+        estimate.radiance_error().square().mean().item()
+    )  # never below what is known for sure, so chance only adds to it
     assert 0.8 * true < mapped < 1.5 * true + chance
-    assert estimate.most_relative_error() >= estimate.relative_error()
+    assert estimate.max_relative_error() >= estimate.relative_error()
 
 
 def test_what_two_passes_err_by_is_told_without_bias():
@@ -64,14 +66,16 @@ def test_what_two_passes_err_by_is_told_without_bias():
     a, b = noisy_halves(truth, deviation)
     passes = [F.avg_pool2d(half, 5, 1, 2, count_include_pad=False) for half in (a, b)]
     mean = (passes[0] + passes[1]) / 2
-    estimate = estimated(with_halves(a, b), mean, passes, [a, b], torch.zeros(SHAPES))
-    scale = estimate.scale.square()
+    estimate = estimate_error(with_halves(a, b), mean, passes, [a, b], torch.zeros(SHAPES))
+    scale = estimate.radiance_scale.square()
     inner = (..., slice(4, -4), slice(4, -4))
     bias = F.avg_pool2d(truth, 5, 1, 2, count_include_pad=False) - truth
     variance = F.avg_pool2d((deviation * truth).square(), 5, 1, 2) / 25 / 2
     expected = (bias.square() + variance)[inner].mean().item()
     assert (estimate.filter_error * scale)[inner].mean().item() == pytest.approx(expected, rel=0.06)
-    assert (estimate.spread * scale)[inner].mean().item() == pytest.approx(variance[inner].mean().item(), rel=0.06)
+    assert (estimate.filter_variance * scale)[inner].mean().item() == pytest.approx(
+        variance[inner].mean().item(), rel=0.06
+    )
     own = ((deviation * truth).square() / 2 / 25)[inner].mean().item()  # each pixel's noise is a 25th of its mean
     assert (estimate.covariance * scale)[inner].mean().item() == pytest.approx(own, rel=0.06)
 
@@ -82,7 +86,7 @@ def test_samples_are_asked_for_as_errors_of_mixtures_fall():
     deviation = 0.5
     _, estimate = judged(truth, deviation)
     target = estimate.relative_error() / 2
-    e2, v = estimate.over_surfaces(estimate.filter_error), estimate.over_surfaces(estimate.variance)
+    e2, v = estimate.surface_mean(estimate.filter_error), estimate.surface_mean(estimate.variance)
     assert estimate.samples_for(target) == pytest.approx(8 * (4 * (e2 + v) - v) / e2, rel=0.3)
     assert estimate.samples_for(10.0) == 8  # those that there are
     assert estimate.samples_for(1e-9) == float("inf")
@@ -92,21 +96,21 @@ def test_samples_are_asked_for_as_errors_of_mixtures_fall():
 def test_equal_halves_have_no_error():
     image = 0.1 + torch.rand(1, 3, 40, 40)
     frame = replace(with_halves(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
-    output, _, estimate = with_error(Shrunk(Blur()), frame, None)
+    output, _, estimate = denoise_with_error(JamesStein(Blur()), frame, None)
     torch.testing.assert_close(output, image)
-    assert estimate.radiance().max() < 1e-5 and estimate.relative_error() < 1e-5
+    assert estimate.radiance_error().max() < 1e-5 and estimate.relative_error() < 1e-5
 
 
 def test_a_frame_without_halves_is_refused():
     with pytest.raises(BadInput, match="no halves"):
-        with_error(Shrunk(Blur()), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
+        denoise_with_error(JamesStein(Blur()), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
 
 
 def test_it_gives_what_the_denoiser_gives():
     a, b = noisy_halves(waves(20), 0.3)
     frame = with_halves(a, b)
-    denoiser = Shrunk(Blur())
-    torch.testing.assert_close(with_error(denoiser, frame, None)[0], denoiser(frame, None)[0])
+    denoiser = JamesStein(Blur())
+    torch.testing.assert_close(denoise_with_error(denoiser, frame, None)[0], denoiser(frame, None)[0])
 
 
 @settings(max_examples=40, deadline=None)
@@ -122,18 +126,18 @@ def test_any_halves_tell_something_finite(seed, height, width, levels, backgroun
     a, b = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
     mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
     depth = mesh if background else mesh + 1
-    output, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b, mesh_id=mesh, depth=depth), None)
-    error = estimate.radiance()
+    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b, mesh_id=mesh, depth=depth), None)
+    error = estimate.radiance_error()
     assert torch.isfinite(output).all() and torch.isfinite(error).all() and (error >= 0).all()
     assert ((error == 0) | (depth > 0)).all()
-    assert 0 <= estimate.relative_error() <= estimate.most_relative_error() < float("inf")
+    assert 0 <= estimate.relative_error() <= estimate.max_relative_error() < float("inf")
     assert estimate.samples_for(0.02) >= 8 and estimate.samples_for(0.0) >= 8
 
 
 def test_a_firefly_in_one_half_is_told_where_it_is():
     a, b = noisy_halves(torch.ones(1, 3, 64, 64), 0.3)
     a[..., 32, 32] = 1e4
-    _, _, estimate = with_error(Shrunk(Blur()), with_halves(a, b), None)
-    error = estimate.radiance()
+    _, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b), None)
+    error = estimate.radiance_error()
     assert torch.isfinite(error).all()
     assert error[..., :8, :8].max() < 0.5

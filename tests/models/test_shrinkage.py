@@ -14,7 +14,7 @@ from models import compiled, registry
 from models.denoiser import Denoiser, State
 from models.filters.neighbours import mesh_sums
 from models.wrappers import shrinkage
-from models.wrappers.shrinkage import RARE, SCARCE, STANDARD_ERRORS, Shrunk, shrunk
+from models.wrappers.shrinkage import RARE_PIXELS, SCARCE_SAMPLES, STANDARD_ERRORS, JamesStein, shrunk
 from tests.helpers.frames import flat_frame, play
 from tests.helpers.halves import noisy_halves, with_halves
 
@@ -34,7 +34,7 @@ class Told(Denoiser):
 
 def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     """What `Told` of that irradiance becomes."""
-    denoiser = Shrunk(Told())
+    denoiser = JamesStein(Told())
     assert isinstance(denoiser.inner, Told)
     denoiser.inner.image = image
     return play(denoiser, [frame])[0][0]
@@ -60,9 +60,9 @@ def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray, sam
     wide = sums(small, 9)
     widest = sums(wide, 27)
     mean_small, mean_wide = small / small[4], wide / wide[4]
-    rare = RARE * widest[3] / widest[4]
+    rare = RARE_PIXELS * widest[3] / widest[4]
     error_small, error_wide = (
-        np.sqrt(mean[2] / each[4]) + (SCARCE / samples * mean[1] + rare) / each[4]
+        np.sqrt(mean[2] / each[4]) + (SCARCE_SAMPLES / samples * mean[1] + rare) / each[4]
         for mean, each in ((mean_small, small), (mean_wide, wide))
     )
     overall = np.clip((mean_wide[0] - STANDARD_ERRORS * error_wide) / mean_wide[1], 0, 1)
@@ -102,7 +102,7 @@ def test_windows_that_missed_rare_light_are_not_believed_dark(monkeypatch):
         return float((shrunk(frame, truth, "total") - truth).abs().mean())
 
     assert error() < 0.02
-    monkeypatch.setattr(shrinkage, "RARE", 0.0)
+    monkeypatch.setattr(shrinkage, "RARE_PIXELS", 0.0)
     assert error() > 0.1
 
 

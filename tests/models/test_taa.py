@@ -9,7 +9,7 @@ from errors import BadInput
 from models.denoiser import CLASSICAL
 from models.filters.baselines import Accumulated, Noisy
 from models.networks.rae import RAE
-from models.wrappers.taa import Antialiased, compress, expand, largest_around
+from models.wrappers.taa import TAA, inverse_tone_map, max_3x3, tone_map
 from tests.helpers.frames import chain, flat_frame, run
 
 
@@ -29,15 +29,15 @@ def noise(count, size=24, seed=0):
 @pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (0.4, -0.3)])
 def test_a_constant_stays_what_it_is(level, motion):
-    colour = level * torch.tensor([1.0, 0.5, 0.1])[None, :, None, None].expand(1, 3, 7, 9)
-    for output in run_chained(Antialiased(Noisy()), [lit(colour, motion=motion) for _ in range(6)]):
+    colour = level * torch.tensor([1.0, 0.5, 0.1])[None, :, None, None].inverse_tone_map(1, 3, 7, 9)
+    for output in run_chained(TAA(Noisy()), [lit(colour, motion=motion) for _ in range(6)]):
         torch.testing.assert_close(output, colour, rtol=1e-5, atol=0)
 
 
 def test_the_flicker_of_still_noise_falls():
     frames = noise(20)
     raw = run_chained(Noisy(), frames)
-    smooth = run_chained(Antialiased(Noisy()), frames)
+    smooth = run_chained(TAA(Noisy()), frames)
     flicker = [(a[-1] - a[-2]).abs().mean() for a in (raw, smooth)]
     assert flicker[1] < 0.3 * flicker[0]
     assert abs(smooth[-1].mean() - 1) < 0.05
@@ -46,7 +46,7 @@ def test_the_flicker_of_still_noise_falls():
 def test_a_first_frame_and_a_new_size_pass_unchanged():
     small = noise(2)
     large = noise(1, size=31)
-    outputs = run_chained(Antialiased(Noisy()), [*small, *large])
+    outputs = run_chained(TAA(Noisy()), [*small, *large])
     torch.testing.assert_close(outputs[0], small[0].direct)
     torch.testing.assert_close(outputs[2], large[0].direct)
 
@@ -54,20 +54,20 @@ def test_a_first_frame_and_a_new_size_pass_unchanged():
 def test_ghosts_are_clamped_to_the_pixels_around():
     """A bright frame, then a dark one: nothing of the bright one is left, in any channel."""
     dark = 0.1 + 0.05 * torch.rand(1, 3, 12, 12, generator=torch.Generator().manual_seed(1))
-    _, output = run_chained(Antialiased(Noisy()), [lit(torch.full((1, 3, 12, 12), 50.0)), lit(dark)])
+    _, output = run_chained(TAA(Noisy()), [lit(torch.full((1, 3, 12, 12), 50.0)), lit(dark)])
     assert output.max() < 0.2 and output.min() > 0.05
-    still, _ = run_chained(Antialiased(Noisy()), [lit(dark), lit(dark)])
+    still, _ = run_chained(TAA(Noisy()), [lit(dark), lit(dark)])
     torch.testing.assert_close(still, dark)
 
 
 def test_history_follows_the_motion():
     """A step that slides by a whole pixel stays as sharp as it is, and by a half is blended across its edge."""
-    ramp = torch.where(torch.arange(16) < 8, 0.2, 1.0).expand(1, 3, 6, 16)
+    ramp = torch.where(torch.arange(16) < 8, 0.2, 1.0).inverse_tone_map(1, 3, 6, 16)
     moved = ramp.roll(1, dims=-1)
     moved[..., 0] = 0.2
-    _, output = run_chained(Antialiased(Noisy()), [lit(ramp), lit(moved, motion=(-1.0, 0.0))])
+    _, output = run_chained(TAA(Noisy()), [lit(ramp), lit(moved, motion=(-1.0, 0.0))])
     torch.testing.assert_close(output, moved, rtol=1e-4, atol=1e-5)
-    _, output = run_chained(Antialiased(Noisy()), [lit(ramp), lit(ramp, motion=(0.5, 0.0))])
+    _, output = run_chained(TAA(Noisy()), [lit(ramp), lit(ramp, motion=(0.5, 0.0))])
     assert 0.3 < output[0, 0, 3, 7] < 0.9
 
 
@@ -75,35 +75,35 @@ def test_off_screen_and_disoccluded_pixels_start_anew():
     a, b = noise(2)
     frames = [a, lit(b.direct, motion=(6.0, 0.0))]
     plain = frames[1].direct
-    output = run_chained(Antialiased(Noisy()), frames)[1]
+    output = run_chained(TAA(Noisy()), frames)[1]
     torch.testing.assert_close(output[..., 19:], plain[..., 19:])
     assert (output[..., :18] != plain[..., :18]).float().mean() > 0.9
     mesh = torch.ones(1, 1, 24, 24)
     mesh[..., 12:] = 2
-    output = run_chained(Antialiased(Noisy()), [a, lit(b.direct, mesh_id=mesh)])[1]
+    output = run_chained(TAA(Noisy()), [a, lit(b.direct, mesh_id=mesh)])[1]
     torch.testing.assert_close(output[..., 13:], b.direct[..., 13:])
     assert (output[..., :12] != b.direct[..., :12]).float().mean() > 0.9
 
 
 def test_compression_and_back():
     rgb = torch.rand(1, 3, 5, 5) * 10 ** torch.linspace(-6, 10, 25).view(5, 5)
-    torch.testing.assert_close(expand(compress(rgb)), rgb, rtol=1e-4, atol=0)
-    grey = compress(torch.full((1, 3, 1, 1), 3.0))
+    torch.testing.assert_close(inverse_tone_map(tone_map(rgb)), rgb, rtol=1e-4, atol=0)
+    grey = tone_map(torch.full((1, 3, 1, 1), 3.0))
     torch.testing.assert_close(grey[0, :, 0, 0], torch.tensor([0.75, 0.0, 0.0, 0.25]))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (6, 1), (7, 8)])
 def test_the_range_around_a_pixel_is_of_its_nine_neighbours(size):
     image = torch.randn(2, 4, *size)
-    assert torch.equal(largest_around(image), torch.nn.functional.max_pool2d(image, 3, 1, padding=1))
+    assert torch.equal(max_3x3(image), torch.nn.functional.max_pool2d(image, 3, 1, padding=1))
 
 
 def test_brightness_does_not_matter():
     frames = noise(4)
     bright = [lit(1000 * frame.direct) for frame in frames]
     for a, b in zip(
-        run_chained(Antialiased(Noisy()), frames),
-        run_chained(Antialiased(Noisy()), bright),
+        run_chained(TAA(Noisy()), frames),
+        run_chained(TAA(Noisy()), bright),
         strict=True,
     ):
         torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
@@ -125,12 +125,12 @@ def test_finite_at_the_extremes(levels, size, motion, depth):
         light = torch.full((1, 3, *size), level)
         light[..., 0, 0] = firefly
         frames.append(lit(light, motion=motion, depth=depth))
-    for output in run_chained(Antialiased(Noisy()), frames):
+    for output in run_chained(TAA(Noisy()), frames):
         assert torch.isfinite(output).all() and (output >= 0).all()
 
 
 def test_it_stands_for_the_denoiser_inside():
-    denoiser = Antialiased(Accumulated(signal="indirect"))
+    denoiser = TAA(Accumulated(signal="indirect"))
     assert set(Accumulated.reads) <= set(denoiser.reads) and len(set(denoiser.reads)) == len(denoiser.reads)
     assert isinstance(denoiser.inner, Accumulated)
     assert denoiser.inner.signal == denoiser.signal == "indirect"
@@ -140,7 +140,7 @@ def test_it_stands_for_the_denoiser_inside():
     frame = flat_frame(4, 4)
     _, state = denoiser(frame, None)
     assert list(state.pictures()) == ["history length"]
-    network = Antialiased(RAE())
+    network = TAA(RAE())
     assert network.parameter_count() == RAE().parameter_count()
     network.prepare(torch.bfloat16)
     assert network.inner.precision == torch.bfloat16 and not network.inner.training
