@@ -1,6 +1,5 @@
 """AAF: widths against similar triangles, and its two passes against Gaussians in float64."""
 
-import contextlib
 import math
 from dataclasses import replace
 
@@ -13,27 +12,18 @@ from hypothesis import strategies as st
 from datasets.channels import HIT_CHANNELS
 from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled
-from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, pixel_size, positions, widths
-from models.filters.neighbours import mesh_min
+from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, positions, widths
 from scenes.camera import View, pixel_centres, unproject
 from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
 
-WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+pytestmark = pytest.mark.usefixtures("implementation")
 DEPTH = 2.0
 PIXEL = DEPTH / FOCAL_LENGTH  # on the wall of flat_frame
 
 
-@pytest.fixture(params=WAYS, autouse=True)
-def way(request):
-    """Every test runs with compiled kernels and the PyTorch way."""
-    with WAYS[request.param]():
-        yield
-
-
 def lit_frame(height=5, width=7, indirect=0.0, blocked=0.0, light=0.0, angle=0.0, roughness=1.0, **others):
-    """A wall whose samples all met the same."""
+    """A wall whose samples all hit the same."""
     frame = flat_frame(height, width, depth=DEPTH, **others)
 
     def image(*values):
@@ -43,17 +33,17 @@ def lit_frame(height=5, width=7, indirect=0.0, blocked=0.0, light=0.0, angle=0.0
     return replace(frame, channels=frame.channels | hits | {"roughness": image(roughness)})
 
 
-def width_of(**met):
-    """For direct and for indirect light, in the middle of a wall, in world units."""
-    direct, indirect = widths(lit_frame(**met))[0, :, 0, 2, 3].tolist()
+def width_of(**hits):
+    """Of direct and of indirect light, in the middle of a wall, in world units."""
+    direct, indirect = widths(lit_frame(**hits))[0, :, 0, 2, 3].tolist()
     return direct, indirect
 
 
 # --- Widths -----------------------------------------------------------------------------------------------------------
 
 
-def test_rendered_samples_tell_the_penumbra():
-    """Of a square lamp at 2, as much of its side as is seen; its blocker stands at 1.2."""
+def test_the_penumbra_from_rendered_samples():
+    """Of a square lamp at 2, with its side foreshortened; its blocker stands at 1.2."""
     wall = plate("a wall", 20, (0, 0, 0), faces=TO_THE_EYE)
     lamp = plate("c lamp", 0.8, (2.5, 0, 2.0), radiance=50, faces=TO_THE_WALL)
     (rendered,) = frames_of(wall, plate("b blocker", 1.2, (1.6, 0, 1.2)), lamp, frames=1)
@@ -67,26 +57,26 @@ def test_rendered_samples_tell_the_penumbra():
 
 
 @pytest.mark.parametrize("height", [0.1, 1.0, 1.9])
-def test_a_penumbra_is_as_wide_as_similar_triangles_say(height):
-    """Of a blocker's edge at `height` over the wall, below a square lamp at 2: across the lamp is seen in part."""
+def test_a_penumbra_is_as_wide_as_by_similar_triangles(height):
+    """Of a blocker's edge at `height` over the wall, below a square lamp at 2."""
     lamp = 2.0
     side = 0.3
     across = side * height / (lamp - height)  # of the penumbra
-    found = penumbra(lit_frame(blocked=height, light=lamp, angle=side / math.sqrt(12) / lamp))
-    torch.testing.assert_close(found, torch.full_like(found, across / math.sqrt(12)))  # for even light, too
+    width = penumbra(lit_frame(blocked=height, light=lamp, angle=side / math.sqrt(12) / lamp))
+    torch.testing.assert_close(width, torch.full_like(width, across / math.sqrt(12)))  # also of uniform light
 
 
 def test_the_sun_s_penumbra_grows_with_the_distance_of_the_blocker():
-    found = penumbra(lit_frame(blocked=3.0, light=0.0, angle=0.01))
-    torch.testing.assert_close(found, torch.full_like(found, 0.03))
+    width = penumbra(lit_frame(blocked=3.0, light=0.0, angle=0.01))
+    torch.testing.assert_close(width, torch.full_like(width, 0.03))
 
 
-def test_widths_are_the_papers():
+def test_widths_are_those_of_the_papers():
     large = 0.9 / 2.0  # angle of a lamp at 2 with σ = 0.9: σ s = 0.9 at half of the way
     assert width_of(blocked=1.0, light=2.0, angle=large)[0] == pytest.approx(0.9 / 3)
     assert width_of(blocked=1e-3, light=2.0, angle=large)[0] == pytest.approx(PIXEL / 3)  # 1 / Ω
-    assert width_of(light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # not blocked
-    assert width_of(blocked=1.9, light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # hardly
+    assert width_of(light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # nothing blocks it
+    assert width_of(blocked=1.9, light=2.0, angle=large)[0] == pytest.approx(2.0 / 5.6)  # a wide penumbra
     assert width_of(indirect=0.7)[1] == pytest.approx(0.7 / 5.6)
     assert width_of(indirect=0.7, roughness=0.5)[1] == pytest.approx(0.7 / (2 * (3.5 + 0.2 * 1.5)))
     assert width_of(indirect=0.7, roughness=0.0)[1] < 1e-4
@@ -100,19 +90,18 @@ def test_smoother_surfaces_reflect_finer_detail():
     assert bands[0] == pytest.approx(2.8) and (bands.diff() > 0).all() and torch.isfinite(bands).all()
 
 
-def test_the_least_counts_of_what_the_own_mesh_met():
+def test_the_nearest_hit_of_the_same_mesh_counts():
     mesh = torch.ones(1, 1, 6, 9)
     mesh[..., 5:] = 2
     frame = lit_frame(6, 9, indirect=2.0, mesh_id=mesh)
     frame.channels["hit_distance"][0, 0, 2, 2] = 0.5
     frame.channels["hit_distance"][0, 0, 2, 5] = 0.1
-    frame.channels["hit_distance"][0, 0, 4, 3] = 0.0  # met nothing
-    found = 5.6 * widths(frame)[0, 1, 0]
+    frame.channels["hit_distance"][0, 0, 4, 3] = 0.0  # no hit
+    nearest = 5.6 * widths(frame)[0, 1, 0]
     expected = torch.full((6, 9), 2.0)
     expected[1:4, 1:4] = 0.5
     expected[1:4, 5:7] = 0.1
-    torch.testing.assert_close(found, expected)
-    assert mesh_min(torch.full((1, 1, 1, 1), 3.0), torch.zeros(1, 1, 1, 1)).item() == 3
+    torch.testing.assert_close(nearest, expected)
 
 
 def test_positions_are_where_the_camera_s_rays_end():
@@ -128,7 +117,7 @@ def test_positions_are_where_the_camera_s_rays_end():
 
 
 def test_on_a_wall_two_passes_are_one_gaussian():
-    """Of one width, it is separable: against the sum over the square of both ranges, away from the borders."""
+    """A Gaussian of constant width is separable: against its sum over a square, away from the borders."""
     size, sigma = 31, 3.0
     rng = np.random.default_rng(0)
     image = rng.random((3, size, size))
@@ -147,18 +136,18 @@ def test_on_a_wall_two_passes_are_one_gaussian():
 def naive_weight(geometry, width, p, q):
     if p == q:
         return 1.0
-    apart = geometry[:3, *q] - geometry[:3, *p]
-    exponent = (apart @ apart - (apart @ geometry[3:, *p]) ** 2) / (2 * width**2)
+    difference = geometry[:3, *q] - geometry[:3, *p]
+    exponent = (difference @ difference - (difference @ geometry[3:, *p]) ** 2) / (2 * width**2)
     same = geometry[3:, *p] @ geometry[3:, *q] > math.cos(math.radians(5))
-    return math.exp(-exponent) if same and exponent <= 4 and math.sqrt(apart @ apart) < 5.6 * width else 0.0
+    return math.exp(-exponent) if same and exponent <= 4 and math.sqrt(difference @ difference) < 5.6 * width else 0.0
 
 
-def naive_pass(image, width, widest, geometry, down):
+def naive_pass(image, width, max_width, geometry, down):
     """filter_lines of (3, H, W), (H, W), (H, W) and (6, H, W), pixel by pixel in float64."""
     out = np.zeros_like(image)
     for p in np.ndindex(width.shape):
         line = [(y, p[1]) for y in range(width.shape[0])] if down else [(p[0], x) for x in range(width.shape[1])]
-        weights = [naive_weight(geometry, min(width[p], widest[q]), p, q) for q in line]
+        weights = [naive_weight(geometry, min(width[p], max_width[q]), p, q) for q in line]
         out[:, *p] = sum(w * image[:, *q] for w, q in zip(weights, line, strict=True)) / sum(weights)
     return out
 
@@ -170,20 +159,11 @@ def test_passes_are_gaussians_of_world_distances(size, seed, down):
     frame = synthetic_frame(seed % 20, *size)
     frame.channels["normal"] = frame.normal + 0.05 * torch.from_numpy(np.float32(rng.normal(size=(1, 3, *size))))
     geometry = pack_geometry(frame)
-    image, width, widest = (np.float32(rng.random((c, *size))) for c in (3, 1, 1))
-    tensors = [torch.from_numpy(array)[None, None] for array in (image, width, widest)]
-    found = filter_lines(*tensors, geometry, down)[0, 0]
-    floats = [np.float64(array) for array in (image, width[0], widest[0], geometry[0, 0].numpy())]
-    np.testing.assert_allclose(found, naive_pass(*floats, down), rtol=1e-4)
-
-
-def test_kernels_and_pytorch_agree_over_frames():
-    frames = [synthetic_frame(index, 61, 70) for index in range(2)]
-    fast = run(AAF(), frames)
-    with compiled.disabled():
-        slow = run(AAF(), frames)
-    for a, b in zip(fast, slow, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    image, width, max_width = (np.float32(rng.random((c, *size))) for c in (3, 1, 1))
+    tensors = [torch.from_numpy(array)[None, None] for array in (image, width, max_width)]
+    filtered = filter_lines(*tensors, geometry, down)[0, 0]
+    floats = [np.float64(array) for array in (image, width[0], max_width[0], geometry[0, 0].numpy())]
+    np.testing.assert_allclose(filtered, naive_pass(*floats, down), rtol=1e-4)
 
 
 def test_shadows_do_not_leak_to_where_filters_are_wide():
@@ -211,7 +191,7 @@ def test_indirect_light_alone_is_filtered_as_in_the_total():
     depth=st.sampled_from([1e-4, 1.0, 1e6, 3e38]),
     level=st.sampled_from([0.0, 1e-7, 6e4, 3e38]),
 )
-def test_extremes_stay_within_what_was_there(hits, depth, level):
+def test_extremes_stay_within_the_range_of_the_input(hits, depth, level):
     frame = lit_frame(7, 9, *hits, irradiance=torch.full((1, 3, 7, 9), level))
     frame.channels["depth"] = torch.full((1, 1, 7, 9), depth)
     frame.direct[0, :, 3, 4] = 1.0
@@ -219,7 +199,3 @@ def test_extremes_stay_within_what_was_there(hits, depth, level):
     low, high = sorted((min(level, 1e16), 1.0))
     assert torch.isfinite(output).all()
     assert low * (1 - 1e-5) <= output.min() and output.max() <= high * (1 + 1e-5)
-
-
-def test_pixels_are_as_large_as_they_lie_far():
-    torch.testing.assert_close(pixel_size(flat_frame(3, 4, depth=DEPTH)), torch.full((1, 1, 3, 4), PIXEL))

@@ -1,4 +1,4 @@
-"""Temporal accumulation on still walls, by hand."""
+"""Temporal accumulation on static walls, by hand."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.helpers.frames import flat_frame
 
 
 def test_accumulation_averages_five_frames_then_moves_on():
-    """alpha = 1, 1/2, 1/3, 1/4, 1/5, 1/5, ...: on a still wall, an even mean of five and then an exponential one."""
+    """alpha = 1, 1/2, 1/3, 1/4, 1/5, 1/5, ...: an even mean of five frames, then an exponential one."""
     history = None
     values = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0, 2.0]
     expected = None

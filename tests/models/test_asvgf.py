@@ -1,4 +1,4 @@
-"""A-SVGF: SVGF where light stays, and its newest frame where light is another."""
+"""A-SVGF: SVGF where light stays, and mostly the newest frame where it changes."""
 
 import numpy as np
 import pytest
@@ -28,16 +28,16 @@ def with_gradient(frame, difference: float, largest: float, where=(slice(None), 
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (0.4, -0.3)])
-def test_it_is_svgf_to_the_bit_where_light_stays(motion):
+def test_it_is_exactly_svgf_where_light_stays(motion):
     frames = chain([flat_frame(SIZE, SIZE, motion, irradiance=light) for light in noise(8)])
     for a, b in zip(run(ASVGF(), frames), run(SVGF(), frames), strict=True):
         assert torch.equal(a, b)
 
 
-def test_equal_ratios_are_found_as_they_are():
+def test_uniform_ratios_are_unchanged():
     frame = with_gradient(flat_frame(SIZE, SIZE), -0.6, 2.0)
     torch.testing.assert_close(change_of_light(frame), torch.full((1, 1, SIZE, SIZE), 0.3))
-    frame = with_gradient(flat_frame(SIZE, SIZE), 5.0, 2.0)  # rounded badly: λ is at most 1
+    frame = with_gradient(flat_frame(SIZE, SIZE), 5.0, 2.0)  # λ is at most 1
     assert (change_of_light(frame) == 1).all()
 
 
@@ -52,7 +52,7 @@ def test_a_change_ends_where_the_surface_does():
     assert (change[..., SIZE // 2 :] == 0).all()
 
 
-def test_strata_without_a_sample_take_that_of_others():
+def test_empty_strata_take_the_ratio_of_others():
     frame = with_gradient(flat_frame(SIZE, SIZE), 0.5, 1.0, (slice(2, 4), slice(3, 5)))
     torch.testing.assert_close(change_of_light(frame), torch.full((1, 1, SIZE, SIZE), 0.5))
 
@@ -68,7 +68,7 @@ def test_it_follows_a_light_that_jumps():
     assert lagging > 0.5
 
 
-def test_history_forgets_in_proportion():
+def test_history_is_discarded_in_proportion():
     """The integrated colour is (1 - α) C' + α C with α = (1 - λ) 0.2 + λ; the length shrinks by 1 - λ."""
     frames = [flat_frame(SIZE, SIZE, irradiance=torch.full((1, 3, SIZE, SIZE), level)) for level in (1.0, 3.0)]
     with_gradient(frames[1], 0.5, 2.0)

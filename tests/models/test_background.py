@@ -1,4 +1,4 @@
-"""Background reflects nothing: it comes out black, and no surface gathers from it or is darkened by it."""
+"""Background reflects nothing: it is black in the output, and no surface gathers from it."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.frame import Frame
-from models import compiled, registry
+from models import registry
 from models.history.running_scale import running_scale
 from models.networks.fusion import fuse
 from models.networks.ntd import reconstruct_image
@@ -20,6 +20,7 @@ from tests.helpers.unfold import unfold_kernel
 
 NAMES = [name for name in registry.DENOISERS if not registry.prototype(name).unavailable()]
 WINDOWS = (3, 5, 13)
+both_implementations = pytest.mark.usefixtures("implementation")
 MASKS = st.builds(
     lambda height, width, share, seed: (
         torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed)) < share
@@ -29,16 +30,6 @@ MASKS = st.builds(
     st.sampled_from([0.0, 0.02, 0.5, 0.98]),
     st.integers(0, 9999),
 )
-
-
-@pytest.fixture(params=["compiled", "PyTorch"], autouse=True)
-def way(request):
-    """Every test runs with compiled kernels and the PyTorch way."""
-    if request.param == "compiled":
-        yield
-    else:
-        with compiled.disabled():
-            yield
 
 
 def with_background(frame: Frame, surface: torch.Tensor) -> Frame:
@@ -60,7 +51,7 @@ def with_background(frame: Frame, surface: torch.Tensor) -> Frame:
 
 
 def noisy_frames(surface: torch.Tensor, count: int = 3) -> list[Frame]:
-    """A camera that slides along a noisy wall with holes, through which the sky is seen; always the same."""
+    """A camera that slides along a noisy wall with holes, with sky behind; always the same."""
     generator = torch.Generator().manual_seed(0)
     height, width = surface.shape[-2:]
     frames = []
@@ -80,6 +71,7 @@ def crop(frame: Frame, width: int) -> Frame:
 # --- All denoisers ----------------------------------------------------------------------------------------------------
 
 
+@both_implementations
 @pytest.mark.parametrize("name", NAMES)
 def test_background_is_its_emission_alone(name):
     torch.manual_seed(0)
@@ -96,6 +88,7 @@ def test_background_is_its_emission_alone(name):
         assert (carried.masked_select(~surface) == 0).all()
 
 
+@both_implementations
 @pytest.mark.parametrize("name", [name for name in NAMES if registry.prototype(name).convex])
 @settings(deadline=None)
 @given(surface=MASKS)
@@ -109,6 +102,7 @@ def test_even_light_stays_even_beside_background(name, surface):
         torch.testing.assert_close(output, torch.where(surface, 7.0, 3.0).expand_as(output), rtol=2e-5, atol=0)
 
 
+@both_implementations
 @pytest.mark.parametrize("name", ["accumulated", "eaw", "svgf"])
 def test_beside_background_is_like_beside_the_border(name):
     """Sky right of a wall filters it as an image that ends there does."""
@@ -126,6 +120,7 @@ def test_beside_background_is_like_beside_the_border(name):
 # --- The operators of the networks ------------------------------------------------------------------------------------
 
 
+@both_implementations
 @settings(deadline=None)
 @given(surface=MASKS, scale=st.sampled_from([1.0, 100.0, 1e4]), seed=st.integers(0, 999))
 def test_fusion_leaves_background_out(surface, scale, seed):
@@ -145,6 +140,7 @@ def test_fusion_leaves_background_out(surface, scale, seed):
     torch.testing.assert_close(fused.double(), expected, rtol=2e-5, atol=0)
 
 
+@both_implementations
 @settings(deadline=None)
 @given(surface=MASKS, size=st.sampled_from([1, 3, 5]), scale=st.sampled_from([1.0, 1e4]), seed=st.integers(0, 999))
 def test_kernels_leave_background_out(surface, size, scale, seed):
@@ -171,8 +167,9 @@ def test_kernels_leave_background_out(surface, size, scale, seed):
     np.testing.assert_allclose(filtered[0], expected, rtol=1e-5, atol=1e-30)
 
 
+@both_implementations
 @pytest.mark.parametrize("scale", [1.0, 300.0])
-def test_gradients_know_the_background_too(scale):
+def test_gradients_leave_background_out(scale):
     """Of both filters, against plain autograd of the softmax over surfaces, with windows that have none."""
     generator = torch.Generator().manual_seed(0)
     surface = torch.rand(1, 1, 9, 11, generator=generator) < 0.5
@@ -227,6 +224,7 @@ def network_like(name: str, height: int, width: int, generator: torch.Generator)
     return [torch.randn(1, c, *size, generator=generator) for c, size in zip(channels, sizes, strict=True)]
 
 
+@both_implementations
 @pytest.mark.parametrize("name", ["wskp-mr", "ntd"])
 def test_pyramids_end_where_surfaces_do(name):
     """Sky right of a wall: the wall comes out as from an image that ends there."""
@@ -247,6 +245,7 @@ def test_pyramids_end_where_surfaces_do(name):
     torch.testing.assert_close(whole[..., :28], alone, rtol=1e-5, atol=1e-6)
 
 
+@both_implementations
 @settings(deadline=None)
 @given(surface=MASKS, name=st.sampled_from(["wskp-mr", "ntd"]), seed=st.integers(0, 999))
 def test_pyramids_keep_even_light_even(surface, name, seed):
@@ -261,6 +260,7 @@ def test_pyramids_keep_even_light_even(surface, name, seed):
     torch.testing.assert_close(output * surface, image, rtol=2e-5, atol=0)
 
 
+@both_implementations
 def test_ntd_fetches_surfaces_alone():
     """A wall of even light that slides past sky by half a pixel: the history at its edge is as bright as elsewhere."""
     torch.manual_seed(0)

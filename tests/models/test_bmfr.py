@@ -1,6 +1,5 @@
-"""BMFR against numpy's padding and least squares, block by block, and against what is known of its parts."""
+"""BMFR against numpy's padding and least squares, block by block."""
 
-import contextlib
 import itertools
 from dataclasses import replace
 
@@ -12,33 +11,16 @@ from hypothesis import strategies as st
 
 from datasets.cameras import Cameras
 from eval.bench.synthetic_frames import synthetic_frame
-from models import compiled
 from models.filters import bmfr
 from models.filters.baselines import Accumulated
 from models.filters.bmfr import BMFR, Blocks
 from tests.helpers.frames import chain, flat_frame, play, run
 
-WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+pytestmark = pytest.mark.usefixtures("one_thread")
 EXAMPLES = settings(deadline=None)
 SIZES = st.tuples(st.integers(1, 70), st.integers(1, 70))
 OFFSETS = st.tuples(st.integers(0, 31), st.integers(0, 31))
 NO_NOISE = torch.zeros(1024, 10, dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Images are tiny: threads would only wait for each other, for long where other processes keep a core busy."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(params=WAYS)
-def way(request):
-    """The test runs with compiled kernels and the PyTorch way."""
-    with WAYS[request.param]():
-        yield request.param
 
 
 def to_torch(array):
@@ -111,10 +93,10 @@ def fitted_by_numpy(light, normal, depth, axes, noise, offset):
         for left in range(-offset[1], width, 32):
             places = [(top + p // 32, left + p % 32) for p in range(1024)]
             pixels = [(mirrored(y, height), mirrored(x, width)) for y, x in places]
-            seen = [pixel for pixel in pixels if depth[pixel] > 0]
-            if not seen:
+            surface = [pixel for pixel in pixels if depth[pixel] > 0]
+            if not surface:
                 continue
-            spots = np.array([where[:, *pixel] for pixel in seen])
+            spots = np.array([where[:, *pixel] for pixel in surface])
             low = spots.min(axis=0)
             extent = np.ptp(spots, axis=0)
             extent = np.maximum(extent, 1e-3 * extent.max())
@@ -134,16 +116,16 @@ def fitted_by_numpy(light, normal, depth, axes, noise, offset):
 
 @EXAMPLES
 @given(size=SIZES, offset=OFFSETS, share=st.sampled_from([0.0, 0.003, 0.05, 0.8, 1.0]), seed=st.integers(0, 9999))
-@pytest.mark.parametrize("name", WAYS)
-def test_blocks_are_fitted_as_numpy_does(name, size, offset, share, seed):
+@pytest.mark.usefixtures("implementation")
+def test_blocks_are_fitted_as_numpy_does(size, offset, share, seed):
     image = scene(np.random.default_rng(seed), *size, share)
     noise = bmfr.feature_noise(seed)
     expected = fitted_by_numpy(*image, noise.numpy(), offset)
-    with WAYS[name]():
-        np.testing.assert_allclose(regress(*image, noise, offset), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(regress(*image, noise, offset), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_combination_of_features_comes_back(way):
+@pytest.mark.usefixtures("implementation")
+def test_a_combination_of_features_comes_back():
     """Without noise; squares of positions around any origin are combinations of those of each block."""
     rng = np.random.default_rng(1)
     _, normal, depth, axes = scene(rng, 70, 90, share=0.9)
@@ -168,34 +150,33 @@ def test_noise_is_small_of_mean_0_and_always_the_same():
     level=st.sampled_from([1e-30, 1.0, 65504.0, 1e30]),
     seed=st.integers(0, 9999),
 )
-@pytest.mark.parametrize("name", WAYS)
-def test_even_light_stays_even_whatever_the_surfaces(name, size, share, level, seed):
+@pytest.mark.usefixtures("implementation")
+def test_even_light_stays_even_whatever_the_surfaces(size, share, level, seed):
     """Flat walls, of which all features but the constant depend on each other, in light from faint to blinding."""
     rng = np.random.default_rng(seed)
     depth = np.float32(3 * (rng.random(size) < share))
     normal = np.float32(np.array([0, 0, -1])[:, None, None] * np.ones((3, *size)))
     light = np.float32(level * (depth > 0) * np.ones((3, *size)))
-    with WAYS[name]():
-        fitted = regress(light, normal, depth, np.eye(3), bmfr.feature_noise(seed), (seed % 32, seed % 31))
+    fitted = regress(light, normal, depth, np.eye(3), bmfr.feature_noise(seed), (seed % 32, seed % 31))
     np.testing.assert_allclose(fitted * (depth > 0), light, rtol=1e-6)
 
 
 @EXAMPLES
 @given(size=SIZES, seed=st.integers(0, 9999))
-@pytest.mark.parametrize("name", WAYS)
-def test_background_takes_part_in_no_regression(name, size, seed):
+@pytest.mark.usefixtures("implementation")
+def test_background_takes_part_in_no_regression(size, seed):
     rng = np.random.default_rng(seed)
     light, normal, depth, axes = scene(rng, *size, share=0.5)
     other, other_normal, _, _ = scene(rng, *size)
     sky = depth == 0
     noise = bmfr.feature_noise(0)
-    with WAYS[name]():
-        one = regress(light, normal, depth, axes, noise, (7, 9))
-        two = regress(np.where(sky, other, light), np.where(sky, other_normal, normal), depth, axes, noise, (7, 9))
-    assert np.array_equal(one, two) and (one[:, sky] == 0).all()
+    fit = regress(light, normal, depth, axes, noise, (7, 9))
+    same = regress(np.where(sky, other, light), np.where(sky, other_normal, normal), depth, axes, noise, (7, 9))
+    assert np.array_equal(fit, same) and (fit[:, sky] == 0).all()
 
 
-def test_a_single_pixel_in_the_sky_keeps_its_light(way):
+@pytest.mark.usefixtures("implementation")
+def test_a_single_pixel_in_the_sky_keeps_its_light():
     rng = np.random.default_rng(2)
     light, normal, depth, axes = scene(rng, 40, 40, share=0)
     depth[11, 13] = 4
@@ -203,16 +184,17 @@ def test_a_single_pixel_in_the_sky_keeps_its_light(way):
     np.testing.assert_allclose(fitted[:, 11, 13], light[:, 11, 13], rtol=1e-5)
 
 
-def test_a_few_pixels_of_a_block_stay_in_range(way):
+@pytest.mark.usefixtures("implementation")
+def test_a_few_pixels_of_a_block_stay_in_range():
     """Fewer than there are features: noise alone does not let them be fitted one by one, nor leap out of range."""
     rng = np.random.default_rng(3)
     for number in range(50):
         light, normal, depth, axes = scene(rng, 32, 32, share=0.004)
         normal[:] = np.array([0, 0, -1])[:, None, None]
-        seen = depth > 0
-        if seen.any():
-            fitted = regress(light, normal, depth, axes, bmfr.feature_noise(number), (0, 0))[:, seen]
-            assert np.abs(fitted).max() < 2 * light[:, seen].max()
+        surface = depth > 0
+        if surface.any():
+            fitted = regress(light, normal, depth, axes, bmfr.feature_noise(number), (0, 0))[:, surface]
+            assert np.abs(fitted).max() < 2 * light[:, surface].max()
 
 
 # --- The whole --------------------------------------------------------------------------------------------------------
@@ -220,11 +202,11 @@ def test_a_few_pixels_of_a_block_stay_in_range(way):
 
 def test_both_accumulations(monkeypatch):
     """The first is an even mean of five frames, then exponential with 0.2; the second of ten, then with 0.1."""
-    seen = []
+    inputs = []
 
     def regress(irradiance, *_):
-        seen.append(irradiance[0, 0, 0, 0].item())
-        return torch.full_like(irradiance, fits[len(seen) - 1])
+        inputs.append(irradiance[0, 0, 0, 0].item())
+        return torch.full_like(irradiance, fits[len(inputs) - 1])
 
     monkeypatch.setattr(bmfr, "regress", regress)
     rng = np.random.default_rng(0)
@@ -235,10 +217,10 @@ def test_both_accumulations(monkeypatch):
     for n in range(14):
         accumulated += (lights[n] - accumulated) * max(0.2, 1 / (n + 1))
         shown += (fits[n] - shown) * max(0.1, 1 / (n + 1))
-        assert seen[n] == pytest.approx(accumulated, rel=1e-5)
+        assert inputs[n] == pytest.approx(accumulated, rel=1e-5)
         torch.testing.assert_close(outputs[n], torch.full((1, 3, 4, 5), shown), rtol=1e-5, atol=0)
     assert shown != pytest.approx(fits.mean(), rel=1e-3)
-    assert seen[4] == pytest.approx(lights[:5].mean(), rel=1e-5)
+    assert inputs[4] == pytest.approx(lights[:5].mean(), rel=1e-5)
     assert outputs[9][0, 0, 0, 0].item() == pytest.approx(fits[:10].mean(), rel=1e-5)
     assert state.frames == 14 and (state.pictures()["history length"] == 14).all()
 
@@ -253,21 +235,9 @@ def test_what_was_fitted_is_clipped_and_dropped_where_disoccluded(monkeypatch):
     assert torch.isfinite(outputs[2]).all() and (outputs[2] > 1e30).all()
 
 
-@pytest.mark.parametrize("signal", ["total", "indirect"])
-def test_compiled_and_plain_agree(signal):
-    frames = [synthetic_frame(index, 41, 70) for index in range(6)]
-    made = BMFR(signal=signal)
-    torch.set_num_threads(2)
-    fast = run(made, frames)
-    torch.set_num_threads(1)
-    with compiled.disabled():
-        slow = run(made, frames)
-    for a, b in zip(fast, slow, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-
-
-def test_the_same_frames_give_the_same_bits_and_far_from_the_origin_the_same_picture(way):
-    """Of cameras the regression knows the rotation alone; what differs far away is how reprojection rounds."""
+@pytest.mark.usefixtures("implementation")
+def test_the_same_frames_give_the_same_bits_and_far_from_the_origin_the_same_picture():
+    """The regression depends on the camera's rotation alone; far away only reprojection rounds differently."""
     away = torch.eye(4, dtype=torch.float64)
     away[:3, 3] = torch.tensor([1e7, -3e6, 2e7])
 
@@ -280,14 +250,6 @@ def test_the_same_frames_give_the_same_bits_and_far_from_the_origin_the_same_pic
     assert all(torch.equal(a, b) for a, b in zip(near, again, strict=True))
     for a, b in zip(near, there, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
-
-
-def test_a_thousand_times_the_light_is_a_thousand_times_the_output():
-    frames = [synthetic_frame(index, 30, 40) for index in range(4)]
-    lights = ("direct", "indirect", "emission")
-    bright = [replace(f, channels=f.channels | {name: 1000 * f.channels[name] for name in lights}) for f in frames]
-    for a, b in zip(run(BMFR(), frames), run(BMFR(), bright), strict=True):
-        torch.testing.assert_close(1000 * a, b, rtol=1e-4, atol=1e-3)
 
 
 def test_noise_on_a_wall_is_gone():

@@ -1,10 +1,8 @@
-"""What every denoiser must keep to. A new one is included by being registered."""
+"""Requirements on every registered denoiser, baselines and RAE, and weights."""
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
@@ -56,7 +54,7 @@ def test_a_prototype_takes_no_memory_for_weights():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reads_what_it_says_and_nothing_else(tiny, denoisers, name):
+def test_it_needs_only_the_channels_that_it_reads(tiny, denoisers, name):
     clip = Dataset(tiny).clips("test")[1]
     frames = [read_frame(clip, index, denoisers[name].reads) for index in range(3)]
     for output in run(denoisers[name], frames):
@@ -65,14 +63,14 @@ def test_reads_what_it_says_and_nothing_else(tiny, denoisers, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("size", [(1, 1), (1, 37), (33, 1), (2, 3), (31, 33), (67, 41)])
+@pytest.mark.parametrize("size", [(1, 37), (33, 1), (67, 41)])
 def test_any_size(denoisers, name, size):
     frames = [flat_frame(*size), flat_frame(*size, motion=(0.3, -0.7))]
     assert all(output.shape == (1, 3, *size) for output in run(denoisers[name], frames))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_change_of_size_starts_anew(denoisers, name):
+def test_a_change_of_size_resets_the_history(denoisers, name):
     """Also where both sizes are padded alike, and for another batch size."""
     a = flat_frame(20, 20)
     b = flat_frame(30, 30, depth=50.0, irradiance=torch.full((1, 3, 30, 30), 1000.0))
@@ -91,9 +89,6 @@ def test_batch_items_do_not_mix(tiny, denoisers, name):
         torch.testing.assert_close(together[item : item + 1], run(denoisers[name], frames)[-1], rtol=1e-4, atol=1e-5)
 
 
-EXTREMES = st.sampled_from([0.0, 1e-7, 1e-3, 1.0, 6e4, 65504.0])
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_radiance_that_demodulation_would_make_infinite(denoisers, name):
     frames = [flat_frame(9, 11, irradiance=torch.full((1, 3, 9, 11), 0.5)) for _ in range(3)]
@@ -102,42 +97,6 @@ def test_radiance_that_demodulation_would_make_infinite(denoisers, name):
     frames[1].direct[0, :, 4, 5] = 3e38
     for output in run(denoisers[name], frames):
         assert torch.isfinite(output).all() and (output >= 0).all()
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    level=EXTREMES,
-    firefly=EXTREMES,
-    depth=st.sampled_from([0.0, 1e-4, 1.0, 1e6]),
-    albedo=st.sampled_from([0.0, 0.5, 1.0]),
-)
-@pytest.mark.parametrize("name", NAMES)
-def test_finite_in_finite_out(denoisers, name, level, firefly, depth, albedo):
-    frames = []
-    for motion in ((0.0, 0.0), (1e5, -1e5), (0.5, 0.0)):
-        frame = flat_frame(9, 11, motion, depth=depth, irradiance=torch.full((1, 3, 9, 11), level))
-        frame.direct[0, :, 4, 5] = firefly
-        frame.channels["albedo"] = torch.full((1, 3, 9, 11), albedo)
-        if depth == 0:
-            frame.channels["mesh_id"] = torch.zeros(1, 1, 9, 11)
-        frames.append(frame)
-    for output in run(denoisers[name], frames):
-        assert torch.isfinite(output).all() and (output >= 0).all()
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "noisy"])
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf])
-def test_a_poisoned_pixel_is_gone_from_the_next_frame(denoisers, name, poison):
-    clean = [flat_frame(12, 12) for _ in range(3)]
-    frames = [flat_frame(12, 12) for _ in range(3)]
-    frames[0].direct[0, :, 5, 6] = poison
-    assert all(torch.isfinite(output).all() for output in run(denoisers[name], frames))
-    if name == "accumulated":
-        outputs = run(denoisers[name], frames)
-        expected = run(denoisers[name], clean)
-        others = torch.ones(12, 12, dtype=torch.bool)
-        others[5, 6] = False
-        assert all(torch.equal(a[..., others], b[..., others]) for a, b in zip(outputs, expected, strict=True))
 
 
 def test_accumulation_beats_the_noise(tiny, denoisers):
@@ -201,19 +160,6 @@ def test_rae_state_carries_over(tiny, denoisers):
     assert isinstance(next_state, RAEState) and len(next_state.hidden) == 6
     assert torch.equal(with_state, run(rae, frames)[1])
     assert not torch.allclose(with_state, without)
-
-
-def test_rae_is_blind_to_the_scene_s_brightness(tiny, denoisers):
-    """Causal exposure: a sequence a thousand times brighter comes out a thousand times brighter."""
-    rae = denoisers["rae"]
-    clip = Dataset(tiny).clips("test")[0]
-    frames = [read_frame(clip, index, rae.reads) for index in range(3)]
-    bright = [read_frame(clip, index, rae.reads) for index in range(3)]
-    for frame in bright:
-        for name in ("direct", "indirect", "emission"):
-            frame.channels[name] = frame.channels[name] * 1000
-    for a, b in zip(run(rae, frames), run(rae, bright), strict=True):
-        torch.testing.assert_close(1000 * a, b, rtol=1e-3, atol=1e-3)
 
 
 def test_rae_inputs_are_the_seven_of_the_paper(tiny, denoisers, monkeypatch):

@@ -1,4 +1,4 @@
-"""The error that halves tell: without bias where the truth is known, and sane at the extremes."""
+"""The error estimate: unbiased where the truth is known, and finite at the extremes."""
 
 from dataclasses import replace
 
@@ -14,8 +14,8 @@ from errors import BadInput
 from models.denoiser import Denoiser, State
 from models.wrappers.error_estimate import ErrorEstimate, denoise_with_error, estimate_error
 from models.wrappers.shrinkage import JamesStein
+from tests.helpers.buffers import noisy_buffers, with_buffers
 from tests.helpers.frames import flat_frame
-from tests.helpers.halves import noisy_halves, with_halves
 
 SIZE = (256, 256)
 SHAPES = (1, 3, *SIZE)
@@ -32,14 +32,14 @@ class Blur(Denoiser):
 
 
 def waves(length: float) -> Tensor:
-    """Irradiance (1, 3, H, W) that goes up and down within so many pixels, by a half."""
+    """Irradiance (1, 3, H, W) that oscillates by a half, with this wavelength in pixels."""
     x = torch.arange(SIZE[1]) * (2 * torch.pi / length)
     return (1 + torch.sin(x) / 2).expand(SHAPES).clone()
 
 
-def judged(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
-    a, b = noisy_halves(truth, deviation)
-    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b), None)
+def denoised(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
+    a, b = noisy_buffers(truth, deviation)
+    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_buffers(a, b), None)
     return output, estimate
 
 
@@ -47,26 +47,24 @@ def judged(truth: Tensor, deviation: float) -> tuple[Tensor, ErrorEstimate]:
 @pytest.mark.parametrize("deviation", [0.05, 0.3])
 def test_it_is_the_true_error(length, deviation):
     truth = waves(length)
-    output, estimate = judged(truth, deviation)
+    output, estimate = denoised(truth, deviation)
     true = (output - truth).square().mean().item()
-    told = (estimate.squared_error * estimate.radiance_scale.square()).mean().item()
+    estimated = (estimate.squared_error * estimate.radiance_scale.square()).mean().item()
     chance = 3 * 2 * deviation**2 / 2 / (3 * SIZE[0] * SIZE[1]) ** 0.5
-    assert told == pytest.approx(true, rel=0.08, abs=chance)
-    mapped = (
-        estimate.radiance_error().square().mean().item()
-    )  # never below what is known for sure, so chance only adds to it
+    assert estimated == pytest.approx(true, rel=0.08, abs=chance)
+    mapped = estimate.radiance_error().square().mean().item()  # its lower bound only adds to it
     assert 0.8 * true < mapped < 1.5 * true + chance
     assert estimate.max_relative_error() >= estimate.relative_error()
 
 
-def test_what_two_passes_err_by_is_told_without_bias():
-    """Of the mean of both passes itself, against the variance of sums and the bias that are known of a mean of 25."""
+def test_the_error_of_the_mean_of_two_passes_is_unbiased():
+    """Against the known variance and bias of a mean of 25 pixels."""
     truth = waves(12)
     deviation = 0.4
-    a, b = noisy_halves(truth, deviation)
-    passes = [F.avg_pool2d(half, 5, 1, 2, count_include_pad=False) for half in (a, b)]
+    a, b = noisy_buffers(truth, deviation)
+    passes = [F.avg_pool2d(buffer, 5, 1, 2, count_include_pad=False) for buffer in (a, b)]
     mean = (passes[0] + passes[1]) / 2
-    estimate = estimate_error(with_halves(a, b), mean, passes, [a, b], torch.zeros(SHAPES))
+    estimate = estimate_error(with_buffers(a, b), mean, passes, [a, b], torch.zeros(SHAPES))
     scale = estimate.radiance_scale.square()
     inner = (..., slice(4, -4), slice(4, -4))
     bias = F.avg_pool2d(truth, 5, 1, 2, count_include_pad=False) - truth
@@ -80,35 +78,35 @@ def test_what_two_passes_err_by_is_told_without_bias():
     assert (estimate.covariance * scale)[inner].mean().item() == pytest.approx(own, rel=0.06)
 
 
-def test_samples_are_asked_for_as_errors_of_mixtures_fall():
-    """Where error and noise are alike everywhere, the error falls by (e² + v) / (k e² + v)."""
+def test_the_number_of_samples_for_an_error():
+    """Where error and noise are uniform, the error falls by (e² + v) / (k e² + v)."""
     truth = waves(9)
     deviation = 0.5
-    _, estimate = judged(truth, deviation)
+    _, estimate = denoised(truth, deviation)
     target = estimate.relative_error() / 2
     e2, v = estimate.surface_mean(estimate.filter_error), estimate.surface_mean(estimate.variance)
     assert estimate.samples_for(target) == pytest.approx(8 * (4 * (e2 + v) - v) / e2, rel=0.3)
-    assert estimate.samples_for(10.0) == 8  # those that there are
+    assert estimate.samples_for(10.0) == 8  # those of the frame
     assert estimate.samples_for(1e-9) == float("inf")
     assert estimate.samples_for(1.2 * target) < estimate.samples_for(target)
 
 
-def test_equal_halves_have_no_error():
+def test_equal_buffers_have_no_error():
     image = 0.1 + torch.rand(1, 3, 40, 40)
-    frame = replace(with_halves(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
+    frame = replace(with_buffers(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
     output, _, estimate = denoise_with_error(JamesStein(Blur()), frame, None)
     torch.testing.assert_close(output, image)
     assert estimate.radiance_error().max() < 1e-5 and estimate.relative_error() < 1e-5
 
 
-def test_a_frame_without_halves_is_refused():
-    with pytest.raises(BadInput, match="no halves"):
+def test_a_frame_without_buffers_is_refused():
+    with pytest.raises(BadInput, match="sample buffers"):
         denoise_with_error(JamesStein(Blur()), flat_frame(8, 8, irradiance=torch.ones(1, 3, 8, 8)), None)
 
 
-def test_it_gives_what_the_denoiser_gives():
-    a, b = noisy_halves(waves(20), 0.3)
-    frame = with_halves(a, b)
+def test_the_output_is_that_of_the_denoiser():
+    a, b = noisy_buffers(waves(20), 0.3)
+    frame = with_buffers(a, b)
     denoiser = JamesStein(Blur())
     torch.testing.assert_close(denoise_with_error(denoiser, frame, None)[0], denoiser(frame, None)[0])
 
@@ -121,12 +119,12 @@ def test_it_gives_what_the_denoiser_gives():
     levels=st.lists(st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20]), min_size=2, max_size=2),
     background=st.booleans(),
 )
-def test_any_halves_tell_something_finite(seed, height, width, levels, background):
+def test_estimates_are_finite_for_any_buffers(seed, height, width, levels, background):
     generator = torch.Generator().manual_seed(seed)
     a, b = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
     mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
     depth = mesh if background else mesh + 1
-    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b, mesh_id=mesh, depth=depth), None)
+    output, _, estimate = denoise_with_error(JamesStein(Blur()), with_buffers(a, b, mesh_id=mesh, depth=depth), None)
     error = estimate.radiance_error()
     assert torch.isfinite(output).all() and torch.isfinite(error).all() and (error >= 0).all()
     assert ((error == 0) | (depth > 0)).all()
@@ -134,10 +132,10 @@ def test_any_halves_tell_something_finite(seed, height, width, levels, backgroun
     assert estimate.samples_for(0.02) >= 8 and estimate.samples_for(0.0) >= 8
 
 
-def test_a_firefly_in_one_half_is_told_where_it_is():
-    a, b = noisy_halves(torch.ones(1, 3, 64, 64), 0.3)
+def test_the_error_of_a_firefly_is_local():
+    a, b = noisy_buffers(torch.ones(1, 3, 64, 64), 0.3)
     a[..., 32, 32] = 1e4
-    _, _, estimate = denoise_with_error(JamesStein(Blur()), with_halves(a, b), None)
+    _, _, estimate = denoise_with_error(JamesStein(Blur()), with_buffers(a, b), None)
     error = estimate.radiance_error()
     assert torch.isfinite(error).all()
     assert error[..., :8, :8].max() < 0.5

@@ -1,4 +1,4 @@
-"""Reprojection against linear ramps and a slow, obvious version in float64, and the kernel against PyTorch."""
+"""Reprojection against linear ramps and a slow version in float64, and the kernel against PyTorch."""
 
 import numpy as np
 import pytest
@@ -23,13 +23,13 @@ def ramp(height: int, width: int) -> torch.Tensor:
 def test_bilinear_inside_a_plane_is_exact(motion):
     """A linear ramp is reproduced exactly where all taps are inside the image."""
     frame = flat_frame(6, 8, motion)
-    history, found = reproject(frame, ramp(6, 8), GBuffer.of(frame))
+    history, has_history = reproject(frame, ramp(6, 8), GBuffer.of(frame))
     y, x = np.mgrid[0:6, 0:8].astype(float)
     px = x + motion[0]
     py = y + motion[1]
     inside = (px >= 0) & (px <= 7) & (py >= 0) & (py <= 5)
     np.testing.assert_allclose(history[0, 0].numpy()[inside], (px + 10 * py)[inside], atol=1e-4)
-    assert found[0, 0].numpy()[inside].all()
+    assert has_history[0, 0].numpy()[inside].all()
 
 
 def naive_reproject(frame: Frame, history: np.ndarray, mesh_then: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -38,9 +38,9 @@ def naive_reproject(frame: Frame, history: np.ndarray, mesh_then: np.ndarray) ->
     mesh = frame.mesh_id[0, 0].numpy()
     motion = frame.motion[0].numpy().astype(float)
     out = np.zeros((height, width))
-    found = np.zeros((height, width), bool)
+    has_history = np.zeros((height, width), bool)
 
-    def consistent(y, x, r, c):
+    def valid(y, x, r, c):
         return 0 <= r < height and 0 <= c < width and mesh_then[r, c] == mesh[y, x]
 
     for y in range(height):
@@ -52,20 +52,20 @@ def naive_reproject(frame: Frame, history: np.ndarray, mesh_then: np.ndarray) ->
             fx = px - c0
             fy = py - r0
             taps = [(r0 + j, c0 + i, (fy if j else 1 - fy) * (fx if i else 1 - fx)) for j in (0, 1) for i in (0, 1)]
-            good = [(r, c, w) for r, c, w in taps if consistent(y, x, r, c)]
-            lost = sum(w for r, c, w in taps if not consistent(y, x, r, c))
+            good = [(r, c, w) for r, c, w in taps if valid(y, x, r, c)]
+            lost = sum(w for r, c, w in taps if not valid(y, x, r, c))
             if good:
                 out[y, x] = sum((w + lost / len(good)) * history[r, c] for r, c, w in good)
-                found[y, x] = True
+                has_history[y, x] = True
                 continue
             row = int(np.floor(py + 0.5))
             column = int(np.floor(px + 0.5))
             box = [(row + j, column + i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
-            values = [history[r, c] for r, c in box if consistent(y, x, r, c)]
+            values = [history[r, c] for r, c in box if valid(y, x, r, c)]
             if values:
                 out[y, x] = np.mean(values)
-                found[y, x] = True
-    return out, found
+                has_history[y, x] = True
+    return out, has_history
 
 
 @settings(max_examples=60, deadline=None)
@@ -82,24 +82,24 @@ def test_reprojection_equals_the_naive_version(height, width, dx, dy, seed):
     frame = flat_frame(height, width, (dx, dy), mesh_id=torch.from_numpy(now)[None, None])
     before = flat_frame(height, width, mesh_id=torch.from_numpy(then)[None, None])
     values = rng.uniform(0, 1, (height, width))
-    history, found = reproject(frame, torch.from_numpy(values).float()[None, None], GBuffer.of(before))
-    expected, expected_found = naive_reproject(frame, values, then)
-    np.testing.assert_array_equal(found[0, 0].numpy(), expected_found)
+    history, has_history = reproject(frame, torch.from_numpy(values).float()[None, None], GBuffer.of(before))
+    expected, expected_valid = naive_reproject(frame, values, then)
+    np.testing.assert_array_equal(has_history[0, 0].numpy(), expected_valid)
     np.testing.assert_allclose(history[0, 0].numpy(), expected, atol=1e-5)
 
 
-def test_taps_on_other_depth_or_normal_are_refused():
+def test_taps_of_another_depth_or_normal_are_invalid():
     frame = flat_frame(5, 5)
     nearer = flat_frame(5, 5, depth=1.9)
-    _, found = reproject(frame, ramp(5, 5), GBuffer.of(nearer))
-    assert not found.any()
+    _, has_history = reproject(frame, ramp(5, 5), GBuffer.of(nearer))
+    assert not has_history.any()
     turned = flat_frame(5, 5)
     turned.channels["normal"] = turned.normal.roll(1, dims=1)
-    _, found = reproject(frame, ramp(5, 5), GBuffer.of(turned))
-    assert not found.any()
+    _, has_history = reproject(frame, ramp(5, 5), GBuffer.of(turned))
+    assert not has_history.any()
 
 
-def test_background_finds_background_only():
+def test_background_has_the_history_of_background():
     sky = flat_frame(4, 4, depth=0.0, mesh_id=torch.zeros(1, 1, 4, 4))
     sky.channels["normal"] = torch.zeros(1, 3, 4, 4)
     assert reproject(sky, ramp(4, 4), GBuffer.of(sky))[1].all()
@@ -107,7 +107,7 @@ def test_background_finds_background_only():
 
 
 def test_reprojection_follows_a_mesh_that_moves(tiny):
-    """On the moving box: visible surfaces find their history, and nothing is ever fetched from another mesh."""
+    """Visible surfaces have a history, and nothing is ever fetched from another mesh."""
     clip = Dataset(tiny).clips("test")[1]
     names = ("normal", "depth", "mesh_id", "motion", "dual_motion")
     for index in range(1, clip.frames):
@@ -115,15 +115,15 @@ def test_reprojection_follows_a_mesh_that_moves(tiny):
         position = frame.motion + torch.stack(torch.meshgrid(torch.arange(64), torch.arange(64), indexing="xy"))[None]
         inside = ((position >= 0) & (position <= 63)).all(dim=1, keepdim=True)
         hidden = (frame.dual_motion - frame.motion).abs().amax(dim=1, keepdim=True) > 1 / 64
-        history, found = reproject(frame, before.mesh_id, GBuffer.of(before))
-        assert found[inside & ~hidden].float().mean() > 0.99
-        torch.testing.assert_close(history[found], frame.mesh_id[found])
-    # Seven frames at once: strips too wide for any tap to bridge come into view.
+        history, has_history = reproject(frame, before.mesh_id, GBuffer.of(before))
+        assert has_history[inside & ~hidden].float().mean() > 0.99
+        torch.testing.assert_close(history[has_history], frame.mesh_id[has_history])
+    # Seven frames at once: disoccluded strips too wide for any tap.
     last = read_frame(clip, 7, names[:-1], previous=0)
     first = read_frame(clip, 0, names[:-1])
-    history, found = reproject(last, first.mesh_id, GBuffer.of(first))
-    torch.testing.assert_close(history[found], last.mesh_id[found])
-    assert 0.005 < (~found).float().mean() < 0.3
+    history, has_history = reproject(last, first.mesh_id, GBuffer.of(first))
+    torch.testing.assert_close(history[has_history], last.mesh_id[has_history])
+    assert 0.005 < (~has_history).float().mean() < 0.3
 
 
 def test_compiled_reprojection_equals_pytorch_s(tiny):
@@ -133,10 +133,10 @@ def test_compiled_reprojection_equals_pytorch_s(tiny):
     for index in range(1, clip.frames):
         frame, before = (read_frame(clip, i, names) for i in (index, index - 1))
         history = torch.cat([before.irradiance("total"), before.depth], dim=1)
-        fast, found = reproject(frame, history, GBuffer.of(before))
+        fast, has_history = reproject(frame, history, GBuffer.of(before))
         with compiled.disabled():
             slow, expected = reproject(frame, history, GBuffer.of(before))
-        assert (found != expected).float().mean() < 1e-3
+        assert (has_history != expected).float().mean() < 1e-3
         close = torch.isclose(fast, slow, rtol=1e-3, atol=1e-3).all(dim=1)
         assert close.float().mean() > 0.999
 

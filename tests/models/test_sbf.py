@@ -1,6 +1,5 @@
 """SBF against a slow version in float64, and its estimate of the error against the error."""
 
-import contextlib
 import math
 
 import numpy as np
@@ -9,27 +8,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import compiled
 from models.filters.neighbours import mesh_variance
 from models.filters.sbf import BANK, SBF, best_filtered, filter_with_risk, guides
 from tests.helpers.frames import flat_frame, run
 
-WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
-
-
-@pytest.fixture(params=WAYS, autouse=True)
-def way(request):
-    """Every test runs with compiled kernels and the PyTorch way."""
-    with WAYS[request.param]():
-        yield
+pytestmark = pytest.mark.usefixtures("implementation")
 
 
 def naive_weight(features, sigma, p, q):
-    """Of the paper, σ_r = ∞; features (F, H, W) in units of √2 σ_f."""
+    """The paper's with σ_r = ∞; features (F, H, W) in units of √2 σ_f."""
     if max(abs(p[0] - q[0]), abs(p[1] - q[1])) > round(2 * sigma):
         return 0.0
-    apart = features[:, *p] - features[:, *q]
-    return math.exp(-((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2) / (2 * sigma**2) - apart @ apart)
+    difference = features[:, *p] - features[:, *q]
+    return math.exp(-((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2) / (2 * sigma**2) - difference @ difference)
 
 
 def naive_mean(image, features, sigma, p):
@@ -69,12 +60,12 @@ def inputs(rng, height, width):
 @given(size=st.tuples(st.integers(1, 9), st.integers(1, 9)), seed=st.integers(0, 999))
 def test_the_best_filter_is_chosen(size, seed):
     colour, variance, features = inputs(np.random.default_rng(seed), *size)
-    found = best_filtered(*map(to_torch, (colour, variance, features)))
-    np.testing.assert_allclose(found[0], naive_best(colour, variance, features), rtol=1e-4)
+    filtered = best_filtered(*map(to_torch, (colour, variance, features)))
+    np.testing.assert_allclose(filtered[0], naive_best(colour, variance, features), rtol=1e-4)
 
 
 def test_windows_larger_than_a_strip_of_rows():
-    """Windows of a width that images of the test above do not have, and several strips."""
+    """Windows wider than the images above, over several strips."""
     colour, variance, features = inputs(np.random.default_rng(0), 37, 21)
     filtered, _ = filter_with_risk(*map(to_torch, (colour, variance, features)), BANK)
     for p in ((0, 0), (15, 20), (16, 3), (18, 10), (36, 0)):
@@ -84,7 +75,7 @@ def test_windows_larger_than_a_strip_of_rows():
 
 
 def test_the_derivative_is_that_of_the_filter():
-    """SURE's term 2 σ² dF/dc against finite differences, pixel by pixel."""
+    """SURE's term 2 σ² dF/dc against finite differences."""
     colour, variance, features = map(to_torch, inputs(np.random.default_rng(0), 5, 6))
     filtered, risk = filter_with_risk(colour, variance, features, BANK)
     derivative = ((risk - (filtered - colour[:, None]).square()) / variance[:, None] + 1) / 2
@@ -98,7 +89,7 @@ def test_the_derivative_is_that_of_the_filter():
 
 
 def test_the_risk_is_the_squared_error_on_average():
-    """Over many images of the same truth: an edge that features know, one that they do not, noise that grows."""
+    """Over many images of the same truth: an edge in the features, one that is not, and noise that grows."""
     generator = torch.Generator().manual_seed(0)
     count, height, width = 1000, 6, 8
     truth = torch.linspace(0.2, 1, height)[:, None].repeat(3, 1, width).view(3, height, width)
@@ -131,15 +122,15 @@ def test_noise_is_filtered_widely_and_detail_narrowly():
     torch.testing.assert_close(sharp, narrowest[:, 0])
 
 
-def test_variance_is_that_of_the_own_mesh():
+def test_variance_is_that_of_the_same_mesh():
     rng = np.random.default_rng(0)
     image = rng.random((3, 14, 11))
     mesh = np.zeros((14, 11))
     mesh[:, 5:] = 1
     mesh[7, 2] = 2
-    found = mesh_variance(to_torch(image), to_torch(mesh[None]))[0]
-    np.testing.assert_allclose(found[:, 6, 9], image[:, 2:11, 5:].var(axis=(1, 2)), rtol=1e-4)
-    assert (found[:, 7, 2] == 0).all()
+    variance = mesh_variance(to_torch(image), to_torch(mesh[None]))[0]
+    np.testing.assert_allclose(variance[:, 6, 9], image[:, 2:11, 5:].var(axis=(1, 2)), rtol=1e-4)
+    assert (variance[:, 7, 2] == 0).all()
 
 
 def test_features_are_in_units_of_the_paper_s_deviations():
@@ -149,13 +140,13 @@ def test_features_are_in_units_of_the_paper_s_deviations():
         albedo=torch.tensor([[0.5, 0.75], [0.5, 0.5], [0.5, 0.25]])[None, :, None],
         depth=torch.tensor([[2.0, 5.0]])[None, :, None],
     )
-    apart = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
-    torch.testing.assert_close(2 * apart, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))
+    squares = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
+    torch.testing.assert_close(2 * squares, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))
 
 
 @settings(max_examples=20, deadline=None)
 @given(level=st.sampled_from([0.0, 1e-30, 1e-7, 6e4, 1e35, 3e38]), firefly=st.sampled_from([0.0, 1e-7, 6e4, 3e38]))
-def test_extremes_stay_within_what_was_there(level, firefly):
+def test_extremes_stay_within_the_range_of_the_input(level, firefly):
     frame = flat_frame(7, 9, irradiance=torch.full((1, 3, 7, 9), level))
     frame.direct[0, :, 3, 4] = firefly
     frame.channels["albedo"] = torch.full((1, 3, 7, 9), 0.5)

@@ -1,4 +1,4 @@
-"""NAME+js: shrinkage against a slow version, where it must end, and halves at the extremes."""
+"""NAME+js: shrinkage against a slow version, its limits, and sample buffers at the extremes."""
 
 from dataclasses import replace
 
@@ -10,20 +10,19 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from datasets.frame import Frame
-from models import compiled, registry
+from models import registry
 from models.denoiser import Denoiser, State
-from models.filters.neighbours import mesh_sums
 from models.wrappers import shrinkage
-from models.wrappers.shrinkage import RARE_PIXELS, SCARCE_SAMPLES, STANDARD_ERRORS, JamesStein, shrunk
+from models.wrappers.shrinkage import RARE_PIXELS, SCARCE_SAMPLES, STANDARD_ERRORS, JamesStein
+from tests.helpers.buffers import noisy_buffers, with_buffers
 from tests.helpers.frames import flat_frame, play
-from tests.helpers.halves import noisy_halves, with_halves
 
 SIZE = (24, 40)
 COLOUR = torch.tensor([1.0, 0.5, 0.25])[None, :, None, None]
 
 
-class Told(Denoiser):
-    """Returns what it is told."""
+class FixedImage(Denoiser):
+    """Returns a given image."""
 
     reads = ("direct", "indirect", "emission", "albedo", "depth")
     image: Tensor
@@ -33,15 +32,14 @@ class Told(Denoiser):
 
 
 def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
-    """What `Told` of that irradiance becomes."""
-    denoiser = JamesStein(Told())
-    assert isinstance(denoiser.inner, Told)
-    denoiser.inner.image = image
-    return play(denoiser, [frame])[0][0]
+    """The output for a denoiser that returns this irradiance."""
+    inner = FixedImage()
+    inner.image = image
+    return play(JamesStein(inner), [frame])[0][0]
 
 
 def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray, samples: float) -> np.ndarray:
-    """ρ of one colour, pixel by pixel: windows of 3 x 3 taps of 3 x 3 sums, all of the tap's own mesh; and so on."""
+    """ρ of one colour, pixel by pixel: windows of 3 x 3 taps of 3 x 3 sums, and so on, all of the same mesh."""
     height, width = mesh.shape
 
     def sums(image: np.ndarray, step: int) -> np.ndarray:
@@ -66,62 +64,52 @@ def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray, sam
         for mean, each in ((mean_small, small), (mean_wide, wide))
     )
     overall = np.clip((mean_wide[0] - STANDARD_ERRORS * error_wide) / mean_wide[1], 0, 1)
-    off = mean_small[0] - overall * mean_small[1]
-    believed = np.maximum(0, 1 - (STANDARD_ERRORS * error_small / off) ** 2)
-    rho = np.clip(overall + believed * off / mean_small[1], 0, 1)
+    correction = mean_small[0] - overall * mean_small[1]
+    significant = np.maximum(0, 1 - (STANDARD_ERRORS * error_small / correction) ** 2)
+    rho = np.clip(overall + significant * correction / mean_small[1], 0, 1)
     smooth = sums(np.stack([rho, np.ones_like(rho)]), 1)
     return np.asarray(smooth[0] / smooth[1])
 
 
-def test_shrinkage_is_what_the_formula_says_pixel_by_pixel():
+def test_shrinkage_is_that_of_the_formula_pixel_by_pixel():
     rng = np.random.default_rng(3)
     truth = torch.from_numpy(rng.uniform(0.2, 2, (1, 3, *SIZE))).float()
-    a, b = noisy_halves(truth, 0.5)
+    a, b = noisy_buffers(truth, 0.5)
     mesh = torch.ones(1, 1, *SIZE)
     mesh[..., 17:] = 2
-    frame = with_halves(a, b, mesh_id=mesh)
-    denoised = 0.8 * truth.mean(dim=(2, 3), keepdim=True) * torch.ones_like(truth)  # alike everywhere: a unit of 1.01
-    got = shrunk(frame, denoised, "total")
+    frame = with_buffers(a, b, mesh_id=mesh)
+    denoised = 0.8 * truth.mean(dim=(2, 3), keepdim=True) * torch.ones_like(truth)
+    output = shrunk_to(denoised, frame)
     luminance = (denoised[0, :, 0, 0] * torch.tensor([0.2126, 0.7152, 0.0722])).sum().item()
-    unit = 1.01 * luminance
+    unit = 1.01 * luminance  # of a uniform image
     for c in range(3):
         a_c, b_c, o = (image[0, c].double().numpy() for image in (a, b, denoised))
         rho = slow_rho(((a_c + b_c) / 2 - o) / unit, (a_c - b_c) ** 2 / 4 / unit**2, mesh[0, 0].numpy(), 8)
-        assert 0 < rho.min() < 0.3 or rho.std() > 0.01  # it is neither nothing nor everything
-        np.testing.assert_allclose(got[0, c], o + rho * ((a_c + b_c) / 2 - o), rtol=2e-4)
+        assert 0 < rho.min() < 0.3 or rho.std() > 0.01
+        np.testing.assert_allclose(output[0, c], o + rho * ((a_c + b_c) / 2 - o), rtol=2e-4)
 
 
-def test_windows_that_missed_rare_light_are_not_believed_dark(monkeypatch):
-    """One pixel in 500 finds all the light of as many: most windows seem darker than they are, and free of noise."""
+def test_windows_that_missed_rare_light_do_not_count_as_dark(monkeypatch):
+    """One pixel in 500 has the light of all: most windows seem darker than they are, and free of noise."""
     truth = torch.ones(1, 3, 81, 81)
     generator = torch.Generator().manual_seed(0)
     a, b = (500.0 * (torch.rand(1, 1, 81, 81, generator=generator) < 1 / 500) * truth for _ in range(2))
-    frame = replace(with_halves(a, b), spp=torch.full((1, 1, 1, 1), 64.0))
+    frame = replace(with_buffers(a, b), spp=torch.full((1, 1, 1, 1), 64.0))
 
     def error() -> float:
-        return float((shrunk(frame, truth, "total") - truth).abs().mean())
+        return float((shrunk_to(truth, frame) - truth).abs().mean())
 
     assert error() < 0.02
     monkeypatch.setattr(shrinkage, "RARE_PIXELS", 0.0)
     assert error() > 0.1
 
 
-def test_sums_over_meshes_are_the_same_by_kernel():
-    generator = torch.Generator().manual_seed(1)
-    image = torch.rand(2, 5, 13, 17, generator=generator)
-    mesh = torch.randint(0, 3, (2, 1, 13, 17), generator=generator).float()
-    for step in (1, 3, 20):
-        by_kernel = mesh_sums(image, mesh, step)
-        with compiled.disabled():
-            torch.testing.assert_close(by_kernel, mesh_sums(image, mesh, step))
-
-
 @pytest.mark.parametrize("deviation", [1.0, 0.5, 0.1, 0.02])
 def test_it_is_no_worse_than_the_better_of_noise_and_denoiser(deviation):
-    """The denoiser is 10 % off everywhere: more samples must end at the truth, few at the denoiser."""
+    """The denoiser is 10 % off everywhere: many samples must converge to the truth, few to the denoiser."""
     truth = COLOUR * (1 + torch.sin(torch.arange(96.0) / 7)[None, None, None, :] / 2).expand(1, 1, 64, 96)
-    a, b = noisy_halves(truth, deviation)
-    frame = with_halves(a, b)
+    a, b = noisy_buffers(truth, deviation)
+    frame = with_buffers(a, b)
     denoised = 1.1 * truth
     output = shrunk_to(denoised, frame)
     errors = {
@@ -129,11 +117,11 @@ def test_it_is_no_worse_than_the_better_of_noise_and_denoiser(deviation):
         for name, image in (("noise", (a + b) / 2), ("denoiser", denoised), ("shrunk", output))
     }
     assert errors["shrunk"] < 1.1 * min(errors["noise"], errors["denoiser"])
-    if deviation == 0.1:  # where both err as much, the mixture is better than both
+    if deviation == 0.1:  # where both errors are similar, the blend is better than both
         assert errors["shrunk"] < 0.8 * min(errors["noise"], errors["denoiser"])
 
 
-def test_without_halves_it_is_the_denoiser():
+def test_without_buffers_it_is_the_denoiser():
     frame = flat_frame(*SIZE, irradiance=torch.rand(1, 3, *SIZE))
     for name in ("svgf", "eaw+taa"):
         torch.testing.assert_close(
@@ -141,44 +129,43 @@ def test_without_halves_it_is_the_denoiser():
         )
 
 
-def test_its_name_weights_and_channels_are_those_of_the_denoiser():
-    assert registry.parse_name("wskp6+adaptive+taa+js").base == "wskp6"
+def test_its_attributes_are_those_of_the_denoiser():
     prototype = registry.prototype("ntd+js")
     assert prototype.signal == "indirect" and prototype.is_network
     assert "indirect_halves" in prototype.reads and "direct_halves" not in prototype.reads
     assert registry.prototype("nfor+js").offline
 
 
-def test_a_few_black_samples_are_not_taken_for_the_truth():
-    """Of a small mesh which few samples a pixel may have missed; many would not all have."""
+def test_a_few_black_samples_do_not_count_as_the_truth():
+    """Few samples per pixel may all have missed the light of a small mesh; many would not."""
     mesh = torch.ones(1, 1, *SIZE)
     mesh[..., 10:12, 20:22] = 2
-    a, b = noisy_halves(COLOUR.expand(1, 3, *SIZE), 0.1)
-    for half in (a, b):
-        half[..., 10:12, 20:22] = 0
+    a, b = noisy_buffers(COLOUR.expand(1, 3, *SIZE), 0.1)
+    for buffer in (a, b):
+        buffer[..., 10:12, 20:22] = 0
     denoised = COLOUR.expand(1, 3, *SIZE)
     for spp, kept in ((2.0, True), (1024.0, False)):
-        frame = replace(with_halves(a, b, mesh_id=mesh), spp=torch.full((1, 1, 1, 1), spp))
-        shown = shrunk_to(denoised, frame)[..., 10:12, 20:22]
-        assert torch.allclose(shown, COLOUR) == kept and (shown.max() < 0.05) != kept
+        frame = replace(with_buffers(a, b, mesh_id=mesh), spp=torch.full((1, 1, 1, 1), spp))
+        output = shrunk_to(denoised, frame)[..., 10:12, 20:22]
+        assert torch.allclose(output, COLOUR) == kept and (output.max() < 0.05) != kept
 
 
-def test_equal_halves_have_no_noise():
+def test_equal_buffers_have_no_noise():
     image = torch.rand(1, 3, *SIZE) + 0.1
-    frame = replace(with_halves(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
+    frame = replace(with_buffers(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
     torch.testing.assert_close(shrunk_to(torch.ones_like(image), frame), image)
 
 
-def test_black_halves_of_what_is_black_are_black():
+def test_black_buffers_of_a_black_image_are_black():
     black = torch.zeros(1, 3, *SIZE)
-    assert (shrunk_to(black, with_halves(black, black)) == 0).all()
+    assert (shrunk_to(black, with_buffers(black, black)) == 0).all()
 
 
-def test_a_firefly_in_one_half_stays_out():
-    a, b = noisy_halves(COLOUR.expand(1, 3, *SIZE), 0.3)
+def test_a_firefly_in_one_buffer_is_suppressed():
+    a, b = noisy_buffers(COLOUR.expand(1, 3, *SIZE), 0.3)
     clean = COLOUR.expand(1, 3, *SIZE)
     a[..., 12, 20] = 1e4
-    output = shrunk_to(clean, with_halves(a, b))
+    output = shrunk_to(clean, with_buffers(a, b))
     assert output[..., 12, 20].max() < 20  # of 5000
     assert (output - clean).abs().median() < 0.05
 
@@ -190,11 +177,11 @@ def test_a_firefly_in_one_half_stays_out():
     width=st.integers(1, 12),
     levels=st.lists(st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20, 1e34]), min_size=3, max_size=3),
 )
-def test_any_halves_end_between_noise_and_denoiser(seed, height, width, levels):
+def test_any_buffers_end_between_noise_and_denoiser(seed, height, width, levels):
     generator = torch.Generator().manual_seed(seed)
     a, b, denoised = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
     mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
-    output = shrunk_to(denoised, with_halves(a, b, mesh_id=mesh, depth=mesh + 1))
+    output = shrunk_to(denoised, with_buffers(a, b, mesh_id=mesh, depth=mesh + 1))
     noisy = (a + b) / 2
     assert torch.isfinite(output).all()
     tolerance = 1e-5 * torch.maximum(noisy, denoised)

@@ -1,6 +1,4 @@
-"""TRMV: history is where its cause was, and SVGF's where nothing but the camera moves."""
-
-from dataclasses import replace
+"""TRMV: history follows the cause of light, and is SVGF's where only the camera moves."""
 
 import torch
 from torch import Tensor
@@ -15,13 +13,9 @@ SIZE = 36
 
 
 def stripes(frame: int) -> Tensor:
-    """Light (1, 3, H, W) and shadow of 9 px each on a flat wall, which move to the right by 2 px a frame."""
+    """Stripes of light and shadow (1, 3, H, W), 9 px wide, on a flat wall; they move right by 2 px per frame."""
     x = torch.arange(SIZE) - 2 * frame
     return torch.where(x % 18 < 9, 1.0, 0.1).expand(1, 3, SIZE, SIZE).contiguous()
-
-
-def with_channels(frame: Frame, **channels: Tensor) -> Frame:
-    return replace(frame, channels=frame.channels | channels)
 
 
 def vectors(dx: float, dy: float = 0.0) -> Tensor:
@@ -29,19 +23,19 @@ def vectors(dx: float, dy: float = 0.0) -> Tensor:
 
 
 def error(name: str, frames: list[Frame]) -> float:
-    """Of the last of all frames, away from the borders."""
+    """Of the last frame, away from the borders."""
     output = run(registry.create(name), frames)[-1]
     return (output - stripes(len(frames) - 1))[..., 4:-4, 14:-4].abs().mean().item()
 
 
 def test_moving_shadows_do_not_lag():
-    """Where a quarter of the samples say that shadows move."""
+    """A quarter of the samples report that shadows move."""
     generator = torch.Generator().manual_seed(0)
     frames = []
     for index in range(6):
         shaded = torch.rand(1, 1, SIZE, SIZE, generator=generator) < 0.25
         frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
-        frames.append(with_channels(frame, shadow_motion=torch.where(shaded, vectors(-2), 0)))
+        frames.append(frame.with_channels({"shadow_motion": torch.where(shaded, vectors(-2), 0)}))
     assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
 
 
@@ -50,18 +44,18 @@ def test_reflections_do_not_lag():
     for index in range(6):
         frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
         smooth = torch.full_like(frame.roughness, 0.1)
-        frames.append(with_channels(frame, roughness=smooth, reflection_motion=vectors(-2)))
+        frames.append(frame.with_channels({"roughness": smooth, "reflection_motion": vectors(-2)}))
     assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
 
 
 def test_without_moving_causes_it_is_svgf():
     frames = [synthetic_frame(index, 40, 60) for index in range(4)]
-    frames = [with_channels(frame, dual_motion=frame.motion) for frame in frames]
+    frames = [frame.with_channels({"dual_motion": frame.motion}) for frame in frames]
     for ours, theirs in zip(run(registry.create("trmv"), frames), run(registry.create("svgf"), frames), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
-def test_offsets_are_means_over_the_own_mesh():
+def test_offsets_are_means_over_the_same_mesh():
     mesh = torch.ones(1, 1, SIZE, SIZE)
     mesh[..., 20:] = 2
     motion = vectors(1, 0)
@@ -69,27 +63,29 @@ def test_offsets_are_means_over_the_own_mesh():
     offset[:, :, 10, 10] = torch.tensor([3.0, -1])
     offset[:, :, 12, 12] = torch.tensor([5.0, 1])
     offset[:, :, 10, 22] = 100
-    frame = with_channels(flat_frame(SIZE, SIZE, mesh_id=mesh), motion=motion)
-    around, share = mean_offset(motion + offset, frame)
-    torch.testing.assert_close(around[0, :, 11, 11], torch.tensor([4.0, 0]))
+    frame = flat_frame(SIZE, SIZE, mesh_id=mesh).with_channels({"motion": motion})
+    mean, share = mean_offset(motion + offset, frame)
+    torch.testing.assert_close(mean[0, :, 11, 11], torch.tensor([4.0, 0]))
     torch.testing.assert_close(share[0, 0, 11, 11], torch.tensor(2 / 81))
-    torch.testing.assert_close(around[0, :, 10, 18], torch.tensor([0.0, 0]))  # beside another mesh
+    torch.testing.assert_close(mean[0, :, 10, 18], torch.tensor([0.0, 0]))  # beside another mesh
     torch.testing.assert_close(share[0, 0, 10, 22], torch.tensor(1 / 54))  # 9 rows of two threes of columns
 
 
 def test_each_kind_of_light_has_its_vectors():
-    frame = with_channels(
-        flat_frame(SIZE, SIZE), dual_motion=vectors(1), shadow_motion=vectors(2), reflection_motion=vectors(3)
-    )
+    motion = {"dual_motion": vectors(1), "shadow_motion": vectors(2), "reflection_motion": vectors(3)}
+    frame = flat_frame(SIZE, SIZE).with_channels(motion)
 
-    def found(**channels: Tensor) -> list[float]:
-        direct, indirect = reliable_vectors(with_channels(frame, **channels))
+    def vectors_for(**channels: Tensor) -> list[float]:
+        direct, indirect = reliable_vectors(frame.with_channels(channels))
         return [direct[0, 0, 18, 18].item(), indirect[0, 0, 18, 18].item()]
 
     smooth = torch.full((1, 1, SIZE, SIZE), 0.1)
     few = torch.zeros(1, 2, SIZE, SIZE)
     few[..., ::4, ::4] = 2.0
-    assert found() == [2, 1]
-    assert found(roughness=smooth) == [3, 3]
-    assert found(roughness=smooth, reflection_motion=few) == [2, 1]  # of plastic, one sample in 16 is a reflection
-    assert found(shadow_motion=few) == [1, 1]
+    assert vectors_for() == [2, 1]
+    assert vectors_for(roughness=smooth) == [3, 3]
+    assert vectors_for(roughness=smooth, reflection_motion=few) == [
+        2,
+        1,
+    ]  # plastic
+    assert vectors_for(shadow_motion=few) == [1, 1]
