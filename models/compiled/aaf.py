@@ -1,16 +1,14 @@
-"""models.filters.aaf for the processor: every row by itself, every loop along it vectorised."""
-
-from typing import Any
+"""models.filters.aaf for the CPU: rows in parallel, every loop along them vectorised."""
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled.eaw import columns_with_tap, divide
+from models.compiled.arrays import Image, Index, Row, Signals, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
-from models.compiled.lines import add_line, add_product, copy_line
+from models.compiled.lines import add_line, add_product, columns_with_tap, copy_line, divide_line
 
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
 MAX_REACH = 50  # px
@@ -18,16 +16,13 @@ TRUNCATION = 8**0.5  # standard deviations at which Gaussians end
 COSINE_OF_5_DEGREES = 0.99619  # largest angle between the normals of pixels that are filtered together
 MAX_GAUSSIAN_EXPONENT = np.float32(TRUNCATION**2 / 2)
 NEAR = np.float32(2 * DIFFUSE_BAND)
-HALF = np.float32(0.5)
-ZERO = np.float32(0)
-INFINITY = np.float32(np.inf)
 
 
 @jit_in_any_order
-def measure(distance: Any, along: Any, geometry: Any, row: Any, left: Any, dx: Any, dy: Any) -> None:
-    """Squared distances (n) of n pixels of a row to their taps, and in the plane of the surface.
+def measure(distance: Row, along: Row, geometry: Image, row: Index, left: Index, dx: Index, dy: Index) -> None:
+    """Squared distances |d|² (n) of n pixels of a row to their taps, and |d|² - (d · n)² in the plane of the surface.
 
-    geometry (6, H, W). They are infinite where normals differ.
+    geometry (6, H, W): positions, unit normals n. Distances are infinite where normals differ.
     """
     right = left + distance.size
     to = row + dy
@@ -43,24 +38,26 @@ def measure(distance: Any, along: Any, geometry: Any, row: Any, left: Any, dx: A
         c = to_z[i] - z[i]
         squared = a * a + b * b + c * c
         off = a * n_x[i] + b * n_y[i] + c * n_z[i]
-        same = n_x[i] * m_x[i] + n_y[i] * m_y[i] + n_z[i] * m_z[i] > np.float32(COSINE_OF_5_DEGREES)
-        distance[i] = squared if same else INFINITY
-        along[i] = max(squared - off * off, ZERO)
+        same = n_x[i] * m_x[i] + n_y[i] * m_y[i] + n_z[i] * m_z[i] > f32(COSINE_OF_5_DEGREES)
+        distance[i] = squared if same else f32(np.inf)
+        along[i] = max(squared - off * off, f32(0))
 
 
 @jit_in_any_order
-def weigh(weight: Any, distance: Any, along: Any, width: Any, max_width: Any) -> None:
+def weigh(weight: Row, distance: Row, along: Row, width: Row, widest: Row) -> None:
     """models.filters.aaf.gaussian_weight (n)."""
     for i in range(weight.size):
-        narrower = min(width[i], max_width[i])
-        exponent = HALF * along[i] / (narrower * narrower)
+        narrower = min(width[i], widest[i])
+        exponent = f32(0.5) * along[i] / (narrower * narrower)
         reached = distance[i] < NEAR * NEAR * narrower * narrower and exponent <= MAX_GAUSSIAN_EXPONENT
-        weight[i] = exp(-min(exponent, MAX_GAUSSIAN_EXPONENT)) if reached else ZERO
+        weight[i] = exp(-min(exponent, MAX_GAUSSIAN_EXPONENT)) if reached else f32(0)
 
 
 @jit_with_memory
-def filter_row(out: Any, row: Any, image: Any, width: Any, max_width: Any, geometry: Any, down: Any) -> None:
-    """A row of out (S, 3, H, W) from image, width and max_width (S, H, W)."""
+def filter_row(
+    out: Signals, row: Index, image: Signals, width: Image, widest: Image, geometry: Image, down: bool
+) -> None:
+    """A row of out (S, 3, H, W) from image (S, 3, H, W), width and widest (S, H, W)."""
     signals, _, height, columns = image.shape
     totals = np.ones((signals, columns), np.float32)
     space = np.empty((3, columns), np.float32)
@@ -75,26 +72,26 @@ def filter_row(out: Any, row: Any, image: Any, width: Any, max_width: Any, geome
         distance, along, weight = space[0, : right - left], space[1, : right - left], space[2, : right - left]
         measure(distance, along, geometry, row, left, dx, dy)
         for s in range(signals):
-            here, there = width[s, row, left:right], max_width[s, row + dy, left + dx : right + dx]
+            here, there = width[s, row, left:right], widest[s, row + dy, left + dx : right + dx]
             weigh(weight, distance, along, here, there)
             add_line(totals[s, left:right], weight)
             for c in range(3):
                 add_product(out[s, c, row, left:right], weight, image[s, c, row + dy, left + dx : right + dx])
     for s in range(signals):
         for c in range(3):
-            divide(out[s, c, row], out[s, c, row], totals[s])
+            divide_line(out[s, c, row], out[s, c, row], totals[s])
 
 
 @jit_parallel
-def filter_image(out: Any, image: Any, width: Any, max_width: Any, geometry: Any, down: Any) -> None:
+def filter_image(out: Signals, image: Signals, width: Image, widest: Image, geometry: Image, down: bool) -> None:
     for row in numba.prange(image.shape[2]):
-        filter_row(out, np.int64(row), image, width, max_width, geometry, down)
+        filter_row(out, np.int64(row), image, width, widest, geometry, down)
 
 
-def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
+def filter_lines(image: Tensor, width: Tensor, widest: Tensor, geometry: Tensor, down: bool) -> Tensor:
     """See models.filters.aaf.filter_lines."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
-        images = array(image[item]), array(width[item, :, 0]), array(max_width[item, :, 0]), array(geometry[item, 0])
+        images = array(image[item]), array(width[item, :, 0]), array(widest[item, :, 0]), array(geometry[item, 0])
         filter_image(out[item].numpy(), *images, down)
     return out

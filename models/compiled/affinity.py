@@ -1,26 +1,74 @@
-"""models.networks.affinity for the processor, with its gradients: every loop along a row is vectorised."""
+"""models.networks.affinity for the CPU, with its gradients: every loop along a row is vectorised.
 
-from collections.abc import Sequence
-from typing import Any
+A level filters with 3 x 3 taps q, `step` pixels apart, of each pixel p that shows a surface (surface_p = 1, else 0):
+
+    out_p = Σ_q w_pq image_q / Σ_q w_pq
+    w_pq = surface_q exp(importance_q - sharpness_p |features_p - features_q|²),  w_pp = exp(own_p)
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from models.compiled.arrays import RGB, Image, Index, Row, Rows, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory, match_threads
-from models.compiled.lines import add_line, add_product, scale_line
+from models.compiled.jit import array, jit_in_any_order, jit_inlined, jit_parallel, jit_with_memory, match_threads
+from models.compiled.lines import add_line, add_product, add_weighted, normalise, scale_line, triple_of_lines
 
 MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
-ZERO = np.float32(0)
-TWO = np.float32(2)
 BLOCK_PIXELS = 2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
 STRIDE = 4  # features that are compared in one pass
 
 
+class Level(NamedTuple):
+    """What a level filters, row after row (see models.networks.affinity), or the gradients of that."""
+
+    image: Image  # (B, 3, N)
+    features: Image  # (B, F, N), F a multiple of STRIDE
+    sharpness: Rows  # (B, N), as those below
+    own: Rows
+    importance: Rows
+
+
+class Layout(NamedTuple):
+    """Which taps a pixel has."""
+
+    width: int
+    step: int
+    surface: Rows  # (B, N), 1 for pixels that count, else 0
+    inside: Rows  # (3, N), whether taps to the left, above or below, and to the right are inside, for whole rows
+
+
+class Filtered(NamedTuple):
+    """The output of a level (B, 3, N), its sums of weights (B, N), and the gradient of the output (B, 3, N)."""
+
+    out: Image
+    total: Rows
+    gradient: Image
+
+
+class Taps(NamedTuple):
+    """Pixels `low` to `high` - 1, which have their taps `offset` pixels further in the image's rows."""
+
+    offset: Index
+    low: Index
+    high: Index
+    column: int  # 0: the taps are to the left, 1: above, below or the pixels themselves, 2: to the right
+
+
+@jit_inlined
+def four(features: Rows, f: int, low: Index, high: Index) -> tuple[Row, Row, Row, Row]:
+    return features[f, low:high], features[f + 1, low:high], features[f + 2, low:high], features[f + 3, low:high]
+
+
 @jit_in_any_order
-def add_squares(distance: Any, a: Any, b: Any, c: Any, d: Any, to_a: Any, to_b: Any, to_c: Any, to_d: Any) -> None:
+def add_squares(distance: Row, here: tuple[Row, Row, Row, Row], there: tuple[Row, Row, Row, Row]) -> None:
+    a, b, c, d = here
+    to_a, to_b, to_c, to_d = there
     for x in range(distance.size):
         by_a = a[x] - to_a[x]
         by_b = b[x] - to_b[x]
@@ -30,154 +78,99 @@ def add_squares(distance: Any, a: Any, b: Any, c: Any, d: Any, to_a: Any, to_b: 
 
 
 @jit_in_any_order
-def measure(distance: Any, features: Any, low: Any, high: Any, offset: Any) -> None:
-    """distance (n): |f_p - f_q|² of the pixels low to high and those `offset` further."""
-    distance[:] = ZERO
+def measure(distance: Row, features: Rows, low: Index, high: Index, offset: Index) -> None:
+    """distance (n): |f_p - f_q|² of the pixels low to high - 1 and those `offset` further."""
+    distance[:] = f32(0)
     for f in range(0, features.shape[0], STRIDE):
-        add_squares(
-            distance,
-            features[f, low:high],
-            features[f + 1, low:high],
-            features[f + 2, low:high],
-            features[f + 3, low:high],
-            features[f, low + offset : high + offset],
-            features[f + 1, low + offset : high + offset],
-            features[f + 2, low + offset : high + offset],
-            features[f + 3, low + offset : high + offset],
-        )
+        add_squares(distance, four(features, f, low, high), four(features, f, low + offset, high + offset))
 
 
 @jit_in_any_order
-def weigh(weight: Any, distance: Any, sharpness: Any, importance: Any, surface: Any) -> None:
+def weigh(weight: Row, distance: Row, sharpness: Row, importance: Row, surface: Row) -> None:
     for x in range(weight.size):
         exponent = importance[x] - sharpness[x] * distance[x]
-        weight[x] = exp(min(max(exponent, np.float32(MIN_LOGIT)), -np.float32(MIN_LOGIT))) * surface[x]
+        weight[x] = exp(min(max(exponent, f32(MIN_LOGIT)), -f32(MIN_LOGIT))) * surface[x]
 
 
 @jit_in_any_order
-def weigh_own(weight: Any, own: Any, surface: Any) -> None:
+def weigh_own(weight: Row, own: Row, surface: Row) -> None:
     for x in range(weight.size):
         weight[x] = exp(own[x]) * surface[x]
 
 
 @jit_in_any_order
-def add_weighted(
-    red: Any, green: Any, blue: Any, total: Any, weight: Any, from_red: Any, from_green: Any, from_blue: Any
-) -> None:
-    for x in range(total.size):
-        w = weight[x]
-        red[x] += w * from_red[x]
-        green[x] += w * from_green[x]
-        blue[x] += w * from_blue[x]
-        total[x] += w
-
-
-@jit_in_any_order
-def normalise(red: Any, green: Any, blue: Any, total: Any) -> None:
-    for x in range(total.size):
-        scale = np.float32(1) / total[x] if total[x] > ZERO else ZERO
-        red[x] *= scale
-        green[x] *= scale
-        blue[x] *= scale
-
-
-@jit_in_any_order
-def weigh_tap(
-    weight: Any,
-    distance: Any,
-    features: Any,
-    sharpness: Any,
-    own: Any,
-    importance: Any,
-    surface: Any,
-    inside: Any,
-    low: Any,
-    high: Any,
-    offset: Any,
-) -> None:
-    """weight (n) of the taps `offset` further than the pixels low to high, 0 where they are not `inside` (n)."""
+def weigh_taps(weight: Row, distance: Row, level: Level, layout: Layout, item: Index, taps: Taps, first: Index) -> None:
+    """weight (n) of taps; `first` is the first pixel of the block."""
+    offset, low, high, column = taps
+    surface = layout.surface[item]
     if offset == 0:
-        weigh_own(weight, own[low:high], surface[low:high])
+        weigh_own(weight, level.own[item, low:high], surface[low:high])
         return
-    measure(distance, features, low, high, offset)
+    measure(distance, level.features[item], low, high, offset)
     there = slice(low + offset, high + offset)
-    weigh(weight, distance, sharpness[low:high], importance[there], surface[there])
-    scale_line(weight, inside)
+    weigh(weight, distance, level.sharpness[item, low:high], level.importance[item, there], surface[there])
+    scale_line(weight, layout.inside[column, low - first : high - first])
+
+
+@jit_in_any_order
+def taps_of_block(layout: Layout, first: Index, last: Index) -> Iterator[Taps]:
+    """The nine taps of the pixels `first` to `last` - 1, without those in rows above and below the image."""
+    pixels = layout.surface.shape[1]
+    for tap in range(9):
+        offset = ((tap // 3 - 1) * layout.width + tap % 3 - 1) * layout.step
+        low = max(first, -offset)
+        high = min(last, pixels - offset)
+        if low < high and (offset == 0) == (tap == 4):
+            yield Taps(offset, low, high, tap % 3)
 
 
 @jit_with_memory
-def columns_inside(pixels: int, width: int, step: int) -> Any:
-    """Whether the taps to the left, above or below, and to the right of `pixels` in whole rows are inside: (3, N)."""
-    inside = np.ones((3, pixels), np.float32)
-    for p in range(pixels):
-        inside[0, p] = np.float32(p % width >= step)
-        inside[2, p] = np.float32(p % width < width - step)
-    return inside
+def filter_block(out: Rows, total: Row, level: Level, layout: Layout, item: Index, first: Index, last: Index) -> None:
+    """Pixels `first` to `last` - 1 of out (3, N) and total (N)."""
+    weights = np.empty(last - first, np.float32)
+    distances = np.empty(last - first, np.float32)
+    out[:, first:last] = f32(0)
+    total[first:last] = f32(0)
+    for taps in taps_of_block(layout, first, last):
+        offset, low, high, _ = taps
+        weight = weights[: high - low]
+        weigh_taps(weight, distances[: high - low], level, layout, item, taps, first)
+        there = triple_of_lines(level.image[item], low + offset, high + offset)
+        add_weighted(triple_of_lines(out, low, high), total[low:high], weight, there)
+    scale_line(total[first:last], layout.surface[item, first:last])
+    normalise(triple_of_lines(out, first, last), total[first:last])
+
+
+@jit_in_any_order
+def block_size(width: int) -> int:
+    return max(1, BLOCK_PIXELS // width) * width
 
 
 @jit_parallel
-def filter_image(
-    out: Any,
-    total: Any,
-    image: Any,
-    features: Any,
-    sharpness: Any,
-    own: Any,
-    importance: Any,
-    surface: Any,
-    width: int,
-    step: int,
-) -> None:
-    """out (3, N) and the sums of weights, total (N), from image (3, N), features (F, N), others (N), row after row."""
-    pixels = total.size
-    block = max(1, BLOCK_PIXELS // width) * width
-    inside = columns_inside(block, width, step)
+def filter_item(out: Image, total: Rows, level: Level, layout: Layout, item: int) -> None:
+    pixels = total.shape[1]
+    block = block_size(layout.width)
     for number in numba.prange((pixels + block - 1) // block):
-        distances = np.empty(block, np.float32)
-        weights = np.empty(block, np.float32)
-        first: Any = np.int64(number) * block
-        last = min(first + block, pixels)
-        out[:, first:last] = ZERO
-        total[first:last] = ZERO
-        for tap in range(9):
-            offset = (tap // 3 - 1) * step * width + (tap % 3 - 1) * step
-            # Rows above and below the image are cut off here, columns beside it have no weight.
-            low = max(first, -offset)
-            high = min(last, pixels - offset)
-            if low >= high or (offset == 0) != (tap == 4):
-                continue
-            weight = weights[: high - low]
-            weigh_tap(
-                weight,
-                distances[: high - low],
-                features,
-                sharpness,
-                own,
-                importance,
-                surface,
-                inside[tap % 3, low - first : high - first],
-                low,
-                high,
-                offset,
-            )
-            there = slice(low + offset, high + offset)
-            add_weighted(
-                out[0, low:high],
-                out[1, low:high],
-                out[2, low:high],
-                total[low:high],
-                weight,
-                image[0, there],
-                image[1, there],
-                image[2, there],
-            )
-        scale_line(total[first:last], surface[first:last])
-        normalise(out[0, first:last], out[1, first:last], out[2, first:last], total[first:last])
+        first = np.int64(number) * block
+        filter_block(out[item], total[item], level, layout, item, first, min(first + block, pixels))
 
 
-def flat(tensor: Tensor) -> Any:
+def flat(tensor: Tensor) -> Image:
     """(B, C, H, W) as an array (B, C, N)."""
     return array(tensor).reshape(*tensor.shape[:2], -1)
+
+
+def level_of(inputs: Sequence[Tensor]) -> Level:
+    image, features, *others = inputs
+    sharpness, own, importance = (flat(tensor)[:, 0] for tensor in others)
+    return Level(flat(image), flat(features), sharpness, own, importance)
+
+
+def layout_of(surface: Tensor, step: int) -> Layout:
+    width = surface.shape[-1]
+    column = np.arange(block_size(width)) % width
+    inside = np.stack([column >= step, column >= 0, column < width - step])
+    return Layout(width, step, flat(surface)[:, 0], inside.astype(np.float32))
 
 
 def filter_level(
@@ -186,183 +179,101 @@ def filter_level(
     """See models.networks.affinity.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
+    level, layout = level_of([image, features, sharpness, own, importance]), layout_of(surface, step)
     for item in range(len(image)):
-        filter_image(
-            flat(out)[item],
-            flat(total)[item, 0],
-            flat(image)[item],
-            flat(features)[item],
-            flat(sharpness)[item, 0],
-            flat(own)[item, 0],
-            flat(importance)[item, 0],
-            flat(surface)[item, 0],
-            image.shape[-1],
-            step,
-        )
+        filter_item(flat(out), flat(total)[:, 0], level, layout, item)
     return out, total
 
 
 # --- Gradients --------------------------------------------------------------------------------------------------------
 #
-# With g the gradient of the output over the sum of weights, that of the weight of q for p is g_p (image_q - out_p).
+# With g the gradient of the output, dL/dw_pq = g_p · (image_q - out_p) / Σ_q w_pq.
 
 
 @jit_in_any_order
-def pull_weights(
-    pull: Any, weight: Any, red: Any, green: Any, blue: Any, dot: Any, to_red: Any, to_green: Any, to_blue: Any
-) -> None:
+def scale_gradient(scaled: Row, dot: Row, gradient: Row, out: Row, total: Row) -> None:
+    """scaled = g / Σ w, and dot += scaled · out, for one colour."""
+    for x in range(scaled.size):
+        scaled[x] = gradient[x] / total[x] if total[x] > f32(0) else f32(0)
+        dot[x] += scaled[x] * out[x]
+
+
+@jit_in_any_order
+def pull_weights(pull: Row, weight: Row, scaled: RGB, dot: Row, values: RGB) -> None:
     """pull (n): the gradients of the weights, times the weights."""
+    red, green, blue = scaled
+    to_red, to_green, to_blue = values
     for x in range(pull.size):
         pull[x] = weight[x] * (red[x] * to_red[x] + green[x] * to_green[x] + blue[x] * to_blue[x] - dot[x])
 
 
 @jit_in_any_order
-def pull_exponent(to_sharpness: Any, pull: Any, distance: Any, sharpness: Any, importance: Any) -> None:
+def pull_exponent(to_sharpness: Row, pull: Row, distance: Row, sharpness: Row, importance: Row) -> None:
     """pull (n) becomes the gradient of the exponent; -2 sharpness times that, for features, is left in distance."""
     for x in range(pull.size):
-        inside = importance[x] - sharpness[x] * distance[x] >= np.float32(MIN_LOGIT)
-        pull[x] = pull[x] if inside else ZERO
+        inside = importance[x] - sharpness[x] * distance[x] >= f32(MIN_LOGIT)
+        pull[x] = pull[x] if inside else f32(0)
         to_sharpness[x] -= pull[x] * distance[x]
-        distance[x] = -TWO * sharpness[x] * pull[x]
+        distance[x] = -f32(2) * sharpness[x] * pull[x]
 
 
 @jit_in_any_order
-def pull_feature(to_here: Any, to_there: Any, pull: Any, here: Any, there: Any) -> None:
+def pull_feature(to_here: Row, to_there: Row, pull: Row, here: Row, there: Row) -> None:
     for x in range(pull.size):
         step = pull[x] * (here[x] - there[x])
         to_here[x] += step
         to_there[x] -= step
 
 
-@jit_in_any_order
-def scale_gradient(scaled: Any, dot: Any, gradient: Any, out: Any, total: Any) -> None:
-    for x in range(scaled.size):
-        scaled[x] = gradient[x] / total[x] if total[x] > ZERO else ZERO
-        dot[x] += scaled[x] * out[x]
+@jit_with_memory
+def pull_block(
+    to: Level, level: Level, layout: Layout, filtered: Filtered, item: Index, first: Index, last: Index
+) -> None:
+    """Add to the gradients `to` those by the outputs of pixels `first` to `last` - 1."""
+    n = last - first
+    weights, distances, pulls = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    dots = np.zeros(n, np.float32)
+    scaled = np.empty((3, n), np.float32)
+    for c in range(3):
+        gradient, out = filtered.gradient[item, c, first:last], filtered.out[item, c, first:last]
+        scale_gradient(scaled[c], dots, gradient, out, filtered.total[item, first:last])
+    for taps in taps_of_block(layout, first, last):
+        offset, low, high, _ = taps
+        here = slice(low - first, high - first)
+        there = slice(low + offset, high + offset)
+        weight, distance, pull = weights[: high - low], distances[: high - low], pulls[: high - low]
+        weigh_taps(weight, distance, level, layout, item, taps, first)
+        values = triple_of_lines(level.image[item], low + offset, high + offset)
+        pull_weights(pull, weight, triple_of_lines(scaled, low - first, high - first), dots[here], values)
+        for c in range(3):
+            add_product(to.image[item, c, there], weight, scaled[c, here])
+        if offset == 0:
+            add_line(to.own[item, low:high], pull)
+            continue
+        sharpness = level.sharpness[item, low:high]
+        pull_exponent(to.sharpness[item, low:high], pull, distance, sharpness, level.importance[item, there])
+        add_line(to.importance[item, there], pull)
+        for f in range(level.features.shape[1]):
+            features, to_features = level.features[item, f], to.features[item, f]
+            pull_feature(to_features[low:high], to_features[there], distance, features[low:high], features[there])
 
 
 @jit_parallel
-def pull_images(
-    to_image: Any,
-    to_features: Any,
-    to_sharpness: Any,
-    to_own: Any,
-    to_importance: Any,
-    gradient: Any,
-    image: Any,
-    features: Any,
-    sharpness: Any,
-    own: Any,
-    importance: Any,
-    surface: Any,
-    out: Any,
-    total: Any,
-    width: int,
-    step: int,
-) -> None:
-    """The gradients of what affinity_level takes, added to `to_...`: (B, ., N), items in parallel."""
-    batch, colours, pixels = image.shape
-    block = max(1, BLOCK_PIXELS // width) * width
-    inside = columns_inside(block, width, step)
-    for item in numba.prange(batch):
-        distances = np.empty(block, np.float32)
-        weights = np.empty(block, np.float32)
-        pulls = np.empty(block, np.float32)
-        dots = np.empty(block, np.float32)
-        scaled = np.empty((colours, block), np.float32)
+def pull_items(to: Level, level: Level, layout: Layout, filtered: Filtered) -> None:
+    """The gradients of a level, added to `to`; items in parallel, for the blocks of one share pixels."""
+    pixels = filtered.total.shape[1]
+    block = block_size(layout.width)
+    for item in numba.prange(len(filtered.total)):
         for first in range(0, pixels, block):
-            last = min(first + block, pixels)
-            dots[:] = ZERO
-            for c in range(colours):
-                scale_gradient(
-                    scaled[c, : last - first],
-                    dots[: last - first],
-                    gradient[item, c, first:last],
-                    out[item, c, first:last],
-                    total[item, 0, first:last],
-                )
-            for tap in range(9):
-                offset = (tap // 3 - 1) * step * width + (tap % 3 - 1) * step
-                low = max(first, -offset)
-                high = min(last, pixels - offset)
-                if low >= high or (offset == 0) != (tap == 4):
-                    continue
-                there = slice(low + offset, high + offset)
-                here = slice(low - first, high - first)
-                weight = weights[: high - low]
-                distance = distances[: high - low]
-                pull = pulls[: high - low]
-                weigh_tap(
-                    weight,
-                    distance,
-                    features[item],
-                    sharpness[item, 0],
-                    own[item, 0],
-                    importance[item, 0],
-                    surface[item, 0],
-                    inside[tap % 3, here],
-                    low,
-                    high,
-                    offset,
-                )
-                pull_weights(
-                    pull,
-                    weight,
-                    scaled[0, here],
-                    scaled[1, here],
-                    scaled[2, here],
-                    dots[here],
-                    image[item, 0, there],
-                    image[item, 1, there],
-                    image[item, 2, there],
-                )
-                for c in range(colours):
-                    add_product(to_image[item, c, there], weight, scaled[c, here])
-                if offset == 0:
-                    add_line(to_own[item, 0, low:high], pull)
-                    continue
-                pull_exponent(
-                    to_sharpness[item, 0, low:high],
-                    pull,
-                    distance,
-                    sharpness[item, 0, low:high],
-                    importance[item, 0, there],
-                )
-                add_line(to_importance[item, 0, there], pull)
-                for f in range(features.shape[1]):
-                    pull_feature(
-                        to_features[item, f, low:high],
-                        to_features[item, f, there],
-                        distance,
-                        features[item, f, low:high],
-                        features[item, f, there],
-                    )
+            pull_block(to, level, layout, filtered, np.int64(item), first, min(first + block, pixels))
 
 
 def pull_level(
-    gradient: Tensor, given: Sequence[Tensor], surface: Tensor, out: Tensor, total: Tensor, step: int
+    gradient: Tensor, inputs: Sequence[Tensor], surface: Tensor, out: Tensor, total: Tensor, step: int
 ) -> tuple[Tensor, ...]:
-    """The gradients of what was `given`: image, features, sharpness, own and importance."""
+    """The gradients of the `inputs`: image, features, sharpness, own and importance."""
     match_threads()
-    image, features, sharpness, own, importance = given
-    pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in given]
-    to_image, to_features, to_sharpness, to_own, to_importance = (flat(tensor) for tensor in pulled)
-    pull_images(
-        to_image,
-        to_features,
-        to_sharpness,
-        to_own,
-        to_importance,
-        flat(gradient),
-        flat(image),
-        flat(features),
-        flat(sharpness),
-        flat(own),
-        flat(importance),
-        flat(surface),
-        flat(out),
-        flat(total),
-        surface.shape[-1],
-        step,
-    )
+    pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs]
+    filtered = Filtered(flat(out), flat(total)[:, 0], flat(gradient))
+    pull_items(level_of(pulled), level_of(inputs), layout_of(surface, step), filtered)
     return tuple(pulled)

@@ -1,6 +1,6 @@
 """Types of what kernels take and return: for readers and mypy, for Numba infers its own.
 
-Arrays of float32 are contiguous. Letters: C channels, S signals (direct and indirect light), H rows, W columns, N = H W.
+Arrays of float32 are contiguous. C: channels, S: signals (direct and indirect light), H: rows, W: columns, N = H W.
 """
 
 from typing import TypeAlias
@@ -17,6 +17,7 @@ Image: TypeAlias = NDArray[np.float32]  # (C, H, W)
 Signals: TypeAlias = NDArray[np.float32]  # (S, C, H, W), or a batch of images
 RGB: TypeAlias = tuple[Row, Row, Row]  # parts of three rows: red, green and blue, or x, y and z
 Matrix: TypeAlias = NDArray[np.float32]
+Mask: TypeAlias = NDArray[np.bool_]  # (H, W)
 Doubles: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int32]
 Index: TypeAlias = int | np.int64

@@ -1,119 +1,97 @@
-"""models.filters.neighbours for the processor: rows in parallel, every loop along them vectorised."""
-
-from typing import Any
+"""models.filters.neighbours for the CPU: rows in parallel, every loop along them vectorised."""
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.channels import LUMINANCE_WEIGHTS
-from models.compiled.eaw import columns_with_tap
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
-from models.compiled.lines import add_line, add_product
+from models.compiled.arrays import RGB, Image, Index, Plane, Row, f32
+from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.lines import add_line, add_product, divide_line, luminance, triple, window_taps
 from models.operators import MAX_LUMINANCE
 
 MIN_MEAN = 1e-20  # smallest luminance that deviations are divided by
-ONE = np.float32(1)
-ZERO = np.float32(0)
-RED_WEIGHT, GREEN_WEIGHT, BLUE_WEIGHT = (np.float32(weight) for weight in LUMINANCE_WEIGHTS)
 SUMS = 6  # red, green, blue, luminance, its square, pixels
 
 
 @jit_in_any_order
-def compare(same: Any, mesh: Any, other: Any) -> None:
+def compare(same: Row, mesh: Row, other: Row) -> None:
     for x in range(same.size):
-        same[x] = ONE if mesh[x] == other[x] else ZERO
+        same[x] = f32(1) if mesh[x] == other[x] else f32(0)
 
 
 @jit_in_any_order
-def add_luminances(first: Any, second: Any, same: Any, red: Any, green: Any, blue: Any) -> None:
+def add_luminances(first: Row, second: Row, same: Row, colour: RGB) -> None:
+    """Add the luminance, and its square, of pixels of the same mesh."""
+    red, green, blue = colour
     for x in range(same.size):
-        y = min(RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x], np.float32(MAX_LUMINANCE))
+        y = min(luminance(red[x], green[x], blue[x]), f32(MAX_LUMINANCE))
         first[x] += same[x] * y
         second[x] += same[x] * y * y
 
 
 @jit_in_any_order
-def add_pixels(sums: Any, y: Any, low: Any, high: Any, same: Any, image: Any, to: Any, dx: Any) -> None:
-    there = slice(low + dx, high + dx)
-    red, green, blue = image[0, to, there], image[1, to, there], image[2, to, there]
-    add_product(sums[0, y, low:high], same, red)
-    add_product(sums[1, y, low:high], same, green)
-    add_product(sums[2, y, low:high], same, blue)
-    add_luminances(sums[3, y, low:high], sums[4, y, low:high], same, red, green, blue)
-    add_line(sums[5, y, low:high], same)
-
-
-@jit_in_any_order
-def divide(line: Any, total: Any, count: Any) -> None:
-    for x in range(line.size):
-        line[x] = total[x] / count[x]
-
-
-@jit_in_any_order
-def spread(line: Any, first: Any, second: Any, count: Any) -> None:
+def set_relative_deviation(line: Row, first: Row, second: Row, count: Row) -> None:
+    """√(E[y²] - E[y]²) / E[y], from sums of y, of y² and of pixels."""
     for x in range(line.size):
         mean = first[x] / count[x]
-        variance = max(second[x] / count[x] - mean * mean, ZERO)
-        line[x] = np.sqrt(variance) / max(mean, np.float32(MIN_MEAN))
+        variance = max(second[x] / count[x] - mean * mean, f32(0))
+        line[x] = np.sqrt(variance) / max(mean, f32(MIN_MEAN))
 
 
-@jit_parallel
-def sum_close(sums: Any, image: Any, mesh: Any) -> None:
-    """sums (SUMS, H, W) over 3 x 3 pixels from image (3, H, W) and mesh (H, W)."""
+@jit_with_memory
+def sum_row(sums: Image, to: Index, image: Image, mesh: Plane, row: Index, step: int) -> None:
+    """Row `to` of sums (C, ·, W) over 3 x 3 taps `step` pixels apart of the same mesh, of a row of image (C, H, W)."""
     height, width = mesh.shape
-    for row in numba.prange(height):
-        y = np.int64(row)
-        same = np.empty(width, np.float32)
-        sums[:, y] = ZERO
-        for tap in range(9):
-            dy, dx = tap // 3 - 1, tap % 3 - 1
-            low, high = columns_with_tap(y, dx, dy, height, width)
-            if low >= high:
-                continue
-            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
-            add_pixels(sums, y, low, high, same[low:high], image, y + dy, dx)
+    space = np.empty(width, np.float32)
+    sums[:, to] = 0
+    for dx, dy, left, right in window_taps(row, 1, step, height, width):
+        same = space[left:right]
+        compare(same, mesh[row, left:right], mesh[row + dy, left + dx : right + dx])
+        for c in range(len(image)):
+            add_product(sums[c, to, left:right], same, image[c, row + dy, left + dx : right + dx])
 
 
-@jit_parallel
-def average(near: Any, around: Any, deviation: Any, close: Any, mesh: Any) -> None:
-    """near and around (3, H, W) and deviation (H, W) from the sums over 3 x 3 pixels."""
+@jit_with_memory
+def sum_colours_row(sums: Image, image: Image, mesh: Plane, row: Index) -> None:
+    """A row of sums (SUMS, H, W) over 3 x 3 pixels of the same mesh."""
     height, width = mesh.shape
-    for row in numba.prange(height):
-        y = np.int64(row)
-        same = np.empty(width, np.float32)
-        sums = np.zeros((SUMS, width), np.float32)
-        for tap in range(9):
-            dy, dx = 3 * (tap // 3 - 1), 3 * (tap % 3 - 1)
-            low, high = columns_with_tap(y, dx, dy, height, width)
-            if low >= high:
-                continue
-            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
-            for c in range(SUMS):
-                add_product(sums[c, low:high], same[low:high], close[c, y + dy, low + dx : high + dx])
+    space = np.empty(width, np.float32)
+    sums[:, row] = 0
+    for dx, dy, left, right in window_taps(row, 1, 1, height, width):
+        same = space[left:right]
+        compare(same, mesh[row, left:right], mesh[row + dy, left + dx : right + dx])
         for c in range(3):
-            divide(near[c, y], close[c, y], close[SUMS - 1, y])
-            divide(around[c, y], sums[c], sums[SUMS - 1])
-        spread(deviation[y], sums[3], sums[4], sums[SUMS - 1])
+            add_product(sums[c, row, left:right], same, image[c, row + dy, left + dx : right + dx])
+        there = triple(image, row + dy, left + dx, right + dx)
+        add_luminances(sums[3, row, left:right], sums[4, row, left:right], same, there)
+        add_line(sums[5, row, left:right], same)
 
 
 @jit_parallel
-def sum_taps(sums: Any, image: Any, mesh: Any, step: Any) -> None:
-    """sums (C, H, W) over 3 x 3 taps `step` pixels apart, from image (C, H, W) and mesh (H, W)."""
+def sum_colours(sums: Image, image: Image, mesh: Plane) -> None:
+    for row in numba.prange(len(mesh)):
+        sum_colours_row(sums, image, mesh, np.int64(row))
+
+
+@jit_parallel
+def average(mean_3x3: Image, mean_9x9: Image, deviation: Plane, sums_3x3: Image, mesh: Plane) -> None:
+    """Means (3, H, W) and relative deviation (H, W) from the sums (SUMS, H, W) over 3 x 3 pixels."""
     height, width = mesh.shape
     for row in numba.prange(height):
         y = np.int64(row)
-        same = np.empty(width, np.float32)
-        sums[:, y] = ZERO
-        for tap in range(9):
-            dy, dx = step * (tap // 3 - 1), step * (tap % 3 - 1)
-            low, high = columns_with_tap(y, dx, dy, height, width)
-            if low >= high:
-                continue
-            compare(same[low:high], mesh[y, low:high], mesh[y + dy, low + dx : high + dx])
-            for c in range(image.shape[0]):
-                add_product(sums[c, y, low:high], same[low:high], image[c, y + dy, low + dx : high + dx])
+        sums = np.empty((SUMS, 1, width), np.float32)
+        sum_row(sums, 0, sums_3x3, mesh, y, 3)
+        for c in range(3):
+            divide_line(mean_3x3[c, y], sums_3x3[c, y], sums_3x3[5, y])
+            divide_line(mean_9x9[c, y], sums[c, 0], sums[5, 0])
+        set_relative_deviation(deviation[y], sums[3, 0], sums[4, 0], sums[5, 0])
+
+
+@jit_parallel
+def sum_taps(sums: Image, image: Image, mesh: Plane, step: int) -> None:
+    for row in numba.prange(len(mesh)):
+        sum_row(sums, np.int64(row), image, mesh, np.int64(row), step)
 
 
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
@@ -126,13 +104,12 @@ def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
 
 def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """See models.filters.neighbours.mesh_means."""
-    batch, _, height, width = image.shape
-    near = torch.empty(batch, 3, height, width)
-    around = torch.empty(batch, 3, height, width)
-    deviation = torch.empty(batch, 1, height, width)
-    close = np.empty((SUMS, height, width), np.float32)
-    for item in range(batch):
+    mean_3x3 = torch.empty_like(image, memory_format=torch.contiguous_format)
+    mean_9x9 = torch.empty_like(mean_3x3)
+    deviation = torch.empty_like(mesh_id, memory_format=torch.contiguous_format)
+    sums = np.empty((SUMS, *image.shape[2:]), np.float32)
+    for item in range(len(image)):
         mesh = array(mesh_id[item, 0])
-        sum_close(close, array(image[item]), mesh)
-        average(near[item].numpy(), around[item].numpy(), deviation[item, 0].numpy(), close, mesh)
-    return near, around, deviation
+        sum_colours(sums, array(image[item]), mesh)
+        average(mean_3x3[item].numpy(), mean_9x9[item].numpy(), deviation[item, 0].numpy(), sums, mesh)
+    return mean_3x3, mean_9x9, deviation

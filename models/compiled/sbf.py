@@ -1,6 +1,4 @@
-"""models.filters.sbf for the processor: every row by itself, every loop along it vectorised."""
-
-from typing import Any
+"""models.filters.sbf for the CPU: rows in parallel, every loop along them vectorised."""
 
 import numba
 import numpy as np
@@ -9,48 +7,46 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models.compiled.affinity import STRIDE, measure
-from models.compiled.eaw import columns_with_tap, decay
+from models.compiled.arrays import Image, Index, Plane, Row, Rows, Scalar, Signals
+from models.compiled.eaw import decay
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.lines import window_taps
 
 
 @jit_in_any_order
-def decay_line(line: Any) -> None:
+def decay_line(line: Row) -> None:
     for x in range(line.size):
         line[x] = decay(line[x])
 
 
 @jit_in_any_order
-def add_scaled(line: Any, scale: Any, weight: Any, image: Any) -> None:
+def add_scaled(line: Row, scale: Scalar, weight: Row, image: Row) -> None:
     for x in range(line.size):
         line[x] += scale * weight[x] * image[x]
 
 
 @jit_with_memory
-def sum_row(sums: Any, row: Any, image: Any, guides: Any, gaussians: Any) -> None:
-    """A row of sums (S, C, H, W) from image (C, H, W), guides (F, H * W), gaussians (2 radius + 1, S)."""
+def sum_row(sums: Signals, row: Index, image: Image, guides: Rows, gaussians: Plane) -> None:
+    """A row of sums (S, C, H, W) from image (C, H, W), guides (F, N), gaussians (2 radius + 1, S)."""
     channels, height, width = image.shape
     taps, filters = gaussians.shape
     radius = taps // 2
     space = np.empty(width, np.float32)
     sums[:, :, row] = 0
-    for dy in range(-radius, radius + 1):
-        for dx in range(-radius, radius + 1):
-            left, right = columns_with_tap(row, dx, dy, height, width)
-            if left >= right:
-                continue
-            weight = space[: right - left]
-            measure(weight, guides, row * width + left, row * width + right, dy * width + dx)
-            decay_line(weight)
-            for s in range(filters):
-                scale = gaussians[radius + dy, s] * gaussians[radius + dx, s]
-                if scale > 0:
-                    for c in range(channels):
-                        there = image[c, row + dy, left + dx : right + dx]
-                        add_scaled(sums[s, c, row, left:right], scale, weight, there)
+    for dx, dy, left, right in window_taps(row, radius, 1, height, width):
+        weight = space[: right - left]
+        measure(weight, guides, row * width + left, row * width + right, dy * width + dx)
+        decay_line(weight)
+        for s in range(filters):
+            scale = gaussians[radius + dy, s] * gaussians[radius + dx, s]
+            if scale > 0:
+                for c in range(channels):
+                    there = image[c, row + dy, left + dx : right + dx]
+                    add_scaled(sums[s, c, row, left:right], scale, weight, there)
 
 
 @jit_parallel
-def sum_image(sums: Any, image: Any, guides: Any, gaussians: Any) -> None:
+def sum_image(sums: Signals, image: Image, guides: Rows, gaussians: Plane) -> None:
     for row in numba.prange(image.shape[1]):
         sum_row(sums, np.int64(row), image, guides, gaussians)
 

@@ -91,7 +91,7 @@ def cross_bilateral(pixels: Pixels, sharpness: Tensor) -> Tensor:
     """The filtered image (B, 3, H, W), a convex mean of surfaces around each pixel, 0 off them.
 
     Differentiable in the sharpness (B, 1 + groups, H, W) >= 0: that of the distance in the image, then of each group
-    of features. Colours lie within ±LARGEST_LUMINANCE.
+    of features. Colours lie within ±MAX_LUMINANCE.
     """
     filtered: Tensor = CrossBilateral.apply(sharpness, *pixels)
     return filtered

@@ -1,7 +1,7 @@
 """What LBF's network sees: statistics of the features around each pixel (Kalantari et al. 2015, §3.3).
 
 All take features (B, sum(FEATURE_GROUPS), H, W) and `surface` (B, 1, H, W), 1 for pixels that count: background and
-what is outside the image is in none of them. Statistics are taken channel by channel, then averaged over those of a group.
+what is outside the image is in none of them. Statistics are taken by channel, then averaged over those of a group.
 """
 
 import torch
