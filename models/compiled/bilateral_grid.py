@@ -1,57 +1,55 @@
-"""models.networks.bilateral_grid for the processor: two rows of cells at a time, which stay in the cache."""
+"""models.networks.bilateral_grid for the CPU: two rows of cells at a time, which stay in the cache.
 
-from typing import Any
+A row of cells is a line of columns * levels * 4 numbers: red, green, blue and weight. It has an empty column and level
+more at either end, so that no pixel has to test whether its cells are inside.
+"""
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from models.compiled.arrays import RGB, Image, Index, Plane, Row, Scalar, f32
 from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory, plane_or_empty
-from models.compiled.lines import fill_line
+from models.compiled.lines import fill_line, triple
 
 GUIDES = 256  # values of a guide (Meng et al. 2020), which cells of a grid divide as they divide pixels
-HALF = np.float32(0.5)
-ONE = np.float32(1)
-ZERO = np.float32(0)
 GRID_STRIP_ROWS = 64  # of pixels that a thread filters at once; a multiple of all spacings
 
-# A row of cells is a line of columns * levels * 4 numbers: red, green, blue and weight. It has a column and a level
-# more at either end, which are emptied before they are read: so no pixel has to ask whether its cells are inside.
-
 
 @jit_inlined
-def in_cells(position: Any, per_cell: Any) -> Any:
+def in_cells(position: Scalar, per_cell: Scalar) -> Scalar:
     """Where a pixel, or a guide, lies along an axis, counted from the middle of the cell before the grid."""
-    return (position + HALF) * per_cell + HALF
+    return (position + f32(0.5)) * per_cell + f32(0.5)
 
 
 @jit_inlined
-def cells_around(x: Any, guide: Any, levels: Any, per_cell: Any) -> Any:
-    """Where the first cell around a pixel of a line begins, and how far it lies to the right of it and behind it."""
-    inside = guide if ZERO <= guide <= ONE else ZERO  # NaN would be outside of memory
-    across = in_cells(np.float32(x), per_cell)
-    deep = in_cells(np.float32(GUIDES - 1) * inside, per_cell)
+def cells_of_pixel(x: Index, guide: Scalar, levels: int, per_cell: Scalar) -> tuple[Index, Scalar, Scalar]:
+    """Where the first of the four cells nearest to a pixel begins, and how far across and behind it the pixel is."""
+    inside = guide if f32(0) <= guide <= f32(1) else f32(0)  # NaN would be outside of memory
+    across = in_cells(f32(x), per_cell)
+    deep = in_cells(f32(GUIDES - 1) * inside, per_cell)
     column = np.int64(across)
     level = np.int64(deep)
-    return (column * levels + level) * 4, across - np.float32(column), deep - np.float32(level)
+    return (column * levels + level) * 4, across - f32(column), deep - f32(level)
 
 
 @jit_inlined
-def weight_of(tap: Any, right: Any, behind: Any) -> Any:
-    """Of the four cells in a row that are around a pixel."""
-    return (right if tap // 2 else ONE - right) * (behind if tap % 2 else ONE - behind)
+def weight_of(tap: int, right: Scalar, behind: Scalar) -> Scalar:
+    """Bilinear weight of one of the four cells."""
+    return (right if tap // 2 else f32(1) - right) * (behind if tap % 2 else f32(1) - behind)
 
 
 @jit_in_order
 def splat_line(
-    cells: Any, by_row: Any, red: Any, green: Any, blue: Any, guide: Any, surface: Any, levels: Any, per_cell: Any
+    cells: Row, by_row: Scalar, colour: RGB, guide: Row, surface: Row, levels: int, per_cell: Scalar
 ) -> None:
     """Add a line of pixels, weighted by_row, to a row of cells."""
+    red, green, blue = colour
     for x in range(guide.size):
-        if surface.size > 0 and surface[x] == ZERO:
+        if surface.size > 0 and surface[x] == f32(0):
             continue
-        first, right, behind = cells_around(x, guide[x], levels, per_cell)
+        first, right, behind = cells_of_pixel(x, guide[x], levels, per_cell)
         for tap in range(4):
             weight = by_row * weight_of(tap, right, behind)
             cell = first + (tap // 2 * levels + tap % 2) * 4
@@ -62,40 +60,32 @@ def splat_line(
 
 
 @jit_in_order
-def normalise(cells: Any, levels: Any) -> None:
+def normalise_cells(cells: Row, levels: int) -> None:
     """Sums become means, and weights 1, of the cells that have any and are inside; all others become 0."""
     columns = cells.size // (4 * levels)
     for column in range(columns):
         for level in range(levels):
             cell = (column * levels + level) * 4
             inside = 0 < column < columns - 1 and 0 < level < levels - 1
-            scale = ONE / cells[cell + 3] if inside and cells[cell + 3] > ZERO else ZERO
+            scale = f32(1) / cells[cell + 3] if inside and cells[cell + 3] > f32(0) else f32(0)
             cells[cell] *= scale
             cells[cell + 1] *= scale
             cells[cell + 2] *= scale
-            cells[cell + 3] = ONE if scale > ZERO else ZERO
+            cells[cell + 3] = f32(1) if scale > f32(0) else f32(0)
 
 
 @jit_in_order
 def slice_line(
-    red: Any,
-    green: Any,
-    blue: Any,
-    above: Any,
-    below: Any,
-    down: Any,
-    guide: Any,
-    surface: Any,
-    levels: Any,
-    per_cell: Any,
+    colour: RGB, above: Row, below: Row, down: Scalar, guide: Row, surface: Row, levels: int, per_cell: Scalar
 ) -> None:
     """Fill a line of pixels, `down` of the way from the middle of the row of cells above to that of the one below."""
+    red, green, blue = colour
     for x in range(guide.size):
-        if surface.size > 0 and surface[x] == ZERO:
-            red[x] = green[x] = blue[x] = ZERO
+        if surface.size > 0 and surface[x] == f32(0):
+            red[x] = green[x] = blue[x] = f32(0)
             continue
-        first, right, behind = cells_around(x, guide[x], levels, per_cell)
-        r = g = b = total = ZERO
+        first, right, behind = cells_of_pixel(x, guide[x], levels, per_cell)
+        r = g = b = total = f32(0)
         for tap in range(4):
             weight = weight_of(tap, right, behind)
             lower = weight * down
@@ -105,40 +95,40 @@ def slice_line(
             g += upper * above[cell + 1] + lower * below[cell + 1]
             b += upper * above[cell + 2] + lower * below[cell + 2]
             total += upper * above[cell + 3] + lower * below[cell + 3]
-        scale = ONE / total
+        scale = f32(1) / total
         red[x] = r * scale
         green[x] = g * scale
         blue[x] = b * scale
 
 
 @jit_with_memory
-def line(surface: Any, y: Any) -> Any:
+def row_or_empty(surface: Plane, y: Index) -> Row:
     return surface[min(y, surface.shape[0] - 1)] if surface.size > 0 else surface.ravel()
 
 
 @jit_with_memory
-def fill_cells(cells: Any, row: Any, image: Any, guide: Any, surface: Any, levels: Any, spacing: Any) -> None:
+def fill_cells(cells: Row, row: Index, image: Image, guide: Plane, surface: Plane, levels: int, spacing: int) -> None:
     """The means of a row of cells; 0 in a row outside the grid."""
-    height = guide.shape[0]
-    per_cell = ONE / np.float32(spacing)
-    fill_line(cells, ZERO)
+    height, width = guide.shape
+    per_cell = f32(1) / f32(spacing)
+    fill_line(cells, f32(0))
     if not 0 <= row * spacing < height:
         return
     first = row * spacing - spacing // 2
     for y in range(max(first, 0), min(first + 2 * spacing, height)):
-        by_row = ONE - abs(in_cells(np.float32(y), per_cell) - np.float32(row + 1))
-        lines = image[0, y], image[1, y], image[2, y], guide[y], line(surface, y)
-        splat_line(cells, by_row, *lines, levels, per_cell)
-    normalise(cells, levels)
+        by_row = f32(1) - abs(in_cells(f32(y), per_cell) - f32(row + 1))
+        colour = triple(image, y, 0, width)
+        splat_line(cells, by_row, colour, guide[y], row_or_empty(surface, y), levels, per_cell)
+    normalise_cells(cells, levels)
 
 
 @jit_parallel
-def filter_image(out: Any, image: Any, guide: Any, surface: Any, spacing: int) -> None:
-    """out and image (3, H, W), guide (H, W), surface (H, W) or empty, see models.networks.bilateral_grid.grid_mean."""
+def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing: int) -> None:
+    """See models.networks.bilateral_grid.grid_mean; surface is (H, W) or empty."""
     height, width = guide.shape
     levels = GUIDES // spacing + 2
     columns = (width + spacing - 1) // spacing + 2
-    per_cell = ONE / np.float32(spacing)
+    per_cell = f32(1) / f32(spacing)
     strips = (height + spacing // 2 + GRID_STRIP_ROWS - 1) // GRID_STRIP_ROWS
     for strip in numba.prange(strips):
         above = np.empty(columns * levels * 4, np.float32)
@@ -151,9 +141,9 @@ def filter_image(out: Any, image: Any, guide: Any, surface: Any, spacing: int) -
             fill_cells(below, row, image, guide, surface, levels, spacing)
             top = row * spacing - spacing // 2
             for y in range(max(top, 0), min(top + spacing, height)):
-                down = in_cells(np.float32(y), per_cell) - np.float32(row)
-                lines = guide[y], line(surface, y)
-                slice_line(out[0, y], out[1, y], out[2, y], above, below, down, *lines, levels, per_cell)
+                down = in_cells(f32(y), per_cell) - f32(row)
+                lines = guide[y], row_or_empty(surface, y)
+                slice_line(triple(out, y, 0, width), above, below, down, *lines, levels, per_cell)
 
 
 def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None = None) -> Tensor:

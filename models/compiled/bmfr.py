@@ -1,12 +1,13 @@
-"""models.filters.bmfr for the processor: every block by itself, its matrix in the cache, column by column."""
+"""models.filters.bmfr for the CPU: blocks in parallel, each with its matrix in the cache, column by column."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from models.compiled.arrays import Doubles, Image, Index, Plane
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 
 BLOCK_SIDE = 32  # px
@@ -18,15 +19,25 @@ POSITION = 4  # the first column of positions
 SQUARE = 7  # and of their squares
 
 
+class RegressionInputs(NamedTuple):
+    """One item of what models.filters.bmfr.regress takes."""
+
+    irradiance: Image
+    normal: Image
+    depth: Plane
+    axes: Doubles  # (3, 3): rays in the camera's frame are x axes[:, 0] + y axes[:, 1] + axes[:, 2]
+    noise: Doubles  # (10, P), added to the features
+
+
 @jit_in_any_order
-def mirror(place: Any, size: Any) -> Any:
+def mirror(place: Index, size: int) -> Index:
     """The pixel at a place of an axis that is mirrored at both ends."""
     place %= 2 * size
     return min(place, 2 * size - 1 - place)
 
 
 @jit_in_any_order
-def dot(a: Any, b: Any) -> Any:
+def dot(a: Doubles, b: Doubles) -> float:
     total = 0.0
     for i in range(a.size):
         total += a[i] * b[i]
@@ -34,17 +45,18 @@ def dot(a: Any, b: Any) -> Any:
 
 
 @jit_in_any_order
-def add_multiple(a: Any, b: Any, factor: Any) -> None:
+def add_multiple(a: Doubles, b: Doubles, factor: float) -> None:
     for i in range(a.size):
         a[i] += factor * b[i]
 
 
 @jit_in_any_order
-def gather(columns: Any, light: Any, top: Any, left: Any, irradiance: Any, normal: Any, depth: Any, axes: Any) -> Any:
-    """Fill columns (10, P), but positions unscaled, and light (3, P), with 0 off surfaces; returns whether any shows.
+def gather_block(columns: Doubles, light: Doubles, inputs: RegressionInputs, top: Index, left: Index) -> bool:
+    """Fill columns (10, P), but positions unscaled, and light (3, P), with 0 off surfaces.
 
-    The block begins at row `top` and column `left` of the image.
+    The block begins at row `top` and column `left` of the image. Returns whether it shows any surface.
     """
+    irradiance, normal, depth, axes, _ = inputs
     height, width = depth.shape
     count = 0.0
     for p in range(PIXELS):
@@ -63,8 +75,8 @@ def gather(columns: Any, light: Any, top: Any, left: Any, irradiance: Any, norma
 
 
 @jit_in_any_order
-def begin_at_0(position: Any, surface: Any) -> Any:
-    """Shift the positions (P) of surfaces along an axis; returns how far they extend."""
+def begin_at_0(position: Doubles, surface: Doubles) -> float:
+    """Shift the positions (P) of surfaces along an axis; returns their extent."""
     low = np.inf
     high = -np.inf
     for i in range(position.size):
@@ -76,14 +88,14 @@ def begin_at_0(position: Any, surface: Any) -> Any:
 
 
 @jit_in_any_order
-def scale(position: Any, square: Any, factor: Any) -> None:
+def scale(position: Doubles, square: Doubles, factor: float) -> None:
     for i in range(position.size):
         position[i] *= factor
         square[i] = position[i] * position[i]
 
 
 @jit_with_memory
-def scale_positions(columns: Any) -> None:
+def scale_positions(columns: Doubles) -> None:
     """Scale the positions among columns (10, P) to [0, 1], and square them."""
     extents = np.empty(3)
     for i in range(3):
@@ -95,8 +107,8 @@ def scale_positions(columns: Any) -> None:
 
 
 @jit_in_any_order
-def triangularise(matrix: Any) -> None:
-    """Matrix (13, P), column after column: the first ten become R, by Householder reflections of all."""
+def triangularise(matrix: Doubles) -> None:
+    """Matrix (13, P), column after column: the first ten become R of a QR factorisation, by Householder reflections."""
     for k in range(REGRESSORS):
         v = matrix[k, k:]
         length = np.sqrt(dot(v, v))
@@ -109,7 +121,7 @@ def triangularise(matrix: Any) -> None:
 
 
 @jit_in_any_order
-def substitute(coefficients: Any, matrix: Any) -> None:
+def substitute(coefficients: Doubles, matrix: Doubles) -> None:
     """Coefficients (3, 10) of each colour, from the last feature to the first."""
     for c in range(3):
         for i in range(REGRESSORS - 1, -1, -1):
@@ -120,7 +132,7 @@ def substitute(coefficients: Any, matrix: Any) -> None:
 
 
 @jit_in_any_order
-def write(plane: Any, values: Any, top: Any, left: Any) -> None:
+def write_block(plane: Plane, values: Doubles, top: Index, left: Index) -> None:
     """The part of values (P) that lies in the image's plane (H, W)."""
     height, width = plane.shape
     for y in range(max(top, 0), min(top + BLOCK_SIDE, height)):
@@ -130,16 +142,14 @@ def write(plane: Any, values: Any, top: Any, left: Any) -> None:
 
 
 @jit_with_memory
-def regress_block(
-    fitted: Any, irradiance: Any, normal: Any, depth: Any, axes: Any, noise: Any, top: Any, left: Any
-) -> None:
+def regress_block(fitted: Image, inputs: RegressionInputs, top: Index, left: Index) -> None:
     columns = np.empty((REGRESSORS, PIXELS))
     matrix = np.empty((COLUMNS, PIXELS))
     coefficients = np.empty((3, REGRESSORS))
     light = matrix[REGRESSORS:]
-    if gather(columns, light, top, left, irradiance, normal, depth, axes):
+    if gather_block(columns, light, inputs, top, left):
         scale_positions(columns)
-        matrix[:REGRESSORS] = columns + noise
+        matrix[:REGRESSORS] = columns + inputs.noise
         triangularise(matrix)
         substitute(coefficients, matrix)
         for c in range(3):
@@ -147,22 +157,18 @@ def regress_block(
             for i in range(REGRESSORS):
                 add_multiple(light[c], columns[i], coefficients[c, i])
     for c in range(3):
-        write(fitted[c], light[c], top, left)
+        write_block(fitted[c], light[c], top, left)
 
 
 @jit_parallel
-def regress_image(
-    fitted: Any, irradiance: Any, normal: Any, depth: Any, axes: Any, noise: Any, above: int, before: int
-) -> None:
-    """fitted (3, H, W), as models.filters.bmfr.regress, with noise (10, P)."""
-    height, width = depth.shape
+def regress_image(fitted: Image, inputs: RegressionInputs, above: int, before: int) -> None:
+    """fitted (3, H, W), by blocks of which the first begins `above` and `before` the image."""
+    height, width = inputs.depth.shape
     down = (height + above + BLOCK_SIDE - 1) // BLOCK_SIDE
     across = (width + before + BLOCK_SIDE - 1) // BLOCK_SIDE
     for block in numba.prange(down * across):
         number = np.int64(block)
-        top = number // across * BLOCK_SIDE - above
-        left = number % across * BLOCK_SIDE - before
-        regress_block(fitted, irradiance, normal, depth, axes, noise, top, left)
+        regress_block(fitted, inputs, number // across * BLOCK_SIDE - above, number % across * BLOCK_SIDE - before)
 
 
 def regress(
@@ -170,14 +176,9 @@ def regress(
 ) -> Tensor:
     """See models.filters.bmfr.regress."""
     fitted = torch.empty_like(irradiance, memory_format=torch.contiguous_format)
+    doubles = noise.T.contiguous().numpy()
     for item in range(len(irradiance)):
-        regress_image(
-            fitted[item].numpy(),
-            array(irradiance[item]),
-            array(normal[item]),
-            array(depth[item, 0]),
-            axes[item].contiguous().numpy(),
-            noise.T.contiguous().numpy(),
-            *offset,
-        )
+        images = array(irradiance[item]), array(normal[item]), array(depth[item, 0])
+        inputs = RegressionInputs(*images, axes[item].contiguous().numpy(), doubles)
+        regress_image(fitted[item].numpy(), inputs, *offset)
     return fitted

@@ -1,23 +1,24 @@
-"""models.networks.pixel_kernels for the processor: rows in parallel, each with its logits in a core's cache."""
+"""models.networks.pixel_kernels for the CPU: rows in parallel, each with its logits in a core's cache."""
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from models.compiled.arrays import Image, Index, Plane, Row, Rows, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory, plane_or_empty
+from models.compiled.lines import add_product, window_taps
 
-MIN_RELATIVE_LOGIT = np.float32(-87)  # less than the largest: exp of less is denormal in float32, which is slow
-NEVER = np.float32(-np.inf)  # logit of a tap that shows no surface
-ONE_LINE = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
+MIN_RELATIVE_LOGIT = np.float32(-87)  # to the largest: exp of less is denormal in float32, which is slow
+PADDING = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
 
 
 @jit_in_order
-def to_float32(row: Any, logits: Any, bfloat: bool) -> None:
+def to_float32(row: Rows, logits: NDArray[np.float32 | np.int16], bfloat: bool) -> None:
     """row (taps, W) from logits of float32, or of the bits of bfloat16, which are the upper half of a float32."""
     if bfloat:
         for x in range(logits.shape[1]):
@@ -30,68 +31,59 @@ def to_float32(row: Any, logits: Any, bfloat: bool) -> None:
 
 
 @jit_in_order
-def leave_out(logits: Any, surface: Any) -> None:
+def exclude(logits: Row, surface: Row) -> None:
+    """No weight for taps that show no surface."""
     for x in range(surface.size):
-        logits[x] = logits[x] if surface[x] > 0 else NEVER
+        logits[x] = logits[x] if surface[x] > 0 else f32(-np.inf)
 
 
 @jit_in_order
-def raise_top(top: Any, logits: Any) -> None:
+def raise_top(top: Row, logits: Row) -> None:
     for x in range(top.size):
         top[x] = max(top[x], logits[x])
 
 
 @jit_in_order
-def to_weights(logits: Any, top: Any, total: Any) -> None:
-    """In place, weights relative to the largest logit; total += weights."""
+def to_weights(logits: Row, top: Row, total: Row) -> None:
+    """In place, weights exp(logit - top); total += weights."""
     for x in range(top.size):
         weight = exp(max(logits[x] - top[x], MIN_RELATIVE_LOGIT))
-        logits[x] = weight if logits[x] > NEVER else np.float32(0)
+        logits[x] = weight if logits[x] > f32(-np.inf) else f32(0)
         total[x] += logits[x]
 
 
-@jit_in_order
-def add_weighted(line: Any, weight: Any, values: Any) -> None:
-    for x in range(line.size):
-        line[x] += weight[x] * values[x]
-
-
 @jit_with_memory
-def apply_to_row(output: Any, image: Any, surface: Any, row: Any, y: Any, size: int) -> None:
-    """Row y of output, filtered by the softmax of row (size², W + ONE_LINE), whose contents are lost.
+def apply_to_row(output: Image, image: Image, surface: Plane, row: Rows, y: Index, size: int) -> None:
+    """Row y of output, filtered by the softmax of row (size², W + PADDING), whose contents are lost.
 
     surface (H, W) is empty where all pixels count.
-
-    Slices are taken where they can be seen to be contiguous: else no loop would be vectorised.
     """
     channels, height, width = image.shape
     radius = size // 2
-    top = np.full(width, NEVER)
+    top = np.full(width, f32(-np.inf))
     total = np.zeros(width, np.float32)
     sums = np.zeros((channels, width), np.float32)
-    for gather in (False, True):
-        for dy in range(max(-radius, -y), min(radius + 1, height - y)):
-            for dx in range(max(-radius, 1 - width), min(radius + 1, width)):
-                low = max(0, -dx)
-                high = min(width, width - dx)
-                logits = row[(dy + radius) * size + dx + radius, low:high]
-                if not gather:
-                    if surface.size > 0:
-                        leave_out(logits, surface[y + dy, low + dx : high + dx])
-                    raise_top(top[low:high], logits)
-                    continue
-                to_weights(logits, top[low:high], total[low:high])
-                for c in range(channels):
-                    add_weighted(sums[c, low:high], logits, image[c, y + dy, low + dx : high + dx])
+    for dx, dy, low, high in window_taps(y, radius, 1, height, width):
+        logits = row[(dy + radius) * size + dx + radius, low:high]
+        if surface.size > 0:
+            exclude(logits, surface[y + dy, low + dx : high + dx])
+        raise_top(top[low:high], logits)
+    for dx, dy, low, high in window_taps(y, radius, 1, height, width):
+        logits = row[(dy + radius) * size + dx + radius, low:high]
+        to_weights(logits, top[low:high], total[low:high])
+        for c in range(channels):
+            add_product(sums[c, low:high], logits, image[c, y + dy, low + dx : high + dx])
     for c in range(channels):
-        output[c, y] = sums[c] / np.maximum(total, np.float32(1))
+        output[c, y] = sums[c] / np.maximum(total, f32(1))
 
 
 @jit_parallel
-def apply_to_image(output: Any, image: Any, surface: Any, logits: Any, size: int, bfloat: bool) -> None:
+def apply_to_image(
+    output: Image, image: Image, surface: Plane, logits: NDArray[np.float32 | np.int16], size: int, bfloat: bool
+) -> None:
     _, height, width = image.shape
     for y in numba.prange(height):
-        row = np.empty((size * size, width + ONE_LINE), np.float32)
+        row = np.empty((size * size, width + PADDING), np.float32)
         to_float32(row, logits[:, y], bfloat)
         apply_to_row(output, image, surface, row, np.int64(y), size)
 

@@ -8,15 +8,15 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import features as kernels
-from models.compiled.features import FEATURES, GAMMA
+from models.compiled.features import FEATURE_CHANNELS, GAMMA
 from models.history.running_scale import RunningScale
 
 
 @compiled.by(kernels.network_features)
 def network_features(
-    frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURES)
+    frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
 ) -> Tensor:
-    """The network's input (B, 10, H, W) in [0, 1], or fewer channels for some `names` of FEATURES only.
+    """The network's input (B, 10, H, W) in [0, 1], or fewer channels for some `names` of FEATURE_CHANNELS only.
 
     Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
     world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from datasets.frame import Signal
-from models.compiled.features import FEATURES
+from models.compiled.features import FEATURE_CHANNELS
 from models.networks.bilateral_grid import grid_mean
 from models.networks.wskp import KernelPredictor
 
@@ -38,7 +38,7 @@ class NBGD(KernelPredictor):
         super().__init__(signal=signal)
         outputs = len(SPACINGS) + len(SPACINGS) - 1
         self.network = nn.Sequential(
-            nn.Conv2d(sum(FEATURES.values()), WIDTH, KERNEL, padding=KERNEL // 2),
+            nn.Conv2d(sum(FEATURE_CHANNELS.values()), WIDTH, KERNEL, padding=KERNEL // 2),
             nn.LeakyReLU(LEAK, inplace=True),
             nn.Conv2d(WIDTH, outputs, KERNEL, padding=KERNEL // 2),
         )

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.compiled.features import FEATURES
+from models.compiled.features import FEATURE_CHANNELS
 from models.compiled.fusion import THREAD_ROWS, WINDOWS
 from models.denoiser import State, as_it_is, matching_state
 from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
@@ -53,7 +53,7 @@ class KernelPredictor(Accumulating):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = dict(FEATURES)
+        self.inputs = dict(FEATURE_CHANNELS)
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
         first = next(iter(self.network.children()))
@@ -125,7 +125,7 @@ class KernelPredictor(Accumulating):
 
 def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
     """`layers` RepVGG blocks from the inputs to `outputs` channels."""
-    return repvgg([sum(FEATURES.values()), *[WIDTH] * (layers - 1), outputs], sizes)
+    return repvgg([sum(FEATURE_CHANNELS.values()), *[WIDTH] * (layers - 1), outputs], sizes)
 
 
 class WSKP(KernelPredictor):
@@ -224,7 +224,7 @@ class MultiResolution(KernelPredictor):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.network = MultiResolutionNet(sum(FEATURES.values()), self.maps + 1)
+        self.network = MultiResolutionNet(sum(FEATURE_CHANNELS.values()), self.maps + 1)
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
         return [self.network.down[0][0]]  # type: ignore[index, list-item]

@@ -43,7 +43,7 @@ def by_definition(inputs: list[Tensor], item: int, y: int, x: int, step: int) ->
 
 @pytest.mark.parametrize("kernels", [True, False])
 @pytest.mark.parametrize("step", [1, 3])
-def test_is_the_mean_that_it_says(kernels: bool, step: int) -> None:
+def test_a_level_is_its_formula(kernels: bool, step: int) -> None:
     inputs = random_inputs(0, 5, 7)
     with compiled.disabled() if not kernels else torch.no_grad():
         filtered = affinity_level(*inputs, step)
@@ -68,7 +68,7 @@ def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: in
         torch.testing.assert_close(gradient, other, rtol=1e-4, atol=1e-4)
 
 
-def test_different_features_stop_it_and_equal_ones_do_not() -> None:
+def test_different_features_stop_the_filter_and_equal_ones_do_not() -> None:
     image = torch.zeros(1, 3, 4, 8)
     image[..., 4:] = 1
     ones = torch.ones(1, 1, 4, 8)
@@ -98,7 +98,7 @@ def test_stays_within_its_neighbourhood_whatever_the_weights(
     assert (filtered[(surface == 0).expand_as(filtered)] == 0).all()
 
 
-def test_a_firefly_off_surfaces_is_never_seen() -> None:
+def test_a_firefly_off_surfaces_has_no_weight() -> None:
     image, features, sharpness, own, importance, _ = random_inputs(3, 9, 9)
     surface = torch.ones(2, 1, 9, 9)
     surface[..., 4, 4] = 0

@@ -8,7 +8,7 @@ from models import compiled
 from provenance import ROOT, sources
 
 
-def named(name: str):
+def version(name: str):
     def function(image: Tensor, other: Tensor, scale: float = 1.0) -> str:
         return name
 
@@ -17,8 +17,8 @@ def named(name: str):
 
 @pytest.fixture
 def function():
-    """Says which of its versions ran."""
-    return compiled.by(named("processor"), gpu=named("gpu"))(named("pytorch"))
+    """Returns which of its versions ran."""
+    return compiled.by(version("processor"), gpu=version("gpu"))(version("pytorch"))
 
 
 IMAGE = torch.zeros(2, 2)
@@ -32,7 +32,7 @@ def test_kernels_run_on_processors_in_float32(function):
     assert function(IMAGE.to("meta"), IMAGE) == function(IMAGE.to("meta"), IMAGE.to("meta")) == "pytorch"
 
 
-def test_kernels_know_no_gradients(function):
+def test_kernels_have_no_gradients(function):
     weights = torch.zeros(2, 2, requires_grad=True)
     assert function(IMAGE, weights) == function(weights, IMAGE) == "pytorch"
     with torch.no_grad():
@@ -51,12 +51,12 @@ def test_kernels_can_be_disabled(function):
 def test_kernels_run_on_gpus_where_there_are_any(function):
     image = IMAGE.cuda()
     assert function(image, image) == "gpu"
-    assert compiled.by(named("processor"))(named("pytorch"))(image, image) == "pytorch"
+    assert compiled.by(version("processor"))(version("pytorch"))(image, image) == "pytorch"
     assert function(image, IMAGE) == "pytorch"
 
 
 def test_results_follow_from_all_kernels():
-    """Whoever names the code that made a result finds them by their import statements."""
+    """The sources of a result include the kernels that their import statements name."""
     kernels = {f"models.compiled.{file.stem}" for file in (ROOT / "models" / "compiled").glob("[!_]*.py")}
     assert kernels and kernels <= sources("models.registry").keys()
     assert "models.compiled.svgf" in sources("models.filters.svgf") and "models.compiled.svgf" not in sources(

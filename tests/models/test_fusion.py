@@ -55,7 +55,7 @@ def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offs
 
 
 def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
-    """Strips choose their path on their own: the boundary between the two must not show."""
+    """Strips choose their path one by one: the boundary between the two must not be visible."""
     torch.manual_seed(1)
     importance = torch.randn(1, 6, 200, 40)
     mixture = torch.randn(1, 6, 200, 40)

@@ -50,8 +50,8 @@ def naive_weights(guide, variance, surface, radius, k):
 
 def naive_means(image, weights):
     out = np.zeros_like(image)
-    for p, around in weights.items():
-        out[:, *p] = sum(w * image[:, *q] for q, w in around.items()) / sum(around.values())
+    for p, taps in weights.items():
+        out[:, *p] = sum(w * image[:, *q] for q, w in taps.items()) / sum(taps.values())
     return out
 
 
@@ -59,17 +59,17 @@ def naive_regression(image, features, weights):
     """Fits by numpy's least squares, their ridge as further equations."""
     sums = np.zeros_like(image)
     total = np.zeros(image.shape[1:])
-    for p, around in weights.items():
-        w = np.array(list(around.values()))
-        position = np.array([[q[0] - p[0], q[1] - p[1]] for q in around]) / 9
-        known = np.array([features[:, *q] - features[:, *p] for q in around])
-        x = np.hstack([np.ones((len(w), 1)), position, known])
-        y = np.array([image[:, *q] for q in around])
+    for p, taps in weights.items():
+        w = np.array(list(taps.values()))
+        position = np.array([[q[0] - p[0], q[1] - p[1]] for q in taps]) / 9
+        apart = np.array([features[:, *q] - features[:, *p] for q in taps])
+        x = np.hstack([np.ones((len(w), 1)), position, apart])
+        y = np.array([image[:, *q] for q in taps])
         ridge = math.sqrt(1e-5 * w.sum()) * np.eye(x.shape[1])[1:]
         equations = np.vstack([np.sqrt(w)[:, None] * x, ridge])
         right = np.vstack([np.sqrt(w)[:, None] * y, np.zeros((len(ridge), 3))])
         predicted = x @ np.linalg.lstsq(equations, right, rcond=None)[0]
-        for q, weight, colour in zip(around, w, predicted, strict=True):
+        for q, weight, colour in zip(taps, w, predicted, strict=True):
             sums[:, *q] += weight * colour
             total[q] += weight
     return sums / np.where(total > 0, total, 1)
@@ -119,13 +119,13 @@ def random_images(seed, height, width):
 @given(size=SIZES, seed=st.integers(0, 999), radius=st.sampled_from([1, 3]))
 def test_weights_are_those_of_patches(size, seed, radius):
     a, _, variance, _, surface = random_images(seed, *size)
-    found = to_numpy(patch_distances(to_torch(a), to_torch(variance), to_torch(surface[None]), radius))
+    distances = to_numpy(patch_distances(to_torch(a), to_torch(variance), to_torch(surface[None]), radius))
     weights = naive_weights(a, variance, surface, radius, 1.0)
     for number, tap in enumerate(np.ndindex(19, 19)):
         for p in np.ndindex(size):
             q = p[0] + tap[0] - 9, p[1] + tap[1] - 9
             expected = weights.get(p, {}).get(q, 0.0)
-            assert math.exp(-found[number, *p]) == pytest.approx(expected, rel=1e-4)
+            assert math.exp(-distances[number, *p]) == pytest.approx(expected, rel=1e-4)
 
 
 @EXAMPLES
@@ -145,12 +145,12 @@ def test_means_and_fits_are_weighted_by_distance(size, seed, k):
 def test_the_whole_is_the_paper_s_pseudocode(size, seed):
     a, b, variance, features, surface = random_images(seed, *size)
     buffers = torch.stack([to_torch(a), to_torch(b)], dim=1)
-    found = nfor(buffers, to_torch(variance), to_torch(features), to_torch(surface[None]))
-    np.testing.assert_allclose(to_numpy(found), naive_nfor(a, b, variance, features, surface), rtol=2e-3, atol=2e-4)
+    denoised = nfor(buffers, to_torch(variance), to_torch(features), to_torch(surface[None]))
+    np.testing.assert_allclose(to_numpy(denoised), naive_nfor(a, b, variance, features, surface), rtol=2e-3, atol=2e-4)
 
 
 def test_images_larger_than_windows():
-    """What is linear in features and position comes back as it was, whatever the weights."""
+    """An image that is linear in features and position is reproduced, whatever the weights."""
     rng = np.random.default_rng(0)
     features = rng.uniform(-1, 1, (7, 24, 40))
     y, x = np.mgrid[:24, :40]
@@ -163,13 +163,10 @@ def test_images_larger_than_windows():
     np.testing.assert_allclose(to_numpy(fitted), image, rtol=1e-3, atol=1e-3)
 
 
-def test_features_without_variation_leave_the_weighted_mean():
-    """A fit of constants and position alone: flat noise becomes flat."""
-    generator = torch.Generator().manual_seed(0)
-    noise = 1 + torch.randn(1, 3, 30, 30, generator=generator)
+def test_features_without_variation_leave_a_fit_of_position():
+    noise = 1 + torch.randn(1, 3, 30, 30, generator=torch.Generator().manual_seed(0))
     same = patch_distances(torch.ones_like(noise), torch.ones_like(noise), torch.ones(1, 1, 30, 30), 3)
-    fitted = regress(noise, torch.ones(1, 7, 30, 30), same, 1.0)
-    assert (fitted - 1).square().mean() < 0.02
+    assert (regress(noise, torch.ones(1, 7, 30, 30), same, 1.0) - 1).square().mean() < 0.02
 
 
 # --- Buffers A and B --------------------------------------------------------------------------------------------------
@@ -205,9 +202,9 @@ def test_noise_is_reduced_tenfold():
     truth = 1 + features[:, :1].repeat(1, 3, 1, 1)
     truth[..., 20:, :] *= 0.3
     buffers = truth[:, None] + 0.4 * torch.randn(1, 2, 3, 40, 48, generator=generator)
-    found = nfor(buffers, torch.full_like(truth, 0.08), features, torch.ones(1, 1, 40, 48))
+    denoised = nfor(buffers, torch.full_like(truth, 0.08), features, torch.ones(1, 1, 40, 48))
     noise = (buffers.mean(dim=1) - truth).square().mean()
-    assert (found - truth).square().mean() < 0.1 * noise
+    assert (denoised - truth).square().mean() < 0.1 * noise
 
 
 # --- The denoiser -----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Per-pixel kernels against unfolding in float64, against plain autograd, and the compiled way against PyTorch's."""
+"""Per-pixel kernels against unfolding in float64 and against plain autograd, compiled and in PyTorch."""
 
 import pytest
 import torch
@@ -55,7 +55,7 @@ def test_equals_the_naive_version(size, height, width, spread, seed):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("memory", [torch.contiguous_format, torch.channels_last])
 def test_logits_as_a_network_leaves_them(dtype, memory):
-    """Some channels of a larger tensor, in half precision, channels last: computed in float32 all the same."""
+    """Some channels of a larger tensor, in half precision, channels last: computed in float32 nevertheless."""
     image, _ = inputs(5, 9, 33)
     head = torch.randn(2, 51, 9, 33).to(dtype).contiguous(memory_format=memory)
     image = image.contiguous(memory_format=memory)
@@ -65,7 +65,7 @@ def test_logits_as_a_network_leaves_them(dtype, memory):
 
 
 def test_one_tap_picks_its_pixel():
-    """Taps are counted row by row from the top left, and a missing one is left to the others."""
+    """Taps are counted row by row from the top left; those outside the image have no weight."""
     image = torch.arange(12.0).view(1, 1, 3, 4)
     logits = torch.zeros(1, 9, 3, 4)
     logits[:, 2] = 1e4  # up and to the right
@@ -74,7 +74,7 @@ def test_one_tap_picks_its_pixel():
         assert filtered[0, 0, 0, 0] == pytest.approx((0 + 1 + 4 + 5) / 4)
 
 
-def test_it_never_leaves_the_range_of_the_window():
+def test_the_output_is_within_the_range_of_the_window():
     image = torch.full((1, 3, 8, 40), 1e-7)
     image[..., 4, 20] = 65504 / 0.01
     for filtered in both_ways(image, 100 * torch.randn(1, 25, 8, 40)):
@@ -112,8 +112,8 @@ def test_gradients_of_extreme_logits_are_finite():
     assert torch.isfinite(image.grad).all() and torch.isfinite(logits.grad).all()
 
 
-def test_training_remembers_no_window():
-    """What is kept for the way back: the inputs, the result, and two numbers a pixel."""
+def test_training_keeps_no_window():
+    """Saved for the backward pass: the inputs, the result, and two numbers a pixel."""
     image, logits = inputs(5, 32, 32)
     kept: list[int] = []
     with torch.autograd.graph.saved_tensors_hooks(lambda t: kept.append(t.numel()) or t, lambda t: t):
