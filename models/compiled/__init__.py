@@ -1,9 +1,12 @@
-"""Kernels compiled at first use: the fast way of what models/ also says in PyTorch.
+"""Kernels compiled at first use: fast versions of functions that models/ has in PyTorch.
 
-`by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba makes the
-kernels for the processor without a compiler and keeps them on disk from run to run. `with_gradients` is for kernels
-that have gradients of their own. Whatever has no kernel (other gradients, half precision, most of all on GPUs) takes
-the PyTorch way, which the tests hold the kernels to.
+`by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba compiles
+kernels for the CPU and keeps them on disk from run to run. `with_gradients` is for kernels with gradients of their
+own. What no kernel can compute (other gradients, half precision, nearly everything on GPUs) runs in PyTorch; tests
+hold kernels to that.
+
+The constants of a paper stand at the top of its kernel file, as Python numbers, from where the PyTorch version takes
+them; kernels round them with `f32`. Limits that several share are in models.operators.
 """
 
 import contextlib
@@ -24,7 +27,7 @@ enabled = True
 
 @contextlib.contextmanager
 def disabled() -> Iterator[None]:
-    """Take the PyTorch way within the context: for tests and benches."""
+    """Run PyTorch within the context: for tests and benches."""
     global enabled
     before = enabled
     enabled = False
@@ -35,7 +38,7 @@ def disabled() -> Iterator[None]:
 
 
 def tensors_among(values: Iterable[object]) -> Iterator[Tensor]:
-    """Those that are tensors, those in lists and tuples, and the parameters of modules."""
+    """The values that are tensors, those in lists and tuples, and the parameters of modules."""
     for value in values:
         if isinstance(value, Tensor):
             yield value
@@ -46,9 +49,9 @@ def tensors_among(values: Iterable[object]) -> Iterator[Tensor]:
 
 
 def kernel_device(tensors: Sequence[Tensor]) -> str | None:
-    """The type of device whose kernels can work on the tensors ("cpu", "cuda"); None where PyTorch must.
+    """The type of device whose kernels can run on the tensors ("cpu", "cuda"); None where PyTorch must.
 
-    Kernels know no gradients and take images in float32, of which the first tensor is one.
+    Kernels have no gradients and take images in float32, of which the first tensor is one.
     """
     differentiates = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     if not enabled or differentiates or tensors[0].dtype != torch.float32:
@@ -58,17 +61,17 @@ def kernel_device(tensors: Sequence[Tensor]) -> str | None:
 
 
 def with_gradients(image: Tensor) -> bool:
-    """Whether kernels that bring their own gradients can work on an image; then on as many threads as PyTorch."""
+    """Whether kernels with gradients of their own can run on an image; then on as many threads as PyTorch."""
     possible = enabled and image.device.type == "cpu" and image.dtype == torch.float32
     if possible:
         match_threads()
     return possible
 
 
-def by(processor: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let kernels do the work of the PyTorch function that this decorates, wherever they can: see `kernel_device`.
+def by(cpu: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A decorator that runs kernels in place of a PyTorch function wherever they can: see `kernel_device`.
 
-    `processor` and `gpu` have the function's signature and return what it returns, but for rounding.
+    `cpu` and `gpu` have the function's signature and return the same, but for rounding.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -77,7 +80,7 @@ def by(processor: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable
             device = kernel_device([*tensors_among((*args, *kwargs.values()))])
             if device == "cpu":
                 match_threads()
-                return processor(*args, **kwargs)
+                return cpu(*args, **kwargs)
             if device == "cuda" and gpu is not None:
                 return gpu(*args, **kwargs)
             return function(*args, **kwargs)

@@ -44,10 +44,10 @@ def measure(distance: Row, along: Row, geometry: Image, row: Index, left: Index,
 
 
 @jit_in_any_order
-def weigh(weight: Row, distance: Row, along: Row, width: Row, widest: Row) -> None:
+def weigh(weight: Row, distance: Row, along: Row, width: Row, max_width: Row) -> None:
     """models.filters.aaf.gaussian_weight (n)."""
     for i in range(weight.size):
-        narrower = min(width[i], widest[i])
+        narrower = min(width[i], max_width[i])
         exponent = f32(0.5) * along[i] / (narrower * narrower)
         reached = distance[i] < NEAR * NEAR * narrower * narrower and exponent <= MAX_GAUSSIAN_EXPONENT
         weight[i] = exp(-min(exponent, MAX_GAUSSIAN_EXPONENT)) if reached else f32(0)
@@ -55,9 +55,9 @@ def weigh(weight: Row, distance: Row, along: Row, width: Row, widest: Row) -> No
 
 @jit_with_memory
 def filter_row(
-    out: Signals, row: Index, image: Signals, width: Image, widest: Image, geometry: Image, down: bool
+    out: Signals, row: Index, image: Signals, width: Image, max_width: Image, geometry: Image, down: bool
 ) -> None:
-    """A row of out (S, 3, H, W) from image (S, 3, H, W), width and widest (S, H, W)."""
+    """A row of out (S, 3, H, W) from image (S, 3, H, W), width and max_width (S, H, W)."""
     signals, _, height, columns = image.shape
     totals = np.ones((signals, columns), np.float32)
     space = np.empty((3, columns), np.float32)
@@ -72,7 +72,7 @@ def filter_row(
         distance, along, weight = space[0, : right - left], space[1, : right - left], space[2, : right - left]
         measure(distance, along, geometry, row, left, dx, dy)
         for s in range(signals):
-            here, there = width[s, row, left:right], widest[s, row + dy, left + dx : right + dx]
+            here, there = width[s, row, left:right], max_width[s, row + dy, left + dx : right + dx]
             weigh(weight, distance, along, here, there)
             add_line(totals[s, left:right], weight)
             for c in range(3):
@@ -83,15 +83,15 @@ def filter_row(
 
 
 @jit_parallel
-def filter_image(out: Signals, image: Signals, width: Image, widest: Image, geometry: Image, down: bool) -> None:
+def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, geometry: Image, down: bool) -> None:
     for row in numba.prange(image.shape[2]):
-        filter_row(out, np.int64(row), image, width, widest, geometry, down)
+        filter_row(out, np.int64(row), image, width, max_width, geometry, down)
 
 
-def filter_lines(image: Tensor, width: Tensor, widest: Tensor, geometry: Tensor, down: bool) -> Tensor:
+def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
     """See models.filters.aaf.filter_lines."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
-        images = array(image[item]), array(width[item, :, 0]), array(widest[item, :, 0]), array(geometry[item, 0])
+        images = array(image[item]), array(width[item, :, 0]), array(max_width[item, :, 0]), array(geometry[item, 0])
         filter_image(out[item].numpy(), *images, down)
     return out

@@ -11,8 +11,8 @@ from datasets.frame import Frame
 from models.compiled.arrays import Image, Plane, Row, f32
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
 from models.compiled.lines import block_count, rows_of_block
-from models.compiled.reprojection import CameraMatrices, FramePair, GBuffer, find_taps, gather, new_taps
-from models.history.surfaces import Surfaces
+from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
+from models.history.geometry import GBuffer
 
 MIN_ALPHA = 0.2  # SVGF §4.1: weight of the newest frame in a long history
 
@@ -42,22 +42,14 @@ def blend(line: Row, past: Row, alpha: Row, noisy: Row) -> None:
 
 
 @jit_parallel
-def accumulate_image(
-    out: AccumulatedArrays,
-    noisy: Image,
-    past: AccumulatedArrays,
-    motion: Image,
-    now: GBuffer,
-    then: GBuffer,
-    cameras: CameraMatrices,
-) -> None:
+def accumulate_image(out: AccumulatedArrays, noisy: Image, past: AccumulatedArrays, pair: FramePair) -> None:
     _, height, width = noisy.shape
     for block in numba.prange(block_count(height)):
         taps = new_taps(width)
         gathered = np.empty(width, np.float32)
         alpha = np.empty(width, np.float32)
         for y in rows_of_block(block, height):
-            find_taps(taps, y, FramePair(motion, now, then, cameras))
+            find_taps(taps, y, pair)
             gather(gathered, past.length, y, taps)
             weigh(alpha, out.length[y], gathered, taps.valid)
             for c in range(3):
@@ -66,7 +58,7 @@ def accumulate_image(
 
 
 def accumulate_samples(
-    frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, surfaces: Surfaces
+    frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, gbuffer: GBuffer
 ) -> tuple[Tensor, Tensor]:
     """See models.history.accumulation.accumulate_samples."""
     irradiance = torch.empty_like(noisy, memory_format=torch.contiguous_format)
@@ -74,5 +66,5 @@ def accumulate_samples(
     for item in range(len(noisy)):
         out = AccumulatedArrays(irradiance[item].numpy(), length[item, 0].numpy())
         past = AccumulatedArrays(array(past_irradiance[item]), array(past_length[item, 0]))
-        accumulate_image(out, array(noisy[item]), past, *FramePair.of(frame, surfaces, item))
+        accumulate_image(out, array(noisy[item]), past, FramePair.of(frame, gbuffer, item))
     return irradiance, length

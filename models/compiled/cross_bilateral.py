@@ -13,6 +13,7 @@ from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 from models.compiled.lines import (
     add_product,
+    add_square,
     add_weighted,
     fill_line,
     normalise,
@@ -50,12 +51,6 @@ def add_colour_distance(exponent: Row, here: Row, there: Row, variance: Row, var
         off = there[x] - here[x]
         noise = f32(MIN_DIVISOR) + variance[x] + variance_there[x]
         exponent[x] += f32(COLOUR_SHARPNESS) * (off * off / noise)
-
-
-@jit_in_any_order
-def add_square(distance: Row, here: Row, there: Row) -> None:
-    for x in range(distance.size):
-        distance[x] += (there[x] - here[x]) * (there[x] - here[x])
 
 
 @jit_in_any_order

@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled.arrays import RGB, Image, Index, Row, Scalar, f32
+from models.compiled.arrays import Image, Index, Row, Scalar, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
-from models.compiled.lines import divide_line, fill_line, triple, triple_of_lines, window_taps
+from models.compiled.lines import add_square, add_weighted, divide_line, fill_line, triple, triple_of_lines, window_taps
 from models.filters.atrous import B3_SPLINE, RADIUS
 
 SPLINE = np.array(B3_SPLINE, np.float32)
@@ -22,22 +22,10 @@ def decay(a: Scalar) -> Scalar:
 
 
 @jit_in_any_order
-def add_squares(distance: Row, here: Row, there: Row) -> None:
-    for i in range(distance.size):
-        distance[i] += (here[i] - there[i]) * (here[i] - there[i])
-
-
-@jit_in_any_order
-def add_tap(sums: RGB, total: Row, h: Scalar, distance: Row, colour: RGB) -> None:
-    """Add one tap of n pixels, weighted by h exp(-distance), to the sums of colours and of weights."""
-    red, green, blue = sums
-    from_red, from_green, from_blue = colour
-    for i in range(distance.size):
-        w = h * decay(distance[i])
-        total[i] += w
-        red[i] += w * from_red[i]
-        green[i] += w * from_green[i]
-        blue[i] += w * from_blue[i]
+def decay_line(line: Row, scale: Scalar) -> None:
+    """Distances become weights: scale exp(-distance)."""
+    for x in range(line.size):
+        line[x] = scale * decay(line[x])
 
 
 @jit_with_memory
@@ -49,10 +37,11 @@ def filter_row(out: Image, row: Index, colour: Image, features: Image, step: int
         distance = space[: right - left]
         fill_line(distance, f32(0))
         for c in range(len(features)):
-            add_squares(distance, features[c, row, left:right], features[c, row + dy, left + dx : right + dx])
+            add_square(distance, features[c, row, left:right], features[c, row + dy, left + dx : right + dx])
         h = SPLINE[dy // step + RADIUS] * SPLINE[dx // step + RADIUS]
+        decay_line(distance, h)
         there = triple(colour, row + dy, left + dx, right + dx)
-        add_tap(triple_of_lines(sums, left, right), sums[3, left:right], h, distance, there)
+        add_weighted(triple_of_lines(sums, left, right), sums[3, left:right], distance, there)
     for c in range(3):
         divide_line(out[c, row], sums[c], sums[3])
 

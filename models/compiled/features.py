@@ -72,7 +72,7 @@ def network_features(
     depth_scale = array(scale.log_depth.value.exp())
     out = torch.empty(len(irradiance), *frame.size, sum(FEATURE_CHANNELS[name] for name in names))
     for item in range(len(out)):
-        images = (array(image[item]) for image in (irradiance, frame.albedo, frame.normal))
-        arrays = FeatureArrays(*images, array(frame.depth[item, 0]), exposure[item], depth_scale[item])
+        albedo, normal, depth = array(frame.albedo[item]), array(frame.normal[item]), array(frame.depth[item, 0])
+        arrays = FeatureArrays(array(irradiance[item]), albedo, normal, depth, exposure[item], depth_scale[item])
         feature_image(out[item].numpy(), arrays, "albedo" in names, "normal" in names)
     return out.permute(0, 3, 1, 2)

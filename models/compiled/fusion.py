@@ -6,7 +6,7 @@ end, and slices of several dimensions might have any stride. Neither is vectoris
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Rows, Scalar, Signals, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
-from models.compiled.lines import add_line, copy_line, triple, triple_of_lines
+from models.compiled.lines import add_line, copy_line, fill_line, triple, triple_of_lines
 from models.operators import MIN_DIVISOR
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # Fan et al. 2021, §5.3
@@ -89,18 +89,6 @@ def weigh(weighted: RGB, weight: Row, logits: Row, shift: Scalar, colour: RGB) -
 
 
 @jit_in_any_order
-def add_share(fused: RGB, share: Row, sums: RGB, weight: Row) -> None:
-    """fused += share times the sums of colours over that of weights."""
-    red, green, blue = fused
-    r, g, b = sums
-    for x in range(share.size):
-        factor = share[x] / max(weight[x], f32(MIN_DIVISOR))
-        red[x] += factor * r[x]
-        green[x] += factor * g[x]
-        blue[x] += factor * b[x]
-
-
-@jit_in_any_order
 def raise_line(line: Row, other: Row) -> None:
     for x in range(line.size):
         line[x] = other[x] if other[x] > line[x] else line[x]
@@ -155,9 +143,15 @@ def row_sums(total: Rows, columns: Rows, radius: Index) -> None:
 
 @jit_in_any_order
 def mix(fused: Image, y: Index, total: Rows, share: Row) -> None:
-    """Row y of fused (3, H, W) += share (W) times the ratio of sums in total (4, W)."""
-    width = share.size
-    add_share(triple(fused, y, 0, width), share, triple_of_lines(total, 0, width), total[3])
+    """Row y of fused (3, H, W) += share (W) times the sums of colours over that of weights, in total (4, W)."""
+    red, green, blue = triple(fused, y, 0, share.size)
+    r, g, b = triple_of_lines(total, 0, share.size)
+    weight = total[3]
+    for x in range(share.size):
+        factor = share[x] / max(weight[x], f32(MIN_DIVISOR))
+        red[x] += factor * r[x]
+        green[x] += factor * g[x]
+        blue[x] += factor * b[x]
 
 
 @jit_with_memory
@@ -178,8 +172,7 @@ def softmax(shares: Image, y: Index, top: Row, total: Row) -> None:
     copy_line(top, shares[0, y])
     for i in range(1, count):
         raise_line(top, shares[i, y])
-    for x in range(width):
-        total[x] = 0
+    fill_line(total, f32(0))
     for i in range(count):
         share = shares[i, y]
         for x in range(width):
@@ -321,16 +314,12 @@ def compiled_fuse_strips() -> Callable[..., None]:
     maps = numba.float32[:, :, :]
     scratch = numba.float32[:, :, :, ::1]
     signature = numba.void(image, image, numba.float32[:, ::1], maps, maps, numba.int64[::1], scratch, scratch, scratch)
-    compiled: Any = numba.njit(signature, cache=True, parallel=True, error_model="numpy")(fuse_strips)
+    compiled: Callable[..., None] = numba.njit(signature, cache=True, parallel=True, error_model="numpy")(fuse_strips)
     return compiled
 
 
 def fuse(
-    image: Tensor,
-    importance: Tensor,
-    mixture: Tensor,
-    windows: Sequence[int] = WINDOWS,
-    surface: Tensor | None = None,
+    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
 ) -> Tensor:
     """See models.networks.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
@@ -350,11 +339,7 @@ def fuse(
 
 
 def fuse_on_gpu(
-    image: Tensor,
-    importance: Tensor,
-    mixture: Tensor,
-    windows: Sequence[int] = WINDOWS,
-    surface: Tensor | None = None,
+    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
 ) -> Tensor:
     """The same for CUDA devices, by Triton, which is imported here because it takes long and is not everywhere."""
     from models.compiled.fusion_triton import fuse

@@ -1,4 +1,4 @@
-"""How Numba compiles the kernels here, and on how many threads they run."""
+"""How Numba compiles kernels, and on how many threads they run."""
 
 import functools
 import os
@@ -14,16 +14,16 @@ from torch import Tensor
 from provenance import code_digest
 
 FOLDER = Path(__file__).parent
-# Numba notices when the file of a kernel changes, but not when another does that the kernel takes functions or numbers
-# from. So kernels are kept apart by all the code that any of them follows from.
+# Numba recompiles a kernel when its file changes, but not when another does that it takes functions or numbers from. So
+# the cache's folder is named by a digest of the sources of all kernels.
 KERNELS = code_digest(*(f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))))
 os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "__pycache__" / f"kernels-{KERNELS[:16]}"))
 
-import numba  # noqa: E402 - must come after the choice of its folder
+import numba  # noqa: E402 - reads the folder when it is imported
 
-# For functions that kernels call, by what LLVM may do to their roundings: "contract", round a product and a sum once;
+# For functions that kernels call, by which roundings LLVM may change: "contract", round a product and a sum once;
 # "nsz", lose the sign of zero; "arcp", multiply by a reciprocal instead of dividing; "reassoc", add up in any order,
-# which lets it vectorise sums. None of them may take numbers to be finite.
+# which lets it vectorise sums. None of them may assume that numbers are finite.
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -31,7 +31,8 @@ Function = TypeVar("Function", bound=Callable[..., object])
 def without_memory(*fastmath: str, inline: bool = False) -> Callable[[Function], Function]:
     """A decorator for functions that allocate nothing.
 
-    Numba need not count references to the lines that they are given, which takes longer than most of them.
+    Numba does not count references to their arguments, which would take longer than most of them. They must not return
+    arrays to functions that do allocate.
     """
     options: dict[str, Any] = {"fastmath": set(fastmath), "forceinline": inline, "_nrt": False}
     decorator: Any = numba.njit(error_model="numpy", boundscheck=False, **options)
@@ -43,9 +44,9 @@ jit_in_order = without_memory("contract", "nsz")
 jit_with_reciprocals = without_memory("contract", "nsz", "arcp", inline=True)
 jit_in_any_order = without_memory("contract", "nsz", "arcp", "reassoc")
 jit_inlined_in_any_order = without_memory("contract", "nsz", "arcp", "reassoc", inline=True)
-jit_with_memory = numba.njit(error_model="numpy", boundscheck=False)  # what allocates itself, for the others
-# For the kernels themselves, which alone are kept on disk, with all that they call. Numba counts the rows of a prange
-# without a sign: take np.int64(row) before anything is subtracted from it.
+jit_with_memory = numba.njit(error_model="numpy", boundscheck=False)  # for functions that allocate
+# For the kernels themselves, which alone are kept on disk, with all that they call. The index of a prange is unsigned:
+# take np.int64(row) before anything is subtracted from it.
 jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
 
 
@@ -55,7 +56,7 @@ def array(tensor: Tensor) -> NDArray[np.float32]:
 
 
 def plane_or_empty(images: Tensor | None, item: int) -> NDArray[np.float32]:
-    """One of images (B, 1, H, W), as (H, W); (0, 0) where there are none, so that kernels need no second version."""
+    """One of images (B, 1, H, W), as (H, W); (0, 0) for None, so that kernels need no second version."""
     return np.empty((0, 0), np.float32) if images is None else array(images[item, 0])
 
 

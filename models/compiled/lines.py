@@ -49,6 +49,13 @@ def add_product(line: Row, weight: Row, values: Row) -> None:
 
 
 @jit_in_any_order
+def add_square(distance: Row, here: Row, there: Row) -> None:
+    """distance += (here - there)²."""
+    for x in range(distance.size):
+        distance[x] += (here[x] - there[x]) * (here[x] - there[x])
+
+
+@jit_in_any_order
 def add_weighted(sums: RGB, total: Row, weight: Row, values: RGB) -> None:
     """Add weighted colours, and their weights, to running sums."""
     red, green, blue = sums
@@ -133,4 +140,4 @@ def block_count(height: int) -> int:
 @jit_in_any_order
 def rows_of_block(block: Index, height: int) -> range:
     start = np.int64(block) * BLOCK_ROWS
-    return range(start, min(start + BLOCK_ROWS, height))
+    return range(start, min(start + BLOCK_ROWS, np.int64(height)))

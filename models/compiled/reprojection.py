@@ -17,37 +17,32 @@ from datasets.frame import Frame
 from models.compiled.arrays import RGB, Image, Index, Integers, Mask, Matrix, Plane, Row, Rows, Scalar, f32
 from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_reciprocals
 from models.compiled.lines import add_product, block_count, rows_of_block, triple, triple_of_lines
-from models.history.surfaces import BACKGROUND_ID, Surfaces, to_previous_camera
+from models.history.geometry import BACKGROUND_ID, GBuffer, to_previous_camera
 
 PLANE_TOLERANCE = 0.01  # of the depth: largest distance of a tap's surface from the point's plane
 NORMAL_TOLERANCE = 0.9  # smallest cosine of the angle between a tap's normal and the point's
 SHORTEST_RUN = 8  # px; loops over less are slower than pixel by pixel
 
 
-class GBuffer(NamedTuple):
-    """One item of Surfaces."""
+class FramePair(NamedTuple):
+    """A frame and the previous one, of one item: all that finding history takes."""
 
+    motion: Image  # (2, H, W)
     depth: Plane
     normal: Image
     mesh_id: Plane
-
-    @staticmethod
-    def of(surfaces: Surfaces, item: int) -> "GBuffer":
-        return GBuffer(array(surfaces.depth[item, 0]), array(surfaces.normal[item]), array(surfaces.mesh_id[item, 0]))
-
-
-class CameraMatrices(NamedTuple):
-    """Both cameras of a frame."""
-
+    depth_then: Plane  # of the previous frame, as those below
+    normal_then: Image
+    mesh_then: Plane
     to_then: Matrix  # (M + 1, 3, 4), by mesh id: from this camera's frame to where the mesh was
     turn: Matrix  # (M + 1, 3, 3), by mesh id: of world-space normals
     slopes: Matrix  # (2, 2), of this camera's rays: slope and intercept over x and over y
     axes: Matrix  # (3, 3), the previous camera's rays are x axes[0] + y axes[1] + axes[2]
 
     @staticmethod
-    def of(frame: Frame, item: int) -> "CameraMatrices":
-        now = frame.now
-        previous = frame.previous
+    def of(frame: Frame, gbuffer: GBuffer, item: int) -> "FramePair":
+        """`gbuffer` is the previous frame's."""
+        now, previous = frame.now, frame.previous
         K = now.K[item]
         to_world = now.camera_to_world[item, :3, :3]
         then_to_world = previous.camera_to_world[item, :3, :3]
@@ -55,21 +50,9 @@ class CameraMatrices(NamedTuple):
         turn = to_then[..., :3] @ to_world.T
         slopes = torch.stack([1 / K.diagonal()[:2], -K[:2, 2] / K.diagonal()[:2]], dim=1)
         axes = then_to_world @ torch.linalg.inv(previous.K[item])
-        return CameraMatrices(*(array(matrix) for matrix in (to_then, turn, slopes, axes.T)))
-
-
-class FramePair(NamedTuple):
-    """A frame and the previous one, of one item: all that finding history takes."""
-
-    motion: Image  # (2, H, W)
-    now: GBuffer
-    then: GBuffer
-    cameras: CameraMatrices
-
-    @staticmethod
-    def of(frame: Frame, surfaces: Surfaces, item: int) -> "FramePair":
-        now = GBuffer.of(Surfaces.of(frame), item)
-        return FramePair(array(frame.motion[item]), now, GBuffer.of(surfaces, item), CameraMatrices.of(frame, item))
+        images = frame.motion[item], frame.depth[item, 0], frame.normal[item], frame.mesh_id[item, 0]
+        images_then = gbuffer.depth[item, 0], gbuffer.normal[item], gbuffer.mesh_id[item, 0]
+        return FramePair(*(array(tensor) for tensor in (*images, *images_then, to_then, turn, slopes, axes.T)))
 
 
 class RowTaps(NamedTuple):
@@ -179,32 +162,31 @@ def turn_normals(turned: RGB, normal: RGB, turn: Matrix) -> None:
 @jit_with_reciprocals
 def predict_surface(taps: RowTaps, y: Index, first: Index, last: Index, pair: FramePair) -> None:
     """Where the surface points of a run's pixels were in the previous frame, and their normals."""
-    now, cameras = pair.now, pair.cameras
-    mesh = min(int(now.mesh_id[y, first]), cameras.to_then.shape[0] - 1)
-    across = cameras.slopes[0, 0]
-    offset = across * (f32(first) + f32(0.5)) + cameras.slopes[0, 1]
-    down = cameras.slopes[1, 0] * (f32(y) + f32(0.5)) + cameras.slopes[1, 1]
+    mesh = min(int(pair.mesh_id[y, first]), pair.to_then.shape[0] - 1)
+    across = pair.slopes[0, 0]
+    offset = across * (f32(first) + f32(0.5)) + pair.slopes[0, 1]
+    down = pair.slopes[1, 0] * (f32(y) + f32(0.5)) + pair.slopes[1, 1]
     point = triple_of_lines(taps.point, first, last)
-    transform_points(point, now.depth[y, first:last], cameras.to_then[mesh], across, offset, down)
-    turn_normals(triple_of_lines(taps.normal, first, last), triple(now.normal, y, first, last), cameras.turn[mesh])
+    transform_points(point, pair.depth[y, first:last], pair.to_then[mesh], across, offset, down)
+    turn_normals(triple_of_lines(taps.normal, first, last), triple(pair.normal, y, first, last), pair.turn[mesh])
 
 
 @jit_with_reciprocals
-def is_consistent(x: Index, y: Index, pixel: Index, mesh: Scalar, taps: RowTaps, pair: FramePair) -> bool:
+def is_consistent(x: Index, y: Index, pixel: Index, mesh: Scalar, taps: RowTaps, pair: FramePair) -> bool | np.bool_:
     """Whether the tap at column x, row y of the previous frame shows the surface point of the row's `pixel`."""
-    then, axes = pair.then, pair.cameras.axes
-    height, width = then.mesh_id.shape
-    if x < 0 or y < 0 or y >= height or x >= width or then.mesh_id[y, x] != mesh:
+    axes = pair.axes
+    height, width = pair.mesh_then.shape
+    if x < 0 or y < 0 or y >= height or x >= width or pair.mesh_then[y, x] != mesh:
         return False
     if mesh == BACKGROUND_ID:
         return True
     px = f32(x) + f32(0.5)
     py = f32(y) + f32(0.5)
-    depth = then.depth[y, x]
+    depth = pair.depth_then[y, x]
     off_plane = f32(0)
     cosine = f32(0)
     for i in range(3):
-        n = then.normal[i, y, x]
+        n = pair.normal_then[i, y, x]
         visible = depth * (axes[0, i] * px + axes[1, i] * py + axes[2, i])
         off_plane += (taps.point[i, pixel] - visible) * n
         cosine += n * taps.normal[i, pixel]
@@ -248,19 +230,18 @@ def compare_planes(good: Row, point: RGB, depth: Row, normal: RGB, axes: Matrix,
 @jit_with_reciprocals
 def compare(good: Row, taps: RowTaps, x: Index, y: Index, low: Index, mesh: Scalar, pair: FramePair) -> None:
     """good (n): whether the taps from column x of row y on show the surface points of the pixels from `low` on."""
-    then = pair.then
     high = low + good.size
     end = x + good.size
-    if y < 0 or y >= then.mesh_id.shape[0]:
+    if y < 0 or y >= pair.mesh_then.shape[0]:
         good[:] = f32(0)
         return
-    compare_meshes(good, mesh, then.mesh_id[y, x:end])
+    compare_meshes(good, mesh, pair.mesh_then[y, x:end])
     if mesh == BACKGROUND_ID:
         return
-    normal = triple(then.normal, y, x, end)
+    normal = triple(pair.normal_then, y, x, end)
     compare_normals(good, triple_of_lines(taps.normal, low, high), normal)
     point = triple_of_lines(taps.point, low, high)
-    compare_planes(good, point, then.depth[y, x:end], normal, pair.cameras.axes, f32(x) + f32(0.5), f32(y) + f32(0.5))
+    compare_planes(good, point, pair.depth_then[y, x:end], normal, pair.axes, f32(x) + f32(0.5), f32(y) + f32(0.5))
 
 
 @jit_with_reciprocals
@@ -295,7 +276,7 @@ def find_boxes(taps: RowTaps, y: Index, pair: FramePair) -> None:
             continue
         column = x + np.int64(taps.shift[0, x]) + (taps.fraction[0, x] >= f32(0.5))
         row = y + np.int64(taps.shift[1, x]) + (taps.fraction[1, x] >= f32(0.5))
-        mesh = pair.now.mesh_id[y, x]
+        mesh = pair.mesh_id[y, x]
         bits = 0
         for tap in range(9):
             if is_consistent(column + tap % 3 - 1, row + tap // 3 - 1, x, mesh, taps, pair):
@@ -313,8 +294,8 @@ def find_boxes(taps: RowTaps, y: Index, pair: FramePair) -> None:
 @jit_with_reciprocals
 def find_taps(taps: RowTaps, y: Index, pair: FramePair) -> None:
     """Fill `taps` for row y."""
-    height, width = pair.now.mesh_id.shape
-    meshes = pair.now.mesh_id[y]
+    height, width = pair.mesh_id.shape
+    meshes = pair.mesh_id[y]
     locate(taps.shift[0], taps.fraction[0], pair.motion[0, y], np.int32(0), np.int32(1), width)
     locate(taps.shift[1], taps.fraction[1], pair.motion[1, y], np.int32(y), np.int32(0), height)
     count = split(taps.runs, meshes, taps.shift[0], taps.shift[1])
@@ -396,32 +377,24 @@ def gather(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
 
 
 @jit_parallel
-def gather_image(
-    gathered: Image,
-    valid: Mask,
-    history: Image,
-    motion: Image,
-    now: GBuffer,
-    then: GBuffer,
-    cameras: CameraMatrices,
-) -> None:
+def gather_image(gathered: Image, valid: Mask, history: Image, pair: FramePair) -> None:
     """gathered (C, H, W), valid (H, W)."""
     for block in numba.prange(block_count(history.shape[1])):
         taps = new_taps(history.shape[2])
         for y in rows_of_block(block, history.shape[1]):
-            find_taps(taps, y, FramePair(motion, now, then, cameras))
+            find_taps(taps, y, pair)
             for c in range(history.shape[0]):
                 gather(gathered[c, y], history[c], y, taps)
             valid[y] = taps.valid > 0
 
 
-def reproject(frame: Frame, history: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
+def reproject(frame: Frame, history: Tensor, gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
     """See models.history.reprojection.reproject."""
     gathered = torch.empty_like(history, memory_format=torch.contiguous_format)
     valid = torch.empty((len(history), 1, *frame.size), dtype=torch.bool)
     for item in range(len(history)):
-        pair = FramePair.of(frame, surfaces, item)
-        gather_image(gathered[item].numpy(), valid[item, 0].numpy(), array(history[item]), *pair)
+        pair = FramePair.of(frame, gbuffer, item)
+        gather_image(gathered[item].numpy(), valid[item, 0].numpy(), array(history[item]), pair)
     return gathered, valid
 
 
@@ -466,9 +439,9 @@ def scatter_image(scattered: Image, gradient: Image, pair: FramePair) -> None:
             scatter(scattered[c], gradient[c, y], y, taps)
 
 
-def reproject_back(gradient: Tensor, frame: Frame, surfaces: Surfaces) -> Tensor:
+def reproject_back(gradient: Tensor, frame: Frame, gbuffer: GBuffer) -> Tensor:
     """The gradient of the history from that of what was gathered of it, both (B, C, H, W)."""
     scattered = torch.zeros_like(gradient, memory_format=torch.contiguous_format)
     for item in range(len(gradient)):
-        scatter_image(scattered[item].numpy(), array(gradient[item]), FramePair.of(frame, surfaces, item))
+        scatter_image(scattered[item].numpy(), array(gradient[item]), FramePair.of(frame, gbuffer, item))
     return scattered

@@ -26,9 +26,9 @@ from models.compiled.jit import (
     plane_or_empty,
 )
 from models.compiled.lines import block_count, copy_line, luminance, rows_of_block, triple, triple_of_lines, window_taps
-from models.compiled.reprojection import CameraMatrices, FramePair, GBuffer, find_taps, gather, new_taps
+from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
 from models.filters.atrous import B3_SPLINE, RADIUS
-from models.history.surfaces import Surfaces
+from models.history.geometry import GBuffer
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 ALPHA = 0.2  # §4.1: weight of the newest sample
@@ -64,16 +64,13 @@ class IntegratedArrays(NamedTuple):
 
 
 @jit_with_reciprocals
-def clamp_luminance(y: Row, colour: RGB) -> None:
+def luminance_moments(first: Row, second: Row, colour: RGB) -> None:
+    """The clamped luminance and its square."""
     red, green, blue = colour
-    for x in range(y.size):
-        y[x] = min(max(luminance(red[x], green[x], blue[x]), -f32(MAX_LUMINANCE)), f32(MAX_LUMINANCE))
-
-
-@jit_with_reciprocals
-def square(line: Row, y: Row) -> None:
-    for x in range(line.size):
-        line[x] = y[x] * y[x]
+    for x in range(first.size):
+        y = min(max(luminance(red[x], green[x], blue[x]), -f32(MAX_LUMINANCE)), f32(MAX_LUMINANCE))
+        first[x] = y
+        second[x] = y * y
 
 
 @jit_with_reciprocals
@@ -93,14 +90,7 @@ def blend(line: Row, past: Row, new: Row, alpha: Row, valid: Row) -> None:
 
 @jit_parallel
 def integrate_image(
-    out: IntegratedArrays,
-    noisy: Signals,
-    past: IntegratedArrays,
-    change: Plane,
-    motion: Image,
-    now: GBuffer,
-    then: GBuffer,
-    cameras: CameraMatrices,
+    out: IntegratedArrays, noisy: Signals, past: IntegratedArrays, change: Plane, pair: FramePair
 ) -> None:
     """`change` (H, W) of the history is dropped; it is empty for none."""
     signals, _, height, width = noisy.shape
@@ -111,15 +101,14 @@ def integrate_image(
         alpha = np.empty(width, np.float32)
         none = np.zeros(width, np.float32)
         for y in rows_of_block(block, height):
-            find_taps(taps, y, FramePair(motion, now, then, cameras))
+            find_taps(taps, y, pair)
             gather(gathered, past.length, y, taps)
             weigh(alpha, out.length[y], gathered, change[y] if change.size > 0 else none, taps.valid)
             for s in range(signals):
                 for c in range(3):
                     gather(gathered, past.colour[s, c], y, taps)
                     blend(out.colour[s, c, y], gathered, noisy[s, c, y], alpha, taps.valid)
-                clamp_luminance(new[0], triple(noisy[s], y, 0, width))
-                square(new[1], new[0])
+                luminance_moments(new[0], new[1], triple(noisy[s], y, 0, width))
                 for c in range(2):
                     gather(gathered, past.moments[s, c], y, taps)
                     blend(out.moments[s, c, y], gathered, new[c], alpha, taps.valid)
@@ -131,7 +120,7 @@ def integrate_samples(
     past_colour: Tensor,
     past_moments: Tensor,
     past_length: Tensor,
-    surfaces: Surfaces,
+    gbuffer: GBuffer,
     change: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See models.filters.svgf.integrate_samples."""
@@ -141,8 +130,8 @@ def integrate_samples(
     for item in range(len(noisy)):
         out = IntegratedArrays(colour[item].numpy(), moments[item].numpy(), length[item, 0].numpy())
         past = IntegratedArrays(array(past_colour[item]), array(past_moments[item]), array(past_length[item, 0]))
-        pair = FramePair.of(frame, surfaces, item)
-        integrate_image(out, array(noisy[item]), past, plane_or_empty(change, item), *pair)
+        pair = FramePair.of(frame, gbuffer, item)
+        integrate_image(out, array(noisy[item]), past, plane_or_empty(change, item), pair)
     return colour, moments, length
 
 
@@ -150,7 +139,7 @@ def integrate_samples(
 
 
 @jit_in_any_order
-def nearer_to_zero(a: Scalar, b: Scalar) -> Scalar:
+def nearer_to_zero(a: np.float32, b: np.float32) -> np.float32:
     """Whichever is nearer to 0; 0 where both are infinite."""
     nearer = a if abs(a) < abs(b) else b
     return nearer if abs(nearer) < np.inf else f32(0)
@@ -209,7 +198,7 @@ def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
 
 @jit_inlined_in_any_order
 def geometry_terms(
-    here: tuple[Scalar, ...], there: tuple[Scalar, ...], dx: Scalar, dy: Scalar
+    here: tuple[np.float32, ...], there: tuple[np.float32, ...], dx: Scalar, dy: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Eq. 3 and 4 as w_n = (n · n')^σ_n, and exponent = |z - z'| / (|σ_z ∇z · (dx, dy)| + tolerance).
 
@@ -256,13 +245,13 @@ def geometry_weights(weights: Row, geometry: Image, row: Index, left: Index, dx:
 
 
 class TapRow(NamedTuple):
-    """The pixels `first` to `first + count` - 1 of a row, whose taps are in the row `to`, `step` pixels apart."""
+    """The pixels `first` to `first + size` - 1 of a row, whose taps are in the row `to`, `step` pixels apart."""
 
     row: Index
     to: Index
     step: int
     first: Index
-    count: Index
+    size: Index
 
 
 @jit_in_any_order
