@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from datasets.channels import LUMINANCE_WEIGHTS
 
+DISPLAY_GAMMA = 2.2
+
 ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
 
@@ -37,7 +39,7 @@ def clip_exposure(y: NDArray[np.floating]) -> float:
 def display(radiance: ArrayOrTensor, exposure: float) -> ArrayOrTensor:
     """clip(exposure * radiance, 0, 1)^(1/2.2), in [0, 1], as an array or a tensor of the same shape."""
     exposed: Any = exposure * radiance
-    return exposed.clip(0, 1) ** (1 / 2.2)
+    return exposed.clip(0, 1) ** (1 / DISPLAY_GAMMA)
 
 
 def noise_of_mean(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:

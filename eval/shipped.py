@@ -22,7 +22,7 @@ from provenance import file_digest
 WEIGHTS_LICENCE = "Apache-2.0"  # that of onespp
 BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
-LISTED_APART = ("profile", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
+LISTED_APART = ("budget", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
 
 FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
 - Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
@@ -56,7 +56,7 @@ def line(name: str) -> dict[str, Any]:
         "network": name,
         "parameters": recipe["parameters"],
         "kB": round(path.stat().st_size / 1000),
-        "budget": recipe["profile"],
+        "budget": recipe["budget"],
         "trained on": f"{Path(data['profile']).name}, {len(data['scenes'])} scenes",
         "step": recipe["step"],
         "validation loss": f"{recipe['validation']:.4g}",
@@ -128,7 +128,7 @@ def facts(name: str) -> str:
         bytes=weights.stat().st_size,
         digest=file_digest(weights),
         licence=WEIGHTS_LICENCE,
-        budget=recipe["profile"],
+        budget=recipe["budget"],
         seed=recipe["seed"],
         data=Path(data["profile"]).name,
         data_seed=data["seed"],

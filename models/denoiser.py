@@ -104,6 +104,10 @@ class Denoiser(torch.nn.Module):
         """
         raise NotImplementedError
 
+    def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
+        """Irradiance times exposure, for losses, of what a network predicts: see train.protocols."""
+        return exposure * prediction
+
     def first_layers(self) -> Sequence[nn.Conv2d]:
         """The convolutions that read `inputs`."""
         raise NotImplementedError

@@ -32,7 +32,10 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """The metadata that `save_weights` wrote: "denoiser", "recipe", "made_by", and "constants"."""
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata() or {}
-    return {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
+    read: dict[str, Any] = {key: text if key == "denoiser" else json.loads(text) for key, text in metadata.items()}
+    if "profile" in read.get("recipe", {}):  # the budget's key in the files that are shipped
+        read["recipe"]["budget"] = read["recipe"].pop("profile")
+    return read
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints: what a training needs to go on where it stood."""
+"""Checkpoints: what an interrupted training needs to resume."""
 
 import io
 from pathlib import Path
@@ -8,10 +8,8 @@ import torch
 
 from errors import BadInput
 from files import write_file
-from train.precision import BFLOAT16, FLOAT32
 
 CHECKPOINT_FILE = "checkpoint.pt"
-OLD_PRECISIONS = {"32-true": FLOAT32, "bf16-mixed": BFLOAT16}  # as earlier versions wrote them
 
 Checkpoint = dict[str, Any]
 
@@ -22,14 +20,12 @@ def load_checkpoint(folder: Path) -> Checkpoint:
     if not path.exists():
         return {}
     try:
-        checkpoint = dict(torch.load(path, weights_only=True, map_location="cpu"))
-        precision = checkpoint["precision"]
+        return dict(torch.load(path, weights_only=True, map_location="cpu"))
     except OSError:
         raise
     except Exception as error:  # a damaged pickle may fail in any way
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise BadInput(f"{path} is damaged ({reason}): delete {folder}") from None
-    return checkpoint | {"precision": OLD_PRECISIONS.get(precision, precision)}
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:

@@ -14,15 +14,15 @@ from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from models.history.running_scale import RunningMean, RunningScale
-from models.networks.wskp import KernelPredictor
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
+from train.protocols import A, FilteringNetwork
 from train.sequences import check_fits, random_window
 
 
 class Crops:
-    """What a training step sees: frames, their accumulated irradiance (B, 3, h, w), and the running scales there.
+    """A batch of crops: frames, their accumulated irradiance (B, 3, h, w), and the running scales there.
 
-    Not a dataclass: Fabric takes those apart.
+    Not a dataclass, whose fields Fabric would convert.
     """
 
     def __init__(self, frame: Frame, irradiance: Tensor, scale: RunningScale):
@@ -54,18 +54,18 @@ class AccumulatedCrops(TorchDataset[Crops]):
     """
 
     def __init__(
-        self, clips: Sequence[Clip], denoiser: KernelPredictor, count: int, crop: int | None, seed: int, cache: Path
+        self, clips: Sequence[Clip], network: FilteringNetwork[A], count: int, crop: int | None, seed: int, cache: Path
     ):
         check_fits(clips, 1, crop)
         cache.mkdir(parents=True, exist_ok=True)
-        folders = [accumulate_clip(clip, denoiser, cache) for clip in tqdm(clips, "accumulating", leave=False)]
+        folders = [accumulate_clip(clip, network, cache) for clip in tqdm(clips, "accumulating", leave=False)]
         self.irradiance: list[NDArray[np.float32]] = [np.load(f / IRRADIANCE_FILE, mmap_mode="r") for f in folders]
         self.scales: list[NDArray[np.float32]] = [np.load(folder / SCALE_FILE) for folder in folders]
         self.clips = clips
         self.crop = crop
         self.seed = seed
         self.epoch = 0
-        self.channels = (*denoiser.filter_reads, *REFERENCE_CHANNELS)
+        self.channels = (*network.filter_reads, *REFERENCE_CHANNELS)
         frames = np.array([clip.frames for clip in clips])
         self.share = frames / frames.sum()
         self.count = int(count * frames.sum())

@@ -1,4 +1,4 @@
-"""What a training step reads: batches of sequences or of accumulated crops, and who reads which."""
+"""Batches of sequences or of accumulated crops, and which process reads which."""
 
 import gc
 import os
@@ -12,9 +12,9 @@ from torch.utils.data import DataLoader
 
 from datasets.clip import Clip
 from models.denoiser import Denoiser
-from models.networks.wskp import KernelPredictor
 from train.augmentation import Augmentation
 from train.crops import AccumulatedCrops, Crops
+from train.protocols import FilteringNetwork
 from train.recipe import Recipe
 from train.sequences import TrainingSequences, collate
 
@@ -32,7 +32,7 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
     Raises BadInput where a clip is too short or too small for the recipe.
     """
     if recipe.crops:
-        assert isinstance(denoiser, KernelPredictor)
+        assert isinstance(denoiser, FilteringNetwork)
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
     augmentation = recipe.augmentation if training else Augmentation()
     frames = recipe.frames(training)

@@ -15,7 +15,7 @@ from files import locked
 from train.checkpoint import load_checkpoint
 from train.fabric import fabric_here
 from train.log import Log
-from train.made_by import other_makers
+from train.made_by import differences
 from train.pictures import loss_curve, sample_picture
 from train.task import WEIGHTS_FILE, Task
 from train.training import BEST_FILE, Training
@@ -37,24 +37,24 @@ def alone_in(folder: Path, fabric: Fabric) -> Iterator[None]:
 
 
 def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
-    """Train, or go on where an interrupted training stopped. Returns the path of the weights.
+    """Train, or resume an interrupted training. Returns the path of the weights.
 
-    Weights that other code or packages have made are kept, with a line that says so. Raises BadInput for unusable
-    data, or where the folder holds another training.
+    Weights that other code or packages have made are kept, and a line reports it. Raises BadInput for unusable data,
+    or where the folder holds another training.
     """
     fabric = fabric_here()
     task.check(fabric.world_size)
     weights = task.folder / WEIGHTS_FILE
     with alone_in(task.folder, fabric):  # before the checkpoint is read, which another process may be about to replace
         training = Training(task, load_checkpoint(task.folder))
-        others = other_makers(training.makers, training.maker)
+        others = differences(training.made_by, training.made_by_here)
         outcome = f"trained, {weights}"
         if others and training.finished:
             outcome = f"trained with {others}, kept at {weights}; delete {task.folder} to train again"
         elif others and fabric.is_global_zero:
-            print(f"{task.name}: begun with {others}, goes on with what is here; its weights name both")
+            print(f"{task.name}: begun with {others}, resumed with what is here; its weights name both")
         if task.specialised and fabric.is_global_zero:
-            left_out = ", ".join(training.judged.denoiser.constants) or "nothing: all that it sees varies"
+            left_out = ", ".join(training.judged.denoiser.constants) or "nothing: all of its inputs vary"
             print(f"{task.name}: specialised to {task.data.path}, left out {left_out}")
         if fabric.is_global_zero:
             train_to_end(training, save_seconds)

@@ -1,35 +1,35 @@
-"""Which code and packages have made a training: weights and checkpoints name them."""
+"""Which code and packages a training ran with: weights and checkpoints name them."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
 from provenance import code_digest, versions
 from train.losses.network_loss import NetworkLoss
 
 TRAINING_PACKAGES = ("torch", "numpy", "numba", "lightning-fabric")  # that training computes with
 
-MadeBy = dict[str, Any]  # {"versions": {package: version}, "code": digest}
-UNKNOWN: MadeBy = {"versions": {}, "code": None}  # of checkpoints from before they named it
+
+class MadeBy(TypedDict):
+    """Versions by package, and the digest of the code."""
+
+    versions: dict[str, str]
+    code: str
 
 
-def maker_here(loss: NetworkLoss) -> MadeBy:
+def made_by_here(loss: NetworkLoss) -> MadeBy:
     """The packages installed here and the code of the training loop, of the network and of its loss."""
-    code = code_digest("train.loop", type(loss).__module__, type(loss.denoiser).__module__)
+    code = code_digest("train.loop", type(loss.loss).__module__, type(loss.denoiser).__module__)
     return {"versions": versions(TRAINING_PACKAGES), "code": code}
 
 
-def other_makers(makers: Sequence[MadeBy], here: MadeBy) -> str:
-    """What made a training and is not here, such as "other code, torch 2.12.0 (now 2.13.0)"; empty if nothing is."""
+def differences(recorded: Sequence[MadeBy], here: MadeBy) -> str:
+    """How what a training ran with differs from here, "other code, torch 2.12.0 (now 2.13.0)"; empty if it does not."""
     found: dict[str, None] = {}  # an ordered set
-    for maker in makers:
-        if maker == UNKNOWN:
-            found["older code"] = None
-            continue
-        if maker["code"] != here["code"]:
+    for made_by in recorded:
+        if made_by["code"] != here["code"]:
             found["other code"] = None
         for package in TRAINING_PACKAGES:
-            then = maker["versions"].get(package, "none")
-            now = here["versions"].get(package, "none")
+            then, now = (each["versions"].get(package, "none") for each in (made_by, here))
             if then != now:
                 found[f"{package} {then} (now {now})"] = None
     return ", ".join(found)

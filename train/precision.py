@@ -28,8 +28,7 @@ def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: 
 def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
     """bfloat16 where that makes a step at least MIN_SPEEDUP times faster, by the best of some turns; else float32.
 
-    On processors one thread computes, and only the time that it computes counts: a busy machine, on which each step
-    waits as it happens to, tells nothing by the clock on the wall.
+    On processors one thread computes, and only its own time counts: on a busy machine the wall clock measures waiting.
     """
     loss = loss.to(device)
     batch = batch.to(device)

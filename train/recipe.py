@@ -4,14 +4,14 @@ import math
 from dataclasses import dataclass, field
 
 from train.augmentation import Augmentation
-from train.losses.network_loss import LossTerms
+from train.losses.network_loss import Loss
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How one network is trained."""
 
-    loss: LossTerms
+    loss: Loss
     rate: float  # Adam's learning rate, at the end of the ramp if there is one
     batch: int  # sequences a step
     crop: int | None  # pixels; None: whole frames

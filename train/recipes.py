@@ -5,16 +5,15 @@ from typing import Any
 
 from errors import BadInput
 from train.augmentation import Augmentation
-from train.losses.displayed import DisplayedTerms
-from train.losses.lbf import LBFTerms
-from train.losses.nbgd import NBGDTerms
-from train.losses.ntd import NTDTerms
-from train.losses.rae import RAETerms
-from train.losses.wskp import SMAPETerms
+from train.losses.displayed import DisplayedLoss
+from train.losses.lbf import LBFLoss
+from train.losses.ntd import NTDLoss
+from train.losses.rae import RAELoss
+from train.losses.wskp import NBGDLoss, SMAPELoss
 from train.recipe import Recipe
 
 RAE_RECIPE = Recipe(
-    loss=RAETerms(),  # §4.4
+    loss=RAELoss(),  # §4.4
     rate=1e-3,  # §5.3
     betas=(0.9, 0.99),  # §5.3
     ramp=10,  # §5.3
@@ -26,7 +25,7 @@ RAE_RECIPE = Recipe(
 )
 
 WSKP_RECIPE = Recipe(
-    loss=SMAPETerms(),  # §5.2
+    loss=SMAPELoss(),  # §5.2
     rate=1e-3,  # §5.3
     batch=64,  # §5.3
     crop=128,  # §5.1
@@ -37,7 +36,7 @@ WSKP_RECIPE = Recipe(
 
 # The paper's text is not known: these are the defaults of its authors' code. That also rotates and mirrors crops.
 NBGD_RECIPE = Recipe(
-    loss=NBGDTerms(),
+    loss=NBGDLoss(),
     rate=1e-4,
     batch=1,
     crop=128,
@@ -48,7 +47,7 @@ NBGD_RECIPE = Recipe(
 
 # How its authors trained is not known but for their 4 to 64 samples a pixel, all in one network.
 LBF_RECIPE = Recipe(
-    loss=LBFTerms(),
+    loss=LBFLoss(),
     rate=1e-2,
     batch=4,
     crop=128,
@@ -58,7 +57,7 @@ LBF_RECIPE = Recipe(
 )
 
 NTD_RECIPE = Recipe(
-    loss=NTDTerms(),  # §4.4, §5
+    loss=NTDLoss(),  # §4.4, §5
     rate=1e-4,  # §5
     batch=1,  # a clip
     crop=None,  # §6.1: 1280 x 720
@@ -66,14 +65,14 @@ NTD_RECIPE = Recipe(
     trained=9,  # §5
     epochs=200,  # §5
 )
-NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDTerms(occlusion=0.0))  # §6.3, experiments A and B
+NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDLoss(occlusion=0.0))  # §6.3, experiments A and B
 
 # Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.
 SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 
 # Ours: sequences long enough to learn what to carry, in all exposures and with all numbers of samples.
 ONE_RECIPE = Recipe(
-    loss=DisplayedTerms(),
+    loss=DisplayedLoss(),
     rate=2e-3,
     batch=4,
     crop=64,
@@ -86,8 +85,8 @@ ONE_RECIPE = Recipe(
 
 # Ours, for weights that are shipped: of references of 32 spp the papers' losses learn the median (docs/experiments.md).
 # A network without coarse levels cannot help what is wrong in large blocks.
-RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedTerms(), "crop": 64, "clip": 1.0}
-RELEASE_CROPS = RELEASE | {"loss": DisplayedTerms(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
+RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedLoss(), "crop": 64, "clip": 1.0}
+RELEASE_CROPS = RELEASE | {"loss": DisplayedLoss(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
 
 # What a budget changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
 RAE_BUDGETS = {
@@ -125,7 +124,7 @@ NTD_BUDGETS = {
 ONE_BUDGETS: dict[str, dict[str, Any]] = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
-    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedTerms(temporal=0.5)},
+    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedLoss(temporal=0.5)},
     "paper": {},
 }
 

@@ -13,7 +13,7 @@ SHIPPED = "weights"  # in place of a file: those that are shipped
 
 
 def start_file(name: str, start: str | None) -> Path | None:
-    """The weights that a training of a network is to begin with. Raises BadInput where SHIPPED are not there."""
+    """The weights that a training of a network is to begin with. Raises BadInput where none are shipped."""
     if start == SHIPPED:
         return require_shipped(name)
     return Path(start) if start else None

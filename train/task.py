@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from datasets.clip import Dataset
+from datasets.clip import Clip, Dataset, constant_channels
 from errors import BadInput
 from models.denoiser import Denoiser
+from models.specialise import specialise
+from models.weights import load_weights
 from train.recipe import Recipe
 from train.sequences import check_fits
 
@@ -20,9 +22,16 @@ def run_folder(runs: Path, name: str, budget: str) -> Path:
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, on what, and where that is kept. `create` makes the network with fresh weights.
+    """What is trained, on what, and where that is kept.
 
-    `start` has the weights to begin with instead; `specialised` networks do without what does not vary in the data.
+    Attributes:
+        create: makes the network with fresh weights.
+        folder: of this training.
+        cache: of accumulated frames, which trainings share.
+        precision: by default the fastest here.
+        micro_batch: items in memory together; by default what fits a few gigabytes.
+        start: the weights to begin with instead of fresh ones.
+        specialised: whether the network does without what does not vary in the data.
     """
 
     name: str
@@ -30,11 +39,11 @@ class Task:
     recipe: Recipe
     budget: str
     data: Dataset
-    folder: Path  # of this training
-    cache: Path  # of accumulated frames, which trainings share
+    folder: Path
+    cache: Path
     seed: int = 0
-    precision: str | None = None  # by default the fastest here
-    micro_batch: int | None = None  # items in memory together; by default what fits a few gigabytes
+    precision: str | None = None
+    micro_batch: int | None = None
     start: Path | None = None
     specialised: bool = False
 
@@ -49,3 +58,25 @@ class Task:
             raise BadInput(f"a micro-batch of {self.micro_batch} items is none: use 1 or more")
         check_fits(self.data.clips("train"), self.recipe.frames(training=True), self.recipe.crop)
         check_fits(self.data.clips("val"), self.recipe.frames(training=False), self.recipe.crop)
+
+    def network(self, clips: list[Clip]) -> Denoiser:
+        """The network that the training begins with, specialised to `clips` if it is to be.
+
+        Raises BadInput where the weights to start from cannot be used, or are specialised to other scenes than these,
+        and where a network that needs all of its inputs is to be specialised.
+        """
+        denoiser = self.create()
+        if self.start:
+            load_weights(denoiser, self.name, self.start)
+        constants = constant_channels(clips)
+        for name, value in denoiser.constants.items():
+            if constants.get(name) != value:
+                raise BadInput(
+                    f"{self.start} is specialised to scenes whose {name} is {value} everywhere, which it is not in "
+                    f"{self.data.path}: start from general weights"
+                )
+        if self.specialised:
+            if not denoiser.dispensable:
+                raise BadInput(f"'{self.name}' cannot do without any of its inputs: train it without --specialise")
+            specialise(denoiser, constants)
+        return denoiser

@@ -10,30 +10,44 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from errors import BadInput
 from models.weights import save_weights
 from provenance import file_digest
-from train.average import decay_after, join_average
 from train.checkpoint import Checkpoint, save_checkpoint
 from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
 from train.fabric import fabric_here
 from train.losses.network_loss import NetworkLoss
-from train.made_by import UNKNOWN, maker_here
+from train.made_by import MadeBy, made_by_here
 from train.precision import fastest_precision
-from train.start import starting_network
 from train.task import Task
 
 BEST_FILE = "best.safetensors"
 VALIDATIONS = 10  # in a training
-MOST_SKIPPED_IN_A_ROW = 20
+MAX_SKIPPED_IN_A_ROW = 20
+
+
+def average_decay(updates: int, span: float) -> float:
+    """The decay of the exponential average of weights, when those after update number `updates`, from 1, join it.
+
+    1 - 1 / `span` in the long run, the mean of about the last `span` updates; less at first, lest the average keep
+    the weights that the training began with.
+    """
+    return min(1 - 1 / max(span, 1), (1 + updates) / (10 + updates))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, network: nn.Module, decay: float) -> None:
+    """Move the weights of `average` to those of `network` by 1 - `decay` of the way."""
+    get_ema_multi_avg_fn(decay)(list(average.parameters()), list(network.parameters()), None)
 
 
 @dataclass
 class Position:
-    """Where a training stands."""
+    """How far a training has come."""
 
     done: int = 0  # steps
     best: float = math.inf  # mean loss over the validation clips
@@ -42,11 +56,11 @@ class Position:
 
 
 class Training:
-    """One run: network, optimiser, data, and where it stands. Everything random follows from (seed, epoch, item).
+    """One run: network, optimiser, data and position. Everything random follows from (seed, epoch, item).
 
     `judged` is what is validated and saved: the average of the weights where the recipe has one, else the weights.
 
-    Goes on from the checkpoint `saved`, if there is one. Raises BadInput where that is of another training, or for
+    Resumes from the checkpoint `saved`, if there is one. Raises BadInput where that is of another training, or for
     unusable data.
     """
 
@@ -56,8 +70,8 @@ class Training:
         torch.backends.mkldnn.deterministic = True  # type: ignore[assignment]
         torch.manual_seed(task.seed)
         self.clips = {split: task.data.clips(split) for split in ("train", "val")}
-        denoiser = starting_network(task, [*self.clips["train"], *self.clips["val"]])
-        loss = self.recipe.loss.around(denoiser)
+        denoiser = task.network([*self.clips["train"], *self.clips["val"]])
+        loss = NetworkLoss(denoiser, self.recipe.loss)
         fabric = fabric_here()
         with fabric.rank_zero_first():  # the others find the accumulated frames that the first has cached
             make = partial(items, recipe=self.recipe, denoiser=denoiser, seed=task.seed, cache=task.cache)
@@ -76,9 +90,9 @@ class Training:
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
         self.judged: NetworkLoss = self.loss.module
         if self.recipe.average:
-            self.judged = self.recipe.loss.around(deepcopy(denoiser)).to(self.fabric.device)
+            self.judged = NetworkLoss(deepcopy(denoiser), self.recipe.loss).to(self.fabric.device)
         self.facts: dict[str, Any] = {
-            "profile": task.budget,  # the name that it has in checkpoints
+            "budget": task.budget,
             "seed": task.seed,
             "data": {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")},
             **asdict(self.recipe),
@@ -88,12 +102,12 @@ class Training:
             self.facts["from"] = file_digest(task.start)
         if denoiser.constants:
             self.facts["constants"] = denoiser.constants
-        self.maker = maker_here(loss)
-        self.makers = saved.get("made_by", [UNKNOWN]) if saved else []
+        self.made_by: list[MadeBy] = saved["made_by"] if saved else []
+        self.made_by_here = made_by_here(loss)
         if saved:
             self.resume(saved)
-        if not self.finished and self.maker not in self.makers:
-            self.makers = [*self.makers, self.maker]
+        if not self.finished and self.made_by_here not in self.made_by:
+            self.made_by = [*self.made_by, self.made_by_here]
 
     @property
     def finished(self) -> bool:
@@ -133,7 +147,7 @@ class Training:
         content = {
             "facts": self.facts,
             "precision": self.precision,
-            "made_by": self.makers,
+            "made_by": self.made_by,
             "loss": self.loss.state_dict(),
             "judged": self.judged.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -142,7 +156,7 @@ class Training:
         save_checkpoint(self.task.folder, content)
 
     def steps(self) -> Iterator[dict[str, float]]:
-        """Update the weights step by step until the last epoch's end; yields what is worth noting of each step."""
+        """Update the weights step by step until the last epoch's end; yields the log row of each step."""
         rank = self.fabric.global_rank
         world = self.fabric.world_size
         while not self.finished:
@@ -200,8 +214,8 @@ class Training:
             self.optimiser.step()
             if self.recipe.average:
                 updates = self.position.done - self.position.skipped + 1
-                decay = decay_after(updates, self.recipe.average * self.total)
-                join_average(self.judged, self.loss.module, decay)
+                decay = average_decay(updates, self.recipe.average * self.total)
+                update_average(self.judged, self.loss.module, decay)
         else:
             self.skip_step()
         self.optimiser.zero_grad()
@@ -211,7 +225,7 @@ class Training:
         """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""
         self.position.skipped += 1
         self.position.skipped_in_a_row += 1
-        if self.position.skipped_in_a_row >= MOST_SKIPPED_IN_A_ROW:
+        if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise BadInput(
                 f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the data "
                 f"with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
@@ -239,4 +253,4 @@ class Training:
         if validation < self.position.best:  # never true of NaN
             self.position.best = validation
             facts = {**self.facts, "step": self.position.done, "validation": validation}
-            save_weights(self.judged.denoiser, self.task.name, facts, self.task.folder / BEST_FILE, self.makers)
+            save_weights(self.judged.denoiser, self.task.name, facts, self.task.folder / BEST_FILE, self.made_by)

@@ -15,6 +15,7 @@ from models.operators import pad_to_multiple
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
+MIN_SLOPE_AT = 0.01  # exposed irradiance, below which `raised` has no flatter slope
 ENCODER = (32, 32, 43, 57, 76, 101, 101)
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
 # The auxiliary inputs (§3.2): the number of channels of each, and how to compute it.
@@ -36,6 +37,17 @@ def conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 def activate(x: Tensor) -> Tensor:
     return F.leaky_relu(x, SLOPE, inplace=True)
+
+
+def raised(p: Tensor) -> Tensor:
+    """max(p, 0)^5, exposed irradiance of the raw output p, with a gradient that does not vanish at p <= 0.
+
+    Its slope is that of p^5, but never less than where p^5 = MIN_SLOPE_AT: darker than that, errors are not relative
+    any more. A slope of another size, whatever the target, keeps the minimiser: a zero of the loss's gradient.
+    """
+    value = p.detach().clamp(min=0) ** (1 / POWER)
+    slope = p.detach().clamp(min=MIN_SLOPE_AT**POWER) ** (1 / POWER - 1) / POWER
+    return value + slope * (p - p.detach())
 
 
 class RecurrentBlock(nn.Module):
@@ -134,9 +146,8 @@ class RAE(Denoiser):
         p, hidden = self.network(x, before.hidden if before else None)
         return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
 
-    def target(self, frame: Frame) -> Tensor:
-        """The training target, irradiance (B, 3, H, W)."""
-        return frame.reference_irradiance(self.signal)
+    def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
+        return raised(prediction)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into the network's space: (gain · exposure · irradiance)^0.2."""

@@ -8,10 +8,9 @@ import torch
 from torch import nn
 
 from tests.helpers.training import short_task, tensors
-from train.average import decay_after, join_average
 from train.checkpoint import load_checkpoint
 from train.loop import train_network
-from train.training import BEST_FILE, Training
+from train.training import BEST_FILE, Training, average_decay, update_average
 
 
 def test_average_by_hand():
@@ -19,19 +18,19 @@ def test_average_by_hand():
     network = nn.Linear(1, 1, bias=False)
     average.weight.data.fill_(2.0)
     network.weight.data.fill_(10.0)
-    join_average(average, network, 0.75)
+    update_average(average, network, 0.75)
     assert average.weight.item() == 4.0 and network.weight.item() == 10.0
 
 
 def test_average_forgets_the_beginning_and_spans_what_it_should():
     """The weights of update i in the average after n, from the decays alone."""
-    decays = [decay_after(n, 50) for n in range(1, 1001)]
+    decays = [average_decay(n, 50) for n in range(1, 1001)]
     assert decays[:2] == pytest.approx([2 / 11, 3 / 12]) and decays[-1] == pytest.approx(0.98)
     weights = [(1 - decay) * np.prod(decays[n:]) for n, decay in enumerate(decays, start=1)]
     ages = [len(weights) - n for n in range(1, len(weights) + 1)]
     assert sum(weights) == pytest.approx(1, abs=1e-6)
     assert sum(w * age for w, age in zip(weights, ages, strict=True)) == pytest.approx(49, rel=0.01)
-    assert decay_after(5, 0.5) == 0  # over less than an update: the weights themselves
+    assert average_decay(5, 0.5) == 0  # over less than an update: the weights themselves
 
 
 def test_the_average_is_what_is_validated_and_saved(tiny, tmp_path):

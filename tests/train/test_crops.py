@@ -81,11 +81,9 @@ def test_accumulating_is_done_once_and_whole(clips, cache, tmp_path, monkeypatch
 def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkeypatch):
     wskp = create("wskp3")
     with monkeypatch.context() as patched:
-        patched.setattr(accumulation, "accumulation_digest", lambda: "other")
+        patched.setattr(accumulation, "accumulation_digest", lambda network: "other")
         stale = accumulate_clip(clips[0], wskp, tmp_path)
     another_clip = accumulate_clip(clips[1], wskp, tmp_path)
-    by_fingerprint_alone = tmp_path / clips[0].fingerprint  # as earlier versions named it
-    by_fingerprint_alone.mkdir()
     (stale / "irradiance.npy").write_bytes(b"stale")
     fresh = accumulate_clip(clips[0], wskp, tmp_path)
     assert np.load(fresh / "irradiance.npy").shape[0] == clips[0].frames
@@ -93,7 +91,8 @@ def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkey
 
 
 def test_the_key_follows_code_and_packages(monkeypatch):
-    accumulating = sources("train.accumulation")
+    wskp = create("wskp3")
+    accumulating = sources("train.accumulation", "models.networks.wskp")
     assert accumulating.keys() >= {
         "models.operators",
         "models.compiled.reprojection",
@@ -107,13 +106,14 @@ def test_the_key_follows_code_and_packages(monkeypatch):
         "models.networks.ntd",
         "models.registry",
     }
-    here = accumulation_digest()
-    assert len(here) == 16 and here == accumulation_digest()
+    here = accumulation_digest(wskp)
+    assert here == accumulation_digest(create("nbgd"))  # which accumulates alike
+    assert len(here) == 16 and here == accumulation_digest(wskp)
     with monkeypatch.context() as patched:
         patched.setattr(accumulation, "versions", lambda packages: dict.fromkeys(packages, "0"))
-        assert accumulation_digest() != here
+        assert accumulation_digest(wskp) != here
     monkeypatch.setattr(accumulation, "code_digest", lambda *modules: "other")
-    assert accumulation_digest() != here
+    assert accumulation_digest(wskp) != here
 
 
 def test_a_full_disk_is_an_error_and_leaves_nothing(clips, tmp_path):

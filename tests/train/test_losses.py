@@ -19,33 +19,24 @@ from models.networks.wskp import WSKP
 from models.registry import create
 from train.crops import Crops
 from train.data import items, loader
-from train.losses.displayed import DisplayedLoss, DisplayedTerms, shrunk, tone
-from train.losses.lbf import LBFLoss, LBFTerms
-from train.losses.nbgd import NBGDLoss, NBGDTerms
-from train.losses.network_loss import surface_mean
-from train.losses.ntd import NTDLoss, NTDTerms, masked_mean
-from train.losses.rae import RAELoss, RAETerms, laplacian_of_gaussian
-from train.losses.relative import RelativeTerms
-from train.losses.wskp import SMAPELoss, SMAPETerms, smape
+from train.losses.displayed import DisplayedLoss, block_means, tone
+from train.losses.lbf import LBFLoss
+from train.losses.network_loss import NetworkLoss, surface_mean
+from train.losses.ntd import NTDLoss, masked_mean
+from train.losses.rae import RAELoss, edges, laplacian_of_gaussian
+from train.losses.relative import RelativeLoss
+from train.losses.wskp import smape
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 from train.sequences import Batch
 
-LOSSES = {
-    RAETerms: RAELoss,
-    SMAPETerms: SMAPELoss,
-    NBGDTerms: NBGDLoss,
-    LBFTerms: LBFLoss,
-    NTDTerms: NTDLoss,
-    DisplayedTerms: DisplayedLoss,
-}
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
 
 
 @pytest.fixture(scope="module")
 def batch_of(tiny, tmp_path_factory) -> Callable[..., Any]:
-    """Makes a batch that a network is trained on in the tiny profile, without augmentation."""
+    """Makes a batch that a network is trained on in the tiny budget, without augmentation."""
     cache = tmp_path_factory.mktemp("accumulated")
 
     def make(name: str, count: int = 1, **changes: Any) -> Batch | Crops:
@@ -69,22 +60,21 @@ def test_log_kernel_is_that_of_scipy():
     np.testing.assert_allclose(kernel, scipy, atol=2e-4 * np.abs(scipy).max() + 1e-4)
     assert abs(kernel.sum()) < 1e-12
     picture = np.random.default_rng(0).uniform(0, 1, (40, 50))
-    ours = RAELoss(RAE()).edges(torch.from_numpy(picture).float().expand(2, 3, 40, 50))[1, 2].numpy()
+    ours = edges(torch.from_numpy(picture).float().expand(2, 3, 40, 50))[1, 2].numpy()
     np.testing.assert_allclose(ours * LOG_NORM, gaussian_laplace(picture, 1.5, mode="nearest"), atol=2e-3)
 
 
 def test_the_terms_of_rae_have_one_scale():
     """Errors of white noise: HFEN is as large as L1, the change between two frames sqrt(2) times as large."""
     error = torch.randn(4, 3, 256, 256, generator=torch.Generator().manual_seed(0))
-    edges = RAELoss(RAE()).edges(error).abs().mean()
-    assert edges.item() == pytest.approx(error.abs().mean().item(), rel=0.01)
+    assert edges(error).abs().mean().item() == pytest.approx(error.abs().mean().item(), rel=0.01)
 
 
 def test_rae_loss_by_hand(batch_of, monkeypatch):
     """With a network that returns known outputs, every term follows from §4.4's equations, in numpy and float64."""
     batch = batch_of("rae", 2)
     rae = RAE()
-    loss = RAELoss(rae)
+    loss = NetworkLoss(rae, RAELoss())
     outputs = []
     targets = []
     generator = torch.Generator().manual_seed(0)
@@ -153,7 +143,7 @@ def test_losses_of_crops_compare_radiance_as_exposed(batch_of, monkeypatch, name
     denoiser = create(name)
     guess = torch.rand_like(batch.irradiance)
     monkeypatch.setattr(denoiser, "filter", lambda frame, irradiance, scale: (guess, None))
-    value, _ = recipe_for(name, "paper").loss.around(denoiser)(batch)
+    value, _ = NetworkLoss(denoiser, recipe_for(name, "paper").loss)(batch)
     frame = batch.frame
     exposure = 0.18 * np.exp(-batch.scale.log_luminance.value.numpy())[:, None, None, None]
     albedo = np.maximum(frame.albedo.numpy(), 0.01)
@@ -171,7 +161,7 @@ def test_lbf_loss_by_hand(batch_of, monkeypatch):
     _, state = denoiser.predict(frame, None)
     guess = torch.rand_like(frame.albedo)
     monkeypatch.setattr(denoiser, "predict", lambda frame, before: (guess, state))
-    value, _ = LBFLoss(denoiser)(Batch([frame]))
+    value, _ = NetworkLoss(denoiser, LBFLoss())(Batch([frame]))
     exposure = state.scale.exposure().numpy()
     albedo = np.maximum(frame.albedo.numpy(), 0.01)
     output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
@@ -202,7 +192,7 @@ def test_ntd_loss_by_hand(batch_of, monkeypatch):
     for index, frame in enumerate(batch.frames):  # more to see than what happens to be disoccluded in a crop
         frame.channels["dual_motion"] = frame.motion.clone()
         frame.channels["dual_motion"][:, 0, index : index + 4] += 0.1
-    loss = NTDLoss(ntd)
+    loss = NetworkLoss(ntd, NTDLoss())
     _, parts = loss(batch)
 
     references = [f.indirect_reference.mean(dim=1) / f.albedo.clamp(min=0.01) for f in batch.frames]
@@ -235,7 +225,7 @@ def test_occlusion_counts_like_the_other_terms_of_ntd():
 
 @pytest.mark.parametrize("progress, training, counts", [(0.49, True, False), (0.5, True, True), (0.0, False, True)])
 def test_occlusion_loss_joins_in_the_second_half(batch_of, progress, training, counts):
-    loss = NTDLoss(NTD()).train(training)
+    loss = NetworkLoss(NTD(), NTDLoss()).train(training)
     loss.progress = progress
     batch = batch_of("ntd", length=3)
     for frame in batch.frames:
@@ -243,7 +233,7 @@ def test_occlusion_loss_joins_in_the_second_half(batch_of, progress, training, c
     value, parts = loss(batch)
     expected = parts["spatial"] + parts["temporal"] + counts * parts["occlusion"]
     assert parts["occlusion"] > 0 and value.item() == pytest.approx(expected.item(), rel=1e-6)
-    ablated = NTDLoss(loss.denoiser, NTDTerms(occlusion=0.0)).eval()
+    ablated = NetworkLoss(loss.denoiser, NTDLoss(occlusion=0.0)).eval()
     assert ablated(batch)[0].item() == pytest.approx((parts["spatial"] + parts["temporal"]).item(), rel=1e-6)
 
 
@@ -261,23 +251,23 @@ def test_mean_over_surfaces_by_hand():
     assert torch.stack(parts).mean().item() == pytest.approx(expected.item())
 
 
-@pytest.mark.parametrize("terms", [None, RelativeTerms()], ids=["its own", "relative"])
+@pytest.mark.parametrize("loss", [None, RelativeLoss()], ids=["its own", "relative"])
 @pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
-def test_the_background_is_not_learnt_from(batch_of, name, terms):
+def test_the_background_is_not_learnt_from(batch_of, name, loss):
     """Whatever the reference holds there, the loss stays what it is, also where a surface comes into view."""
     torch.manual_seed(0)
     batch = batch_of(name, 2)
     for index, frame in enumerate(frames_of(batch)):
         frame.channels["depth"] = frame.depth.clone()
         frame.channels["depth"][..., 20 + 4 * index :, :] = 0
-    loss = (terms or recipe_for(name, "tiny").loss).around(create(name))
+    trained = NetworkLoss(create(name), loss or recipe_for(name, "tiny").loss)
     values = []
     for sky in (0.0, 3.0, 1e4):
         for index, frame in enumerate(frames_of(batch)):
             for half in {"direct_reference", "indirect_reference"} & frame.channels.keys():
                 frame.channels[half] = frame.channels[half].clone()
                 frame.channels[half][..., 20 + 4 * index :, :] = sky
-        values.append(loss(batch)[0].item())
+        values.append(trained(batch)[0].item())
     assert values[0] == values[1] == values[2] and values[0] > 0
 
 
@@ -293,8 +283,7 @@ def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level, 
         )
     if isinstance(batch, Crops):
         batch.irradiance.fill_(level)
-    terms = RelativeTerms() if relative else recipe_for(name, "tiny").loss
-    loss = terms.around(create(name))
+    loss = NetworkLoss(create(name), RelativeLoss() if relative else recipe_for(name, "tiny").loss)
     value, _ = loss(batch)
     value.backward()
     assert torch.isfinite(value)
@@ -307,7 +296,7 @@ def test_validation_knows_bfloat16(batch_of, name):
     """Where there are no gradients networks may take other ways, which autocast must not trip."""
     torch.manual_seed(0)
     batch = batch_of(name)
-    loss = recipe_for(name, "release").loss.around(create(name))
+    loss = NetworkLoss(create(name), recipe_for(name, "release").loss)
     exact = loss(batch)[0].item()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         assert loss(batch)[0].item() == pytest.approx(exact, rel=0.05)
@@ -318,7 +307,7 @@ def test_gradients_are_finite_at_extreme_gains(batch_of, gain):
     batch = batch_of("rae")
     for frame in batch.frames:
         frame.gain.fill_(gain)
-    loss = RAELoss(RAE())
+    loss = NetworkLoss(RAE(), RAELoss())
     value, _ = loss(batch)
     value.backward()
     assert torch.isfinite(value) and all(torch.isfinite(p.grad).all() for p in loss.parameters())
@@ -346,7 +335,7 @@ def test_equal_images_have_no_loss_and_finite_gradients(batch_of, name, monkeypa
             return known(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth), state
 
         monkeypatch.setattr(denoiser, "predict", predict)
-    value, _ = recipe_for(name, "tiny").loss.around(denoiser)(batch)
+    value, _ = NetworkLoss(denoiser, recipe_for(name, "tiny").loss)(batch)
     value.backward()
     assert value.item() == pytest.approx(0, abs=1e-6)
     assert all(leaf.grad is not None and torch.isfinite(leaf.grad).all() for leaf in leaves)
@@ -420,7 +409,7 @@ def test_sequences_of_a_batch_do_not_leak_into_one_another(batch_of, name):
 def test_no_term_of_rae_is_next_to_nothing(batch_of):
     """The share of each weighted term in the loss, after some steps; by a kernel of another norm HFEN had 1 %."""
     torch.manual_seed(0)
-    loss = RAELoss(RAE())
+    loss = NetworkLoss(RAE(), RAELoss())
     optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
     batch = batch_of("rae", 2)
     for _ in range(15):
@@ -428,7 +417,7 @@ def test_no_term_of_rae_is_next_to_nothing(batch_of):
         loss(batch)[0].backward()
         optimiser.step()
     value, parts = loss(batch)
-    shares = {name: getattr(loss.terms, name) * part.item() / value.item() for name, part in parts.items()}
+    shares = {name: getattr(loss.loss, name) * part.item() / value.item() for name, part in parts.items()}
     assert sum(shares.values()) == pytest.approx(1)
     assert shares["gradient"] > 0.04 and shares["temporal"] > 0.01
 
@@ -438,7 +427,7 @@ def test_occlusion_is_not_next_to_nothing(batch_of):
     """On the rendered clips, of whose pixels a few percent are hidden in the frame before."""
     torch.manual_seed(0)
     batch = batch_of("ntd", 4, length=6, crop=64)
-    value, parts = NTDLoss(NTD()).eval()(batch)
+    value, parts = NetworkLoss(NTD(), NTDLoss()).eval()(batch)
     hidden = torch.cat([disoccluded(frame.motion, frame.dual_motion) for frame in batch.frames]).float().mean()
     assert 0 < hidden < 0.05
     assert parts["occlusion"] > 0.1 * value
@@ -456,7 +445,7 @@ def test_blocks_are_means_over_their_surfaces():
     surface = torch.ones(1, 1, 6, 8)
     surface[..., :2, 1:4] = 0
     surface[..., 4:, 4:] = 0
-    mean, share = shrunk(radiance, surface, 4)
+    mean, share = block_means(radiance, surface, 4)
     assert mean.shape == (1, 3, 2, 2)
     lit = surface[0, 0, :4, :4] > 0
     torch.testing.assert_close(mean[0, 1, 0, 0], radiance[0, 1, :4, :4][lit].mean())
@@ -480,7 +469,7 @@ def test_one_s_loss_by_hand(batch_of, monkeypatch):
         return output, state
 
     monkeypatch.setattr(denoiser, "predict", predict)
-    value, parts = DisplayedLoss(denoiser, DisplayedTerms(temporal=0.5, scales=(1, 8)))(batch)
+    value, parts = NetworkLoss(denoiser, DisplayedLoss(temporal=0.5, scales=(1, 8)))(batch)
     spatial = 0.0
     errors: list[list[Tensor]] = []
     for frame, (output, truth) in zip(batch.frames, seen, strict=True):
@@ -495,14 +484,6 @@ def test_one_s_loss_by_hand(batch_of, monkeypatch):
     temporal = sum(surface_mean(change.abs(), each) for change, each in zip(changes, shares, strict=True))
     assert parts["spatial"].item() == pytest.approx(spatial.item(), rel=1e-4)
     assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
-
-
-def test_every_recipe_has_a_loss_for_its_terms():
-    for name in TRAINABLE:
-        terms = recipe_for(name, "paper").loss
-        loss = terms.around(create(name))
-        assert type(loss) is LOSSES[type(terms)] and loss.terms is terms
-    assert RAELoss(RAE()).terms == RAETerms()
 
 
 SAME_NETWORK = [  # as ntd's
@@ -532,7 +513,7 @@ def test_every_network_learns_one_batch(batch_of, name, steps, changes, left):
     The other networks begin as filters already, so that less is left to learn, and for the few weights of LBF little.
     """
     torch.manual_seed(0)
-    loss = recipe_for(name, "tiny").loss.around(create(name)).train()
+    loss = NetworkLoss(create(name), recipe_for(name, "tiny").loss).train()
     loss.progress = 1.0
     optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
     batch = batch_of(name, 1, crop=24, **changes)

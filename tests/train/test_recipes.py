@@ -8,11 +8,10 @@ import pytest
 from errors import BadInput
 from models.registry import DENOISERS, create
 from train.augmentation import Augmentation
-from train.losses.displayed import DisplayedTerms
-from train.losses.nbgd import NBGDTerms
-from train.losses.ntd import NTDTerms
-from train.losses.rae import RAETerms
-from train.losses.wskp import SMAPETerms
+from train.losses.displayed import DisplayedLoss
+from train.losses.ntd import NTDLoss
+from train.losses.rae import RAELoss
+from train.losses.wskp import NBGDLoss, SMAPELoss
 from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
 
 EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained"}
@@ -28,28 +27,28 @@ def test_rae_is_the_paper_s():
     assert recipe.learning_rate(40) == pytest.approx(5e-4)
     assert (recipe.batch, recipe.length, recipe.crop, recipe.epochs, recipe.betas) == (4, 7, 128, 500, (0.9, 0.99))
     assert recipe.augmentation == Augmentation(True, True, True, True)
-    assert recipe.loss == RAETerms(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
+    assert recipe.loss == RAELoss(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
 
 
 @pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"])
 def test_wskp_is_the_paper_s(name):
     recipe = recipe_for(name, "paper")
     assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (64, 128, (80, 20), 500, 1e-3)
-    assert recipe.loss == SMAPETerms(0.01) and recipe.augmentation == Augmentation()
+    assert recipe.loss == SMAPELoss(0.01) and recipe.augmentation == Augmentation()
     assert recipe.learning_rate(0) == recipe.learning_rate(499) == 1e-3
 
 
 def test_nbgd_is_its_authors():
     recipe = recipe_for("nbgd", "paper")
     assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (1, 128, (50, 50), 100, 1e-4)
-    assert recipe.loss == NBGDTerms() and recipe.augmentation == Augmentation()
+    assert recipe.loss == NBGDLoss() and recipe.augmentation == Augmentation()
 
 
 @pytest.mark.parametrize("name, occlusion", [("ntd-a", 0.0), ("ntd-b", 0.0), ("ntd", 1.0)])
 def test_ntd_is_the_paper_s(name, occlusion):
     recipe = recipe_for(name, "paper")
     assert (recipe.batch, recipe.length, recipe.trained, recipe.crop, recipe.epochs) == (1, 10, 9, None, 200)
-    assert recipe.loss == NTDTerms(1.0, 1.0, occlusion, (1.0, 0.8, 0.6), 0.5)
+    assert recipe.loss == NTDLoss(1.0, 1.0, occlusion, (1.0, 0.8, 0.6), 0.5)
     assert recipe.learning_rate(0) == recipe.learning_rate(199) == 1e-4 and recipe.augmentation == Augmentation()
 
 
@@ -70,7 +69,7 @@ def test_budgets_scale_the_effort_and_anneal():
 def test_what_is_shipped_learns_from_noisy_references(name):
     """Without the blocks of 16 where a network filters single frames by small windows."""
     recipe = recipe_for(name, "release")
-    assert isinstance(recipe.loss, DisplayedTerms)
+    assert isinstance(recipe.loss, DisplayedLoss)
     assert recipe.loss.scales == ((1, 4) if recipe.crops else (1, 4, 16))
     assert recipe.clip == 1.0 and recipe.augmentation.rotate is (recipe.crops is None)
 

@@ -11,7 +11,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame
 from models.history.running_scale import RunningScale
 from models.networks.ntd import NTD
-from models.networks.rae import RAE
+from models.networks.rae import RAE, raised
 from models.networks.wskp import WSKP
 from models.registry import create
 from tests.helpers.frames import flat_frame
@@ -21,8 +21,7 @@ from train.data import items, loader
 from train.loop import train_network
 from train.losses.network_loss import NetworkLoss
 from train.losses.ntd import NTDLoss
-from train.losses.outputs import raised
-from train.losses.relative import RelativeLoss, RelativeTerms
+from train.losses.relative import RelativeLoss
 from train.losses.wskp import SMAPELoss
 from train.recipes import recipe_for
 from train.sequences import Batch
@@ -45,12 +44,12 @@ def crops_of(frame: Frame) -> Crops:
     return Crops(frame, torch.zeros_like(frame.albedo), RunningScale.neutral(frame.albedo))
 
 
-def fitted(loss: NetworkLoss, frame: Frame, parameter: torch.nn.Parameter) -> float:
-    """What a network that returns one constant, `parameter`, learns of a frame."""
+def fitted(loss: NetworkLoss, batch: Batch | Crops, parameter: torch.nn.Parameter) -> float:
+    """What a network that returns one constant, `parameter`, learns from a batch."""
     optimiser = torch.optim.Rprop([parameter], lr=0.02)  # goes by the sign of the slope alone
     for _ in range(100):
         optimiser.zero_grad()
-        loss(crops_of(frame))[0].backward()
+        loss(batch)[0].backward()
         optimiser.step()
     return parameter.item()
 
@@ -66,7 +65,7 @@ def test_the_minimiser_is_the_mean_of_noisy_targets(monkeypatch):
     frame = noisy_frame()
     mean = frame.direct_reference.mean().item()
     wskp, parameter = constant_wskp(monkeypatch, 0.05)
-    assert fitted(RelativeLoss(wskp), frame, parameter) == pytest.approx(mean, rel=0.002)
+    assert fitted(NetworkLoss(wskp, RelativeLoss()), crops_of(frame), parameter) == pytest.approx(mean, rel=0.002)
     assert mean == pytest.approx(MEAN, rel=0.02)
 
 
@@ -74,15 +73,16 @@ def test_other_losses_end_elsewhere(monkeypatch):
     """SMAPE, and NTD's L1 of the logarithm, which is the median's: both are too dark."""
     frame = noisy_frame()
     wskp, parameter = constant_wskp(monkeypatch, 0.05)
-    assert fitted(SMAPELoss(wskp), frame, parameter) < 0.9 * MEAN
+    assert fitted(NetworkLoss(wskp, SMAPELoss()), crops_of(frame), parameter) < 0.9 * MEAN
     ntd = NTD(signal="total")
     parameter = torch.nn.Parameter(torch.tensor(0.05))
     state = ntd.predict(replace(frame, whole=torch.tensor([[np.log(0.18), 0.0]]).float()), None)[1]
     monkeypatch.setattr(ntd, "predict", lambda f, _: (parameter.expand(f.albedo.shape), state))
-    loss = NTDLoss(ntd)
-    monkeypatch.setattr(loss, "forward", lambda crops: NTDLoss.forward(loss, Batch([crops.frame])))
     median = frame.direct_reference.mean(dim=1).median().item()
-    assert fitted(loss, frame, parameter) == pytest.approx(median, rel=0.01) and median < 0.95 * MEAN
+    assert (
+        fitted(NetworkLoss(ntd, NTDLoss()), Batch([frame]), parameter) == pytest.approx(median, rel=0.01)
+        and median < 0.95 * MEAN
+    )
 
 
 @pytest.mark.parametrize("start", [-0.2, 0.0, 1.5])
@@ -93,10 +93,8 @@ def test_rae_s_raw_output_finds_the_mean_from_anywhere(monkeypatch, start):
     parameter = torch.nn.Parameter(torch.tensor(start))
     state = rae.predict(replace(frame, whole=torch.tensor([[np.log(0.18), 0.0]]).float()), None)[1]
     monkeypatch.setattr(rae, "predict", lambda f, _: (parameter.expand(f.albedo.shape), state))
-    loss = RelativeLoss(rae)
-    monkeypatch.setattr(loss, "forward", lambda crops: RelativeLoss.forward(loss, Batch([crops.frame])))
     mean = frame.direct_reference.mean().item()
-    assert fitted(loss, frame, parameter) ** 5 == pytest.approx(mean, rel=0.01)
+    assert fitted(NetworkLoss(rae, RelativeLoss()), Batch([frame]), parameter) ** 5 == pytest.approx(mean, rel=0.01)
 
 
 def test_raising_is_the_power_with_a_slope_that_does_not_vanish():
@@ -117,7 +115,7 @@ def test_the_value_does_not_count_the_noise_of_the_reference(monkeypatch, sigma)
     for seed in range(16):
         frame = noisy_frame(sigma, seed)
         wskp, parameter = constant_wskp(monkeypatch, guess)
-        value, _ = RelativeLoss(wskp)(crops_of(frame))
+        value, _ = NetworkLoss(wskp, RelativeLoss())(crops_of(frame))
         value.backward()
         target = frame.direct_reference.mean(dim=1)
         squared = (parameter - target) ** 2 / (guess + 0.01) ** 2
@@ -157,7 +155,7 @@ def test_the_loss_of_a_sequence_by_hand(batch, monkeypatch):
     monkeypatch.setattr(rae, "predict", predict)
     frames = [replace(frame, colour_gain=gain.expand(2, 3, 1, 1)) for frame in batch.frames]
     weights = (0.2, 0.5, 1.0)
-    value, parts = RelativeLoss(rae, RelativeTerms(temporal=0.7, frames=weights))(Batch(frames))
+    value, parts = NetworkLoss(rae, RelativeLoss(temporal=0.7, frames=weights))(Batch(frames))
 
     spatial = []
     temporal = []
@@ -189,7 +187,7 @@ def test_what_ntd_makes_negative_still_learns(monkeypatch):
     """The error is that of the output below 0; the scale that divides it is that of what is shown."""
     frame = noisy_frame(0.1)
     wskp, parameter = constant_wskp(monkeypatch, -0.01)  # where f + epsilon would be 0
-    value, _ = RelativeLoss(wskp)(crops_of(frame))
+    value, _ = NetworkLoss(wskp, RelativeLoss())(crops_of(frame))
     value.backward()
     assert value.item() == pytest.approx((0.31 / 0.01) ** 2, rel=0.01) and parameter.grad < 0
 
@@ -199,6 +197,6 @@ def test_what_ntd_makes_negative_still_learns(monkeypatch):
 )
 def test_a_training_by_it_ends_with_weights(tiny, tmp_path, name):
     changes = {"crops": (2, 1)} if name == "wskp6" else {}
-    recipe: dict[str, object] = {"epochs": 1, "loss": RelativeTerms(), "clip": 1.0, **changes}
+    recipe: dict[str, object] = {"epochs": 1, "loss": RelativeLoss(), "clip": 1.0, **changes}
     weights = train_network(short_task(name, tiny, tmp_path, **recipe))
     assert all(torch.isfinite(tensor).all() for tensor in tensors(weights).values())

@@ -149,7 +149,7 @@ def test_where_all_varies_nothing_is_left_out(capsys, tiny, tmp_path):
     special = Training(short("wskp6", tiny, tmp_path / "special", specialised=True))
     assert special.facts == general.facts and special.judged.denoiser.constants == {}
     train_network(short("wskp6", tiny, tmp_path / "special", specialised=True))
-    assert "left out nothing: all that it sees varies" in capsys.readouterr().out
+    assert "left out nothing: all of its inputs vary" in capsys.readouterr().out
 
 
 def test_what_needs_all_of_its_inputs_is_not_specialised(tiny, tmp_path):

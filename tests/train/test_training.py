@@ -11,8 +11,8 @@ from errors import BadInput
 from tests.helpers.training import full_disk, short_task
 from train.checkpoint import CHECKPOINT_FILE
 from train.loop import train_network
-from train.losses.rae import RAELoss
-from train.training import BEST_FILE, MOST_SKIPPED_IN_A_ROW, Training
+from train.losses.network_loss import NetworkLoss
+from train.training import BEST_FILE, MAX_SKIPPED_IN_A_ROW, Training
 
 
 def test_gradients_of_parts_add_up_to_those_of_the_batch(tiny, tmp_path):
@@ -46,7 +46,7 @@ def test_what_cannot_be_trained_with_is_refused_before_anything_is_written(tiny,
 
 
 def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monkeypatch):
-    genuine = RAELoss.forward
+    genuine = NetworkLoss.forward
     finite = [True, False, True]  # whether the loss of each step is; the last is of all that follow
 
     def forward(self, batch):
@@ -54,7 +54,7 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monke
         keep = finite.pop(0) if len(finite) > 1 else finite[0]
         return (value if keep else value * math.nan), parts
 
-    monkeypatch.setattr(RAELoss, "forward", forward)
+    monkeypatch.setattr(NetworkLoss, "forward", forward)
     training = Training(short_task("rae", tiny, tmp_path, epochs=2))
     steps = training.steps()
     next(steps)
@@ -96,15 +96,15 @@ def test_a_loss_that_is_not_finite_is_never_the_best(tiny, tmp_path):
 
 
 def test_a_training_that_only_skips_is_refused(tiny, tmp_path, monkeypatch):
-    genuine = RAELoss.forward
+    genuine = NetworkLoss.forward
 
     def forward(self, batch):
         value, parts = genuine(self, batch)
         return value * math.nan, parts
 
-    monkeypatch.setattr(RAELoss, "forward", forward)
+    monkeypatch.setattr(NetworkLoss, "forward", forward)
     training = Training(short_task("rae", tiny, tmp_path, epochs=2))
-    training.position.skipped_in_a_row = MOST_SKIPPED_IN_A_ROW - 2
+    training.position.skipped_in_a_row = MAX_SKIPPED_IN_A_ROW - 2
     steps = training.steps()
     next(steps)
     with pytest.raises(BadInput, match=r"not finite in 20 steps in a row.*--precision float32"):

@@ -7,28 +7,27 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.compiled.features import GAMMA
+from datasets.tonemap import DISPLAY_GAMMA
 from models.denoiser import Denoiser
 from train.crops import Crops
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
-from train.losses.outputs import exposed_outputs
+from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
 from train.sequences import Batch
 
-DARKEST = 1e-4  # exposed radiance, below which the curve is no steeper
+TONE_OFFSET = 1e-4  # of exposed radiance: it bounds the slope of the curve at black
 
 
-def cut_tone(radiance: Tensor) -> Tensor:
-    """Exposed radiance as a display shows it, about in [0, 1]; what is brighter than white is cut."""
-    return (radiance.clamp(0, 1) + DARKEST) ** (1 / GAMMA)
+def clipped_tone(radiance: Tensor) -> Tensor:
+    """Exposed radiance as a display shows it, about in [0, 1]; what is brighter than white is clipped."""
+    return (radiance.clamp(0, 1) + TONE_OFFSET) ** (1 / DISPLAY_GAMMA)
 
 
 def tone(radiance: Tensor) -> Tensor:
-    """The same, but what is brighter than white goes on as its logarithm."""
-    return cut_tone(radiance) + torch.log(radiance.clamp(min=1)) / GAMMA
+    """The same, but radiance above white continues as its logarithm."""
+    return clipped_tone(radiance) + torch.log(radiance.clamp(min=1)) / DISPLAY_GAMMA
 
 
-def shrunk(radiance: Tensor, surface: Tensor, scale: int) -> tuple[Tensor, Tensor]:
-    """The means over the surfaces in blocks of scale x scale pixels (B, 3, h, w), and where there are any."""
+def block_means(radiance: Tensor, surface: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+    """The means over the surfaces in blocks of scale x scale pixels (B, 3, h, w), and the share of surfaces there."""
     if scale == 1:
         return radiance, surface
     share = F.avg_pool2d(surface, scale, ceil_mode=True)
@@ -42,43 +41,31 @@ def sum_of_scales(errors: Sequence[Tensor], shares: Sequence[Tensor]) -> Tensor:
 
 
 @dataclass(frozen=True)
-class DisplayedTerms(LossTerms):
-    """The weight of what changes, and the scales in pixels, the first of them 1.
+class DisplayedLoss(Loss):
+    """L1 of what is displayed, and of its changes, at each scale. For any network, which sets the exposure.
 
     A network that is only compared pixel by pixel to noisy references learns their median, which is too dark where
     light is rare. Means over blocks have hardly any noise left: they keep the energy, and they are where blotches show.
     """
 
-    temporal: float = 0.25  # where there are sequences
-    scales: tuple[int, ...] = (1, 4, 16)
-
-    def around(self, denoiser: Denoiser) -> "DisplayedLoss":
-        return DisplayedLoss(denoiser, self)
-
-
-class DisplayedLoss(NetworkLoss):
-    """L1 of what is displayed, and of its changes, at each scale. For any network, which sets the exposure."""
-
-    def __init__(self, denoiser: Denoiser, terms: DisplayedTerms | None = None):
-        super().__init__()
-        self.denoiser = denoiser
-        self.terms = terms or DisplayedTerms()
+    temporal: float = 0.25  # weight of what changes, where there are sequences
+    scales: tuple[int, ...] = (1, 4, 16)  # pixels, the first of them 1
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Output minus target (B, 3, H, W) as displayed, 0 off surfaces; where these are: in blocks of each scale."""
-        found = []
-        for scale in self.terms.scales:
-            shown, share = shrunk(output, surface, scale)
-            error = tone(shown) - tone(shrunk(target, surface, scale)[0])
-            found.append((torch.where(share > 0, error, 0), share))
-        return found
+        """Output minus target (B, 3, H, W) as displayed, 0 off surfaces, and their share in blocks of each scale."""
+        errors = []
+        for scale in self.scales:
+            mean, share = block_means(output, surface, scale)
+            error = tone(mean) - tone(block_means(target, surface, scale)[0])
+            errors.append((torch.where(share > 0, error, 0), share))
+        return errors
 
-    def forward(self, batch: Batch | Crops) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Sequence[Tensor] = ()  # the last frame's errors
-        for frame, output, exposure in exposed_outputs(self.denoiser, batch):
-            target = exposure * frame.reference_buffers(self.denoiser.signal).mean(dim=1)
+        for frame, output, exposure in exposed_outputs(network, batch):
+            target = exposure * frame.reference_buffers(network.signal).mean(dim=1)
             errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
             spatial.append(sum_of_scales(errors, shares))
             if before:
@@ -88,5 +75,5 @@ class DisplayedLoss(NetworkLoss):
         loss = parts["spatial"]
         if temporal:
             parts["temporal"] = torch.stack(temporal).mean()
-            loss = loss + self.terms.temporal * parts["temporal"]
-        return loss, {name: part.detach() for name, part in parts.items()}
+            loss = loss + self.temporal * parts["temporal"]
+        return loss, parts

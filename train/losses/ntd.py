@@ -6,36 +6,23 @@ import torch
 from torch import Tensor
 
 from datasets.frame import disoccluded
-from models.denoiser import Denoiser, State
-from models.networks.ntd import NTD
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from models.denoiser import Denoiser
+from train.crops import Crops
+from train.losses.network_loss import Loss, Parts, predictions, surface_mean
+from train.protocols import CompressingNetwork
 from train.sequences import Batch
 
-FEWEST_OCCLUDED = 1e-3  # share of a sequence's pixels: the mean over fewer would be noise, and is that share of them
-
-
-@dataclass(frozen=True)
-class NTDTerms(LossTerms):
-    """The three equal parts of the loss of NTD §5, Eq. 6."""
-
-    spatial: float = 1.0  # L_spat
-    temporal: float = 1.0  # L_temp
-    occlusion: float = 1.0  # L_occ
-    masks: tuple[float, ...] = (1.0, 0.8, 0.6)  # w^0, w^1, w^2 of §4.4
-    occlusion_start: float = 0.5  # of the epochs: L_occ joins for the last 100 of 200
-
-    def around(self, denoiser: Denoiser) -> "NTDLoss":
-        assert isinstance(denoiser, NTD)
-        return NTDLoss(denoiser, self)
+MIN_OCCLUDED = 1e-3  # share of a sequence's pixels: the mean over fewer would be noise, and is that share of them
 
 
 def masked_mean(values: Tensor, masks: Tensor) -> Tensor:
     """Mean of `values` (B, 3 F, H, W) over the pixels where `masks` (B, F, H, W) is not 0; items count the same."""
-    count = (masks > 0).sum(dim=(1, 2, 3)).clamp(min=FEWEST_OCCLUDED * masks[0].numel())
+    count = (masks > 0).sum(dim=(1, 2, 3)).clamp(min=MIN_OCCLUDED * masks[0].numel())
     return (values.sum(dim=(1, 2, 3)) / (3 * count)).mean()
 
 
-class NTDLoss(NetworkLoss):
+@dataclass(frozen=True)
+class NTDLoss(Loss):
     """Spatial L1 + temporal L1 + motion occlusion L1 (NTD Eq. 5, 6), means over frames, in the space of `compress`.
 
     "They are all L1 loss and have equal weight" (§5): the occlusion loss is the mean over the pixels of a sequence that
@@ -45,43 +32,41 @@ class NTDLoss(NetworkLoss):
     weights of all of it are comparable.
     """
 
-    def __init__(self, denoiser: NTD, terms: NTDTerms | None = None):
-        super().__init__()
-        self.denoiser: NTD = denoiser
-        self.terms = terms or NTDTerms()
+    spatial: float = 1.0  # L_spat
+    temporal: float = 1.0  # L_temp
+    occlusion: float = 1.0  # L_occ
+    masks: tuple[float, ...] = (1.0, 0.8, 0.6)  # w^0, w^1, w^2 of §4.4
+    occlusion_start: float = 0.5  # of the epochs: L_occ joins for the last 100 of 200
 
-    def masks(self, hidden: list[Tensor]) -> Tensor:
+    def mask(self, hidden: list[Tensor]) -> Tensor:
         """Sum of w^k M_{i-k} over k (Eq. 5), (B, 1, H, W).
 
         `hidden` has the masks M (B, 1, H, W) up to this frame's, the newest last. Frames before the first count as
         this one (§4.4).
         """
         return torch.stack(
-            [w * hidden[-1 - k if k < len(hidden) else -1].float() for k, w in enumerate(self.terms.masks)]
+            [w * hidden[-1 - k if k < len(hidden) else -1].float() for k, w in enumerate(self.masks)]
         ).sum(dim=0)
 
-    def forward(self, batch: Batch) -> tuple[Tensor, Parts]:
-        terms = self.terms
-        denoiser = self.denoiser
+    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+        assert isinstance(network, CompressingNetwork)
         hidden: list[Tensor] = []
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         occluded: list[Tensor] = []
         masks: list[Tensor] = []
-        state: State | None = None
         before: Tensor | None = None  # the error of the frame before
-        for frame in batch.frames:
-            irradiance, state = denoiser.predict(frame, state)
-            images = (irradiance, frame.reference_irradiance(denoiser.signal))
-            output, target = (denoiser.compress(image, state.scale, frame) for image in images)
+        for frame, irradiance, scale in predictions(network, batch):
+            images = (irradiance, frame.reference_irradiance(network.signal))
+            output, target = (network.compress(image, scale, frame) for image in images)
             error = torch.where(frame.depth > 0, output - target, 0)
             spatial.append(surface_mean(error.abs(), frame.depth))
             if before is not None:
                 temporal.append(surface_mean((error - before).abs(), frame.depth))
             before = error
-            if terms.occlusion:
+            if self.occlusion:
                 hidden.append(disoccluded(frame.motion, frame.dual_motion))
-                masks.append(self.masks(hidden))
+                masks.append(self.mask(hidden))
                 occluded.append(error.abs() * masks[-1])
         nothing = error.new_zeros(())
         parts = {
@@ -89,7 +74,6 @@ class NTDLoss(NetworkLoss):
             "temporal": torch.stack(temporal).mean() if temporal else nothing,
             "occlusion": masked_mean(torch.cat(occluded, dim=1), torch.cat(masks, dim=1)) if masks else nothing,
         }
-        starts = not self.training or self.progress >= terms.occlusion_start
-        weights = {"spatial": terms.spatial, "temporal": terms.temporal, "occlusion": terms.occlusion * starts}
-        loss = torch.stack([weights[name] * part for name, part in parts.items() if weights[name]]).sum()
-        return loss, {name: part.detach() for name, part in parts.items()}
+        starts = progress >= self.occlusion_start
+        weights = {"spatial": self.spatial, "temporal": self.temporal, "occlusion": self.occlusion * starts}
+        return torch.stack([weights[name] * part for name, part in parts.items() if weights[name]]).sum(), parts

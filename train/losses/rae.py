@@ -1,14 +1,16 @@
 """The loss of RAE."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.denoiser import Denoiser, State
-from models.networks.rae import RAE
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from models.denoiser import Denoiser
+from train.crops import Crops
+from train.losses.network_loss import Loss, Parts, predictions, surface_mean
+from train.protocols import CompressingNetwork
 from train.sequences import Batch
 
 
@@ -21,21 +23,23 @@ def laplacian_of_gaussian(sigma: float = 1.5, size: int = 15) -> Tensor:
     return kernel - kernel.mean()
 
 
+@cache
+def edge_kernel(device: torch.device) -> Tensor:
+    """LoG of norm 1, for a convolution of three channels each by itself, (3, 1, 15, 15)."""
+    kernel = laplacian_of_gaussian()
+    return (kernel / kernel.norm()).float().repeat(3, 1, 1, 1).to(device)
+
+
+def edges(x: Tensor) -> Tensor:
+    """LoG, of norm 1, of each of the three channels of x (B, 3, H, W), borders replicated, in full precision."""
+    with torch.autocast(x.device.type, enabled=False):
+        kernel = edge_kernel(x.device)
+        margin = kernel.shape[-1] // 2
+        return F.conv2d(F.pad(x, (margin,) * 4, mode="replicate"), kernel, groups=3)
+
+
 @dataclass(frozen=True)
-class RAETerms(LossTerms):
-    """Weights of the loss of RAE §4.4."""
-
-    spatial: float = 0.8  # w_s
-    gradient: float = 0.1  # w_g
-    temporal: float = 0.1  # w_t
-    frames: tuple[float, ...] = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)  # of a sequence, a Gaussian
-
-    def around(self, denoiser: Denoiser) -> "RAELoss":
-        assert isinstance(denoiser, RAE)
-        return RAELoss(denoiser, self)
-
-
-class RAELoss(NetworkLoss):
+class RAELoss(Loss):
     """0.8 spatial L1 + 0.1 HFEN + 0.1 temporal L1, later frames weighted more (RAE §4.4).
 
     All in the space of the network: raw output p against (gain · exposure · irradiance)^0.2 of the reference.
@@ -44,36 +48,23 @@ class RAELoss(NetworkLoss):
     has the norm 1: of errors that differ from pixel to pixel like white noise, HFEN is then as large as L1.
     """
 
-    kernel: Tensor
+    spatial: float = 0.8  # w_s
+    gradient: float = 0.1  # w_g
+    temporal: float = 0.1  # w_t
+    frames: tuple[float, ...] = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)  # of a sequence, a Gaussian
 
-    def __init__(self, denoiser: RAE, terms: RAETerms | None = None):
-        super().__init__()
-        self.denoiser: RAE = denoiser
-        self.terms = terms or RAETerms()
-        kernel = laplacian_of_gaussian()
-        self.register_buffer("kernel", (kernel / kernel.norm()).float().repeat(3, 1, 1, 1), persistent=False)
-
-    def edges(self, x: Tensor) -> Tensor:
-        """LoG, of norm 1, of each of the three channels of x (B, 3, H, W), borders replicated, in full precision."""
-        with torch.autocast(x.device.type, enabled=False):
-            margin = self.kernel.shape[-1] // 2
-            return F.conv2d(F.pad(x, (margin,) * 4, mode="replicate"), self.kernel, groups=3)
-
-    def forward(self, batch: Batch) -> tuple[Tensor, Parts]:
-        terms = self.terms
-        parts = {name: batch.frames[0].albedo.new_zeros(()) for name in ("spatial", "gradient", "temporal")}
-        state: State | None = None
+    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+        assert isinstance(network, CompressingNetwork)
+        parts: Parts = {}
         before: Tensor | None = None  # the error of the frame before
-        for frame, weight in zip(batch.frames, terms.frames, strict=True):
-            p, state = self.denoiser.predict(frame, state)
-            target = self.denoiser.compress(self.denoiser.target(frame), state.scale, frame)
+        for (frame, p, scale), weight in zip(predictions(network, batch), self.frames, strict=True):
+            target = network.compress(frame.reference_irradiance(network.signal), scale, frame)
             error = torch.where(frame.depth > 0, p - target, 0)
-            errors = {"spatial": error, "gradient": self.edges(error)}
+            errors = {"spatial": error, "gradient": edges(error)}
             if before is not None:  # |dP/dt - dT/dt| is the change of the error
                 errors["temporal"] = error - before
             for name, each in errors.items():
-                parts[name] = parts[name] + weight * surface_mean(each.abs(), frame.depth)
+                parts[name] = parts.get(name, error.new_zeros(())) + weight * surface_mean(each.abs(), frame.depth)
             before = error
-        weights = {"spatial": terms.spatial, "gradient": terms.gradient, "temporal": terms.temporal}
-        loss = torch.stack([weights[name] * part for name, part in parts.items()]).sum()
-        return loss, {name: part.detach() for name, part in parts.items()}
+        weights = {"spatial": self.spatial, "gradient": self.gradient, "temporal": self.temporal}
+        return torch.stack([weights[name] * part for name, part in parts.items()]).sum(), parts

@@ -1,13 +1,15 @@
-"""The loss of WSKP."""
+"""The losses of networks that filter accumulated crops: those of WSKP and of NBGD."""
 
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from models.networks.wskp import KernelPredictor
 from train.crops import Crops
-from train.losses.network_loss import LossTerms, NetworkLoss, Parts, surface_mean
+from train.losses.displayed import clipped_tone
+from train.losses.network_loss import Loss, Parts, surface_mean
+from train.protocols import FilteringNetwork
+from train.sequences import Batch
 
 
 def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
@@ -15,38 +17,37 @@ def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
     return (x - reference).abs() / (x.abs() + reference.abs() + epsilon)
 
 
-def exposed_images(denoiser: KernelPredictor, crops: Crops) -> tuple[Tensor, Tensor]:
-    """What a network makes of accumulated crops and the reference, as exposed radiance, emission included."""
-    signal = denoiser.signal
-    frame = crops.frame
-    filtered, _ = denoiser.filter(frame, crops.irradiance, crops.scale)
-    exposure = crops.scale.exposure()
-    output, reference = (frame.remodulate(image, signal) for image in (filtered, frame.reference_irradiance(signal)))
-    return exposure * output, exposure * reference
+@dataclass(frozen=True)
+class CropLoss(Loss):
+    """The mean `error` of radiance, emission included, scaled by the causal exposure."""
+
+    def error(self, output: Tensor, reference: Tensor) -> Tensor:
+        """Of every pixel and channel (B, 3, H, W), of exposed radiance."""
+        raise NotImplementedError
+
+    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+        assert isinstance(network, FilteringNetwork) and isinstance(batch, Crops)
+        frame = batch.frame
+        filtered, _ = network.filter(frame, batch.irradiance, batch.scale)
+        exposure = batch.scale.exposure()
+        images = (filtered, frame.reference_irradiance(network.signal))
+        output, reference = (exposure * frame.remodulate(image, network.signal) for image in images)
+        return surface_mean(self.error(output, reference), frame.depth), {}
 
 
 @dataclass(frozen=True)
-class SMAPETerms(LossTerms):
-    """The loss of WSKP §5.2, Eq. 6."""
+class SMAPELoss(CropLoss):
+    """SMAPE of HDR radiance (WSKP §5.2, Eq. 6). By the exposure, epsilon means the same in whatever units are used."""
 
     epsilon: float = 0.01
 
-    def around(self, denoiser: Denoiser) -> "SMAPELoss":
-        assert isinstance(denoiser, KernelPredictor)
-        return SMAPELoss(denoiser, self)
+    def error(self, output: Tensor, reference: Tensor) -> Tensor:
+        return smape(output, reference, self.epsilon)
 
 
-class SMAPELoss(NetworkLoss):
-    """SMAPE of HDR radiance (WSKP §5.2), emission included.
+@dataclass(frozen=True)
+class NBGDLoss(CropLoss):
+    """L1 of radiance as displayed, clipped at white (Meng et al. 2020), whose authors' renderings come exposed."""
 
-    Radiance is scaled by the causal exposure, so that epsilon means the same in whatever units a scene is lit.
-    """
-
-    def __init__(self, denoiser: KernelPredictor, terms: SMAPETerms | None = None):
-        super().__init__()
-        self.denoiser: KernelPredictor = denoiser
-        self.terms = terms or SMAPETerms()
-
-    def forward(self, batch: Crops) -> tuple[Tensor, Parts]:
-        output, reference = exposed_images(self.denoiser, batch)
-        return surface_mean(smape(output, reference, self.terms.epsilon), batch.frame.depth), {}
+    def error(self, output: Tensor, reference: Tensor) -> Tensor:
+        return (clipped_tone(output) - clipped_tone(reference)).abs()
