@@ -127,7 +127,8 @@ def train(
     folder = data_folder(data, budget)
     for name in names or trained_by_default(budget):
         start = start_file(name, from_)
-        train_network(task_for(name, folder, runs, budget, seed, precision, micro_batch, start, specialise))
+        task = replace(task_for(name, folder, runs, budget), seed=seed, precision=precision, start=start)
+        train_network(replace(task, micro_batch=micro_batch, specialised=specialise))
 
 
 def evaluate(

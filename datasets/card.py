@@ -13,17 +13,17 @@ from files import write_file
 
 CARD_FILE = "card.json"
 PAGE_FILE = "README.md"
-LICENCE = "CC0-1.0"  # of scenes built in
-LICENCE_OF_OTHERS = "that of its scene file"
+LICENCE = "CC0-1.0"  # of built-in scenes
+OTHER_LICENCE = "that of its scene file"
 
 PAGE = """# {profile}, seed {seed}
 
-{clips} clips of animated scenes, rendered for denoising: noisy frames with few samples a pixel, references in two
-independent halves, and what the primary rays see (albedo, normals, depth, motion, cameras). {bytes} bytes. `card.json`
-has all of this page for programs.
+{clips} clips of animated scenes, rendered for denoising: noisy frames with few samples per pixel, references in two
+independent sample buffers, and what the primary rays hit (albedo, normals, depth, motion, cameras). {bytes} bytes.
+`card.json` has all of this page for programs.
 
 - Made by `{command}`, with {versions}; generator version {generator}.{reads}
-- Options of rendering: {options}.
+- Rendering options: {options}.
 - Licence: {licence}.{notes}
 
 ## Splits
@@ -36,32 +36,32 @@ has all of this page for programs.
 
 {channels}
 
-Clips in which mirrors are seen have `mirrored_albedo` and so on besides: the same channels of what the mirrors show.
+Clips in which mirrors are visible also have `mirrored_albedo` and so on: the same channels of what the mirrors show.
 
-Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or follows
+Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or derived
 from others: `clip.json` of each clip.
 
 ## Clips
 
 {rows}
 
-*crc32* is the checksum of the clip's `clip.json`, which holds those of all channels.
+*crc32* is the checksum of the clip's `clip.json`, which contains those of all channels.
 """
 
 
 def write_card(dataset: Dataset) -> None:
-    """Write the card of a data set into its folder, where all its clips are there and it is not written already."""
+    """Write the card of a data set into its folder, if all its clips are there and it is not written already."""
     if not all(map(is_clip, dataset.planned())):
         return
     card = card_of(dataset)
-    for name, text in ((CARD_FILE, card_text(card)), (PAGE_FILE, page_of(card))):
+    for name, text in ((CARD_FILE, json.dumps(card, indent=1) + "\n"), (PAGE_FILE, page_of(card))):
         path = dataset.path / name
         if not path.exists() or path.read_bytes() != text.encode():
             write_file(path, text.encode())
 
 
 def card_of(dataset: Dataset) -> dict[str, Any]:
-    """The card as JSON holds it. It follows from the data alone: the same data set has the same card anywhere.
+    """The card, for JSON. It follows from the data alone: the same data set has the same card anywhere.
 
     Raises BadInput where a clip is missing or damaged.
     """
@@ -75,9 +75,9 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
         "generator": facts["generator"],
         "versions": facts["versions"],
         "options": facts["options"],
-        "licence": LICENCE_OF_OTHERS if facts.get("source") else LICENCE,
-        "source": {Path(path).name: crc32 for path, crc32 in facts.get("source", {}).items()},
-        "notes": facts.get("notes", []),
+        "licence": OTHER_LICENCE if facts["source"] else LICENCE,
+        "source": {Path(path).name: crc32 for path, crc32 in facts["source"].items()},
+        "notes": facts["notes"],
         "scenes": facts["scenes"],
         "bytes": sum(clip["bytes"] for clip in clips.values()),
         "splits": {split: split_facts([clips[f"{split}/{name}"] for name in facts["splits"][split]]) for split in used},
@@ -95,14 +95,14 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
 
 
 def command_of(facts: dict[str, Any]) -> str:
-    """What renders such a data set, given what dataset.json says of it."""
+    """The command that renders such a data set, from the facts in dataset.json."""
     options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
-    what = f"--scene {Path(facts['profile']).name}" if facts.get("source") else f"--profile {facts['profile']}"
+    what = f"--scene {Path(facts['profile']).name}" if facts["source"] else f"--profile {facts['profile']}"
     return f"onespp dataset {what} --seed {facts['seed']}{options}"
 
 
 def clip_facts(clip: Clip) -> dict[str, Any]:
-    """What the card says of a clip; the keys are the columns of the page too."""
+    """A clip on the card; the keys are also the columns of the page."""
     stored = [clip.path / entry["file"] for entry in clip.channels.values() if "file" in entry]
     return {
         "frames": clip.frames,
@@ -118,7 +118,7 @@ def clip_facts(clip: Clip) -> dict[str, Any]:
 
 
 def split_facts(clips: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the card says of a split, from its clips."""
+    """A split on the card, from its clips."""
     floors = [clip["floor_db"] for clip in clips]
     return {
         "clips": len(clips),
@@ -126,10 +126,6 @@ def split_facts(clips: list[dict[str, Any]]) -> dict[str, Any]:
         "floor_db": round(sum(floors) / len(floors), 2),
         "worst_floor_db": min(floors),
     }
-
-
-def card_text(card: dict[str, Any]) -> str:
-    return json.dumps(card, indent=1) + "\n"
 
 
 def page_of(card: dict[str, Any]) -> str:

@@ -5,11 +5,11 @@ from typing import Literal
 
 Kind = Literal[
     "noisy",  # radiance of the noisy samples
-    "buffers",  # the same radiance as two independent sample buffers, A and B; stored on request
-    "reference",  # the same radiance with many samples, also as two buffers
+    "buffers",  # the same as two independent sample buffers, A and B; stored on request
+    "reference",  # the same with many samples, also in two buffers
     "emission",  # radiance without noise
     "surface",  # what a primary ray hits
-    "mirrored",  # a surface channel, of what mirrors show; stored where a mirror is in view
+    "mirrored",  # a surface channel or motion, of what mirrors show; stored where a mirror is in view
     "motion",  # vectors to the frame before
     "gradient",  # how light has changed since the frame before
     "hit",  # means over those of the noisy samples that hit something; 0 where none did
@@ -23,11 +23,9 @@ class Channel:
 
     Attributes:
         axes: F frames, S noise realisations, H rows, W columns and M meshes; a number is the length of its own axis.
-        dtype: as stored.
-        unit: of its numbers.
+        dtype: as stored; float32 instead, if it `widens`, where float16 would lose precision.
         letters: of its components in EXR layers.
         of: the channel that this is another form of, for buffers, references and mirrored channels.
-        widens: whether it is stored as float32 where float16 would lose precision.
         essential: whether it is rendered whatever denoisers read.
         step: the optional step of rendering that makes it.
         renderer_only: whether no other renderer writes it, and nothing else can take its place.
@@ -45,11 +43,6 @@ class Channel:
     step: str | None = None
     renderer_only: bool = False
     is_camera_motion: bool = False
-
-    @property
-    def components(self) -> int:
-        """Numbers per pixel of a channel that is an image."""
-        return len(self.letters)
 
     @property
     def is_image(self) -> bool:
@@ -81,42 +74,44 @@ LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (I
 STRATUM = 3  # px, the side of the squares of which each has one sample of the channel gradient
 ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
-REALISATIONS = ("F", "S", "H", "W")
 IMAGES = ("F", "H", "W")
-
-NOISY_ROW = Channel("noisy", (*REALISATIONS, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True)
-BUFFERS_ROW = replace(NOISY_ROW, kind="buffers", axes=("F", "S", 2, "H", "W", 3), essential=False)
-REFERENCE_ROW = replace(NOISY_ROW, kind="reference", axes=("F", 2, "H", "W", 3))
-MOTION_ROW = Channel("motion", (*IMAGES, 2), "<f4", "px", "XY")
-TRACKED_ROW = replace(MOTION_ROW, step="shadow_motion", renderer_only=True)  # of what causes a pixel's light
-HIT_ROW = Channel("hit", (*REALISATIONS, 1), "<f2", LENGTH, "Z", widens=True, step="hit_distance", renderer_only=True)
+REALISATIONS = ("F", "S", "H", "W")
+NOISY = Channel("noisy", (*REALISATIONS, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True)
+BUFFERS = replace(NOISY, kind="buffers", axes=("F", "S", 2, "H", "W", 3), essential=False)
+REFERENCE = replace(NOISY, kind="reference", axes=("F", 2, "H", "W", 3))
+MOTION = Channel("motion", (*IMAGES, 2), "<f4", "px", "XY")
+TRACKED = replace(MOTION, step="shadow_motion", renderer_only=True)  # motion of what causes a pixel's light
+HIT = Channel("hit", (*REALISATIONS, 1), "<f2", LENGTH, "Z", widens=True, step="hit_distance", renderer_only=True)
 
 CHANNELS: dict[str, Channel] = {
-    "direct": NOISY_ROW,
-    "indirect": NOISY_ROW,
-    "direct_halves": replace(BUFFERS_ROW, of="direct"),
-    "indirect_halves": replace(BUFFERS_ROW, of="indirect"),
-    "direct_reference": replace(REFERENCE_ROW, of="direct"),
-    "indirect_reference": replace(REFERENCE_ROW, of="indirect"),
+    "direct": NOISY,
+    "indirect": NOISY,
+    "direct_halves": replace(BUFFERS, of="direct"),
+    "indirect_halves": replace(BUFFERS, of="indirect"),
+    "direct_reference": replace(REFERENCE, of="direct"),
+    "indirect_reference": replace(REFERENCE, of="indirect"),
     "emission": Channel("emission", (*IMAGES, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True),
     "albedo": Channel("surface", (*IMAGES, 3), "<f2", "1", "RGB", essential=True),
     "normal": Channel("surface", (*IMAGES, 3), "<f2", "1", "XYZ"),
     "depth": Channel("surface", (*IMAGES, 1), "<f4", LENGTH, "Z", essential=True),
     "roughness": Channel("surface", (*IMAGES, 1), "<f2", "GGX alpha", "Y"),
     "mesh_id": Channel("surface", (*IMAGES, 1), "<u2", "index", "I", essential=True),
-    "motion": replace(MOTION_ROW, is_camera_motion=True),
-    "dual_motion": replace(MOTION_ROW, step="dual_motion"),
-    "shadow_motion": replace(TRACKED_ROW, is_camera_motion=True),
-    "reflection_motion": TRACKED_ROW,
-    "gradient": Channel(
-        "gradient", (*IMAGES, 2), "<f2", RADIANCE, "XY", widens=True, step="gradient", renderer_only=True
-    ),
-    "hit_distance": replace(HIT_ROW, axes=(*REALISATIONS, 2), letters="XY"),
-    "light_distance": HIT_ROW,
-    "light_angle": replace(HIT_ROW, unit="rad", letters="Y"),
+    "motion": replace(MOTION, is_camera_motion=True),
+    "dual_motion": replace(MOTION, step="dual_motion"),
+    "shadow_motion": replace(TRACKED, is_camera_motion=True),
+    "reflection_motion": TRACKED,
+    "gradient": replace(TRACKED, kind="gradient", dtype="<f2", unit=RADIANCE, widens=True, step="gradient"),
+    "hit_distance": replace(HIT, axes=(*REALISATIONS, 2), letters="XY"),
+    "light_distance": HIT,
+    "light_angle": replace(HIT, unit="rad", letters="Y"),
     "K": Channel("camera", ("F", 3, 3), "<f8", "px", essential=True),
     "camera_to_world": Channel("camera", ("F", 4, 4), "<f8", LENGTH, essential=True),
     "object_to_world": Channel("camera", ("F", "M", 4, 4), "<f8", LENGTH, essential=True),
+}
+CHANNELS |= {
+    f"mirrored_{name}": replace(channel, kind="mirrored", of=name, essential=False, is_camera_motion=False)
+    for name, channel in CHANNELS.items()
+    if channel.kind == "surface" or name == "motion"
 }
 
 
@@ -130,16 +125,11 @@ def forms_of(kind: Kind) -> dict[str, str]:
     return {str(CHANNELS[name].of): name for name in channels_of(kind)}
 
 
-MIRRORABLE = (*channels_of("surface"), "motion")
-CHANNELS |= {
-    f"mirrored_{name}": replace(CHANNELS[name], kind="mirrored", of=name, essential=False, is_camera_motion=False)
-    for name in MIRRORABLE
-}
-MIRRORED = forms_of("mirrored")
-SAMPLE_BUFFERS = forms_of("buffers")
 NOISY_CHANNELS = channels_of("noisy")
 REFERENCE_CHANNELS = channels_of("reference")
 HIT_CHANNELS = channels_of("hit")
 MOTION_CHANNELS = channels_of("motion")
 CAMERA_CHANNELS = channels_of("camera")
+SAMPLE_BUFFERS = forms_of("buffers")
+MIRRORED = forms_of("mirrored")
 USUAL_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].kind not in ("buffers", "mirrored"))

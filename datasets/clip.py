@@ -39,8 +39,6 @@ class Clip:
     def __init__(self, path: Path):
         self.path = path
         self.facts = read_json(path / "clip.json", FACTS_OF_A_CLIP)
-        if not self.facts["complete"]:
-            raise BadInput(f"{path} is not a complete clip: delete it and rerun `onespp dataset`")
         self.frames: int = self.facts["frames"]
         self.height: int = self.facts["height"]
         self.width: int = self.facts["width"]
@@ -59,7 +57,7 @@ class Clip:
 
     @property
     def fingerprint(self) -> str:
-        """The checksum (crc32, 8 hex digits) of clip.json, which in turn holds those of all channels."""
+        """The checksum (crc32, 8 hex digits) of clip.json, which contains those of all channels."""
         return f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
 
     @property
@@ -76,7 +74,7 @@ class Clip:
     def entry(self, channel: str) -> dict[str, Any]:
         """How a channel is stored, from clip.json. Raises BadInput where the channel was not rendered."""
         if channel not in self.channels:
-            raise BadInput(f"{self.path} holds no '{channel}': it was not rendered; render the data set with it")
+            raise BadInput(f"{self.path} has no '{channel}': it was not rendered; render the data set with it")
         return self.channels[channel]
 
     def map(self, channel: str) -> NDArray[Any]:
@@ -109,7 +107,7 @@ class Clip:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
             buffers = (2,) if spec.has_buffers else ()
             value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
-            return np.broadcast_to(value, (*buffers, *area, spec.components))
+            return np.broadcast_to(value, (*buffers, *area, len(spec.letters)))
         if "derived" in entry:
             return self._motion(self.read, frame, max(frame - 1, 0), window)
         array = self.map(channel)
@@ -142,13 +140,19 @@ class Clip:
         mesh_id = surface("mesh_id", frame, window)[..., 0]
         return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
 
+    def noisy(self, frame: int, realisation: int = 0) -> NDArray[np.float32]:
+        """Noisy radiance (H, W, 3): emission + direct + indirect."""
+        emission, direct, indirect = (
+            self.read(name, frame, realisation=realisation).astype(np.float32) for name in ("emission", *NOISY_CHANNELS)
+        )
+        return emission + direct + indirect
+
     def reference(self, frame: int, signal: Literal["total", "indirect"] = "total") -> NDArray[np.float32]:
         """Both buffers (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone."""
         indirect = self.read("indirect_reference", frame).astype(np.float32)
         if signal == "indirect":
             return indirect
-        direct = self.read("direct_reference", frame).astype(np.float32)
-        emission = self.read("emission", frame).astype(np.float32)
+        direct, emission = (self.read(name, frame).astype(np.float32) for name in ("direct_reference", "emission"))
         return direct + indirect + emission
 
 

@@ -1,4 +1,4 @@
-"""How hard the light of a clip is to reconstruct from one sample a pixel."""
+"""How hard the light of a clip is to reconstruct from one sample per pixel."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.clip import Clip
 from datasets.tonemap import luminance
 
-MOST_MEASURED_FRAMES = 8  # spread evenly over a clip
+MAX_MEASURED_FRAMES = 8  # spread evenly over a clip
 
 
 class Difficulty(NamedTuple):
@@ -26,7 +26,7 @@ class Measure(NamedTuple):
 
     head: str  # of its column in tables
     title: str  # of its histogram
-    lowest: float  # end of the histogram's axis; values below are shown there
+    minimum: float  # of the histogram's axis; smaller values are shown there
 
 
 MEASURES = {  # by field of Difficulty
@@ -38,11 +38,11 @@ MEASURES = {  # by field of Difficulty
 
 
 def difficulty_of_clip(clip: Clip) -> Difficulty:
-    """The mean over up to MOST_MEASURED_FRAMES frames of a clip, in its first noise realisation.
+    """The mean over up to MAX_MEASURED_FRAMES frames of a clip, in its first noise realisation.
 
-    Measures are NaN where a frame shows no surface or no light falls on any.
+    Measures are NaN where a frame shows no surface, or none that is lit.
     """
-    frames = np.unique(np.linspace(0, clip.frames - 1, MOST_MEASURED_FRAMES).round().astype(int))
+    frames = np.unique(np.linspace(0, clip.frames - 1, MAX_MEASURED_FRAMES).round().astype(int))
     with np.errstate(divide="ignore", invalid="ignore"):
         measured = [difficulty_of_frame(clip, int(frame)) for frame in frames]
     return Difficulty(*np.mean(measured, axis=0))
@@ -53,11 +53,11 @@ def difficulty_of_frame(clip: Clip, frame: int) -> Difficulty:
     albedo = np.maximum(clip.read("albedo", frame).astype(np.float64), ALBEDO_FLOOR)
     surface = clip.read("mesh_id", frame)[..., 0] > 0
     if not surface.any():
-        return Difficulty(math.nan, math.nan, math.nan, math.nan)
+        return Difficulty(*[math.nan] * len(MEASURES))
     light = clip.read("direct", frame).astype(np.float64) + clip.read("indirect", frame)
-    light_of_halves = clip.read("direct_reference", frame).astype(np.float64) + clip.read("indirect_reference", frame)
+    buffers = clip.read("direct_reference", frame).astype(np.float64) + clip.read("indirect_reference", frame)
     noisy = luminance(light / albedo)[surface]
-    reference = luminance(light_of_halves / albedo).mean(axis=0)[surface]
+    reference = luminance(buffers / albedo).mean(axis=0)[surface]
     low, high = np.percentile(reference, [5, 95])
     return Difficulty(
         zeros=float((noisy == 0).mean()),

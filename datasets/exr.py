@@ -53,7 +53,7 @@ def write_planes(path: Path, planes: dict[str, NDArray[Any]], attributes: dict[s
 def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     """Write one frame of a clip atomically.
 
-    Layers are all channels that the clip has, in their stored precision, and the noisy beauty image as plain R, G, B
+    Layers are all channels of the clip, in their stored precision, and the noisy beauty image as plain R, G, B
     (float32). The header has `worldToCamera` (for row vectors, in the camera frame of docs/format.md), and the exact
     cameras as JSON in `onespp`.
 
@@ -62,21 +62,16 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     names = [name for name in clip.channels if CHANNELS[name].is_image]
     arrays = {name: clip.read(name, index, realisation=realisation) for name in names}
     planes = {key: plane for name, array in arrays.items() for key, plane in layers_of(name, array).items()}
-    beauty = sum(arrays[name].astype(np.float32) for name in ("emission", "direct", "indirect"))
-    planes |= {c: np.ascontiguousarray(np.asarray(beauty)[..., i]) for i, c in enumerate("RGB")}
+    beauty = clip.noisy(index, realisation)
+    planes |= {c: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate("RGB")}
     view = clip.view(index)
     facts = {
-        "exposure": clip.facts["exposure"],
-        "noisy_spp": clip.facts["noisy_spp"],
-        "reference_spp": clip.facts["reference_spp"],
-        "meshes": clip.facts["meshes"],
+        **{key: clip.facts[key] for key in ("exposure", "noisy_spp", "reference_spp", "meshes")},
         "scene": clip.scene,
         "clip": clip.name,
         "frame": index,
         "realisation": realisation,
-        "K": view.K.tolist(),
-        "camera_to_world": view.camera_to_world.tolist(),
-        "object_to_world": view.object_to_world.tolist(),
+        **{name: matrix.tolist() for name, matrix in view._asdict().items()},
     }
     attributes = {
         "worldToCamera": np.ascontiguousarray(inverse_pose(view.camera_to_world).T, np.float32),
@@ -96,11 +91,11 @@ def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]
             facts = json.loads(file.header()[FACTS_ATTRIBUTE])
     except (RuntimeError, KeyError, ValueError) as error:
         raise BadInput(f"{path} is missing, damaged or not written by onespp ({error})") from None
-    return channels_of(planes), view_of_facts(facts), facts
+    return channels_in(planes), view_of_facts(facts), facts
 
 
-def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Those of our channels, as `Clip.read` returns them, that EXR channels (H, W) hold: the inverse of layers_of."""
+def channels_in(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Those of our channels, as `Clip.read` returns them, that EXR channels (H, W) contain: inverts layers_of."""
     channels: dict[str, NDArray[Any]] = {}
     for name, channel in CHANNELS.items():
         layers = layer_names(name)
@@ -112,7 +107,7 @@ def channels_of(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def view_of_facts(facts: Mapping[str, Any]) -> View:
-    """The exact view that the header's facts hold."""
+    """The exact view in the header's facts."""
     return View._make(np.array(facts[key]) for key in View._fields)
 
 

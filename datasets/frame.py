@@ -40,7 +40,7 @@ class ChannelTensor:
 
 @dataclass(frozen=True)
 class Moment:
-    """What identifies a frame among those of a sequence: its size (B, H, W) and cameras."""
+    """What identifies a frame of a sequence: its size (B, H, W) and cameras."""
 
     shape: tuple[int, int, int]
     cameras: Cameras
@@ -111,19 +111,19 @@ class Frame:
         return self.shape[1:]
 
     def ones(self, components: int) -> Tensor:
-        """Ones (B, components, 1, 1) on the frame's device."""
+        """(B, components, 1, 1)."""
         return next(iter(self.channels.values())).new_ones(self.shape[0], components, 1, 1)
 
     @property
     def moment(self) -> Moment:
-        """What identifies this frame among those of its sequence."""
+        """What identifies this frame in its sequence."""
         return Moment(self.shape, self.now)
 
     def follows(self, moment: Moment) -> bool:
         """Whether this frame comes right after `moment`: it has the same size and its previous cameras are those.
 
-        So a cut needs no flag: the first frame of another shot names other previous cameras. Between two still shots
-        from the same place neither camera nor meshes differ, and a cut goes unnoticed: pass None as the state there.
+        So a cut needs no flag: the first frame of another shot has other previous cameras. Between two still shots from
+        the same place neither camera nor meshes differ, and a cut goes unnoticed: pass None as the state there.
         """
         return moment.shape == self.shape and self.previous.almost_equal(moment.cameras)
 

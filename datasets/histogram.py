@@ -15,9 +15,9 @@ def difficulty_histograms(clips: Sequence[Difficulty]) -> Figure:
     figure, axes = plt.subplots(1, len(MEASURES), figsize=(12, 2.6), layout="constrained")
     for axis, (field, measure) in zip(axes, MEASURES.items(), strict=True):
         values = np.array([getattr(clip, field) for clip in clips])
-        finite = np.maximum(values[np.isfinite(values)], measure.lowest)
-        highest = max(finite.max(initial=measure.lowest), 2 * measure.lowest)
-        edges = np.geomspace(measure.lowest, highest * 1.0001, BINS + 1)
+        finite = np.maximum(values[np.isfinite(values)], measure.minimum)
+        maximum = max(finite.max(initial=measure.minimum), 2 * measure.minimum)
+        edges = np.geomspace(measure.minimum, maximum * 1.0001, BINS + 1)
         axis.hist(finite, edges, color="#4477aa", edgecolor="white")
         axis.set(xscale="log", xlabel=measure.title)
         if len(finite):

@@ -7,31 +7,14 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
 from errors import BadInput
 from files import read_json
 
-# Whatever helps to denoise the noisy channels.
-AUXILIARY_CHANNELS = tuple(
-    name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in (*NOISY_CHANNELS, *REFERENCE_CHANNELS)
-)
 OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))
-CLIP_HEAD = (
-    "clip",
-    "frames",
-    "size",
-    "noisy",
-    "reference spp",
-    "floor dB",
-    "exposure",
-    "bad values",
-    *(measure.head for measure in MEASURES.values()),
-    "MB",
-    "seconds",
-)
 
 SecondsByStep = dict[str, float]
 
@@ -43,27 +26,24 @@ def summarise(root: Path, plot: Path | None = None) -> str:
     Raises BadInput where there is no data set at `root`, or no clip to plot.
     """
     dataset = Dataset(root)
-    rows: list[list[object]] = []
+    rows: list[dict[str, object]] = []
     clips: list[Clip] = []
     difficulties: list[Difficulty] = []
     timings: list[SecondsByStep] = []
     for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
         label = str(path.relative_to(root))
         if not is_clip(path):
-            rows.append([label, "missing"])
+            rows.append({"clip": label, "frames": "missing"})
             continue
-        clip = Clip(path)
-        difficulty = difficulty_of_clip(clip)
-        timing = read_json(path / "timing.json")
-        rows.append(clip_row(label, clip, difficulty, sum(timing.values())))
-        clips.append(clip)
-        difficulties.append(difficulty)
-        timings.append(timing)
+        clips.append(Clip(path))
+        difficulties.append(difficulty_of_clip(clips[-1]))
+        timings.append(read_json(path / "timing.json"))
+        rows.append({"clip": label, **clip_row(clips[-1], difficulties[-1], sum(timings[-1].values()))})
     if plot:
         plot_difficulties(root, difficulties, plot)
     facts = dataset.facts
     title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {megabytes(size_of(root))} MB"
-    parts = [title, tabulate(rows, CLIP_HEAD)]
+    parts = [title, tabulate(rows, "keys")]
     if clips:
         parts += [channel_table(clips), step_table(clips, timings)]
     return "\n\n".join(parts)
@@ -79,40 +59,38 @@ def plot_difficulties(root: Path, difficulties: list[Difficulty], path: Path) ->
     save_figure(path, difficulty_histograms(difficulties))
 
 
-def clip_row(label: str, clip: Clip, difficulty: Difficulty, seconds: float) -> list[object]:
-    """The row of a clip under CLIP_HEAD."""
-    bad_values = sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values())
-    return [
-        label,
-        clip.frames,
-        f"{clip.height}x{clip.width}",
-        clip.realisations,
-        clip.facts["reference_spp"],
-        f"{psnr(clip.facts['floor_mse']):.1f}",
-        f"{clip.exposure:.3g}",
-        bad_values,
-        *(f"{getattr(difficulty, field):.3g}" for field in MEASURES),
-        megabytes(size_of(clip.path)),
-        f"{seconds:.1f}",
-    ]
+def clip_row(clip: Clip, difficulty: Difficulty, seconds: float) -> dict[str, object]:
+    """The row of a clip, by column."""
+    return {
+        "frames": clip.frames,
+        "size": f"{clip.height}x{clip.width}",
+        "noisy": clip.realisations,
+        "reference spp": clip.facts["reference_spp"],
+        "floor dB": f"{psnr(clip.facts['floor_mse']):.1f}",
+        "exposure": f"{clip.exposure:.3g}",
+        "bad values": sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values()),
+        **{measure.head: f"{getattr(difficulty, field):.3g}" for field, measure in MEASURES.items()},
+        "MB": megabytes(size_of(clip.path)),
+        "seconds": f"{seconds:.1f}",
+    }
 
 
 def channel_table(clips: list[Clip]) -> str:
     """How channels are stored, and what that saves."""
     rows: list[list[str]] = []
-    stored: dict[str, int] = {}
-    full: dict[str, int] = {}
-    names = [name for name in CHANNELS if name in USUAL_CHANNELS or any(name in clip.channels for clip in clips)]
-    for name in names:
-        stored[name] = sum(stored_size(clip, name) for clip in clips)
-        full[name] = sum(size_in_full(clip, name) for clip in clips)
+    auxiliary = np.zeros(2, int)  # bytes as stored and in full, of what helps to denoise the noisy channels
+    everything = np.zeros(2, int)
+    for name, channel in CHANNELS.items():
+        if name not in USUAL_CHANNELS and not any(name in clip.channels for clip in clips):
+            continue
+        sizes = np.sum([[stored_size(clip, name), size_in_full(clip, name)] for clip in clips], axis=0)
         kinds = sorted({stored_as(clip, name) for clip in clips})
-        rows.append([name, ", ".join(kinds), megabytes(stored[name]), megabytes(full[name])])
-    for label, summed in (("auxiliary channels", AUXILIARY_CHANNELS), ("all", tuple(names))):
-        total_stored = sum(stored[name] for name in summed)
-        total_full = sum(full[name] for name in summed)
-        share = f"{total_stored / total_full:.0%} of full"
-        rows.append([label, share, megabytes(total_stored), megabytes(total_full)])
+        rows.append([name, ", ".join(kinds), *map(megabytes, sizes)])
+        everything += sizes
+        if name in USUAL_CHANNELS and channel.kind not in ("noisy", "reference", "camera"):
+            auxiliary += sizes
+    for label, sizes in (("auxiliary channels", auxiliary), ("all", everything)):
+        rows.append([label, f"{sizes[0] / sizes[1]:.0%} of full", *map(megabytes, sizes)])
     return tabulate(rows, ["channel", "stored as", "MB", "in full"], disable_numparse=True)
 
 
@@ -138,9 +116,7 @@ def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
 def stored_as(clip: Clip, channel: str) -> str:
     """The data type of a channel that has a file, or else why it has none."""
     entry = clip.channels.get(channel, {})
-    if "file" in entry:
-        return str(entry["dtype"])
-    return next((kind for kind in ("value", "derived") if kind in entry), "not rendered")
+    return str(entry.get("dtype") or next(iter(entry), "not rendered"))
 
 
 def stored_size(clip: Clip, channel: str) -> int:
@@ -151,12 +127,10 @@ def stored_size(clip: Clip, channel: str) -> int:
 
 def size_in_full(clip: Clip, channel: str) -> int:
     """Bytes that a channel would take with all its numbers written out."""
-    entry = clip.channels.get(channel, {})
-    if "file" in entry:
-        return math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize
     meshes = len(clip.facts["meshes"])
     shape = CHANNELS[channel].shape(F=clip.frames, S=clip.realisations, H=clip.height, W=clip.width, M=meshes)
-    return math.prod(shape) * np.dtype(CHANNELS[channel].dtype).itemsize
+    entry = clip.channels.get(channel, {})
+    return math.prod(shape) * np.dtype(entry.get("dtype", CHANNELS[channel].dtype)).itemsize
 
 
 def size_of(path: Path) -> int:

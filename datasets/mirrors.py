@@ -1,4 +1,4 @@
-"""Mirrors as denoisers see them: what a mirror shows, as if it stood behind the mirror."""
+"""Mirrors in the input of denoisers: what a mirror shows, as if it stood behind the mirror."""
 
 from collections.abc import Callable, Container
 from typing import Any

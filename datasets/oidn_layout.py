@@ -23,12 +23,12 @@ TARGET = "reference"  # comes after all numbers
 
 
 def export_dataset(root: Path, out: Path) -> int:
-    """Write all splits of a data set to `out`, or go on with that. Returns how many noisy images there are.
+    """Write all splits of a data set to `out`, or resume that. Returns the number of noisy images.
 
-    Every noise realisation of a frame is a group of its own, SCENE-CLIP-FRAME-REALISATION: a group holds one image for
-    each number of samples. Files that are there are kept. The data set's card tells what the images are of.
+    Every noise realisation of a frame is a group of its own, SCENE-CLIP-FRAME-REALISATION: a group has one image for
+    each number of samples. Files that are there are kept. The data set's card is put beside them.
 
-    Raises BadInput where a clip is missing or damaged, or `out` holds something else.
+    Raises BadInput where a clip is missing or damaged, or `out` contains something else.
     """
     dataset = Dataset(root)
     splits = [split for split, names in dataset.facts["splits"].items() if names]
@@ -46,24 +46,24 @@ def export_dataset(root: Path, out: Path) -> int:
 
 
 def claim_folder(out: Path, dataset: Dataset) -> None:
-    """Put the data set's card into `out`. Raises BadInput where that holds another data set, or something else."""
+    """Put the data set's card into `out`. Raises BadInput where that has another data set, or something else."""
     card = card_of(dataset)
     out.mkdir(parents=True, exist_ok=True)
     if (out / CARD_FILE).exists():
         if read_json(out / CARD_FILE) != card:
-            raise BadInput(f"{out} holds another data set than {dataset.path}: choose another folder or delete it")
+            raise BadInput(f"{out} contains another data set than {dataset.path}: choose another folder or delete it")
     elif any(out.glob("[!.]*")):
-        raise BadInput(f"{out} holds something else than a data set for OIDN: choose an empty or new folder")
+        raise BadInput(f"{out} contains something else than a data set for OIDN: choose an empty or new folder")
     else:
         write_json(out / CARD_FILE, card)
 
 
 def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
-    """Write the noisy image of one realisation with its features, and its reference, unless they are there."""
+    """Write the noisy image of one realisation with its features, and its reference, unless they exist."""
     group = f"{clip.scene}-{clip.name}-{frame:04d}-{realisation}"
     noisy = f"{group}_{clip.facts['noisy_spp']:04d}spp"
     images: dict[str, Callable[[], NDArray[np.generic]]] = {
-        f"{noisy}.hdr": lambda: noisy_radiance(clip, frame, realisation),
+        f"{noisy}.hdr": lambda: clip.noisy(frame, realisation),
         f"{noisy}.alb": lambda: clip.read_visible("albedo", frame),
         f"{noisy}.nrm": lambda: clip.read_visible("normal", frame),
         f"{group}_{TARGET}.hdr": lambda: clip.reference(frame).mean(axis=0),
@@ -73,9 +73,3 @@ def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
         if not path.exists():
             image = read()
             write_planes(path, {c: np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGB")}, {})
-
-
-def noisy_radiance(clip: Clip, frame: int, realisation: int) -> NDArray[np.float32]:
-    """Noisy radiance (H, W, 3): emission + direct + indirect."""
-    parts = (clip.read(name, frame, realisation=realisation) for name in ("emission", "direct", "indirect"))
-    return np.sum([part.astype(np.float32) for part in parts], axis=0, dtype=np.float32)

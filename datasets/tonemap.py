@@ -1,6 +1,6 @@
-"""Exposure and the display transform, for metrics and pictures only: networks never see them.
+"""Exposure and the display transform, for metrics and pictures only: they are no inputs of networks.
 
-Numpy, as data sets and renderers have it; `models.operators.image_luminance` is the luminance of tensors.
+`models.operators.image_luminance` is the luminance of tensors.
 """
 
 import math

@@ -5,44 +5,42 @@ import zlib
 from contextlib import suppress
 from filecmp import cmp
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, REFERENCE_CHANNELS, Channel
+from datasets.channels import CHANNELS, MIRRORED, REFERENCE_CHANNELS
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean
 from files import write_json
 
-HALF_PRECISION = 2.0**-11  # largest relative error of rounding to float16 in its normal range
-
-
-def working_dtype(channel: Channel) -> str:
-    """The precision in which frames are kept until the clip is whole and the precision to store can be decided."""
-    return "<f4" if channel.dtype == "<f2" else channel.dtype
+FLOAT16_ROUNDING = 2.0**-11  # largest relative error of rounding to float16 in its normal range
+FLOAT16_MAX = float(np.finfo(np.float16).max)
 
 
 class RawChannel:
     """The frames of one channel on their way to disk, and what decides how they are stored."""
 
     def __init__(self, folder: Path, name: str):
-        self.name = name
         self.channel = CHANNELS[name]
+        # Until the clip is complete, and the precision to store can be decided:
+        self.working_dtype = np.dtype("<f4" if self.channel.dtype == "<f2" else self.channel.dtype)
         self.path = folder / f"{name}.raw"
         self.file = self.path.open("wb")
         self.frame_shape: tuple[int, ...] = ()
         self.frames = 0
         self.nonfinite = 0
+        self.clamped = 0  # to the range of float16
         self.first_pixel: NDArray[Any] | None = None  # of an image
         self.constant = self.channel.is_image  # whether all pixels so far are equal
-        self.half_loses = False  # whether float16 would lose precision of what widens
+        self.float16_loses = False  # whether float16 would lose precision of what widens
 
     def add(self, array: NDArray[Any]) -> NDArray[Any]:
         """Append one frame, with the channel's axes but F. Non-finite numbers are counted and become 0.
 
         Returns the frame as it was appended.
         """
-        array = np.ascontiguousarray(array, dtype=working_dtype(self.channel))
+        array = np.ascontiguousarray(array, dtype=self.working_dtype)
         if array.dtype.kind == "f":
             finite = np.isfinite(array)
             self.nonfinite += int(array.size - finite.sum())
@@ -54,74 +52,55 @@ class RawChannel:
         if self.channel.widens:
             with np.errstate(over="ignore"):
                 error = np.abs(array.astype("<f2").astype("<f8") - array).sum()
-            self.half_loses |= not error <= HALF_PRECISION * np.abs(array).sum(dtype=np.float64)
+            self.float16_loses |= not error <= FLOAT16_ROUNDING * np.abs(array).sum(dtype=np.float64)
         self.file.write(array.tobytes())
         self.frames += 1
         return array
 
     def read(self, frame: int) -> NDArray[Any]:
         """An appended frame, in working precision."""
-        dtype = np.dtype(working_dtype(self.channel))
         count = int(np.prod(self.frame_shape))
-        return np.fromfile(self.path, dtype, count, offset=frame * count * dtype.itemsize).reshape(self.frame_shape)
+        offset = frame * count * self.working_dtype.itemsize
+        return np.fromfile(self.path, self.working_dtype, count, offset=offset).reshape(self.frame_shape)
 
-    def storage_dtype(self) -> str:
-        """float32 for what widens, where float16 would round some frame worse than it rounds normal numbers."""
-        return "<f4" if self.half_loses else self.channel.dtype
+    def finish(self, derived: str | None) -> dict[str, Any]:
+        """Write the final file where one is needed. Returns the entry of clip.json.
 
-    def finish(self, derived: str | None) -> tuple[dict[str, Any], int]:
-        """Write the final file where one is needed; `derived` says what the channel is derived from, if it is.
-
-        Returns the entry of clip.json and how many numbers were clamped.
+        `derived` names what readers derive the channel from, if they do.
         """
-        dtype = self.storage_dtype()
+        dtype = "<f4" if self.float16_loses else self.channel.dtype
         if derived:
             entry: dict[str, Any] = {"derived": derived}
-            clamped = 0
         elif self.constant:
             assert self.first_pixel is not None
-            stored, clamped = to_storage(self.first_pixel, dtype)
-            entry = {"value": stored.tolist()}
+            entry = {"value": self.to_storage(self.first_pixel, dtype).tolist()}
         else:
-            entry, clamped = self._write_array(dtype)
+            entry = self.write_array(dtype)
         self.path.unlink()
-        return entry, clamped
+        return entry
 
-    def _write_array(self, dtype: str) -> tuple[dict[str, Any], int]:
-        shape = [self.frames, *self.frame_shape]
-        clamped = 0
+    def write_array(self, dtype: str) -> dict[str, Any]:
+        """Write all frames to a file. Returns the entry of clip.json."""
+        shape = (self.frames, *self.frame_shape)
         path = self.path.with_suffix(".npy")
-        with path.open("wb") as file:
-            output = ChecksummedFile(file)
-            header = {"descr": dtype, "fortran_order": False, "shape": tuple(shape)}
-            np.lib.format.write_array_header_1_0(output, header)
+        checksum = 0
+        with path.open("w+b") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+            file.seek(0)
+            checksum = zlib.crc32(file.read())
             for frame in range(self.frames):
-                stored, lost = to_storage(self.read(frame), dtype)
-                clamped += lost
-                output.write(stored.tobytes())
-        crc32 = f"{output.crc32:08x}"
-        return {"file": path.name, "dtype": dtype, "shape": shape, "unit": self.channel.unit, "crc32": crc32}, clamped
+                data = self.to_storage(self.read(frame), dtype).tobytes()
+                checksum = zlib.crc32(data, checksum)
+                file.write(data)
+        facts = {"file": path.name, "dtype": dtype, "shape": list(shape), "unit": self.channel.unit}
+        return {**facts, "crc32": f"{checksum:08x}"}
 
-
-class ChecksummedFile:
-    """A binary file that keeps the checksum of what is written to it."""
-
-    def __init__(self, file: BinaryIO):
-        self.file = file
-        self.crc32 = 0
-
-    def write(self, data: bytes) -> int:
-        """Append `data`. Returns how many bytes were written."""
-        self.crc32 = zlib.crc32(data, self.crc32)
-        return self.file.write(data)
-
-
-def to_storage(array: NDArray[Any], dtype: str) -> tuple[NDArray[Any], int]:
-    """The array as `dtype`, and how many numbers were clamped to the range of float16 to stay finite."""
-    if dtype != "<f2":
-        return array.astype(dtype), 0
-    limit = float(np.finfo(np.float16).max)
-    return np.clip(array, -limit, limit).astype(dtype), int((np.abs(array) > limit).sum())
+    def to_storage(self, array: NDArray[Any], dtype: str) -> NDArray[Any]:
+        """The array as `dtype`, clamped to the range of float16 where that has to stay finite."""
+        if dtype != "<f2":
+            return array.astype(dtype)
+        self.clamped += int((np.abs(array) > FLOAT16_MAX).sum())
+        return np.clip(array, -FLOAT16_MAX, FLOAT16_MAX).astype(dtype)
 
 
 class ClipWriter:
@@ -163,41 +142,35 @@ class ClipWriter:
         """The squared error of references as displayed: mean over frames of mean((display A - display B)^2) / 4."""
         floors = []
         for frame in range(len(self.luminances)):
-            emission = self.channels["emission"].read(frame)
-            halves = sum(self.channels[name].read(frame) for name in REFERENCE_CHANNELS) + emission
-            a, b = display(halves.astype(np.float64), exposure)
+            buffers = sum(self.channels[name].read(frame) for name in REFERENCE_CHANNELS)
+            a, b = display((buffers + self.channels["emission"].read(frame)).astype(np.float64), exposure)
             floors.append(noise_of_mean(a, b))
         return float(np.mean(floors))
 
-    def leave_out_unseen_mirrors(self) -> None:
-        """Drop the channels of what mirrors show where none is in view: what one shows is always farther away."""
-        shown = self.channels.get(MIRRORED["depth"])
-        if shown is None or not cmp(shown.path, self.channels["depth"].path, shallow=False):
-            return
-        for name in MIRRORED.values() & self.channels.keys():
-            self.channels.pop(name).path.unlink()
+    def drop_mirrored(self) -> None:
+        """Drop the mirrored channels where no mirror is in view: what a mirror shows is always farther away."""
+        mirrored = self.channels.get(MIRRORED["depth"])
+        if mirrored is not None and cmp(mirrored.path, self.channels["depth"].path, shallow=False):
+            for name in MIRRORED.values() & self.channels.keys():
+                self.channels.pop(name).path.unlink()
 
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
-        """Complete the clip. `facts` join clip.json; `derived` says which channels readers derive, and from what."""
+        """Complete the clip. `facts` join clip.json; `derived` names channels that readers derive, and from what."""
         for raw in self.channels.values():
             raw.file.close()
-        self.leave_out_unseen_mirrors()
+        self.drop_mirrored()
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape
-        entries = {}
-        clamped = {}
-        for name, raw in self.channels.items():
-            entries[name], clamped[name] = raw.finish(derived.get(name))
         content = {
             "frames": len(self.luminances),
             "height": height,
             "width": width,
             **facts,
             "exposure": exposure,
-            "channels": entries,
+            "channels": {name: raw.finish(derived.get(name)) for name, raw in self.channels.items()},
             "nonfinite": {name: raw.nonfinite for name, raw in self.channels.items()},
-            "clamped": clamped,
+            "clamped": {name: raw.clamped for name, raw in self.channels.items()},
             "floor_mse": floor_mse,
             "complete": True,
         }

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from datasets import mirrors
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
-from datasets.exr import FACTS_ATTRIBUTE, channels_of, view_of_facts
+from datasets.exr import FACTS_ATTRIBUTE, channels_in, view_of_facts
 from datasets.frame import Frame, to_tensor
 from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
 from denoise.exr_image import ExrImage
@@ -263,7 +263,7 @@ class OwnFrameBuilder:
         """The next Frame. A channel that was not exported is missing in it."""
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
         view = view_of_facts(facts)
-        arrays = channels_of({name: channel.pixels for name, channel in image.channels.items()})
+        arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
         visible = {name: mirrors.visible(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
         before = self.view if self.view is not None else view
         self.view = view

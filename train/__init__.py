@@ -2,6 +2,6 @@
 
 import os
 
-# MKL's sums depend on where memory happens to lie unless told otherwise, before its first use: PyTorch gives it small
+# MKL's sums depend on where memory happens to lie unless set otherwise before its first use: PyTorch gives it small
 # float32 convolutions of a single item. Without this a resumed training ends with other bits.
 os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")

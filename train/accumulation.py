@@ -28,9 +28,9 @@ def accumulation_digest(network: FilteringNetwork[A]) -> str:
 
 @torch.no_grad()
 def accumulate_clip(clip: Clip, network: FilteringNetwork[A], cache: Path) -> Path:
-    """Accumulate all realisations of a clip, unless `cache` holds that already. Returns the folder with the result.
+    """Accumulate all realisations of a clip, unless `cache` has the result already. Returns its folder.
 
-    It holds irradiance.npy (F, S, H, W, 3) and scale.npy (F, S, 2), logarithms of luminance and depth; float32. Its
+    It contains irradiance.npy (F, S, H, W, 3) and scale.npy (F, S, 2), logarithms of luminance and depth; float32. Its
     name identifies the clip and the code; what other code has made of the same clip is deleted.
     """
     folder = cache / f"{clip.fingerprint}-{accumulation_digest(network)}"

@@ -156,7 +156,7 @@ def rotated(frame: Frame) -> Frame:
 
 
 def rotated_cameras(cameras: Cameras, width: int) -> Cameras:
-    """The cameras rolled about the viewing axis, so that they see the image turned by 90° counter-clockwise.
+    """The cameras rolled about the viewing axis, as of the image turned by 90° counter-clockwise.
 
     A position (x, y) of the image, `width` pixels wide, becomes (y, width - x).
     """

@@ -20,36 +20,36 @@ from train.sequences import check_fits, random_window
 
 
 class Crops:
-    """A batch of crops: frames, their accumulated irradiance (B, 3, h, w), and the running scales there.
+    """A batch of crops: frames, accumulated irradiance (B, 3, h, w), and logarithms of luminance and depth (B, 2).
 
     Not a dataclass, whose fields Fabric would convert.
     """
 
-    def __init__(self, frame: Frame, irradiance: Tensor, scale: RunningScale):
+    def __init__(self, frame: Frame, irradiance: Tensor, log_scale: Tensor):
         self.frame = frame
         self.irradiance = irradiance
-        self.scale = scale
+        self.log_scale = log_scale
+
+    @property
+    def scale(self) -> RunningScale:
+        """The running scales of the sequences that the crops are of."""
+        return RunningScale(*(RunningMean(value, torch.ones_like(value)) for value in self.log_scale.unbind(dim=1)))
 
     def to(self, device: torch.device | str) -> "Crops":
-        means = (RunningMean(m.value.to(device), m.count.to(device)) for m in vars(self.scale).values())
-        return Crops(self.frame.to(device), self.irradiance.to(device), RunningScale(*means))
+        return Crops(self.frame.to(device), self.irradiance.to(device), self.log_scale.to(device))
 
     @staticmethod
     def stack(crops: "Sequence[Crops]") -> "Crops":
         """One batch of all crops' batches."""
-        scales = [list(vars(crop.scale).values()) for crop in crops]
-        means = (
-            RunningMean(torch.cat([m.value for m in means]), torch.cat([m.count for m in means]))
-            for means in zip(*scales, strict=True)
-        )
         irradiance = torch.cat([crop.irradiance for crop in crops])
-        return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, RunningScale(*means))
+        log_scale = torch.cat([crop.log_scale for crop in crops])
+        return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, log_scale)
 
 
 class AccumulatedCrops(TorchDataset[Crops]):
     """Crops of `crop` x `crop` pixels (None: whole frames); item i of epoch e depends on (seed, e, i) only.
 
-    An epoch holds `count` crops for every frame of the clips, at random places. Accumulated frames are kept in the
+    An epoch has `count` crops for every frame of the clips, at random places. Accumulated frames are kept in the
     folder `cache`. Raises BadInput where a clip is smaller than a crop.
     """
 
@@ -85,6 +85,5 @@ class AccumulatedCrops(TorchDataset[Crops]):
         realisation = int(rng.integers(clip.realisations))
         window = random_window(clip, self.crop, rng)
         irradiance = to_tensor(self.irradiance[item][position, realisation][window])
-        scales = torch.from_numpy(self.scales[item][position, realisation])
-        means = (RunningMean(value[None], torch.ones(1)) for value in scales)
-        return Crops(read_frame(clip, position, self.channels, window=window), irradiance, RunningScale(*means))
+        log_scale = torch.from_numpy(self.scales[item][position, realisation])[None]
+        return Crops(read_frame(clip, position, self.channels, window=window), irradiance, log_scale)

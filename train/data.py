@@ -23,7 +23,7 @@ Items = TrainingSequences | AccumulatedCrops
 # A forked worker must not collect its parent's garbage: Dr.Jit's would wait for ever for threads that it does not have.
 os.register_at_fork(before=gc.freeze, after_in_parent=gc.unfreeze)
 
-PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, if not told otherwise
+PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, by default
 
 
 def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool, seed: int, cache: Path) -> Items:
@@ -79,8 +79,8 @@ def in_parts(loader: DataLoader[Any], parts: int) -> Iterator[Iterator[Any]]:
 
 def ahead(batches: Iterator[Any]) -> Iterator[Any]:
     """The same batches, each loaded by a thread while the one before it is worked on."""
-    # The number of threads that the loading thread sets is also what PyTorch gives to threads that have not asked for
-    # theirs yet. Ask now, or a training that has done no large operation so far goes on with one.
+    # PyTorch gives the number of threads that the loading thread sets to all threads that have not read theirs yet:
+    # read it now, or a training that has done no large operation so far continues with one.
     torch.get_num_threads()
     with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as thread:
         loading = thread.submit(next, batches, None)

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 METRICS_CSV = "metrics.csv"
 SAMPLE_FILE = "sample.png"
-MOST_ROWS = 2000  # of metrics.csv, whatever the number of steps
+MAX_ROWS = 2000  # of metrics.csv, whatever the number of steps
 
 LogRow = dict[str, float]
 
 
 def read_metrics(path: Path) -> list[LogRow]:
     """The rows of a metrics.csv; what was not measured in a row is missing there."""
-    whole = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]  # a kill may cut one
-    return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(whole)]
+    lines = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]  # a kill may cut one
+    return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(lines)]
 
 
 def open_board(folder: Path, done: int) -> "SummaryWriter | None":
@@ -37,19 +37,19 @@ def open_board(folder: Path, done: int) -> "SummaryWriter | None":
 
 
 class Log:
-    """Means of what `step` is given, a row of metrics.csv and points in TensorBoard for every so many steps.
+    """Means over every so many steps, as rows of metrics.csv and points in TensorBoard.
 
-    A resumed training overwrites what the interrupted one had noted after its last checkpoint.
+    A resumed training overwrites what the interrupted one logged after its last checkpoint.
     """
 
     def __init__(self, folder: Path, done: int, total: int):
         self.path = folder / METRICS_CSV
-        self.every = max(1, total // MOST_ROWS)
+        self.every = max(1, total // MAX_ROWS)
         self.board = open_board(folder, done)
         self.pending: list[LogRow] = []
-        self.forget_after(done)
+        self.truncate(done)
 
-    def forget_after(self, done: int) -> None:
+    def truncate(self, done: int) -> None:
         """Keep the rows of metrics.csv up to step `done`."""
         rows = [row for row in read_metrics(self.path) if row["step"] <= done] if self.path.exists() else []
         if not rows:
@@ -68,7 +68,7 @@ class Log:
         self.pending.append(row)
 
     def write(self, step: int, extra: Mapping[str, float] | None = None) -> None:
-        """Note the mean of the steps since the last time, if that is long enough ago or there is `extra` to note."""
+        """Log the mean of the steps since the last row, if those are enough or there is something `extra` to log."""
         if not self.pending or (len(self.pending) < self.every and extra is None):
             return
         means = {name: float(np.mean([row[name] for row in self.pending])) for name in self.pending[0]}
@@ -95,6 +95,6 @@ class Log:
                 plt.imsave(temporary, image.permute(1, 2, 0).numpy(), format="png")
 
     def close(self) -> None:
-        """Write what TensorBoard still holds back."""
+        """Flush TensorBoard's log."""
         if self.board:
             self.board.close()

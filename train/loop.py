@@ -13,10 +13,10 @@ from errors import BadInput
 from extras import can_draw
 from files import locked
 from train.checkpoint import load_checkpoint
-from train.fabric import fabric_here
-from train.log import Log
+from train.log import Log, LogRow
 from train.made_by import differences
 from train.pictures import loss_curve, sample_picture
+from train.precision import fabric_here
 from train.task import WEIGHTS_FILE, Task
 from train.training import BEST_FILE, Training
 
@@ -27,7 +27,7 @@ SAVE_SECONDS = 60.0  # between checkpoints: what a kill loses at most
 def alone_in(folder: Path, fabric: Fabric) -> Iterator[None]:
     """Hold the lock of a training's folder, which the first of its processes takes for all; the others wait for it.
 
-    Raises BadInput, in all of them, where another training holds it.
+    Raises BadInput, in all of them, where another training has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / ".lock") if fabric.is_global_zero else nullcontext(True) as ours:
@@ -40,7 +40,7 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
     """Train, or resume an interrupted training. Returns the path of the weights.
 
     Weights that other code or packages have made are kept, and a line reports it. Raises BadInput for unusable data,
-    or where the folder holds another training.
+    or where the folder contains another training.
     """
     fabric = fabric_here()
     task.check(fabric.world_size)
@@ -62,29 +62,29 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
             follow(training)
         fabric.barrier()
     if not weights.exists():
-        raise BadInput(f"{task.folder} holds a finished training but no weights: delete it and train again")
+        raise BadInput(f"{task.folder} has a finished training but no weights: delete it and train again")
     if fabric.is_global_zero:
         print(f"{task.name}: {outcome}")
     return weights
 
 
 def follow(training: Training) -> None:
-    """What all processes but the first do: their share of every step and of every validation."""
+    """The work of all processes but the first: their share of every step and of every validation."""
     for _ in training.steps():
         if training.validates:
             training.validate()
 
 
 def train_to_end(training: Training, save_seconds: float) -> None:
-    """Take the steps that are left, with a log and checkpoints; then the best weights become the training's."""
-    folder = training.task.folder
+    """Take the remaining steps, with a log and checkpoints; then the best weights become the training's."""
+    folder, name = training.task.folder, training.task.name
     if not training.finished:
         take_steps(training, save_seconds)
     if (folder / BEST_FILE).exists():  # only a finished training has weights
         if can_draw():
-            loss_curve(folder, f"{training.task.name}, {training.task.budget}")
+            loss_curve(folder, f"{name}, {training.task.budget}")
         else:
-            print(f"{training.task.name}: no loss.png: it needs `pip install 'onespp[report]'`")
+            print(f"{name}: no loss.png: it needs `pip install 'onespp[report]'`")
         os.replace(folder / BEST_FILE, folder / WEIGHTS_FILE)
 
 
@@ -99,9 +99,9 @@ def take_steps(training: Training, save_seconds: float) -> None:
         closing(Log(training.task.folder, position.done, training.total)) as log,
         tqdm(total=training.total, initial=position.done, desc=label, unit="step") as bar,
     ):
-        for noted in training.steps():
-            log.step({**noted, "skipped": position.skipped})
-            bar.set_postfix_str(progress_text(training, noted), refresh=False)
+        for row in training.steps():
+            log.step({**row, "skipped": position.skipped})
+            bar.set_postfix_str(progress_text(training, row), refresh=False)
             bar.update()
             if training.validates:
                 validate_and_show(training, log)
@@ -111,14 +111,14 @@ def take_steps(training: Training, save_seconds: float) -> None:
                 saved = time.monotonic()
 
 
-def progress_text(training: Training, noted: dict[str, float]) -> str:
+def progress_text(training: Training, row: LogRow) -> str:
     position = training.position
-    text = f"loss {noted['loss']:.4f}, best on validation {position.best:.4f}, {noted['step_ms']:.0f} ms"
+    text = f"loss {row['loss']:.4f}, best on validation {position.best:.4f}, {row['step_ms']:.0f} ms"
     return f"{text}, skipped {position.skipped}" if position.skipped else text
 
 
 def validate_and_show(training: Training, log: Log) -> None:
-    """Validate, keep the weights if they are the best, and show what they do."""
+    """Validate, keep the weights if they are the best, and draw a sample."""
     validation = training.validate()
     training.keep_best(validation)
     log.write(training.position.done, {"val_loss": validation})

@@ -1,4 +1,4 @@
-"""Pictures of a training: what the network does to a frame, and the curve of the loss."""
+"""Pictures of a training: a frame as the network denoises it, and the curve of the loss."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ AMPLIFIED = 4  # differences in sample pictures
 def sample_picture(denoiser: Denoiser, clip: Clip, device: torch.device) -> Tensor:
     """Noisy, output, reference and amplified difference side by side as displayed, (3, H, 4 W), of one frame.
 
-    The network runs over the frames before it as it does in use.
+    The network runs over the frames before it too, as in use.
     """
     state: State | None = None
     last = min(SAMPLE_FRAME, clip.frames - 1)

@@ -1,22 +1,40 @@
-"""Which floating-point precision to train in: measured on the step itself, not guessed."""
+"""Precision, devices and processes of a training: Lightning Fabric, and which precision is faster here."""
 
+import os
 import time
 from functools import partial
-from typing import Any
 
 import torch
+from lightning_fabric import Fabric
 
 from models.fastest import MIN_SPEEDUP
 from timing import device_clock, take_turns, thread_count
+from train.crops import Crops
 from train.losses.network_loss import NetworkLoss
+from train.sequences import Batch
 
 FLOAT32 = "float32"
 BFLOAT16 = "bfloat16"  # by autocast; the weights are float32 all the same
-
+FABRIC_NAMES = {FLOAT32: "32-true", BFLOAT16: "bf16-mixed"}
 TURNS = 3
 
 
-def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: str) -> None:
+def fabric_here(precision: str = FLOAT32) -> Fabric:
+    """Fabric for this machine: one GPU or the CPU; under torchrun as many processes as that has started (DDP)."""
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+    world = int(os.environ.get("WORLD_SIZE", 1))
+    fabric = Fabric(
+        accelerator="cuda" if torch.cuda.is_available() else "cpu",
+        strategy="ddp" if world > 1 else "auto",
+        devices=here,
+        num_nodes=world // here,
+        precision=FABRIC_NAMES[precision],  # type: ignore[arg-type]
+    )
+    fabric.launch()
+    return fabric
+
+
+def forward_and_backward(loss: NetworkLoss, batch: Batch | Crops, device: str, precision: str) -> None:
     """Compute the gradients of a batch, and drop them."""
     with torch.autocast(device, torch.bfloat16, enabled=precision == BFLOAT16):
         value, _ = loss(batch)
@@ -25,17 +43,14 @@ def forward_and_backward(loss: NetworkLoss, batch: Any, device: str, precision: 
     loss.zero_grad()
 
 
-def fastest_precision(loss: NetworkLoss, batch: Any, device: str) -> str:
+def fastest_precision(loss: NetworkLoss, batch: Batch | Crops, device: str) -> str:
     """bfloat16 where that makes a step at least MIN_SPEEDUP times faster, by the best of some turns; else float32.
 
     On processors one thread computes, and only its own time counts: on a busy machine the wall clock measures waiting.
     """
     loss = loss.to(device)
     batch = batch.to(device)
-    work = {
-        FLOAT32: partial(forward_and_backward, loss, batch, device, FLOAT32),
-        BFLOAT16: partial(forward_and_backward, loss, batch, device, BFLOAT16),
-    }
+    work = {precision: partial(forward_and_backward, loss, batch, device, precision) for precision in FABRIC_NAMES}
     clock = time.process_time if device == "cpu" else partial(device_clock, device)
     with thread_count(1):
         seconds = take_turns(work, TURNS, clock=clock, label="measuring precisions")

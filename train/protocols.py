@@ -34,7 +34,7 @@ class RecurrentNetwork(Protocol[S]):
     signal: Signal
 
     def predict(self, frame: Frame, state: S | None) -> tuple[Tensor, S]:
-        """What the network returns for a frame, (B, 3, H, W) in its own space, not clamped, and the next state."""
+        """The network's output for a frame, (B, 3, H, W) in its own space, not clamped, and the next state."""
 
     def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
         """Irradiance times exposure, of what `predict` returned, with a gradient everywhere."""
@@ -54,7 +54,7 @@ class FilteringNetwork(Protocol[A]):
 
     signal: Signal
     reads: tuple[str, ...]  # for accumulation
-    filter_reads: tuple[str, ...]  # for the filter
+    filter_reads: tuple[str, ...]
 
     def accumulate(self, frame: Frame, state: A | None) -> A:
         """The state after a frame, before any filter."""

@@ -19,7 +19,7 @@ class Recipe:
     epochs: int
     betas: tuple[float, float] = (0.9, 0.999)  # of Adam; these are its authors' and PyTorch's
     ramp: int = 0  # epochs of a geometric ramp from rate / 10; then rate * sqrt(ramp / e). 0: a constant rate
-    anneal: bool = False  # after the ramp the rate falls to zero instead, by half a cosine
+    anneal: bool = False  # after the ramp the rate falls to zero instead, along half a cosine
     average: float = 0.0  # share of the steps over which weights are averaged to be judged and kept; 0: the last ones
     clip: float | None = None  # the largest norm of a step's gradients; longer ones are shortened to it
     trained: int | None = None  # frames of a sequence that are trained on; the rest is for validation

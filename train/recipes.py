@@ -1,4 +1,4 @@
-"""The recipes of the papers as data, each number with its section. Budgets change the effort and the last steps."""
+"""The recipes of the papers as data, each number with its section; and what budgets change."""
 
 from dataclasses import replace
 from typing import Any
@@ -34,7 +34,7 @@ WSKP_RECIPE = Recipe(
     epochs=500,  # §5.3
 )
 
-# The paper's text is not known: these are the defaults of its authors' code. That also rotates and mirrors crops.
+# The defaults of its authors' code, as we do not have the paper's text. That also rotates and mirrors crops.
 NBGD_RECIPE = Recipe(
     loss=NBGDLoss(),
     rate=1e-4,
@@ -45,7 +45,7 @@ NBGD_RECIPE = Recipe(
     epochs=100,
 )
 
-# How its authors trained is not known but for their 4 to 64 samples a pixel, all in one network.
+# Its authors trained one network on 4 to 64 samples per pixel; more is not known.
 LBF_RECIPE = Recipe(
     loss=LBFLoss(),
     rate=1e-2,
@@ -67,7 +67,9 @@ NTD_RECIPE = Recipe(
 )
 NTD_RECIPE_WITHOUT_OCCLUSION = replace(NTD_RECIPE, loss=NTDLoss(occlusion=0.0))  # §6.3, experiments A and B
 
-# Ours, for trainings that are too short for the papers' rates: those would leave the weights jittering at the end.
+Budgets = dict[str, dict[str, Any]]  # changes of a recipe, by budget; in the budget "paper" there are none
+
+# Ours, for trainings that are too short for the papers' rates, at which the weights would still jitter at the end.
 SHORT: dict[str, Any] = {"anneal": True, "average": 0.05}
 
 # Ours: sequences long enough to learn what to carry, in all exposures and with all numbers of samples.
@@ -88,29 +90,26 @@ ONE_RECIPE = Recipe(
 RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedLoss(), "crop": 64, "clip": 1.0}
 RELEASE_CROPS = RELEASE | {"loss": DisplayedLoss(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
 
-# What a budget changes: epochs and what an epoch holds. An epoch of sequences sees as many pixels as the clips have.
+# An epoch of sequences has as many pixels as the clips.
 RAE_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "ramp": 1},
     "quick": SHORT | {"epochs": 50, "crop": 64, "ramp": 2},
-    "release": RELEASE | {"epochs": 15, "ramp": 0},  # which makes colours itself, and needs the paper's gains
-    "paper": {},
+    "release": RELEASE | {"epochs": 15, "ramp": 0},  # it predicts colours, and needs the paper's gains
 }
 # In a thousand steps WSKP gets further at a higher rate than the paper's (docs/training.md).
 WSKP_BUDGETS = {
     "tiny": SHORT | {"epochs": 4, "crop": 32, "crops": (8, 2), "batch": 8},
     "quick": SHORT | {"epochs": 10, "rate": 4e-3, "crop": 64, "crops": (4, 2), "batch": 16},
     "release": RELEASE_CROPS | {"epochs": 8},
-    "paper": {},
 }
 # In so few steps the authors' rate leaves the weights where they began.
 NBGD_BUDGETS = WSKP_BUDGETS | {"tiny": WSKP_BUDGETS["tiny"] | {"rate": 2e-3}}
 # 436 weights learn from few pixels; each costs thousands of taps.
-LBF_BUDGETS: dict[str, dict[str, Any]] = {
+LBF_BUDGETS: Budgets = {
     "tiny": SHORT | {"epochs": 2, "crop": 32},
     "quick": SHORT | {"epochs": 1, "crop": 64},
     "release": RELEASE
     | {"epochs": 1, "clip": 1.0, "augmentation": Augmentation(rotate=True, exposure=True, samples=True)},
-    "paper": {},
 }
 NTD_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
@@ -118,17 +117,15 @@ NTD_BUDGETS = {
     "release": RELEASE
     | {"epochs": 10, "rate": 5e-4, "batch": 2, "length": 8, "trained": None}
     | {"augmentation": Augmentation(stop=True, rotate=True, exposure=True)},
-    "paper": {},
 }
 
-ONE_BUDGETS: dict[str, dict[str, Any]] = {
+ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
     "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedLoss(temporal=0.5)},
-    "paper": {},
 }
 
-PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
+PAPERS_AND_BUDGETS: dict[str, tuple[Recipe, Budgets]] = {
     "rae": (RAE_RECIPE, RAE_BUDGETS),
     "wskp3": (WSKP_RECIPE, WSKP_BUDGETS),
     "wskp6": (WSKP_RECIPE, WSKP_BUDGETS),
@@ -146,13 +143,13 @@ PAPER_AND_BUDGETS: dict[str, tuple[Recipe, dict[str, dict[str, Any]]]] = {
 
 RECIPES: dict[tuple[str, str], Recipe] = {
     (name, budget): replace(recipe, **changes)
-    for name, (recipe, budgets) in PAPER_AND_BUDGETS.items()
-    for budget, changes in budgets.items()
+    for name, (recipe, budgets) in PAPERS_AND_BUDGETS.items()
+    for budget, changes in (budgets | {"paper": {}}).items()
 }
 
-TRAINABLE = tuple(PAPER_AND_BUDGETS)
+TRAINABLE = tuple(PAPERS_AND_BUDGETS)
 ONE_A_PAPER = ("rae", "wskp6", "ntd-mean")
-WORTH_TRAINING = {"quick": ("wskp6",)}  # in a budget in which the others end as a blur
+WORTH_TRAINING = {"quick": ("wskp6",)}  # in a budget in which the others still blur
 
 
 def trained_by_default(budget: str) -> tuple[str, ...]:
@@ -165,6 +162,6 @@ def recipe_for(name: str, budget: str) -> Recipe:
     if name not in TRAINABLE:
         raise BadInput(f"'{name}' is not a network that can be trained; those are {', '.join(TRAINABLE)}")
     if (name, budget) not in RECIPES:
-        budgets = [known for network, known in RECIPES if network == name]
+        budgets = [each for network, each in RECIPES if network == name]
         raise BadInput(f"unknown budget '{budget}'; the budgets of '{name}' are {', '.join(budgets)}")
     return RECIPES[name, budget]

@@ -19,18 +19,8 @@ def start_file(name: str, start: str | None) -> Path | None:
     return Path(start) if start else None
 
 
-def task_for(
-    name: str,
-    data: Path,
-    runs: Path,
-    budget: str,
-    seed: int = 0,
-    precision: str | None = None,
-    micro_batch: int | None = None,
-    start: Path | None = None,
-    specialised: bool = False,
-) -> Task:
-    """The training of a denoiser in a budget, see Task. Raises BadInput for an unknown name or budget, or no data."""
+def task_for(name: str, data: Path, runs: Path, budget: str) -> Task:
+    """The training of a denoiser in a budget. Raises BadInput for an unknown name or budget, or no data."""
     return Task(
         name=name,
         create=partial(create, name),
@@ -39,9 +29,4 @@ def task_for(
         data=Dataset(data),
         folder=run_folder(runs, name, budget),
         cache=runs / "accumulated",
-        seed=seed,
-        precision=precision,
-        micro_batch=micro_batch,
-        start=start,
-        specialised=specialised,
     )

@@ -39,7 +39,7 @@ def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> Ima
 class WholeFrames:
     """What running_scale measures in the noisy light of `signal`, once for each frame and realisation.
 
-    A crop of 64 x 64 pixels may be three times brighter or darker than its frame; in use networks see whole frames.
+    A crop of 64 x 64 pixels may be three times brighter or darker than its frame; in use, networks get whole frames.
     """
 
     def __init__(self, signal: Signal):

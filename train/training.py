@@ -1,4 +1,4 @@
-"""A training: a network, its optimiser and data, and how to take its steps."""
+"""A training: a network, its optimiser and data, and its steps."""
 
 import math
 import time
@@ -18,11 +18,13 @@ from errors import BadInput
 from models.weights import save_weights
 from provenance import file_digest
 from train.checkpoint import Checkpoint, save_checkpoint
+from train.crops import Crops
 from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
-from train.fabric import fabric_here
+from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
 from train.made_by import MadeBy, made_by_here
-from train.precision import fastest_precision
+from train.precision import fabric_here, fastest_precision
+from train.sequences import Batch
 from train.task import Task
 
 BEST_FILE = "best.safetensors"
@@ -119,12 +121,12 @@ class Training:
         return self.finished or self.position.done % max(1, self.total // VALIDATIONS) == 0
 
     def choose_precision(self, loss: NetworkLoss, saved: Checkpoint | None, fabric: Fabric) -> str:
-        """A resumed run keeps its precision, however the measurement would turn out this time."""
+        """A resumed training keeps its precision, whatever would be the fastest this time."""
         wanted = self.task.precision
         if saved:
             kept: str = saved["precision"]
             if wanted and kept != wanted:
-                raise BadInput(f"{self.task.folder} holds a training in {kept}: delete it or use another --runs")
+                raise BadInput(f"{self.task.folder} has a training in {kept}: delete it or use another --runs")
             return kept
         if wanted:
             return wanted
@@ -134,7 +136,7 @@ class Training:
     def resume(self, saved: Checkpoint) -> None:
         if saved.get("facts") != self.facts:
             raise BadInput(
-                f"{self.task.folder} holds a training with another recipe, seed, data set or start: delete it or use "
+                f"{self.task.folder} has a training with another recipe, seed, data set or start: delete it or use "
                 "another --runs"
             )
         self.loss.load_state_dict(saved["loss"])
@@ -155,7 +157,7 @@ class Training:
         }
         save_checkpoint(self.task.folder, content)
 
-    def steps(self) -> Iterator[dict[str, float]]:
+    def steps(self) -> Iterator[LogRow]:
         """Update the weights step by step until the last epoch's end; yields the log row of each step."""
         rank = self.fabric.global_rank
         world = self.fabric.world_size
@@ -164,14 +166,14 @@ class Training:
             self.items.set_epoch(epoch)
             batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.micro_batch, rank, world)
             for batch in in_parts(loader(self.items, batches), self.parts):
-                noted = self.step(batch)
+                row = self.step(batch)
                 self.position.done += 1
-                yield noted
+                yield row
 
-    def step(self, batch: Iterable[Any]) -> dict[str, float]:
+    def step(self, batch: Iterable[Batch | Crops]) -> LogRow:
         """Update the weights once, from the parts of a batch.
 
-        Returns its rate, loss, the loss's terms, the norm of the gradients and milliseconds.
+        Returns the learning rate, the loss and its parts, the norm of the gradients, and milliseconds.
         """
         start = time.perf_counter()
         ready = start
@@ -203,7 +205,7 @@ class Training:
     def update(self, loss: float) -> float:
         """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision.
 
-        Returns the norm of the gradients, before the recipe cuts it.
+        Returns the norm of the gradients before clipping.
         """
         parameters = list(self.loss.parameters())
         norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
@@ -222,7 +224,7 @@ class Training:
         return float(norm)
 
     def skip_step(self) -> None:
-        """Count a step whose loss or gradient was not finite. Raises BadInput where they do not stop."""
+        """Count a step whose loss or gradient was not finite. Raises BadInput after too many in a row."""
         self.position.skipped += 1
         self.position.skipped_in_a_row += 1
         if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
@@ -238,7 +240,7 @@ class Training:
         numbers = range(len(self.val_items))
         batches = [list(numbers[i : i + self.micro_batch]) for i in range(0, len(numbers), self.micro_batch)]
         batches = batches[self.fabric.global_rank :: self.fabric.world_size]
-        network = self.judged.eval()  # not through DDP: processes may differ in how much they have
+        network = self.judged.eval()  # not through DDP: processes may have different numbers of batches
         total = torch.zeros(2, device=self.fabric.device)
         for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
             with self.fabric.autocast():

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -88,7 +88,7 @@ def bench_training(data: Path, runs: Path, budget: str, names: Sequence[str] = (
     for name in tqdm(names or ONE_A_PAPER, "training", leave=False):
         with TemporaryDirectory() as folder:
             trainings = {
-                precision: Training(task_for(name, data, Path(folder), budget, precision=precision))
+                precision: Training(replace(task_for(name, data, Path(folder), budget), precision=precision))
                 for precision in (FLOAT32, BFLOAT16)
             }
             ms = step_ms(trainings, measured)

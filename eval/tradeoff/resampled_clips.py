@@ -11,7 +11,6 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
-from datasets.writer import to_storage
 from errors import BadInput
 from files import locked, read_json, write_json
 from render.clip import Options, Sampling, render_clip
@@ -115,7 +114,7 @@ def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dic
         for name, entry in clip.channels.items()
     }
     for name in frames[0]:
-        array = to_storage(np.stack([frame[name] for frame in frames])[:, None], "<f4")[0]
+        array = np.stack([frame[name] for frame in frames])[:, None].astype("<f4")
         file = path / f"{name}.npy"
         np.save(file, array)
         crc32 = f"{zlib.crc32(file.read_bytes()):08x}"

@@ -1,4 +1,4 @@
-"""Clips of scenes with mirrors: what is stored, and what denoisers see."""
+"""Clips of scenes with mirrors: what is stored, and the input of denoisers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, panel, placed, 
 
 LAST = FRAMES - 1
 OTHER_MOTION = ("dual_motion", "shadow_motion", "reflection_motion")
-SEEN = (*MIRRORED, *OTHER_MOTION, "gradient", "emission", "direct")
+VISIBLE = (*MIRRORED, *OTHER_MOTION, "gradient", "emission", "direct")
 
 
 def clip_of(scene: Scene, folder: Path, channels: tuple[str, ...] = USUAL_CHANNELS) -> Clip:
@@ -34,36 +34,35 @@ def clip(tmp_path_factory) -> Clip:
     return clip_of(room(SILVER), tmp_path_factory.mktemp("mirror"))
 
 
-def test_denoisers_see_what_mirrors_show(clip):
-    frame = read_frame(clip, LAST, SEEN)
+def test_the_input_of_denoisers_is_what_mirrors_show(clip):
+    frame = read_frame(clip, LAST, VISIBLE)
     stored = {
-        name: np.moveaxis(clip.read(name, LAST).astype(np.float32), -1, 0) for name in clip.channels if name in SEEN
+        name: np.moveaxis(clip.read(name, LAST).astype(np.float32), -1, 0) for name in clip.channels if name in VISIBLE
     }
     shown = {name: np.moveaxis(clip.read(MIRRORED[name], LAST).astype(np.float32), -1, 0) for name in MIRRORED}
     picture = stored["mesh_id"][0] == 1
     for name in MIRRORED:
-        np.testing.assert_array_equal(getattr(frame, name)[0], shown[name], err_msg=name)
+        np.testing.assert_array_equal(frame.channel(name)[0], shown[name], err_msg=name)
     for name in OTHER_MOTION:
-        seen = getattr(frame, name)[0].numpy()
-        np.testing.assert_array_equal(seen[:, picture], shown["motion"][:, picture], err_msg=name)
-        np.testing.assert_array_equal(seen[:, ~picture], stored[name][:, ~picture], err_msg=name)
+        visible = frame.channel(name)[0].numpy()
+        np.testing.assert_array_equal(visible[:, picture], shown["motion"][:, picture], err_msg=name)
+        np.testing.assert_array_equal(visible[:, ~picture], stored[name][:, ~picture], err_msg=name)
     gradient = frame.gradient[0].numpy()
     assert stored["gradient"][:, picture].any() and not gradient[:, picture].any()
     np.testing.assert_array_equal(gradient[:, ~picture], stored["gradient"][:, ~picture])
     for name in ("emission", "direct"):
-        np.testing.assert_array_equal(getattr(frame, name)[0], stored[name], err_msg=name)
+        np.testing.assert_array_equal(frame.channel(name)[0], stored[name], err_msg=name)
     assert picture.mean() > 0.4 and (frame.mesh_id[0, 0].numpy()[picture] != 1).all()
 
 
-def test_what_is_stored_by_its_old_name_is_the_mirror(clip):
+def test_the_plain_channels_are_of_the_mirror_itself(clip):
     depth, mesh_id = (clip.read(name, LAST)[..., 0] for name in ("depth", "mesh_id"))
     assert (mesh_id == 1).mean() > 0.4
     shown = clip.read("mirrored_depth", LAST)[..., 0]
     assert (shown[mesh_id == 1] > depth[mesh_id == 1]).all()
 
 
-def test_motion_to_any_frame_is_that_of_what_is_seen(clip):
-    """And where only the camera moves, so that the mirror's own motion is not stored, that still is the mirror's."""
+def test_motion_to_any_frame_is_that_of_visible_surfaces(clip):
     stored = clip.read("mirrored_motion", LAST)
     np.testing.assert_allclose(clip.motion_to(LAST, LAST - 1), stored, atol=2e-2)
     assert not clip.motion_to(LAST, LAST).any()
@@ -82,11 +81,8 @@ def test_derived_motion_is_the_mirrors_own(clip, tmp_path):
 def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
     reads = ("direct", "indirect", "direct_reference", "indirect_reference", "emission", "albedo", "depth", "mesh_id")
     few = clip_of(room(SILVER), tmp_path / "few", (*reads, "K", "camera_to_world", "object_to_world"))
-    assert {name for name in few.channels if name in MIRRORED.values()} == {
-        "mirrored_albedo",
-        "mirrored_depth",
-        "mirrored_mesh_id",
-    }
+    expected = {MIRRORED[name] for name in ("albedo", "depth", "mesh_id")}
+    assert {name for name in few.channels if name in MIRRORED.values()} == expected
     none = clip_of(room(painted(0.5)), tmp_path / "none")
     scene = room(painted(0.5))
     hand_mirror = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
@@ -95,13 +91,13 @@ def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
     assert not [path.name for path in unseen.path.iterdir() if "mirrored" in path.name]
 
 
-def test_exported_frames_are_seen_alike(clip, tmp_path):
-    builder = OwnFrameBuilder(SEEN)
+def test_exported_frames_look_the_same(clip, tmp_path):
+    builder = OwnFrameBuilder(VISIBLE)
     for index in range(FRAMES):
         path = tmp_path / f"{index}.exr"
         write_exr(path, clip, index)
         frame = builder.build(ExrImage(path))
-        expected = read_frame(clip, index, SEEN)
+        expected = read_frame(clip, index, VISIBLE)
         assert frame.channels.keys() == expected.channels.keys()
         for name, tensor in expected.channels.items():
             assert torch.equal(frame.channels[name], tensor), name

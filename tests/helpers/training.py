@@ -6,15 +6,19 @@ import signal
 import subprocess
 import sys
 from ast import literal_eval
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from safetensors import safe_open
+from torch import Tensor
 
+from datasets.frame import Frame
+from models.history.running_scale import RunningScale
 from train.loop import train_network
 from train.precision import FLOAT32
 from train.registry import task_for
@@ -33,8 +37,8 @@ def short_task(
     name: str, data: Path, runs: Path, seed: int = 0, precision: str | None = FLOAT32, **recipe: Any
 ) -> Task:
     """A training of a few steps, or whatever else the changes to its recipe say."""
-    task = task_for(name, data, runs, "tiny", seed, precision)
-    return replace(task, recipe=replace(task.recipe, **(recipe or SHORT[name])))
+    task = task_for(name, data, runs, "tiny")
+    return replace(task, recipe=replace(task.recipe, **(recipe or SHORT[name])), seed=seed, precision=precision)
 
 
 def folder_of(runs: Path, name: str) -> Path:
@@ -61,6 +65,22 @@ def same_weights(a: Path, b: Path) -> bool:
     x = tensors(a / WEIGHTS_FILE)
     y = tensors(b / WEIGHTS_FILE)
     return x.keys() == y.keys() and all(torch.equal(x[key], y[key]) for key in x)
+
+
+def predict_as(
+    monkeypatch: pytest.MonkeyPatch, denoiser: Any, output: Callable[[Frame, Any], Tensor]
+) -> list[tuple[Tensor, RunningScale]]:
+    """Let a network predict `output` of each frame and state; it is listed with the scale there."""
+    genuine = denoiser.predict
+    predicted = []
+
+    def predict(frame: Frame, state: Any) -> tuple[Tensor, Any]:
+        _, state = genuine(frame, state)
+        predicted.append((output(frame, state), state.scale))
+        return predicted[-1][0], state
+
+    monkeypatch.setattr(denoiser, "predict", predict)
+    return predicted
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """The average of the weights: by hand, over a training, through an interruption, and as what is judged and kept."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ from torch import nn
 
 from tests.helpers.training import short_task, tensors
 from train.checkpoint import load_checkpoint
-from train.loop import train_network
 from train.training import BEST_FILE, Training, average_decay, update_average
 
 
@@ -53,7 +50,9 @@ def test_the_average_is_what_is_validated_and_saved(tiny, tmp_path):
     assert training.validate() != validation
 
 
-def test_a_resumed_training_goes_on_with_its_average(tiny, tmp_path):
+def test_a_resumed_training_continues_its_average(tiny, tmp_path):
+    without = Training(short_task("wskp6", tiny, tmp_path, epochs=1, crops=(2, 1), average=0.0))
+    assert without.judged is without.loss.module
     task = short_task("wskp6", tiny, tmp_path, epochs=2, crops=(2, 1), average=0.5)
     whole = Training(task)
     steps = whole.steps()
@@ -66,10 +65,3 @@ def test_a_resumed_training_goes_on_with_its_average(tiny, tmp_path):
     list(resumed.steps())
     for a, b in zip(whole.judged.parameters(), resumed.judged.parameters(), strict=True):
         assert torch.equal(a, b)
-
-
-def test_without_an_average_the_last_weights_are_kept(tiny, tmp_path):
-    task = short_task("wskp6", tiny, tmp_path, epochs=1, crops=(2, 1), average=0.0)
-    training = Training(task)
-    assert training.judged is training.loss.module
-    assert train_network(replace(task, folder=tmp_path / "other")).exists()

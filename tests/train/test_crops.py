@@ -30,7 +30,7 @@ def crops(clips, cache, crop=32, count=3, seed=0) -> AccumulatedCrops:
     return AccumulatedCrops(clips, create("wskp3"), count, crop, seed, cache)
 
 
-def test_crops_hold_what_the_network_meets_in_use(clips, cache):
+def test_crops_equal_the_input_in_use(clips, cache):
     """A whole frame's input is that of the denoiser, run frame by frame over the clip."""
     wskp = create("wskp3")
     clip = clips[1]
@@ -66,13 +66,13 @@ def test_accumulating_is_done_once_and_whole(clips, cache, tmp_path, monkeypatch
     """A second training finds what the first has accumulated; an interrupted one leaves nothing that looks whole."""
     wskp = create("wskp6")
     accumulate_clip(clips[0], wskp, cache)
-    monkeypatch.setattr(type(wskp), "accumulate", lambda *_: pytest.fail("accumulated again"))
+    monkeypatch.setattr(accumulation, "read_frame", lambda *_: pytest.fail("accumulated again"))
     accumulate_clip(clips[0], wskp, cache)
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(type(wskp), "accumulate", interrupted)
+    monkeypatch.setattr(accumulation, "read_frame", interrupted)
     with pytest.raises(KeyboardInterrupt):
         accumulate_clip(clips[0], wskp, tmp_path)
     assert not list(tmp_path.iterdir())
@@ -93,19 +93,9 @@ def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkey
 def test_the_key_follows_code_and_packages(monkeypatch):
     wskp = create("wskp3")
     accumulating = sources("train.accumulation", "models.networks.wskp")
-    assert accumulating.keys() >= {
-        "models.operators",
-        "models.compiled.reprojection",
-        "datasets.frame",
-        "scenes.camera",
-    }
-    assert not accumulating.keys() & {
-        "train.crops",
-        "train.training",
-        "models.networks.rae",
-        "models.networks.ntd",
-        "models.registry",
-    }
+    assert accumulating.keys() >= {"models.operators", "models.compiled.reprojection", "datasets.frame", "scenes.camera"}
+    others = {"train.crops", "train.training", "models.networks.rae", "models.networks.ntd", "models.registry"}
+    assert not accumulating.keys() & others
     here = accumulation_digest(wskp)
     assert here == accumulation_digest(create("nbgd"))  # which accumulates alike
     assert len(here) == 16 and here == accumulation_digest(wskp)

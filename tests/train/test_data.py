@@ -24,7 +24,7 @@ def test_parts_are_equal_and_the_fewest(count, largest):
 
 
 @given(st.sampled_from([1, 2, 4]), st.integers(1, 8), st.integers(0, 3))
-def test_processes_share_what_one_would_read(world, largest, first):
+def test_processes_share_the_items_of_a_single_process(world, largest, first):
     """Step by step, all processes together read the items of a single one, whatever the parts."""
     batch = 8
     stop = 5
@@ -38,14 +38,14 @@ def test_processes_share_what_one_would_read(world, largest, first):
 
 
 class Trap:
-    """Garbage that tells in which process it was collected."""
+    """Garbage that writes down in which process it was collected."""
 
-    def __init__(self, told: Path):
-        self.told = told
+    def __init__(self, folder: Path):
+        self.folder = folder
         self.itself = self  # so that only the garbage collector finds it
 
     def __del__(self) -> None:
-        (self.told / str(os.getpid())).touch()
+        (self.folder / str(os.getpid())).touch()
 
 
 class Collecting(list):

@@ -127,14 +127,14 @@ def test_the_checkpoint_of_a_training_at_work_is_not_read(tiny, tmp_path, traine
 
 def two_processes() -> tuple[SimpleNamespace, SimpleNamespace]:
     """Stand-ins for Fabric in two processes, which are threads here."""
-    told: Queue[bool] = Queue()
+    sent: Queue[bool] = Queue()
 
-    def tell(value: bool) -> bool:
-        told.put(value)
+    def send(value: bool) -> bool:
+        sent.put(value)
         return value
 
-    first = SimpleNamespace(is_global_zero=True, broadcast=tell)
-    second = SimpleNamespace(is_global_zero=False, broadcast=lambda _: told.get(timeout=60))
+    first = SimpleNamespace(is_global_zero=True, broadcast=send)
+    second = SimpleNamespace(is_global_zero=False, broadcast=lambda _: sent.get(timeout=60))
     return first, second
 
 
@@ -169,7 +169,7 @@ def test_where_another_training_has_the_lock_all_processes_are_refused(tmp_path)
                 pytest.fail("entered")
 
 
-# --- What is seen of it -----------------------------------------------------------------------------------------------
+# --- What it leaves -----------------------------------------------------------------------------------------------
 
 
 def test_training_shows_what_it_does(trained_runs):
@@ -181,19 +181,8 @@ def test_training_shows_what_it_does(trained_runs):
     assert list(folder.glob("events.out.tfevents.*"))
     with (folder / METRICS_CSV).open() as file:
         rows = list(csv.DictReader(file))
-    assert set(rows[0]) == {
-        "step",
-        "learning_rate",
-        "loss",
-        "spatial",
-        "gradient",
-        "temporal",
-        "gradient_norm",
-        "skipped",
-        "step_ms",
-        "loading_ms",
-        "val_loss",
-    }
+    columns = "step learning_rate loss spatial gradient temporal gradient_norm skipped step_ms loading_ms val_loss"
+    assert set(rows[0]) == set(columns.split())
     assert rows[-1]["val_loss"]
     assert imread(folder / "sample.png").shape[:2] == (64, 4 * 64)
     assert imread(folder / "loss.png").ndim == 3

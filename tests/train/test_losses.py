@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from models.networks.ntd import NTD
 from models.networks.rae import RAE
 from models.networks.wskp import WSKP
 from models.registry import create
+from tests.helpers.training import predict_as
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, block_means, tone
@@ -31,7 +33,7 @@ from train.recipes import TRAINABLE, recipe_for
 from train.sequences import Batch
 
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
-LIGHT = ("direct", "indirect", "direct_reference", "indirect_reference")
+LIGHT = {"direct", "indirect", "direct_reference", "indirect_reference"}
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +51,11 @@ def batch_of(tiny, tmp_path_factory) -> Callable[..., Any]:
 
 def frames_of(batch: Batch | Crops) -> list[Frame]:
     return batch.frames if isinstance(batch, Batch) else [batch.frame]
+
+
+def loss_of(name: str, budget: str = "tiny") -> NetworkLoss:
+    torch.manual_seed(0)
+    return NetworkLoss(create(name), recipe_for(name, budget).loss)
 
 
 def test_log_kernel_is_that_of_scipy():
@@ -74,21 +81,13 @@ def test_rae_loss_by_hand(batch_of, monkeypatch):
     """With a network that returns known outputs, every term follows from §4.4's equations, in numpy and float64."""
     batch = batch_of("rae", 2)
     rae = RAE()
-    loss = NetworkLoss(rae, RAELoss())
-    outputs = []
-    targets = []
     generator = torch.Generator().manual_seed(0)
-    genuine = RAE.predict
-
-    def predict(frame, state):
-        _, state = genuine(rae, frame, state)
-        outputs.append(torch.rand(frame.albedo.shape, generator=generator))
-        reference = (frame.direct_reference + frame.indirect_reference).mean(dim=1) / frame.albedo.clamp(min=0.01)
-        targets.append((state.scale.exposure() * reference) ** 0.2)
-        return outputs[-1], state
-
-    monkeypatch.setattr(rae, "predict", predict)
-    value, parts = loss(batch)
+    predicted = predict_as(monkeypatch, rae, lambda frame, _: torch.rand(frame.albedo.shape, generator=generator))
+    value, parts = NetworkLoss(rae, RAELoss())(batch)
+    outputs = [output for output, _ in predicted]
+    references = [(f.direct_reference + f.indirect_reference).mean(1) / f.albedo.clamp(min=0.01) for f in batch.frames]
+    exposures = [scale.exposure() for _, scale in predicted]
+    targets = [(exposure * image) ** 0.2 for exposure, image in zip(exposures, references, strict=True)]
     weights = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)
     p, t = (torch.stack(x).double().numpy() for x in (outputs, targets))
     error = p - t
@@ -177,28 +176,16 @@ def test_ntd_loss_by_hand(batch_of, monkeypatch):
     """Eq. 5 and 6 with known outputs, in numpy and float64: masks of this frame and the two before it."""
     batch = batch_of("ntd", 2, length=5)
     ntd = NTD()
-    outputs = []
-    scales = []
     generator = torch.Generator().manual_seed(0)
-    genuine = NTD.predict
-
-    def predict(frame, state):
-        _, state = genuine(ntd, frame, state)
-        outputs.append(torch.rand(frame.albedo.shape, generator=generator))
-        scales.append(state.scale.exposure())
-        return outputs[-1], state
-
-    monkeypatch.setattr(ntd, "predict", predict)
+    predicted = predict_as(monkeypatch, ntd, lambda frame, _: torch.rand(frame.albedo.shape, generator=generator))
     for index, frame in enumerate(batch.frames):  # more to see than what happens to be disoccluded in a crop
         frame.channels["dual_motion"] = frame.motion.clone()
         frame.channels["dual_motion"][:, 0, index : index + 4] += 0.1
-    loss = NetworkLoss(ntd, NTDLoss())
-    _, parts = loss(batch)
-
+    _, parts = NetworkLoss(ntd, NTDLoss())(batch)
     references = [f.indirect_reference.mean(dim=1) / f.albedo.clamp(min=0.01) for f in batch.frames]
     compressed = [
-        [np.log1p((e * image).double().numpy()) for e, image in zip(scales, images, strict=True)]
-        for images in (outputs, references)
+        [np.log1p((scale.exposure() * x).double().numpy()) for (_, scale), x in zip(predicted, images, strict=True)]
+        for images in ([output for output, _ in predicted], references)
     ]
     error = np.array(compressed[0]) - np.array(compressed[1])
     assert parts["spatial"].item() == pytest.approx(np.abs(error).mean(), rel=1e-5)
@@ -251,52 +238,48 @@ def test_mean_over_surfaces_by_hand():
     assert torch.stack(parts).mean().item() == pytest.approx(expected.item())
 
 
-@pytest.mark.parametrize("loss", [None, RelativeLoss()], ids=["its own", "relative"])
 @pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
-def test_the_background_is_not_learnt_from(batch_of, name, loss):
-    """Whatever the reference holds there, the loss stays what it is, also where a surface comes into view."""
-    torch.manual_seed(0)
+def test_the_background_is_not_learnt_from(batch_of, name):
+    """Whatever the reference holds there, the loss stays the same, also where a surface comes into view."""
     batch = batch_of(name, 2)
     for index, frame in enumerate(frames_of(batch)):
         frame.channels["depth"] = frame.depth.clone()
         frame.channels["depth"][..., 20 + 4 * index :, :] = 0
-    trained = NetworkLoss(create(name), loss or recipe_for(name, "tiny").loss)
-    values = []
-    for sky in (0.0, 3.0, 1e4):
-        for index, frame in enumerate(frames_of(batch)):
-            for half in {"direct_reference", "indirect_reference"} & frame.channels.keys():
-                frame.channels[half] = frame.channels[half].clone()
-                frame.channels[half][..., 20 + 4 * index :, :] = sky
-        values.append(trained(batch)[0].item())
-    assert values[0] == values[1] == values[2] and values[0] > 0
-
-
-@pytest.mark.parametrize("relative", [False, True])
-@pytest.mark.parametrize("name", TRAINABLE)
-@pytest.mark.parametrize("level", [0.0, 1e-7, 1.0, 65504.0])
-def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name, level, relative):
-    torch.manual_seed(0)
-    batch = batch_of(name)
-    for frame in frames_of(batch):
-        frame.channels.update(
-            {light: torch.full_like(frame.channels[light], level) for light in LIGHT if light in frame.channels}
-        )
-    if isinstance(batch, Crops):
-        batch.irradiance.fill_(level)
-    loss = NetworkLoss(create(name), RelativeLoss() if relative else recipe_for(name, "tiny").loss)
-    value, _ = loss(batch)
-    value.backward()
-    assert torch.isfinite(value)
-    gradients = [p.grad for p in loss.parameters()]
-    assert all(g is not None and torch.isfinite(g).all() for g in gradients)
+    own = loss_of(name)
+    for loss in (own, NetworkLoss(own.denoiser, RelativeLoss())):
+        values = []
+        for sky in (0.0, 3.0, 1e4):
+            for index, frame in enumerate(frames_of(batch)):
+                for reference in {"direct_reference", "indirect_reference"} & frame.channels.keys():
+                    frame.channels[reference] = frame.channels[reference].clone()
+                    frame.channels[reference][..., 20 + 4 * index :, :] = sky
+            values.append(loss(batch)[0].item())
+        assert values[0] == values[1] == values[2] and values[0] > 0
 
 
 @pytest.mark.parametrize("name", TRAINABLE)
-def test_validation_knows_bfloat16(batch_of, name):
-    """Where there are no gradients networks may take other ways, which autocast must not trip."""
-    torch.manual_seed(0)
+def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name):
     batch = batch_of(name)
-    loss = NetworkLoss(create(name), recipe_for(name, "release").loss)
+    own = loss_of(name)
+    relative = NetworkLoss(own.denoiser, RelativeLoss())
+    for level, loss in product((0.0, 1e-7, 65504.0), (own, relative)):
+        for frame in frames_of(batch):
+            for light in LIGHT & frame.channels.keys():
+                frame.channels[light] = torch.full_like(frame.channels[light], level)
+        if isinstance(batch, Crops):
+            batch.irradiance.fill_(level)
+        loss.zero_grad()
+        value, _ = loss(batch)
+        value.backward()
+        assert torch.isfinite(value)
+        assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in loss.parameters())
+
+
+@pytest.mark.parametrize("name", TRAINABLE)
+def test_validation_works_in_bfloat16(batch_of, name):
+    """Without gradients networks may take other paths, which must work under autocast too."""
+    batch = batch_of(name)
+    loss = loss_of(name, "release")
     exact = loss(batch)[0].item()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         assert loss(batch)[0].item() == pytest.approx(exact, rel=0.05)
@@ -307,7 +290,7 @@ def test_gradients_are_finite_at_extreme_gains(batch_of, gain):
     batch = batch_of("rae")
     for frame in batch.frames:
         frame.gain.fill_(gain)
-    loss = NetworkLoss(RAE(), RAELoss())
+    loss = loss_of("rae")
     value, _ = loss(batch)
     value.backward()
     assert torch.isfinite(value) and all(torch.isfinite(p.grad).all() for p in loss.parameters())
@@ -327,14 +310,12 @@ def test_equal_images_have_no_loss_and_finite_gradients(batch_of, name, monkeypa
         signal = denoiser.signal
         monkeypatch.setattr(denoiser, "filter", lambda f, *_: (known(f.reference_irradiance(signal)), None))
     else:
-        genuine = denoiser.predict
 
-        def predict(frame, state):
-            _, state = genuine(frame, state)
+        def output(frame, state):
             truth = frame.reference_irradiance(denoiser.signal)
-            return known(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth), state
+            return known(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth)
 
-        monkeypatch.setattr(denoiser, "predict", predict)
+        predict_as(monkeypatch, denoiser, output)
     value, _ = NetworkLoss(denoiser, recipe_for(name, "tiny").loss)(batch)
     value.backward()
     assert value.item() == pytest.approx(0, abs=1e-6)
@@ -408,8 +389,7 @@ def test_sequences_of_a_batch_do_not_leak_into_one_another(batch_of, name):
 
 def test_no_term_of_rae_is_next_to_nothing(batch_of):
     """The share of each weighted term in the loss, after some steps; by a kernel of another norm HFEN had 1 %."""
-    torch.manual_seed(0)
-    loss = NetworkLoss(RAE(), RAELoss())
+    loss = loss_of("rae")
     optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
     batch = batch_of("rae", 2)
     for _ in range(15):
@@ -425,15 +405,14 @@ def test_no_term_of_rae_is_next_to_nothing(batch_of):
 @torch.no_grad()
 def test_occlusion_is_not_next_to_nothing(batch_of):
     """On the rendered clips, of whose pixels a few percent are hidden in the frame before."""
-    torch.manual_seed(0)
     batch = batch_of("ntd", 4, length=6, crop=64)
-    value, parts = NetworkLoss(NTD(), NTDLoss()).eval()(batch)
+    value, parts = loss_of("ntd").eval()(batch)
     hidden = torch.cat([disoccluded(frame.motion, frame.dual_motion) for frame in batch.frames]).float().mean()
     assert 0 < hidden < 0.05
     assert parts["occlusion"] > 0.1 * value
 
 
-def test_tone_is_the_display_s_and_goes_on_as_a_logarithm():
+def test_tone_is_that_of_displays_and_a_logarithm_above_white():
     radiance = torch.tensor([0.0, 0.18, 0.5, 1.0, 2.0, 1000.0])
     expected = [1e-4 ** (1 / 2.2), *(np.array([0.1801, 0.5001, 1.0001]) ** (1 / 2.2))]
     expected += [1.0001 ** (1 / 2.2) + np.log(x) / 2.2 for x in (2.0, 1000.0)]
@@ -453,26 +432,18 @@ def test_blocks_are_means_over_their_surfaces():
     assert share[0, 0, 1, 1] == 0 and mean[0, 0, 1, 1] == 0
 
 
-def test_one_s_loss_by_hand(batch_of, monkeypatch):
+def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
     """Of outputs that are off by a known factor: every frame's error and how it changes, at both scales."""
     batch = batch_of("one", 2, length=2)
     denoiser = create("one")
     factors = iter((1.5, 0.7))
-    genuine = denoiser.predict
-    seen: list[tuple[Tensor, Tensor]] = []
-
-    def predict(frame, state):
-        _, state = genuine(frame, state)
-        truth = frame.reference_irradiance("total")
-        output = next(factors) * truth
-        seen.append(tuple(state.scale.exposure() * frame.divisor * image for image in (output, truth)))
-        return output, state
-
-    monkeypatch.setattr(denoiser, "predict", predict)
+    predicted = predict_as(monkeypatch, denoiser, lambda frame, _: next(factors) * frame.reference_irradiance("total"))
     value, parts = NetworkLoss(denoiser, DisplayedLoss(temporal=0.5, scales=(1, 8)))(batch)
     spatial = 0.0
     errors: list[list[Tensor]] = []
-    for frame, (output, truth) in zip(batch.frames, seen, strict=True):
+    for frame, (irradiance, scale) in zip(batch.frames, predicted, strict=True):
+        images = (irradiance, frame.reference_irradiance("total"))
+        output, truth = (scale.exposure() * frame.divisor * image for image in images)
         surface = (frame.depth > 0).float()
         blocks = [image * surface for image in (output, truth)]
         share = surface.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2))
@@ -512,8 +483,7 @@ def test_every_network_learns_one_batch(batch_of, name, steps, changes, left):
 
     The other networks begin as filters already, so that less is left to learn, and for the few weights of LBF little.
     """
-    torch.manual_seed(0)
-    loss = NetworkLoss(create(name), recipe_for(name, "tiny").loss).train()
+    loss = loss_of(name).train()
     loss.progress = 1.0
     optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
     batch = batch_of(name, 1, crop=24, **changes)

@@ -19,37 +19,29 @@ ENDS_WELL = {"anneal", "average", "rate"}
 FOR_NOISY_REFERENCES = {"loss", "clip", "augmentation"}
 
 
-def test_rae_is_the_paper_s():
-    recipe = recipe_for("rae", "paper")
-    assert recipe.learning_rate(0) == pytest.approx(1e-4)
-    assert recipe.learning_rate(5) == pytest.approx(1e-4 * 10**0.5)
-    assert recipe.learning_rate(10) == pytest.approx(1e-3)
-    assert recipe.learning_rate(40) == pytest.approx(5e-4)
-    assert (recipe.batch, recipe.length, recipe.crop, recipe.epochs, recipe.betas) == (4, 7, 128, 500, (0.9, 0.99))
-    assert recipe.augmentation == Augmentation(True, True, True, True)
-    assert recipe.loss == RAELoss(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
+WSKP = {"batch": 64, "crop": 128, "crops": (80, 20), "epochs": 500, "rate": 1e-3, "loss": SMAPELoss(0.01)}
+NTD = {"batch": 1, "length": 10, "trained": 9, "crop": None, "epochs": 200, "rate": 1e-4}
+PAPERS = [
+    ("rae", {"batch": 4, "length": 7, "crop": 128, "epochs": 500, "betas": (0.9, 0.99)}),
+    *((name, WSKP) for name in ("wskp3", "wskp6", "wskp-mr", "kp", "mr-kp")),
+    ("nbgd", {"batch": 1, "crop": 128, "crops": (50, 50), "epochs": 100, "rate": 1e-4, "loss": NBGDLoss()}),
+    ("ntd", NTD | {"loss": NTDLoss(1.0, 1.0, 1.0, (1.0, 0.8, 0.6), 0.5)}),
+    *((name, NTD | {"loss": NTDLoss(1.0, 1.0, 0.0, (1.0, 0.8, 0.6), 0.5)}) for name in ("ntd-a", "ntd-b")),
+]
 
 
-@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"])
-def test_wskp_is_the_paper_s(name):
+@pytest.mark.parametrize("name, expected", PAPERS)
+def test_recipes_are_those_of_the_papers(name, expected):
     recipe = recipe_for(name, "paper")
-    assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (64, 128, (80, 20), 500, 1e-3)
-    assert recipe.loss == SMAPELoss(0.01) and recipe.augmentation == Augmentation()
-    assert recipe.learning_rate(0) == recipe.learning_rate(499) == 1e-3
-
-
-def test_nbgd_is_its_authors():
-    recipe = recipe_for("nbgd", "paper")
-    assert (recipe.batch, recipe.crop, recipe.crops, recipe.epochs, recipe.rate) == (1, 128, (50, 50), 100, 1e-4)
-    assert recipe.loss == NBGDLoss() and recipe.augmentation == Augmentation()
-
-
-@pytest.mark.parametrize("name, occlusion", [("ntd-a", 0.0), ("ntd-b", 0.0), ("ntd", 1.0)])
-def test_ntd_is_the_paper_s(name, occlusion):
-    recipe = recipe_for(name, "paper")
-    assert (recipe.batch, recipe.length, recipe.trained, recipe.crop, recipe.epochs) == (1, 10, 9, None, 200)
-    assert recipe.loss == NTDLoss(1.0, 1.0, occlusion, (1.0, 0.8, 0.6), 0.5)
-    assert recipe.learning_rate(0) == recipe.learning_rate(199) == 1e-4 and recipe.augmentation == Augmentation()
+    assert {key: getattr(recipe, key) for key in expected} == expected
+    if name == "rae":
+        assert recipe.augmentation == Augmentation(reverse=True, stop=True, rotate=True, gain=True)
+        assert recipe.loss == RAELoss(0.8, 0.1, 0.1, (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0))
+        rates = [recipe.learning_rate(epoch) for epoch in (0, 5, 10, 40)]
+        assert rates == pytest.approx([1e-4, 1e-4 * 10**0.5, 1e-3, 5e-4])
+    else:
+        assert recipe.learning_rate(0) == recipe.learning_rate(recipe.epochs - 1) == recipe.rate
+        assert recipe.augmentation == Augmentation()
 
 
 def test_budgets_scale_the_effort_and_anneal():
@@ -66,7 +58,7 @@ def test_budgets_scale_the_effort_and_anneal():
 
 
 @pytest.mark.parametrize("name", TRAINABLE)
-def test_what_is_shipped_learns_from_noisy_references(name):
+def test_release_recipes_are_for_noisy_references(name):
     """Without the blocks of 16 where a network filters single frames by small windows."""
     recipe = recipe_for(name, "release")
     assert isinstance(recipe.loss, DisplayedLoss)
@@ -93,7 +85,7 @@ def test_every_network_has_recipes_for_all_budgets():
     assert set(RECIPES) == {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")}
 
 
-def test_unknown_names_are_told_apart():
+def test_unknown_names_are_refused():
     with pytest.raises(BadInput, match="'accumulated' is not a network"):
         recipe_for("accumulated", "tiny")
     with pytest.raises(BadInput, match=r"unknown budget 'huge'; the budgets of 'rae' are tiny, quick, release, paper"):

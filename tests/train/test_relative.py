@@ -5,17 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from datasets.clip import Dataset
 from datasets.frame import Frame
-from models.history.running_scale import RunningScale
 from models.networks.ntd import NTD
 from models.networks.rae import RAE, raised
 from models.networks.wskp import WSKP
 from models.registry import create
 from tests.helpers.frames import flat_frame
-from tests.helpers.training import short_task, tensors
+from tests.helpers.training import predict_as, short_task, tensors
 from train.crops import Crops
 from train.data import items, loader
 from train.loop import train_network
@@ -41,7 +39,7 @@ def noisy_frame(sigma: float = 1.0, seed: int = 0) -> Frame:
 
 
 def crops_of(frame: Frame) -> Crops:
-    return Crops(frame, torch.zeros_like(frame.albedo), RunningScale.neutral(frame.albedo))
+    return Crops(frame, torch.zeros_like(frame.albedo), torch.tensor([[np.log(0.18), 0.0]]).float())
 
 
 def fitted(loss: NetworkLoss, batch: Batch | Crops, parameter: torch.nn.Parameter) -> float:
@@ -140,19 +138,11 @@ def batch(tiny, tmp_path_factory) -> Batch:
 def test_the_loss_of_a_sequence_by_hand(batch, monkeypatch):
     """In numpy and float64: radiance with emission, as exposed and gained, weighted by frame, over surfaces."""
     rae = RAE()
-    genuine = RAE.predict
     generator = torch.Generator().manual_seed(0)
     gain = torch.tensor([0.5, 1.0, 2.0])[None, :, None, None]
-    outputs: list[Tensor] = []
-    exposures: list[Tensor] = []
-
-    def predict(frame, state):
-        _, state = genuine(rae, frame, state)
-        outputs.append(torch.rand(frame.albedo.shape, generator=generator) * 1.5 - 0.2)
-        exposures.append(state.scale.exposure() * gain)
-        return outputs[-1], state
-
-    monkeypatch.setattr(rae, "predict", predict)
+    predicted = predict_as(
+        monkeypatch, rae, lambda frame, _: torch.rand(frame.albedo.shape, generator=generator) * 1.5 - 0.2
+    )
     frames = [replace(frame, colour_gain=gain.expand(2, 3, 1, 1)) for frame in batch.frames]
     weights = (0.2, 0.5, 1.0)
     value, parts = NetworkLoss(rae, RelativeLoss(temporal=0.7, frames=weights))(Batch(frames))
@@ -160,9 +150,9 @@ def test_the_loss_of_a_sequence_by_hand(batch, monkeypatch):
     spatial = []
     temporal = []
     before = None
-    for frame, p, exposure in zip(frames, outputs, exposures, strict=True):
+    for frame, (p, scale) in zip(frames, predicted, strict=True):
         albedo, emission, p, exposure = (
-            x.double().numpy() for x in (frame.albedo.clamp(min=0.01), frame.emission, p, exposure)
+            x.double().numpy() for x in (frame.albedo.clamp(min=0.01), frame.emission, p, scale.exposure() * gain)
         )
         f = np.maximum(p, 0) ** 5 * albedo + exposure * emission
         halves = (frame.direct_reference + frame.indirect_reference).double().numpy()

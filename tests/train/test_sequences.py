@@ -6,15 +6,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS, HIT_CHANNELS, USUAL_CHANNELS
-from datasets.clip import Dataset
+from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
-from train.augmentation import Augmentation, averaged, rotated
+from models.registry import create
+from train import sequences as module
+from train.augmentation import Augmentation, LightEdge, averaged, rotated
 from train.data import loader
-from train.sequences import TrainingSequences, collate
+from train.sequences import TrainingSequences, WholeFrames, collate
 
 FORWARD_ALONE = tuple(name for name, channel in CHANNELS.items() if channel.is_temporal and name != "motion")
 IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
@@ -138,7 +142,7 @@ def are_equal(a: Frame, b: Frame) -> bool:
     cameras = [(getattr(a, when), getattr(b, when)) for when in ("now", "previous")]
     return (
         all(torch.equal(a.channels[name], b.channels[name]) for name in IMAGE_CHANNELS)
-        and all(torch.equal(vars(one)[key], vars(two)[key]) for one, two in cameras for key in vars(one))
+        and all(torch.equal(vars(x)[key], vars(y)[key]) for x, y in cameras for key in vars(x))
         and torch.equal(a.gain, b.gain)
     )
 
@@ -203,7 +207,7 @@ def test_reversed_playback_uses_forward_vectors(clips):
 
 
 @pytest.mark.parametrize("name", FORWARD_ALONE)
-def test_what_only_the_renderer_sees_refuses_reversed_playback(tiny, name):
+def test_channels_that_only_the_renderer_computes_refuse_reversed_playback(tiny, name):
     clip = Dataset(tiny).clips("test")[1]
     with pytest.raises(BadInput, match=f"'{name}' exists for forward playback only"):
         read_frame(clip, 3, (name,), previous=4)
@@ -211,7 +215,7 @@ def test_what_only_the_renderer_sees_refuses_reversed_playback(tiny, name):
     assert (read_frame(clip, 3, (name,)).channels[name] != 0).any()
 
 
-def test_gain_is_one_factor_a_channel_and_sequence(clips):
+def test_gains_are_random_per_sequence_and_exposures_do_not_change_colours(clips):
     gains = []
     for index in range(30):
         frames = sequences(clips, AUGMENTATIONS["all"])[index]
@@ -220,6 +224,9 @@ def test_gain_is_one_factor_a_channel_and_sequence(clips):
     gains = torch.stack(gains)
     assert (gains >= 0).all() and (gains <= 2).all() and 0.8 < gains.mean() < 1.2
     assert (sequences(clips)[0][0].gain == 1).all()
+    gains = torch.cat([sequences(clips, Augmentation(exposure=True))[index][0].gain for index in range(20)]).flatten(1)
+    assert torch.equal(gains[:, 0], gains[:, 1]) and torch.equal(gains[:, 0], gains[:, 2])
+    assert 2**-1.5 <= gains.min() < 0.8 and 1.3 < gains.max() <= 2**1.5
 
 
 def test_batches_stack_sequences_and_pad_meshes(clips):
@@ -265,12 +272,12 @@ def test_sequences_of_several_samples_are_means_of_realisations(tiny):
             TrainingSequences(clips, ("direct", "indirect"), 3, 32, augmentation, seed=0)[index]
             for augmentation in (Augmentation(), Augmentation(samples=True))
         )
-        for one, mean in zip(plain, several, strict=True):
+        for single, mean in zip(plain, several, strict=True):
             count = int(mean.samples.item())
             counts.add(count)
             if count == 1:
-                assert torch.equal(one.direct, mean.direct)
-            torch.testing.assert_close(one.direct_reference, mean.direct_reference)
+                assert torch.equal(single.direct, mean.direct)
+            torch.testing.assert_close(single.direct_reference, mean.direct_reference)
         assert len({frame.samples.item() for frame in several}) == 1
     assert counts == {1, 2}  # there are two realisations
 
@@ -287,12 +294,6 @@ def test_means_of_frames_keep_everything_but_the_noise(clips):
             np.testing.assert_allclose(mean.channels[name], both.mean(axis=0).filled(0), rtol=1e-6)
         else:
             assert torch.equal(mean.channels[name], frames[0].channels[name])
-
-
-def test_exposures_vary_without_changing_colours(clips):
-    gains = torch.cat([sequences(clips, Augmentation(exposure=True))[index][0].gain for index in range(20)]).flatten(1)
-    assert torch.equal(gains[:, 0], gains[:, 1]) and torch.equal(gains[:, 0], gains[:, 2])
-    assert 2**-1.5 <= gains.min() < 0.8 and 1.3 < gains.max() <= 2**1.5
 
 
 def test_a_change_of_light_changes_noise_and_references_alike(clips):
@@ -312,3 +313,98 @@ def test_a_change_of_light_changes_noise_and_references_alike(clips):
                 else:
                     assert torch.equal(lit.channels[name], plain.channels[name])
     assert 10 < changed < 60
+
+
+# --- The scale of whole frames ---
+
+Played = tuple[Clip, int, int]
+
+
+class Recorded(WholeFrames):
+    """Notes which frames and realisations were asked for."""
+
+    def __init__(self, signal):
+        super().__init__(signal)
+        self.asked: list[Played] = []
+
+    def __call__(self, clip, index, realisation):
+        self.asked.append((clip, index, realisation))
+        return super().__call__(clip, index, realisation)
+
+
+def is_part_of(crop: Frame, whole: Frame) -> bool:
+    """Whether the noise of a crop of 32 x 32 pixels is somewhere in the whole frame."""
+    windows = whole.indirect.unfold(2, 32, 1).unfold(3, 32, 1)
+    return bool((windows == crop.indirect[:, :, None, None]).all(dim=-1).all(dim=-1).all(dim=1).any())
+
+
+@pytest.mark.parametrize("name, reverse", [("rae", True), ("ntd", False)])
+@torch.no_grad()
+def test_crops_get_the_scale_of_their_whole_frames(clips, name, reverse):
+    """Played backward, with a camera that stops and with gains; without their scale the crop's own is another."""
+    denoiser = create(name)
+    measure = Recorded(denoiser.signal)
+    augmentation = Augmentation(reverse=reverse, stop=True, gain=True)
+    data = TrainingSequences(clips, denoiser.reads, 4, 32, augmentation, 0)
+    data.whole_frames = measure
+    unlike = 0
+    for index in range(6):
+        measure.asked.clear()
+        crops = data[index]
+        cropped = None
+        whole = None
+        last = measure.asked[0][1]
+        for crop, (clip, position, realisation) in zip(crops, measure.asked, strict=True):
+            frame = read_frame(clip, position, denoiser.reads, realisation, previous=last)
+            assert is_part_of(crop, frame)
+            _, cropped = denoiser.predict(crop, cropped)
+            _, whole = denoiser.predict(frame, whole)
+            last = position
+        torch.testing.assert_close(cropped.scale.exposure(), whole.scale.exposure())
+        torch.testing.assert_close(cropped.scale.log_depth.value, whole.scale.log_depth.value)
+        own, with_whole = (denoiser.predict(each, None)[1].scale for each in (replace(crop, whole=None), crop))
+        unlike += not torch.allclose(own.exposure(), with_whole.exposure(), rtol=0.05)
+    assert unlike >= 3
+
+
+def test_each_frame_is_measured_once(clips, monkeypatch):
+    measure = WholeFrames("total")
+    first = measure(clips[0], 3, 1)
+    other = [measure(*asked) for asked in ((clips[0], 3, 0), (clips[0], 4, 1), (clips[1], 3, 1))]
+    assert not any(torch.equal(first, each) for each in other)
+    monkeypatch.setattr(module, "measure", lambda *_: pytest.fail("measured again"))
+    assert torch.equal(measure(clips[0], 3, 1), first)
+
+
+def test_the_scale_of_whole_frames_survives_batches(clips):
+    data = TrainingSequences(clips, ("indirect", "depth"), 2, 32, Augmentation(), 0, "indirect")
+    batch = collate([data[0], data[1]]).to("cpu")
+    assert torch.equal(batch.frames[1].whole, torch.cat([data[0][1].whole, data[1][1].whole]))
+    assert batch.frames[0].whole.shape == (2, 2)
+
+
+# --- Edges of light ---
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 11))
+def test_light_lies_between_one_and_the_factor(seed, frame):
+    edge = LightEdge.random(np.random.default_rng(seed), 12)
+    light = edge.light(frame, 20, 30)
+    assert light.shape == (20, 30) and light.dtype == torch.float32
+    assert (light >= min(1, edge.factor) - 1e-6).all() and (light <= max(1, edge.factor) + 1e-6).all()
+
+
+def test_an_edge_arrives_passes_the_middle_and_is_gone():
+    edge = LightEdge(factor=0.25, angle=np.pi / 2, speed=4.0, passes=5.0, softness=0.1)
+    before, middle, after = (edge.light(frame, 21, 9) for frame in (0, 5, 10))
+    assert torch.allclose(before, torch.ones(21, 9), atol=1e-6)
+    assert torch.allclose(after, torch.full((21, 9), 0.25), atol=1e-6)
+    assert (
+        torch.allclose(middle[10], torch.full((9,), 0.625)) and (middle[:10] < 0.3).all() and (middle[11:] > 0.9).all()
+    )
+
+
+def test_it_moves_along_its_angle():
+    edge = LightEdge(factor=3.0, angle=0.0, speed=2.0, passes=2.0, softness=0.2)
+    first, second = (edge.light(frame, 5, 41) for frame in (2, 3))
+    assert torch.allclose(first[:, :-2], second[:, 2:], atol=1e-5)

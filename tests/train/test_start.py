@@ -52,7 +52,7 @@ def grey(tiny, tmp_path) -> Path:
 
 def short(name: str, data: Path, runs: Path, **arguments) -> Task:
     """A training of a few steps from other weights, or specialised."""
-    task = task_for(name, data, runs, "tiny", precision="float32", **arguments)
+    task = replace(task_for(name, data, runs, "tiny"), precision="float32", **arguments)
     return replace(task, recipe=replace(task.recipe, **SHORT["rae" if name == "rae" else "wskp6"]))
 
 
@@ -79,15 +79,9 @@ def test_its_weights_and_checkpoint_name_what_it_began_with(tiny, tmp_path, gene
 
 
 def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, general):
-    def said(*arguments: str) -> str:
-        there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny"]
-        with pytest.raises(SystemExit) as exit_:
-            main(["train", *arguments, *there])
-        assert exit_.value.code == 2
-        return capsys.readouterr().err
-
-    assert "there are no weights at missing" in said("wskp3", "--from", "missing")
-    assert "holds weights of 'wskp3', not of 'rae'" in said("rae", "--from", str(general))
+    there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny"]
+    assert "there are no weights at missing" in fails(capsys, "train", "wskp3", "--from", "missing", *there)
+    assert "holds weights of 'wskp3', not of 'rae'" in fails(capsys, "train", "rae", "--from", str(general), *there)
     assert not list(tmp_path.glob("runs/train/*/[!.]*"))
 
 
@@ -144,14 +138,11 @@ def test_a_network_is_specialised_from_scratch_too(tiny, tmp_path):
     assert weights == folder_of(tmp_path, "rae") / WEIGHTS_FILE
 
 
-def test_where_all_varies_nothing_is_left_out(capsys, tiny, tmp_path):
+def test_where_all_inputs_vary_none_is_left_out(capsys, tiny, tmp_path):
     general = Training(short_task("wskp6", tiny, tmp_path / "general"))
     special = Training(short("wskp6", tiny, tmp_path / "special", specialised=True))
     assert special.facts == general.facts and special.judged.denoiser.constants == {}
     train_network(short("wskp6", tiny, tmp_path / "special", specialised=True))
     assert "left out nothing: all of its inputs vary" in capsys.readouterr().out
-
-
-def test_what_needs_all_of_its_inputs_is_not_specialised(tiny, tmp_path):
     with pytest.raises(BadInput, match="without --specialise"):
         train_network(replace(short_task("one", tiny, tmp_path), specialised=True))

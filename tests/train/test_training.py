@@ -45,16 +45,21 @@ def test_what_cannot_be_trained_with_is_refused_before_anything_is_written(tiny,
     assert not (tmp_path / "train").exists()
 
 
-def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monkeypatch):
+def make_finite(monkeypatch, *finite: bool) -> None:
+    """Whether the loss of each step is to be finite; the last is of all that follow."""
     genuine = NetworkLoss.forward
-    finite = [True, False, True]  # whether the loss of each step is; the last is of all that follow
+    waiting = list(finite)
 
     def forward(self, batch):
         value, parts = genuine(self, batch)
-        keep = finite.pop(0) if len(finite) > 1 else finite[0]
+        keep = waiting.pop(0) if len(waiting) > 1 else waiting[0]
         return (value if keep else value * math.nan), parts
 
     monkeypatch.setattr(NetworkLoss, "forward", forward)
+
+
+def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monkeypatch):
+    make_finite(monkeypatch, True, False, True)
     training = Training(short_task("rae", tiny, tmp_path, epochs=2))
     steps = training.steps()
     next(steps)
@@ -96,13 +101,7 @@ def test_a_loss_that_is_not_finite_is_never_the_best(tiny, tmp_path):
 
 
 def test_a_training_that_only_skips_is_refused(tiny, tmp_path, monkeypatch):
-    genuine = NetworkLoss.forward
-
-    def forward(self, batch):
-        value, parts = genuine(self, batch)
-        return value * math.nan, parts
-
-    monkeypatch.setattr(NetworkLoss, "forward", forward)
+    make_finite(monkeypatch, False)
     training = Training(short_task("rae", tiny, tmp_path, epochs=2))
     training.position.skipped_in_a_row = MAX_SKIPPED_IN_A_ROW - 2
     steps = training.steps()
