@@ -1,6 +1,7 @@
 """`onespp export`: a trained denoiser as one file, with golden frames of a synthetic sequence."""
 
 from pathlib import Path
+from typing import Literal
 
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.selection import weights_of
@@ -19,13 +20,13 @@ def export(
     to: Format,
     runs: Path,
     weights: Path | None = None,
-    precision: str = "float32",
+    precision: Literal["float32", "float16"] = "float32",
     warp: Warp = "inside",
     out: Path | None = None,
 ) -> str:
-    """Write the export to `out`, by default RUNS/export/NAME-TO. Returns what was written, in words.
+    """Write the export to `out`, by default RUNS/export/NAME-TO. Returns a summary.
 
-    `weights` are by default those shipped, or of NAME@BUDGET those in RUNS. Raises BadInput where the denoiser cannot
+    `weights` are by default the shipped ones, for NAME@BUDGET those in RUNS. Raises BadInput where the denoiser cannot
     be exported or has no weights, and where packages are missing.
     """
     parsed = parse_name(name)

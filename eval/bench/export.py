@@ -16,10 +16,8 @@ from eval.bench.synthetic_frames import synthetic_frame
 from eval.bench.timed import TIMED_FRAMES, WARM_UP_FRAMES, TimedDenoiser
 from files import write_json
 from models.export.package import largest_difference
-from models.export.playing import play
-from models.export.program import check_installed, trace, write_onnx
+from models.export.program import check_installed, play, run_onnx, trace, write_onnx
 from models.export.registry import check_exportable, step_of
-from models.export.runtime import run_onnx
 from models.export.step import Step, Warp
 from models.spec import DenoiserSpec
 from provenance import device_in_words
@@ -89,7 +87,7 @@ def bench_export(
             PYTORCH: sequence.ours(DenoiserSpec.named(name, compiled=False)),
         }
         for way, warp in EXPORTED.items():
-            step = step_of(name, DenoiserSpec.named(name).build(), warp)
+            step = step_of(DenoiserSpec.named(name).build(), warp)
             file = Path(folder) / f"{warp}.onnx"
             with torch.inference_mode(False):
                 operators[way] = write_onnx(trace(step, synthetic_frame(0, *EXAMPLE_SIZE)), step, file).total

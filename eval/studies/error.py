@@ -87,7 +87,9 @@ def run_denoiser(denoiser: JamesStein, clip: Clip, spp: int) -> Iterator[tuple[T
     """Radiance, its error estimate, and the reference's sample buffers (2, 3, H, W), frame by frame."""
     state: State | None = None
     for index in range(clip.frames):
-        output, state, estimate = denoise_with_error(denoiser, frame_with_samples(clip, index, spp, denoiser.reads), state)
+        output, state, estimate = denoise_with_error(
+            denoiser, frame_with_samples(clip, index, spp, denoiser.reads), state
+        )
         yield output, estimate, to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
 
 

@@ -1,14 +1,17 @@
-"""`one` (models/networks/one.py) as a step: inputs, network and affinity filter in one graph."""
+"""`one` (models/networks/one.py) as a step: inputs, network and affinity filter in one graph.
+
+Taps of its filters are slices, all in one tensor: exact in every engine, whereas convolutions round mesh ids and bright
+pixels where engines shorten their inputs.
+"""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import MAX_EXPOSED, SIDE_MULTIPLE
-from models.export.neighbours import affinity_level, mesh_sums
-from models.export.recurrent import RecurrentStep, demodulation
-from models.export.scale import Scale, updated_scale
-from models.export.step import Warp, image
+from models.export.history import Scale, updated_scale
+from models.export.step import Step, Warp, demodulation, image
 from models.filters.neighbours import means_of, summands
 from models.networks.one import (
     HISTORY,
@@ -21,30 +24,43 @@ from models.networks.one import (
     per_pixel_inputs,
     surface_inputs,
 )
-from models.operators import MAX_IRRADIANCE
+from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
-READS = (
-    "noisy",
-    "emission",
-    "albedo",
-    "normal",
-    "depth",
-    "roughness",
-    "mesh_id",
-    "camera_to_world",
-    "samples",
-)
-ONE_HISTORY = image(
-    "history",
-    sum(HISTORY),
-    "denoised and accumulated irradiance, linear RGB each; the accumulation's length in samples; latent channels",
-)
 TO_VIEW = (-1.0, 1.0, -1.0)  # see Frame.to_view
-MARGIN = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
+COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
+
+
+def neighbour_taps(x: Tensor, step: int) -> Tensor:
+    """The 3 x 3 taps `step` pixels apart of (1, C, H, W) but the middle one: (8, C, H, W), 0 outside the image."""
+    padded = F.pad(x, (step, step, step, step))
+    shifts = (slice(None, -2 * step), slice(step, -step), slice(2 * step, None))  # constants for images of any size
+    rows = [padded[:, :, shift] for shift in shifts]
+    taps = [row[..., shift] for row in rows for shift in shifts]
+    return torch.cat(taps[:4] + taps[5:])
+
+
+def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
+    """See models.filters.neighbours.mesh_sums. `mesh` (1, 1, H, W) is nowhere 0."""
+    values, meshes = neighbour_taps(torch.cat([image, mesh], dim=1), step).split([image.shape[1], 1], dim=1)
+    return image + torch.where(meshes == mesh, values, 0).sum(dim=0, keepdim=True)
+
+
+def affinity_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """See models.networks.affinity.affinity_level; `image` is 0 for background."""
+    values = torch.cat([image, surface], dim=1)
+    difference = neighbour_taps(features, step) - features
+    distance = (difference * difference).sum(dim=1, keepdim=True)
+    importances, neighbours = neighbour_taps(torch.cat([importance, values], dim=1), step).split([1, 4], dim=1)
+    weight = torch.exp((importances - sharpness * distance).clamp(min=MIN_LOGIT))
+    total = (weight * neighbours).sum(dim=0, keepdim=True) + torch.exp(centre) * values
+    weighted, weights = total.split([3, 1], dim=1)
+    return torch.where(surface > 0, weighted / weights.clamp(min=MIN_DIVISOR), 0)
 
 
 def pointwise(layers: nn.Sequential) -> nn.Sequential:
-    """The same layers on images: linear ones as convolutions of 1 x 1."""
+    """Per-pixel layers on images: linear ones as convolutions of 1 x 1."""
     plain: list[nn.Module] = []
     for layer in layers:
         if isinstance(layer, nn.Linear):
@@ -55,8 +71,8 @@ def pointwise(layers: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*plain)
 
 
-def of_pixels(layer: nn.Module) -> nn.Sequential:
-    """A layer on patches of 2 x 2 pixels as one on pixels."""
+def on_pixels(layer: nn.Module) -> nn.Sequential:
+    """A layer on patches of 2 x 2 pixels as a strided one on pixels."""
     assert isinstance(layer, nn.Conv2d)
     outputs, inputs = layer.weight.shape[:2]
     convolution = nn.Conv2d(inputs // PATCH, outputs, 2, stride=2)
@@ -66,9 +82,9 @@ def of_pixels(layer: nn.Module) -> nn.Sequential:
 
 
 def resized(x: Tensor, height: int, width: int) -> Tensor:
-    """x (1, C, h, w) with borders repeated, or cut off, at the right and the bottom: (1, C, height, width).
+    """x (1, C, h, w) with borders repeated, or cropped, at the right and the bottom: (1, C, height, width).
 
-    By indices: tracers cannot tell how far an image is from a multiple of 8.
+    By indices, since a tracer cannot express how far a size is from a multiple of 8.
     """
     for dim, size in ((-2, height), (-1, width)):
         x = x.index_select(dim, torch.arange(size).clamp(max=x.shape[dim] - 1))
@@ -76,47 +92,55 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
 
 
 class Coarsest(nn.Sequential):
-    """The network's layers at 1/8 of the resolution, with zeros beside: tracers must know that there are two pixels."""
+    """The layers at 1/8 of the resolution, on images padded with zeros: a tracer needs two pixels."""
 
     def forward(self, x: Tensor) -> Tensor:
-        inside = F.pad(torch.ones_like(x[:, :1]), MARGIN)[..., ::2, ::2]
-        x = F.pad(x, MARGIN)
+        inside = F.pad(torch.ones_like(x[:, :1]), COARSE_PADDING)[..., ::2, ::2]
+        x = F.pad(x, COARSE_PADDING)
         for layer in self:
             x = layer(x) * inside
         return x
 
 
-class WithoutMargin(nn.Module):
-    """What `Coarsest` has added, cut off at twice its resolution."""
+class CropPadding(nn.Module):
+    """Removes the padding of `Coarsest`, at twice its resolution."""
 
     def forward(self, x: Tensor) -> Tensor:
         return x[..., :-2, :-2]
 
 
-class OneStep(RecurrentStep):
-    """`one`, prepared for inference, which must not be used any more."""
+class OneStep(Step):
+    """`one`. The denoiser is prepared for inference and must not be used afterwards."""
+
+    reads = ("noisy", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "camera_to_world", "samples")
+    history = image(
+        "history",
+        sum(HISTORY),
+        None,
+        "output and accumulated irradiance, linear RGB each; effective length of the accumulation in samples; latent",
+    )
 
     def __init__(self, denoiser: One, warp: Warp):
-        super().__init__(READS, ONE_HISTORY, warp)
+        super().__init__(denoiser, warp)
         self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.network
-        self.trunk.enter = nn.Sequential(of_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
+        self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = pointwise(self.trunk.detail)
         self.trunk.down_c = Coarsest(*self.trunk.down_c)
-        self.trunk.up_b = nn.Sequential(self.trunk.up_b, WithoutMargin())  # type: ignore[assignment]
+        self.trunk.up_b = nn.Sequential(self.trunk.up_b, CropPadding())  # type: ignore[assignment]
         self.requires_grad_(False)
 
     def pixel_inputs(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> PixelInputs:
-        """As One.pixel_inputs."""
+        """See One.pixel_inputs."""
         mesh = x["mesh_id"].to(noisy) + 1
-        close = mesh_sums(summands(noisy), mesh, 1)
-        means = means_of(close, mesh_sums(close, mesh, 3))
-        history = self.past(x)
+        sums_3x3 = mesh_sums(summands(noisy), mesh, 1)
+        means = means_of(sums_3x3, mesh_sums(sums_3x3, mesh, 3))
+        history = self.reprojected_history(x)
         has_history = (history[:, 6:7] > 0).to(noisy) * surface  # after the first frame, no length is 0
         return PixelInputs(noisy, *means, history, has_history)
 
     def network_inputs(self, x: dict[str, Tensor], inputs: PixelInputs, scale: Scale) -> Tensor:
-        """As models.networks.one.network_inputs, for pixels."""
+        """The inputs of models.networks.one.network_inputs, for pixels."""
         images = torch.cat(exposed_images(inputs), dim=1)
         colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=MAX_EXPOSED))
         to_view = torch.tensor(TO_VIEW)[:, None] * x["camera_to_world"][:3, :3].T
@@ -125,7 +149,7 @@ class OneStep(RecurrentStep):
         return torch.cat([colours, *per_pixel_inputs(inputs, x["samples"]), *surfaces], dim=1)
 
     def network(self, channels: Tensor) -> Tensor:
-        """The head outputs (1, ·, H, W)."""
+        """Head outputs (1, ·, H, W)."""
         height, width = channels.shape[-2:]
         whole = (SIDE_MULTIPLE * ((size + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for size in (height, width))
         return resized(self.trunk(resized(channels, *whole)), height, width) + self.trunk.detail(channels)

@@ -1,4 +1,4 @@
-"""The page that goes with an exported file: what goes in and out, and how it is called."""
+"""README.md of an exported file: its inputs and outputs, and how to call it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,11 +21,11 @@ def first_state(height, width):
     return {port["name"]: np.zeros([sizes.get(n, n) for n in port["shape"]], port["dtype"]) for port in ports}
 
 
-def step(frame, state):  # dictionaries of arrays: inputs that each frame brings, and those that are state
+def step(frame, state):  # dictionaries of arrays: the frame's inputs, and the state
     inputs = {**frame, **state}
     outputs = dict(zip(names, session.run(names, inputs)))
-    known = {**inputs, **outputs}
-    return outputs["radiance"], {name: known[source] for name, source in carried.items()}
+    tensors = {**inputs, **outputs}
+    return outputs["radiance"], {name: tensors[source] for name, source in carried.items()}
 """,
     "pt2": """import json
 
@@ -45,21 +45,21 @@ def first_state(height, width):
 
 
 @torch.no_grad()
-def step(frame, state):  # dictionaries of tensors: inputs that each frame brings, and those that are state
+def step(frame, state):  # dictionaries of tensors: the frame's inputs, and the state
     inputs = {**frame, **state}
     outputs = program({name: inputs[name] for name in names})
-    known = {**inputs, **outputs}
-    return outputs["radiance"], {name: known[source] for name, source in carried.items()}
+    tensors = {**inputs, **outputs}
+    return outputs["radiance"], {name: tensors[source] for name, source in carried.items()}
 """,
 }
 
 CPP = """Ort::Env env;
 Ort::Session session(env, "FILE", Ort::SessionOptions{});
 Ort::IoBinding step(session);
-step.BindInput("noisy", noisy);  // and so on: an Ort::Value for every input, made once over the renderer's buffers
+step.BindInput("noisy", noisy);  // and so on: an Ort::Value for every input, over the renderer's buffers
 step.BindOutput("radiance", radiance);
 for (;;) {
-  for (size_t i = 0; i < state.size(); ++i) {  // history and scale, two buffers each: the last frame's, the next one's
+  for (size_t i = 0; i < state.size(); ++i) {  // history and scale: double-buffered
     step.BindInput(state_inputs[i], state[i]);
     step.BindOutput(state_outputs[i], next_state[i]);
   }
@@ -68,54 +68,53 @@ for (;;) {
 }
 """
 
-INSIDE = """What is named `previous_…` is the input of the frame before: keep two buffers of each, and copy nothing. The
-transforms of `to_previous_camera` are products of matrices of large numbers: multiply in float64, then round."""
+INSIDE = """Inputs named `previous_…` are those of the previous frame: double-buffer them, without copying. Multiply the
+matrices of `to_previous_camera` in float64 and round the product to float32, since translations can be large."""
 
-OUTSIDE = """Before each frame but the first, move `history` along with the surfaces: at each pixel, what `new_history`
-held where its surface was in the frame before, and 0 in all channels where that surface was not seen: one of them is a
-length, and where it is 0 the denoiser starts anew."""
+OUTSIDE = """Before each frame but the first, reproject `history`: each pixel gets the `new_history` of the pixel that
+showed its surface in the previous frame, and 0 in all channels where the surface was not visible there. One of the
+channels is a length: where it is 0, the denoiser starts anew."""
 
 
-def table(ports: Sequence[Mapping[str, Any]]) -> str:
+def port_table(ports: Sequence[Mapping[str, Any]]) -> str:
     rows = (f"| `{p['name']}` | {p['dtype']} | {' × '.join(map(str, p['shape']))} | {p['meaning']} |" for p in ports)
     return "\n".join(["| name | type | shape | meaning |", "| --- | --- | --- | --- |", *rows])
 
 
-def page(manifest: Mapping[str, Any]) -> str:
-    """The page, in Markdown."""
+def instructions(manifest: Mapping[str, Any]) -> str:
+    """The text, in Markdown."""
     kind = manifest["format"]
     cpp = f"```cpp\n{CPP.replace('FILE', manifest['file'])}```"
     if kind != "onnx":
-        cpp = "Take the ONNX file: `onespp export … --to onnx`."
-    state = "\n".join(f"- `{each['input']}` is `{each['from']}` of the frame before" for each in manifest["state"])
+        cpp = "Export to ONNX: `onespp export … --to onnx`."
+    state = "\n".join(f"- `{each['input']}`: `{each['from']}` of the previous frame" for each in manifest["state"])
     return f"""# {manifest["denoiser"]} as {manifest["file"]}
 
-One frame in, one frame out, at any size from 2 × 2 pixels on. Images are (1, channels, height, width), their rows from
-the top.
-`manifest.json` says the same to programs, with the SHA-256 of every file; `golden/` holds a sequence of frames as
-`input.NAME` and `output.NAME`, to test an integration with.
+Each call denoises one frame, of any size from 2 × 2 pixels. Images have the shape (1, channels, height, width), top row
+first; radiance is linear RGB. `manifest.json` contains the same description for programs, and the SHA-256 of every
+file. Test an integration with the sequence in `golden/`, whose arrays are named `input.NAME` and `output.NAME`.
 
-## In
+## Inputs
 
-{table(manifest["inputs"])}
+{port_table(manifest["inputs"])}
 
-## Out
+## Outputs
 
-{table(manifest["outputs"])}
+{port_table(manifest["outputs"])}
 
-## From frame to frame
+## State
 
 {state}
 
 All state is 0 before the first frame and after a cut. {INSIDE if manifest["warp"] == "inside" else OUTSIDE}
-`noisy` is mended where it is not finite; all other inputs must be finite.
+Non-finite values in `noisy` count as 0; all other inputs must be finite.
 
 ## Calls
 
 ```python
 {PYTHON[kind]}```
 
-In terms of C++:
+In C++:
 
 {cpp}
 """

@@ -1,9 +1,9 @@
-"""Tracing a step, for images of any size, and writing it: ONNX, or PyTorch's pt2."""
+"""A step as a file: tracing it for images of any size, writing it as ONNX or PyTorch's pt2, and running it."""
 
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -11,19 +11,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.export.step import HEIGHT, MESHES, WIDTH, Step
+from models.export.step import HEIGHT, MESHES, WIDTH, Step, Tensors
+from models.history.geometry import GBuffer
+from models.history.reprojection import reproject
 
+Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, of inputs by name
 Format = Literal["onnx", "pt2"]
 OPSET = 20
 NEEDED = {"onnx": ("onnx", "onnxscript", "onnxruntime"), "pt2": ()}
 
 
 def check_installed(to: Format) -> None:
-    """Raises BadInput where a package is missing that a format needs."""
+    """Raise BadInput where a package is missing that a format needs."""
     missing = [package for package in NEEDED[to] if find_spec(package) is None]
     if missing:
         raise BadInput(f"exporting to {to} needs {', '.join(missing)}: pip install 'onespp[export]'")
@@ -31,16 +35,16 @@ def check_installed(to: Format) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the exporter's remarks on what it does not need."""
+    """Suppresses the exporter's irrelevant warnings."""
     logger = logging.getLogger("torch.onnx")
-    before = logger.level
+    level = logger.level
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(before)
+        logger.setLevel(level)
 
 
 def dynamic(step: Step) -> dict[str, dict[int, str]]:
@@ -51,17 +55,17 @@ def dynamic(step: Step) -> dict[str, dict[int, str]]:
 
 
 def trace(step: Step, frame: Frame) -> ExportedProgram:
-    """The step as a program of tensors by name. `frame` is an example, of at least 2 x 2 pixels and one mesh."""
+    """The step as a graph. `frame` is an example of at least 2 x 2 pixels and one mesh."""
     sizes = {HEIGHT: Dim(HEIGHT, min=2), WIDTH: Dim(WIDTH, min=2), MESHES: Dim(MESHES, min=2)}
     shapes = {name: {axis: sizes[size] for axis, size in named.items()} for name, named in dynamic(step).items()}
-    inputs = {**step.feeds(frame), **step.initial(frame)}
+    inputs = {**step.frame_inputs(frame), **step.initial_state(frame)}
     with torch.no_grad(), quiet():
         return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"tensors": shapes})
 
 
 @dataclass(frozen=True)
 class Operators:
-    """How many operators a file has: by kind, and in all of each branch, of which a frame takes one."""
+    """Operators of a graph, counted by kind, and in each branch, of which a frame takes one."""
 
     kinds: dict[str, int]
     branches: dict[str, int]
@@ -89,7 +93,7 @@ class Operators:
 
 
 def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
-    """Write one file with the weights in it. Raises BadInput where packages are missing."""
+    """Write one file, weights included. Raises BadInput where packages are missing."""
     check_installed("onnx")
     from onnxscript.optimizer import remove_unused_nodes
 
@@ -104,13 +108,65 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
             verbose=False,
         )
         assert written is not None
-        remove_unused_nodes(written.model)  # runtimes warn of constants in branches that the exporter leaves
+        remove_unused_nodes(written.model)  # the exporter leaves constants in branches, of which runtimes warn
         written.save(path, external_data=False)
     return Operators.of_onnx(written.model.graph)
 
 
 def write_pt2(program: ExportedProgram, path: Path) -> Operators:
-    """Write one file with the weights in it."""
+    """Write one file, weights included."""
     with quiet():
         torch.export.save(program, path)
     return Operators.of_pt2(program)
+
+
+def run_onnx(path: Path, threads: int | None = None) -> Compute:
+    """The file's step on the CPU, by default with as many threads as PyTorch uses."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or torch.get_num_threads()
+    options.log_severity_level = 3  # errors
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+
+    def compute(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        outputs = session.run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
+        return {name: torch.from_numpy(array) for name, array in zip(names, outputs, strict=True)}
+
+    return compute
+
+
+def run_pt2(path: Path) -> Compute:
+    """The file's step in PyTorch."""
+    with quiet():
+        module = torch.export.load(path).module()
+
+    def compute(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        with torch.no_grad():
+            outputs: dict[str, Tensor] = module(inputs)
+        return outputs
+
+    return compute
+
+
+def warped(step: Step, state: dict[str, Tensor], frame: Frame, previous: Frame) -> dict[str, Tensor]:
+    """The state with those images reprojected that the caller must reproject."""
+    names = [each.port.name for each in step.carried if each.warped]
+    return {**state, **{name: reproject(frame, state[name], GBuffer.of(previous))[0] for name in names}}
+
+
+def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tuple[Tensors, Tensors]]:
+    """Inputs and outputs of each frame (B = 1). After a cut the state is the initial one."""
+    previous: Frame | None = None
+    state: dict[str, Tensor] = {}
+    for frame in frames:
+        if previous is None or not frame.follows(previous.moment):
+            state = step.initial_state(frame)
+        else:
+            state = warped(step, state, frame, previous)
+        inputs = {**step.frame_inputs(frame), **state}
+        outputs = compute(inputs)
+        yield inputs, outputs
+        state = step.next_state(inputs, outputs)
+        previous = frame

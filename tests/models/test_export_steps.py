@@ -1,4 +1,4 @@
-"""Exported steps against our denoisers: equal over sequences, at any size, by any runtime, and at the extremes."""
+"""Exported steps equal the denoisers: over sequences, at any size, in every runtime, and for extreme inputs."""
 
 import copy
 import json
@@ -20,14 +20,12 @@ from models import compiled
 from models.compiled.fusion import WINDOWS
 from models.denoiser import Denoiser
 from models.export import program as programs
-from models.export.box_windows import BoxWindows
-from models.export.neighbours import affinity_level, mesh_sums
+from models.export.history import GraphGBuffer, expected_surfaces, pixel_coordinates, reprojected, reprojection_table
+from models.export.one import affinity_level, mesh_sums
 from models.export.package import Export, largest_difference, write_export
-from models.export.playing import play
-from models.export.program import trace, write_onnx, write_pt2
-from models.export.registry import STEPS, load_step
-from models.export.reprojection import View, expectation, fetch, places, table_of
-from models.export.runtime import run_onnx, run_pt2
+from models.export.program import play, run_onnx, run_pt2, trace, write_onnx, write_pt2
+from models.export.registry import EXPORTABLE, load_step, step_of
+from models.export.wskp import BoxWindows
 from models.filters import neighbours
 from models.history.geometry import GBuffer, to_previous_camera
 from models.history.reprojection import reproject
@@ -56,10 +54,10 @@ onnx_only = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """Files of weights that make the windows' weights differ by much."""
+    """Weight files whose filters' weights vary strongly."""
     folder = tmp_path_factory.mktemp("weights")
     files = {}
-    for name in STEPS:
+    for name in EXPORTABLE:
         torch.manual_seed(0)
         denoiser = create(name)
         with torch.no_grad():
@@ -74,11 +72,22 @@ def sequence(size, first=0, frames=FRAMES):
     return [synthetic_frame(index, *size) for index in range(first, first + frames)]
 
 
-def differences(step, frames, compute, ours: Denoiser):
-    """Largest differences of each frame's radiance from ours."""
+def pair(weights, name, warp="inside"):
+    """The step and the denoiser."""
+    return (load_step(name, weights[name], torch.float32, warp), load(name, weights[name], torch.float32))
+
+
+def outputs_of(step, frames, compute=None):
+    """All outputs of each frame, by default of the step itself."""
     with torch.no_grad():
-        outputs = [outputs["radiance"] for _, outputs in play(step, frames, compute)]
-    return [largest_difference(theirs, mine) for theirs, mine in zip(outputs, run(ours, frames), strict=True)]
+        return [outputs for _, outputs in play(step, frames, compute or step)]
+
+
+def check_equal(step, denoiser: Denoiser, frames, compute=None, tolerance=TOLERANCE):
+    """The radiance of every frame equals the denoiser's."""
+    outputs = outputs_of(step, frames, compute)
+    for actual, expected in zip(outputs, run(denoiser, frames), strict=True):
+        assert largest_difference(actual["radiance"], expected) < tolerance
 
 
 def camera_of(cameras: Cameras):
@@ -86,97 +95,86 @@ def camera_of(cameras: Cameras):
 
 
 @pytest.mark.parametrize("warp", ["inside", "outside"])
-@pytest.mark.parametrize("name", STEPS)
-def test_a_step_is_our_denoiser(weights, name, warp):
-    step = load_step(name, weights[name], torch.float32, warp)
-    ours = load(name, weights[name], torch.float32)
+@pytest.mark.parametrize("name", EXPORTABLE)
+def test_steps_equal_the_denoisers(weights, name, warp):
+    step, denoiser = pair(weights, name, warp)
     for size in (*SIZES, (13, 17), (2, 2), (1, 5), (1, 1), (130, 17)):
-        assert max(differences(step, sequence(size, frames=5), step, ours)) < TOLERANCE
+        check_equal(step, denoiser, sequence(size, frames=5))
 
 
 @each_kind
 @pytest.mark.parametrize("warp", ["inside", "outside"])
 def test_rendered_frames(tiny, weights, name, warp):
-    step = load_step(name, weights[name], torch.float32, warp)
-    ours = load(name, weights[name], torch.float32)
+    step, denoiser = pair(weights, name, warp)
     for clip in Dataset(tiny).clips("test"):
-        frames = [read_frame(clip, index, ours.reads) for index in range(4)]
-        assert max(differences(step, frames, step, ours)) < TOLERANCE
+        check_equal(step, denoiser, [read_frame(clip, index, denoiser.reads) for index in range(4)])
 
 
 @each_kind
-def test_a_cut_starts_anew(weights, name):
-    """So does another size. The first frame after it is the first frame of a sequence, exactly."""
-    step = load_step(name, weights[name], torch.float32, "inside")
+def test_cuts_and_size_changes_reset_the_state(weights, name):
+    """The first frame after a cut equals the first frame of a sequence, exactly."""
+    step, denoiser = pair(weights, name)
     shots = [*sequence((24, 32), 0, 3), *sequence((24, 32), 40, 3), *sequence((20, 30), 43, 2)]
-    ours = load(name, weights[name], torch.float32)
-    assert max(differences(step, shots, step, ours)) < TOLERANCE
-    with torch.no_grad():
-        played = [outputs for _, outputs in play(step, shots, step)]
-        ((_, anew),) = play(step, [shots[3]], step)
-    assert (played[3]["new_history"][:, LENGTH[name]] == 1).all()
-    for name, tensor in anew.items():
-        assert torch.equal(played[3][name], tensor)
+    check_equal(step, denoiser, shots)
+    after_cut = outputs_of(step, shots[:4])[3]
+    (first,) = outputs_of(step, [shots[3]])
+    assert (after_cut["new_history"][:, LENGTH[name]] == 1).all()
+    for output, tensor in first.items():
+        assert torch.equal(after_cut[output], tensor)
 
 
 @each_kind
-def test_background_is_emission_and_nothing_gathers_from_it(weights, name):
-    step = load_step(name, weights[name], torch.float32, "inside")
+def test_background_is_emission_and_does_not_bleed(weights, name):
+    step, denoiser = pair(weights, name)
     frames = sequence((48, 64), frames=3)
     sky = frames[0].depth == 0
     assert 0 < sky.float().mean() < 1
     glowing = [replace(f, channels={**f.channels, "direct": torch.where(f.depth == 0, 1e4, f.direct)}) for f in frames]
-    with torch.no_grad():
-        output = next(play(step, glowing, step))[1]["radiance"]
+    output = outputs_of(step, glowing[:1])[0]["radiance"]
     assert torch.equal(output[sky.expand_as(output)], frames[0].emission[sky.expand_as(output)])
-    ours = load(name, weights[name], torch.float32)
-    assert max(differences(step, glowing, step, ours)) < TOLERANCE
+    check_equal(step, denoiser, glowing)
 
 
 @each_kind
-def test_nothing_but_sky_and_nothing_but_black(weights, name):
-    step = load_step(name, weights[name], torch.float32, "inside")
-    ours = load(name, weights[name], torch.float32)
+def test_frames_of_background_alone_and_black_frames(weights, name):
+    step, denoiser = pair(weights, name)
     frame = flat_frame(20, 24)
     zero = torch.zeros(1, 1, 20, 24)
     sky = replace(frame, channels={**frame.channels, "depth": zero, "mesh_id": zero, "emission": frame.direct * 3})
     black = replace(frame, channels={**frame.channels, "direct": 0 * frame.direct})
     for frames in ([sky, frame, frame], [black, frame, black], [frame, sky, black]):
-        assert max(differences(step, frames, step, ours)) < TOLERANCE
+        check_equal(step, denoiser, frames)
 
 
 @each_kind
-def test_what_is_not_finite_counts_as_nothing(weights, name):
-    step = load_step(name, weights[name], torch.float32, "inside")
-    ours = load(name, weights[name], torch.float32)
+def test_non_finite_radiance_counts_as_zero(weights, name):
+    step, denoiser = pair(weights, name)
     frames = sequence((24, 32), frames=3)
     frames[1].direct[0, :, 5, 6] = torch.tensor([torch.nan, torch.inf, -torch.inf])
     frames[1].indirect[0, :, 5, 6] = 0
     frames[1].direct[0, :, 9, 3] = 6e4
-    assert max(differences(step, frames, step, ours)) < TOLERANCE
+    check_equal(step, denoiser, frames)
 
 
-def test_frames_of_more_samples(weights):
-    """And of other numbers from frame to frame."""
-    step = load_step("one", weights["one"], torch.float32, "inside")
+def test_sample_counts_that_change_from_frame_to_frame(weights):
     frames = [
         replace(frame, spp=torch.full((1, 1, 1, 1), samples))
         for frame, samples in zip(sequence((13, 17), frames=3), (4.0, 1.0, 16.0), strict=True)
     ]
-    assert max(differences(step, frames, step, load("one", weights["one"], torch.float32))) < TOLERANCE
+    check_equal(*pair(weights, "one"), frames)
 
 
 @settings(max_examples=40, deadline=None)
 @given(height=st.integers(1, 9), width=st.integers(1, 9), step=st.integers(1, 12), seed=st.integers(0, 9999))
-def test_neighbours_are_those_of_our_filter(height, width, step, seed):
-    """Over backgrounds and meshes, with bright pixels and all that sharpness and importance may be."""
+def test_neighbour_sums_equal_the_filters(height, width, step, seed):
+    """Over background and meshes, with bright pixels and the whole range of sharpness and importance."""
     torch.manual_seed(seed)
     size = (height, width)
     surface = (torch.rand(1, 1, *size) > 0.2).float()
     image = torch.exp(4 * torch.randn(1, 3, *size)) * surface
-    said = torch.randn(1, 8, *size), torch.exp(3 * torch.randn(1, 1, *size)), *(20 * torch.rand(2, 1, 1, *size) - 10)
-    filtered = affinity_level(image, *said, surface, step)
-    torch.testing.assert_close(filtered, plain_level(image, *said, surface, step), rtol=1e-5, atol=0)
+    maps = torch.randn(1, 8, *size), torch.exp(3 * torch.randn(1, 1, *size)), *(20 * torch.rand(2, 1, 1, *size) - 10)
+    filtered = affinity_level(image, *maps, surface, step)
+    torch.testing.assert_close(filtered, plain_level(image, *maps, surface, step), rtol=1e-5, atol=0)
     mesh_id = torch.randint(0, 3, (1, 1, *size)).float()
     with compiled.disabled():
         expected = neighbours.mesh_sums(image, mesh_id, step)
@@ -191,26 +189,27 @@ def test_neighbours_are_those_of_our_filter(height, width, step, seed):
     dy=st.integers(-48, 48).map(lambda n: n / 16),
     seed=st.integers(0, 9999),
 )
-def test_taps_are_those_of_our_reprojection(height, width, dx, dy, seed):
-    """On walls of a few meshes, where many pixels find nothing among 2 x 2 taps, or nothing at all."""
+def test_reprojection_equals_that_of_the_history(height, width, dx, dy, seed):
+    """On walls of a few meshes, where many pixels have no valid tap among 2 x 2, or none at all."""
     torch.manual_seed(seed)
     meshes = [torch.randint(0, 4, (1, 1, height, width)) for _ in range(2)]
     frame = flat_frame(height, width, (dx, dy), mesh_id=meshes[0])
     surfaces = replace(GBuffer.of(frame), mesh_id=meshes[1].float())
     history = torch.rand(1, 4, height, width)
-    expected, found = reproject(frame, history, surfaces)
-    pixels = places(height, width)
-    then = View(surfaces.depth, surfaces.normal, surfaces.mesh_id, *camera_of(frame.previous))
-    now = View(frame.depth, frame.normal, frame.mesh_id.int(), *camera_of(frame.now))
+    expected, has_history = reproject(frame, history, surfaces)
+    pixels = pixel_coordinates(height, width)
+    previous = GraphGBuffer(surfaces.depth, surfaces.normal, surfaces.mesh_id, *camera_of(frame.previous))
+    now = GraphGBuffer(frame.depth, frame.normal, frame.mesh_id.int(), *camera_of(frame.now))
     matrices = to_previous_camera(frame.now, frame.previous, 0).float()
-    fetched = fetch(table_of(history, then, pixels), expectation(now, matrices, pixels), frame.motion, pixels)
-    torch.testing.assert_close(fetched, expected, rtol=1e-5, atol=1e-5)
-    assert not fetched[~found.expand_as(fetched)].any()
+    table = reprojection_table(history, previous, pixels)
+    actual = reprojected(table, expected_surfaces(now, matrices, pixels), frame.motion, pixels)
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
+    assert not actual[~has_history.expand_as(actual)].any()
 
 
 @pytest.mark.parametrize("spread", [1.0, 30.0, 1e4])
 def test_windows_are_exact_for_any_logits(spread):
-    """Against unfolding and softmax in float64, in which surfaces are left out by logits of -1e9."""
+    """Against unfolding and softmax in float64, with logits of -1e9 for background."""
     torch.manual_seed(0)
     image = 10 * torch.rand(1, 3, 23, 31) ** 4
     importance = spread * torch.randn(1, len(WINDOWS), 23, 31)
@@ -226,22 +225,20 @@ def test_windows_are_exact_for_any_logits(spread):
     torch.testing.assert_close(output.double(), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_float16_in_the_network_alone(weights):
-    """Images stay in float32: radiance may exceed what float16 holds, and histories do not suffer."""
+def test_only_the_network_is_in_float16(weights):
+    """Images stay in float32: radiance may exceed the range of float16, and histories keep their precision."""
     half = load_step("wskp3", weights["wskp3"], torch.float16, "inside")
     whole = load_step("wskp3", weights["wskp3"], torch.float32, "inside")
     frames = [replace(f, channels={**f.channels, "direct": f.direct * 1e5}) for f in sequence((40, 48), frames=6)]
-    with torch.no_grad():
-        pairs = zip(play(half, frames, half), play(whole, frames, whole), strict=True)
-        for (_, a), (_, b) in pairs:
-            assert torch.equal(a["new_history"], b["new_history"]) and torch.equal(a["new_scale"], b["new_scale"])
-            assert largest_difference(a["radiance"], b["radiance"]) < HALF_TOLERANCE
-            assert b["radiance"].max() > 65504
+    for a, b in zip(outputs_of(half, frames), outputs_of(whole, frames), strict=True):
+        assert torch.equal(a["new_history"], b["new_history"]) and torch.equal(a["new_scale"], b["new_scale"])
+        assert largest_difference(a["radiance"], b["radiance"]) < HALF_TOLERANCE
+        assert b["radiance"].max() > 65504
 
 
 @pytest.fixture(scope="module", params=["wskp3", pytest.param("one", marks=pytest.mark.slow)])
 def written(request, weights, tmp_path_factory):
-    """A denoiser of each kind as ONNX, moving its history itself; the folder has its name."""
+    """A denoiser of each kind as ONNX, in a folder of its name."""
     name = request.param
     folder = tmp_path_factory.mktemp("export") / name
     write_export(Export(name, weights[name], "onnx", "float32", "inside"), sequence((40, 56), frames=3), folder)
@@ -249,17 +246,14 @@ def written(request, weights, tmp_path_factory):
 
 
 @onnx_only
-def test_onnx_equals_ours_at_two_sizes(weights, written):
-    name = written.name
-    step = load_step(name, weights[name], torch.float32, "inside")
-    ours = load(name, weights[name], torch.float32)
-    compute = run_onnx(written / f"{name}.onnx")
+def test_onnx_equals_the_denoiser_at_two_sizes(weights, written):
+    step, denoiser = pair(weights, written.name)
     for size in SIZES:
-        assert max(differences(step, sequence(size), compute, ours)) < TOLERANCE
+        check_equal(step, denoiser, sequence(size), run_onnx(written / f"{written.name}.onnx"))
 
 
 @onnx_only
-def test_the_manifest_tells_what_is_there(weights, written):
+def test_the_manifest_describes_the_files(weights, written):
     import onnx
 
     manifest = json.loads((written / "manifest.json").read_text())
@@ -272,67 +266,66 @@ def test_the_manifest_tells_what_is_there(weights, written):
     onnx.checker.check_model(model, full_check=True)
     assert manifest["operators"]["total"] == len(model.graph.node) == sum(manifest["operators"]["kinds"].values())
     assert [*manifest["operators"]["branches"]] == (["then_branch", "else_branch"] if written.name == "wskp3" else [])
-    for told, values in (("inputs", model.graph.input), ("outputs", model.graph.output)):
+    for key, values in (("inputs", model.graph.input), ("outputs", model.graph.output)):
         shapes = {v.name: [d.dim_value or d.dim_param for d in v.type.tensor_type.shape.dim] for v in values}
-        assert {port["name"]: port["shape"] for port in manifest[told]} == shapes
-    names = {port["name"] for told in ("inputs", "outputs") for port in manifest[told]}
+        assert {port["name"]: port["shape"] for port in manifest[key]} == shapes
+    names = {port["name"] for key in ("inputs", "outputs") for port in manifest[key]}
     assert {each["from"] for each in manifest["state"]} | {each["input"] for each in manifest["state"]} <= names
 
 
 @onnx_only
-def test_golden_frames_come_out_of_the_page_s_own_code(written):
+def test_the_instructions_reproduce_the_golden_frames(written):
     check_page(written, np.ascontiguousarray, TOLERANCE)
 
 
+def files_of(step, folder):
+    """The step as ONNX and pt2 files, each as a callable."""
+    program = trace(step, synthetic_frame(0, 24, 32))
+    write_onnx(program, step, folder / "step.onnx")
+    write_pt2(program, folder / "step.pt2")
+    return run_onnx(folder / "step.onnx"), run_pt2(folder / "step.pt2")
+
+
 @onnx_only
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STEPS)
-def test_every_format_equals_ours(weights, tmp_path, name):
-    """Both ways to warp, as ONNX and pt2; in float16, too."""
-    ours = load(name, weights[name], torch.float32)
+@pytest.mark.parametrize("name", EXPORTABLE)
+def test_every_format_equals_the_denoiser(weights, tmp_path, name):
+    """With the warp inside and outside, as ONNX and pt2, and with a float16 network."""
     for warp in ("inside", "outside"):
-        step = load_step(name, weights[name], torch.float32, warp)
-        program = trace(step, synthetic_frame(0, 24, 32))
-        write_onnx(program, step, tmp_path / "step.onnx")
-        write_pt2(program, tmp_path / "step.pt2")
-        for compute in (run_onnx(tmp_path / "step.onnx"), run_pt2(tmp_path / "step.pt2")):
+        step, denoiser = pair(weights, name, warp)
+        for compute in files_of(step, tmp_path):
             for size in SIZES:
-                assert max(differences(step, sequence(size), compute, ours)) < TOLERANCE
-    if torch.float16 not in ours.refuses:
+                check_equal(step, denoiser, sequence(size), compute)
+    if torch.float16 not in denoiser.refuses:
         half = load_step(name, weights[name], torch.float16, "outside")
         write_onnx(trace(half, synthetic_frame(0, 24, 32)), half, tmp_path / "half.onnx")
-        assert max(differences(half, sequence(SIZES[1]), run_onnx(tmp_path / "half.onnx"), ours)) < HALF_TOLERANCE
+        check_equal(half, denoiser, sequence(SIZES[1]), run_onnx(tmp_path / "half.onnx"), HALF_TOLERANCE)
 
 
 @onnx_only
 @pytest.mark.slow
-def test_extreme_logits_take_the_careful_branch_in_files(weights, tmp_path):
+def test_extreme_logits_take_the_slower_branch_in_files(weights, tmp_path):
     denoiser = load("wskp3", weights["wskp3"], torch.float32)
     with torch.no_grad():
         denoiser.network[-1].merged.weight[:6] *= 300
         if hasattr(denoiser.network[-1].merged, "pair"):
             denoiser.network[-1].merged.pair()
-    step = STEPS["wskp3"](copy.deepcopy(denoiser), "outside")
-    program = trace(step, synthetic_frame(0, 24, 32))
-    write_onnx(program, step, tmp_path / "step.onnx")
-    write_pt2(program, tmp_path / "step.pt2")
-    for compute in (run_onnx(tmp_path / "step.onnx"), run_pt2(tmp_path / "step.pt2")):
-        assert max(differences(step, sequence((40, 56), frames=3), compute, denoiser)) < 10 * TOLERANCE
+    step = step_of(copy.deepcopy(denoiser), "outside")
+    for compute in files_of(step, tmp_path):
+        check_equal(step, denoiser, sequence((40, 56), frames=3), compute, 10 * TOLERANCE)
 
 
 def test_what_cannot_be_exported(weights, tmp_path, monkeypatch):
-    frames = sequence((8, 8), frames=1)
-    with pytest.raises(BadInput, match="'svgf' cannot be exported; wskp3, wskp6, one can"):
-        write_export(Export("svgf", weights["wskp3"], "pt2", "float32", "inside"), frames, tmp_path / "out")
-    with pytest.raises(BadInput, match="holds weights of 'wskp3', not of 'wskp6'"):
-        write_export(Export("wskp6", weights["wskp3"], "pt2", "float32", "inside"), frames, tmp_path / "out")
-    with pytest.raises(BadInput, match=r"One does not compute in torch\.float16"):
-        write_export(Export("one", weights["one"], "pt2", "float16", "inside"), frames, tmp_path / "out")
+    def refused(match, name, weights, to="pt2", precision="float32", folder="out"):
+        with pytest.raises(BadInput, match=match):
+            write_export(Export(name, weights, to, precision, "inside"), sequence((8, 8), frames=1), tmp_path / folder)
+
+    refused("'svgf' cannot be exported; wskp3, wskp6, one can", "svgf", weights["wskp3"])
+    refused("holds weights of 'wskp3', not of 'wskp6'", "wskp6", weights["wskp3"])
+    refused(r"One does not compute in torch\.float16", "one", weights["one"], precision="float16")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
-    with pytest.raises(BadInput, match="holds something else"):
-        write_export(Export("wskp3", weights["wskp3"], "pt2", "float32", "inside"), frames, tmp_path / "mine")
+    refused("contains files that are not an export", "wskp3", weights["wskp3"], folder="mine")
     monkeypatch.setattr(programs, "find_spec", lambda package: None if package == "onnxscript" else object())
-    with pytest.raises(BadInput, match=r"needs onnxscript: pip install 'onespp\[export\]'"):
-        write_export(Export("wskp3", weights["wskp3"], "onnx", "float32", "inside"), frames, tmp_path / "out")
+    refused(r"needs onnxscript: pip install 'onespp\[export\]'", "wskp3", weights["wskp3"], "onnx")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]

@@ -93,7 +93,12 @@ def test_other_code_accumulates_anew_and_leaves_one_copy(clips, tmp_path, monkey
 def test_the_key_follows_code_and_packages(monkeypatch):
     wskp = create("wskp3")
     accumulating = sources("train.accumulation", "models.networks.wskp")
-    assert accumulating.keys() >= {"models.operators", "models.compiled.reprojection", "datasets.frame", "scenes.camera"}
+    assert accumulating.keys() >= {
+        "models.operators",
+        "models.compiled.reprojection",
+        "datasets.frame",
+        "scenes.camera",
+    }
     others = {"train.crops", "train.training", "models.networks.rae", "models.networks.ntd", "models.registry"}
     assert not accumulating.keys() & others
     here = accumulation_digest(wskp)
