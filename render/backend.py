@@ -1,7 +1,7 @@
 """Mitsuba and Dr.Jit with the variant chosen: import `mi` and `dr` from here and nowhere else.
 
-The CUDA variant is used where a GPU works. Otherwise Dr.Jit compiles through LLVM and would load whatever libLLVM it
-finds first; versions before 17 abort the process on AVX-512 machines, so one is chosen before Mitsuba loads.
+The CUDA variant is used if there is a GPU. Otherwise Dr.Jit compiles through LLVM and would load the first libLLVM that
+it finds; versions before 17 abort the process on AVX-512 machines, so one is chosen before Mitsuba loads.
 """
 
 import ctypes
@@ -14,13 +14,13 @@ from pathlib import Path
 
 from errors import BadInput
 
-OLDEST_LLVM = 17
+MIN_LLVM = 17
 TESTED_LLVM = 19
-LEAST_THREADS = 2  # with one alone, Mitsuba waits forever for the first EXR that it reads or writes
+MIN_THREADS = 2  # with one, Mitsuba waits forever for the first EXR that it reads or writes
 
 
 def installed_llvms() -> list[tuple[int, str]]:
-    """(major version, path) of every libLLVM that the loader knows or the usual folders hold."""
+    """(major version, path) of every libLLVM in the loader's cache and the usual folders."""
     listing = ""
     if sys.platform.startswith("linux"):
         with suppress(OSError):  # no ldconfig (musl): the folders below remain
@@ -34,7 +34,7 @@ def installed_llvms() -> list[tuple[int, str]]:
         paths += [str(path) for path in Path("/").glob(pattern)]
     found = []
     for path in paths:
-        # The version stands in the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or in its folder (llvm-19).
+        # The version is part of the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or of its folder (llvm-19).
         resolved = Path(path).resolve()
         name = re.fullmatch(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so|dylib)(?:\.(\d+)[\d.]*)?", resolved.name)
         folder = re.search(r"llvm[-@/]?(\d+)", str(resolved.parent))
@@ -45,16 +45,16 @@ def installed_llvms() -> list[tuple[int, str]]:
 
 
 def choose_llvm() -> None:
-    """Point DRJIT_LIBLLVM_PATH at the usable libLLVM nearest to the tested version, unless the user has set it.
+    """Set DRJIT_LIBLLVM_PATH, unless it is set, to the usable libLLVM nearest to the tested version.
 
-    Raises BadInput where there is none.
+    Raises BadInput if there is none.
     """
     if "DRJIT_LIBLLVM_PATH" in os.environ:
         return
-    usable = [(abs(version - TESTED_LLVM), path) for version, path in installed_llvms() if version >= OLDEST_LLVM]
+    usable = [(abs(version - TESTED_LLVM), path) for version, path in installed_llvms() if version >= MIN_LLVM]
     if not usable:
         raise BadInput(
-            f"rendering on the CPU needs libLLVM {OLDEST_LLVM} or newer and none was found: install it "
+            f"rendering on the CPU needs libLLVM {MIN_LLVM} or newer and none was found: install it "
             f"(Debian, Ubuntu: apt install libllvm{TESTED_LLVM}; macOS: brew install llvm) or set DRJIT_LIBLLVM_PATH"
         )
     os.environ["DRJIT_LIBLLVM_PATH"] = min(usable)[1]
@@ -79,6 +79,6 @@ import mitsuba as mi  # noqa: E402
 
 mi.set_variant(VARIANT)
 mi.set_log_level(mi.LogLevel.Error)
-dr.set_thread_count(max(LEAST_THREADS, dr.thread_count()))
+dr.set_thread_count(max(MIN_THREADS, dr.thread_count()))
 
-__all__ = ["LEAST_THREADS", "VARIANT", "dr", "mi"]
+__all__ = ["MIN_THREADS", "VARIANT", "dr", "mi"]

@@ -1,19 +1,21 @@
 """Renders a clip frame by frame, with all its channels."""
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.channels import CHANNELS, MIRRORED, SAMPLE_BUFFERS
+from render.backend import mi
+from render.first_bounce import hit_channels
 from render.gbuffer import render_gbuffer
-from render.gradient import Samples
-from render.hit_distance import HIT_CHANNELS, hit_channels
-from render.motion import dual_motion_vectors
+from render.gradient import GradientSamples
+from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
 from render.path import Draw, PathTracer
 from render.stage import Stage
-from render.tracking import causes, tracked_motion
 from scenes.animation import Scene
 from scenes.camera import View, motion_vectors, pixel_centres
 
@@ -21,7 +23,7 @@ Arrays = dict[str, NDArray[Any]]  # channels of one frame by name
 
 
 class Options(NamedTuple):
-    """What the papers' renderers did: Halton cycles in noisy frames, regularised paths in these and in references."""
+    """Choices of the papers' renderers: Halton cycles in noisy frames; path regularisation, in references too."""
 
     halton: bool = False
     regularise: bool = False
@@ -31,7 +33,7 @@ NO_OPTIONS = Options()
 
 
 class Sampling(NamedTuple):
-    """Samples of a frame: `realisations` of `noisy_spp` a pixel, and a reference of `reference_spp` in two halves."""
+    """Samples of a frame: `realisations` of `noisy_spp` a pixel, and a reference of `reference_spp` in two buffers."""
 
     realisations: int
     noisy_spp: int
@@ -40,14 +42,14 @@ class Sampling(NamedTuple):
 
 
 class StepTimer:
-    """Seconds by step since it was last read."""
+    """Seconds by step since they were last read."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.start()
 
     def start(self) -> None:
-        """Leave out the time until now."""
+        """Ignore the time until now."""
         self.last = time.perf_counter()
 
     def lap(self, step: str) -> None:
@@ -57,60 +59,139 @@ class StepTimer:
         self.last = now
 
     def read(self) -> dict[str, float]:
-        """Seconds by step; the count begins anew."""
-        seconds = self.seconds
-        self.seconds = {}
+        """Seconds by step; resets them."""
+        seconds, self.seconds = self.seconds, {}
         return seconds
 
 
 NOISY_STREAM = 0
 REFERENCE_STREAM = 1
 GRADIENT_STREAM = 2
-OTHER_HALF_STREAM = 3
+SECOND_BUFFER_STREAM = 3
 
 
 def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:
-    """A 32-bit seed of its own for every frame and realisation (NOISY_STREAM), reference half, choice of samples."""
+    """An independent 32-bit seed for each frame, stream, and realisation or buffer."""
     return int(np.random.SeedSequence([seed, frame, stream, index]).generate_state(1)[0])
 
 
-def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTimer) -> Iterator[tuple[View, Arrays]]:
-    """Yield for each frame its view, G-buffer and motion vectors, with the stage posed for it.
+@dataclass
+class FrameInProgress:
+    """A frame for which the stage is posed, with the channels rendered so far."""
 
-    Dual motion vectors need rays through the scene as it stood a frame before, so the G-buffer is a frame ahead.
+    index: int
+    view: View
+    previous: View  # of the frame before; of the frame itself in the first
+    arrays: Arrays
+
+
+def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTimer) -> Iterator[FrameInProgress]:
+    """Yield every frame with its G-buffer and motion vectors.
+
+    Dual motion vectors need rays through the scene of the previous frame, so the G-buffer is rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
     view = stage.view(0)
     arrays = render_gbuffer(stage, view)
     arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
     if stage.has_mirrors:
-        arrays["mirrored_motion"] = arrays["motion"]
+        arrays[MIRRORED["motion"]] = arrays["motion"]
+    frame = FrameInProgress(0, view, view, arrays)
     timer.lap("gbuffer")
-    for following in range(1, frames):
-        stage.pose(following)
-        following_view = stage.view(following)
-        ahead = render_gbuffer(stage, following_view)
+    for index in range(1, frames):
+        stage.pose(index)
+        view = stage.view(index)
+        arrays = render_gbuffer(stage, view)
         timer.lap("gbuffer")
-        depth = ahead["depth"][..., 0].astype(np.float64)
-        mesh_id = ahead["mesh_id"][..., 0]
-        motion = motion_vectors(centres, depth, mesh_id, following_view, view)
-        ahead["motion"] = motion
+        surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
+        arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
         if stage.has_mirrors:
-            shown = ahead["mirrored_depth"][..., 0].astype(np.float64), ahead["mirrored_mesh_id"][..., 0]
-            ahead["mirrored_motion"] = motion_vectors(centres, *shown, following_view, view)
+            shown = arrays[MIRRORED["depth"]][..., 0].astype(np.float64), arrays[MIRRORED["mesh_id"]][..., 0]
+            arrays[MIRRORED["motion"]] = motion_vectors(centres, *shown, view, frame.view)
         timer.lap("motion")
-        stage.pose(following - 1)
+        stage.pose(index - 1)
         timer.lap("gbuffer")
         if wants_dual:
-            ahead["dual_motion"] = dual_motion_vectors(stage, depth, mesh_id, motion, following_view, view)
+            arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
             timer.lap("dual_motion")
-        yield view, arrays
+        yield frame
         timer.start()
-        view = following_view
-        arrays = ahead
+        frame = FrameInProgress(index, view, frame.view, arrays)
     stage.pose(frames - 1)
     timer.lap("gbuffer")
-    yield view, arrays
+    yield frame
+
+
+class SampledChannels:
+    """Renders the channels of a clip that need random samples; its methods take the frames in order."""
+
+    def __init__(self, stage: Stage, sampling: Sampling, seed: int, in_buffers: bool):
+        self.stage = stage
+        self.sampling = sampling
+        self.seed = seed
+        self.in_buffers = in_buffers and sampling.noisy_spp % 2 == 0
+        halton, regularise = sampling.options
+        self.tracer = PathTracer(stage, regularise=regularise)
+        self.noisy_tracer = PathTracer(stage, halton, regularise) if halton else self.tracer
+        self.samples: GradientSamples | None = None  # of the previous frame
+
+    def noisy(self, frame: FrameInProgress) -> Arrays:
+        """Noisy direct and indirect radiance, and their sample buffers."""
+        self.ray: mi.Ray3f = self.stage.rays(frame.view)
+        streams = (NOISY_STREAM, SECOND_BUFFER_STREAM) if self.in_buffers else (NOISY_STREAM,)
+        spp = self.sampling.noisy_spp // len(streams)
+        # A realisation keeps its Halton shift, and its cycle continues from frame to frame.
+        halton = self.sampling.options.halton
+        first = frame.index * self.sampling.noisy_spp if halton else 0
+        shift = 0 if halton else frame.index
+        self.draws = [
+            [Draw(stream_seed(self.seed, shift, stream, i), spp, first + n * spp) for n, stream in enumerate(streams)]
+            for i in range(self.sampling.realisations)
+        ]
+        drawn = np.array([[self.noisy_tracer.radiance(self.ray, *draw) for draw in draws] for draws in self.draws])
+        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, buffers, H, W, 3)
+        self.first_sample = direct[0, 0], indirect[0, 0]
+        arrays = {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
+        buffers = {SAMPLE_BUFFERS["direct"]: direct, SAMPLE_BUFFERS["indirect"]: indirect}
+        return arrays | buffers if self.in_buffers else arrays
+
+    def hit_distance(self, frame: FrameInProgress) -> Arrays:
+        """Distances to what the first rays of the noisy samples hit."""
+        hits = [hit_channels(self.noisy_tracer, frame.view, draws) for draws in self.draws]
+        return {name: np.stack([realisation[name] for realisation in hits]) for name in hits[0]}
+
+    def shadow_motion(self, frame: FrameInProgress) -> Arrays:
+        """Motion of shadows and reflections."""
+        draw = self.draws[0][0]
+        hits = hits_of_samples(self.noisy_tracer, frame.view, draw.seed, draw.first)
+        return tracked_motion(hits, frame.arrays, frame.view, frame.previous)
+
+    def gradient(self, frame: FrameInProgress) -> Arrays:
+        stage = self.stage
+        still = np.zeros((stage.height, stage.width, 2))
+        gradient = self.samples.gradient(self.noisy_tracer, frame.view) if self.samples else still
+        choice = stream_seed(self.seed, frame.index, GRADIENT_STREAM, 0)
+        self.samples = GradientSamples.of(
+            frame.arrays, *self.first_sample, frame.view, stage.poses, self.draws[0][0], choice
+        )
+        return {"gradient": gradient}
+
+    def reference(self, frame: FrameInProgress) -> Arrays:
+        spp = self.sampling.reference_spp // 2
+        seeds = [stream_seed(self.seed, frame.index, REFERENCE_STREAM, buffer) for buffer in range(2)]
+        direct, indirect = zip(*(self.tracer.radiance(self.ray, seed, spp) for seed in seeds), strict=True)
+        return {"direct_reference": np.stack(direct), "indirect_reference": np.stack(indirect)}
+
+
+# By step, in their order; optional steps are those of the channel table.
+MAKERS: dict[str, Callable[[SampledChannels, FrameInProgress], Arrays]] = {
+    "noisy": SampledChannels.noisy,
+    "hit_distance": SampledChannels.hit_distance,
+    "shadow_motion": SampledChannels.shadow_motion,
+    "gradient": SampledChannels.gradient,
+    "reference": SampledChannels.reference,
+}
+OPTIONAL_STEPS = {channel.step for channel in CHANNELS.values() if channel.step}
 
 
 def render_clip(
@@ -124,64 +205,21 @@ def render_clip(
 ) -> Iterator[tuple[Arrays, dict[str, float]]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
-    With `channels` only those are yielded, in a scene with mirrors also `mirrored_`NAME of what they show, and the time
-    that the others alone would take is saved. Noisy frames of an even number of samples a pixel are drawn in two halves
-    where these are named, which makes them other samples.
+    `channels` are those to render, with their mirrored forms in a scene with mirrors; by default all but sample
+    buffers. Sample buffers need an even number of noisy samples a pixel, and change which samples are drawn.
 
-    Deterministic in its arguments on one variant and processor.
+    Deterministic in its arguments for one Mitsuba variant and processor.
     """
     stage = Stage(scene, height, width)
-    halton, regularise = sampling.options
-    tracer = PathTracer(stage, regularise=regularise)
-    noisy_tracer = PathTracer(stage, halton, regularise) if halton else tracer
-    wants_dual = channels is None or "dual_motion" in channels
-    wants_tracked = channels is None or "shadow_motion" in channels or "reflection_motion" in channels
-    wants_gradient = channels is None or "gradient" in channels
-    wants_hits = channels is None or any(name in channels for name in HIT_CHANNELS)
-    wants_halves = channels is not None and "direct_halves" in channels and sampling.noisy_spp % 2 == 0
-    streams = (NOISY_STREAM, OTHER_HALF_STREAM) if wants_halves else (NOISY_STREAM,)
-    spp = sampling.noisy_spp // len(streams)
-    samples: Samples | None = None  # of the frame before
-    before: View | None = None
     timer = StepTimer()
-    for frame, (view, arrays) in enumerate(noise_free_frames(stage, frames, wants_dual, timer)):
-        ray = stage.rays(view)
-        # A Halton cycle goes on from frame to frame with the shift of its realisation.
-        first = frame * sampling.noisy_spp if halton else 0
-        shift = 0 if halton else frame
-        draws = [
-            [Draw(stream_seed(seed, shift, stream, i), spp, first + part * spp) for part, stream in enumerate(streams)]
-            for i in range(sampling.realisations)
-        ]
-        drawn = np.array([[noisy_tracer.radiance(ray, *draw) for draw in each] for each in draws])
-        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, halves, H, W, 3)
-        arrays |= {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
-        arrays |= {"direct_halves": direct, "indirect_halves": indirect} if wants_halves else {}
-        timer.lap("noisy")
-        if wants_hits:
-            hits = [hit_channels(noisy_tracer, view, each) for each in draws]
-            arrays |= {name: np.stack([each[name] for each in hits]) for name in HIT_CHANNELS}
-            timer.lap("hit_distance")
-        if wants_tracked:
-            met = causes(noisy_tracer, view, draws[0][0].seed, first)
-            arrays |= tracked_motion(met, arrays, view, before or view)
-            before = view
-            timer.lap("shadow_motion")
-        if wants_gradient:
-            still = np.zeros((height, width, 2))
-            arrays["gradient"] = samples.gradient(noisy_tracer, view) if samples else still
-            choice = stream_seed(seed, frame, GRADIENT_STREAM, 0)
-            samples = Samples.of(arrays, direct[0, 0], indirect[0, 0], view, stage.poses, draws[0][0], choice)
-            timer.lap("gradient")
-        half = sampling.reference_spp // 2
-        halves = [tracer.radiance(ray, stream_seed(seed, frame, REFERENCE_STREAM, i), half) for i in range(2)]
-        timer.lap("reference")
-        arrays["direct_reference"] = np.stack([direct for direct, _ in halves])
-        arrays["indirect_reference"] = np.stack([indirect for _, indirect in halves])
-        arrays |= view._asdict()  # K, camera_to_world, object_to_world
-        wanted = {
-            name: array
-            for name, array in arrays.items()
-            if channels is None or name.removeprefix("mirrored_") in channels
-        }
-        yield wanted, timer.read()
+    wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
+    wanted |= {MIRRORED[name] for name in wanted & MIRRORED.keys()}
+    skipped = OPTIONAL_STEPS - {CHANNELS[name].step for name in wanted}
+    makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
+    sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted)
+    for frame in noise_free_frames(stage, frames, "dual_motion" not in skipped, timer):
+        for step, maker in makers.items():
+            frame.arrays |= maker(sampled, frame)
+            timer.lap(step)
+        frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
+        yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()

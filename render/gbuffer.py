@@ -1,39 +1,92 @@
-"""What the primary rays see, free of noise: geometry, material and light seen directly."""
+"""Primary visibility without noise, directly and behind mirrors: geometry, materials and emission.
 
-# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
-# mypy: disable-error-code="arg-type"
+A mirror image is described as if it stood behind the mirror: it has edges, textures and motion like any other surface,
+so that denoisers need no special case for it.
+"""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.channels import MIRRORED
 from render.backend import dr, mi
 from render.loading import columns
-from render.mirrors import Seen, look_through
 from render.stage import Stage
 from scenes.camera import Array, View
+
+MAX_MIRRORS = 4  # along a ray
+
+
+@dataclass
+class MirroredHit:
+    """What rays hit behind all mirrors, or the last mirror where that shows only sky."""
+
+    si: mi.SurfaceInteraction3f
+    ray: mi.Ray3f  # the last one
+    beyond: mi.Float  # path length after the first mirror in Mitsuba's units; 0 without one
+    tint: mi.Color3f  # the product of all mirrors' albedos
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]  # the world's, reflected by the mirrors from first to last
+
+    @staticmethod
+    def without_mirrors(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> "MirroredHit":
+        """The hits of primary rays."""
+        axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+        return MirroredHit(si, ray, mi.Float(0), mi.Color3f(1), axes)
+
+    def in_mirrors(self, normal: mi.Vector3f) -> mi.Vector3f:
+        """The mirror image of a world direction (3,)."""
+        return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
+
+
+def trace_mirrors(stage: Stage, hit: MirroredHit) -> MirroredHit:
+    """Follow rays from mirrors that they hit, up to MAX_MIRRORS times."""
+    for _ in range(MAX_MIRRORS):
+        is_mirror, albedo = stage.materials.mirror_at(hit.si)
+        if not dr.any(is_mirror):
+            break
+        hit = reflected(stage, hit, is_mirror, albedo)
+    return hit
+
+
+def reflected(stage: Stage, hit: MirroredHit, is_mirror: mi.Bool, albedo: mi.Color3f) -> MirroredHit:
+    """The hits of the rays that mirrors reflect; unchanged elsewhere, and where a reflected ray misses."""
+    here = hit.si
+    normal = stage.normals.evaluate(here, is_mirror)
+
+    def flipped(direction: mi.Vector3f) -> mi.Vector3f:
+        return direction - 2 * dr.dot(direction, normal) * normal
+
+    onward = stage.past_cutouts(here.spawn_ray(flipped(hit.ray.d)))
+    there = stage.mitsuba_scene.ray_intersect(onward, mi.RayFlags.All, coherent=False, active=is_mirror)
+    distance = hit.beyond + dr.norm(there.p - here.p)
+    x, y, z = map(flipped, hit.axes)
+    shown = MirroredHit(there, onward, distance, hit.tint * albedo, (x, y, z))
+    result: MirroredHit = dr.select(is_mirror & there.is_valid(), shown, hit)
+    dr.eval(result)
+    return result
 
 
 def depth_along_axis(
     stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View, beyond: mi.Float | None = None
 ) -> NDArray[np.float32]:
-    """Distance (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored.
+    """Depth (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored.
 
-    `beyond` is how much farther, in Mitsuba's units, rays go that a mirror at `si` reflects.
+    `beyond` is the length of the path, in Mitsuba's units, after its reflection by a mirror at `si`.
     """
     length = si.t if beyond is None else si.t + beyond
     distance = np.array(dr.select(si.is_valid(), length, 0), dtype=np.float64) * stage.unit
     cosine = columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2]
     depth = distance * cosine
-    if stage.has_holes:  # rays begin behind what they have passed through
+    if stage.has_cutouts:  # rays begin behind those that they have passed
         begins = columns(ray.o).astype(np.float64) * stage.unit - view.camera_to_world[:3, 3]
         depth += np.where(distance > 0, begins @ view.camera_to_world[:3, 2], 0)
     return depth.astype(np.float32)
 
 
 class VisibleSurface(NamedTuple):
-    """What is seen at some places of an image."""
+    """The surfaces visible at some positions of an image."""
 
     depth: Array  # (...,), along the viewing axis; 0 for background
     mesh_id: NDArray[np.uint32]  # (...,), 0 for background
@@ -41,7 +94,7 @@ class VisibleSurface(NamedTuple):
 
 
 def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
-    """What is seen through `pixels` (..., 2). The stage must be posed for `view`'s frame."""
+    """The surfaces visible through `pixels` (..., 2), with the stage posed for `view`'s frame."""
     shape = pixels.shape[:-1]
     ray = stage.rays(view, pixels.reshape(-1, 2))
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
@@ -52,47 +105,44 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
     return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 
-def surface_channels(stage: Stage, seen: Seen) -> dict[str, dr.AnyArray]:
-    """Normals, albedo, roughness and mesh ids of what is seen."""
-    hit = seen.si.is_valid()
-    normal = stage.normals.evaluate(seen.si, hit)
-    normal = seen.in_mirrors(dr.select(dr.dot(normal, seen.ray.d) > 0, -normal, normal))
-    albedo, roughness = stage.materials.evaluate(seen.si, hit)
+def surface_channels(stage: Stage, hit: MirroredHit) -> dict[str, dr.AnyArray]:
+    valid = hit.si.is_valid()
+    normal = stage.normals.evaluate(hit.si, valid)
+    normal = hit.in_mirrors(dr.select(dr.dot(normal, hit.ray.d) > 0, -normal, normal))
+    albedo, roughness = stage.materials.evaluate(hit.si, valid)
     return {
-        "normal": dr.select(hit, normal, mi.Vector3f(0)),
-        "albedo": seen.tint * albedo,
+        "normal": dr.select(valid, normal, mi.Vector3f(0)),
+        "albedo": hit.tint * albedo,
         "roughness": roughness,
-        "mesh_id": stage.mesh_id(seen.si),
+        "mesh_id": stage.mesh_id(hit.si),
     }
 
 
 def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
-    """The noise-free channels (H, W, C), named and shaped as in the channel table (datasets/channels.py).
-
-    The stage must be posed for `view`'s frame.
+    """The noise-free channels (H, W, C) of the channel table, with the stage posed for `view`'s frame.
 
     albedo: diffuse reflectance + specular reflectance at normal incidence, in [0, 1]; 1 for background.
     normal: the shading normal in world space, of unit length, toward the viewer; 0 for background.
     roughness: GGX alpha in [0, 1]; 1 for diffuse surfaces and background.
-    emission: the radiance of lamps and sky that are seen directly.
+    emission: the radiance of directly visible lights and sky.
     depth: along the viewing axis, in world units; 0 for background.
     mesh_id: index of the shape + 1; 0 for background.
 
-    In a scene with mirrors all but emission also as `mirrored_`NAME: in mirrors of what they show, as if it stood
-    behind them. Albedo is times theirs, depth follows from the length of the whole way.
+    In a scene with mirrors all but emission also in mirrored form: surfaces visible in a mirror, as if they stood
+    behind it. Their albedo is multiplied by the mirrors', their depth follows from the length of the whole path.
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    own = Seen.directly(si, ray)
-    channels = {**surface_channels(stage, own), "emission": stage.lights.at(si).eval(si)}
+    direct = MirroredHit.without_mirrors(si, ray)
+    channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.has_mirrors:
-        seen = look_through(stage, own)
-        shown = {f"mirrored_{name}": value for name, value in surface_channels(stage, seen).items()}
-        dr.eval(shown, seen.beyond)
+        mirrored = trace_mirrors(stage, direct)
+        shown = {MIRRORED[name]: value for name, value in surface_channels(stage, mirrored).items()}
+        dr.eval(shown, mirrored.beyond)
         arrays |= {name: stage.image(value) for name, value in shown.items()}
-        depth = depth_along_axis(stage, si, ray, view, seen.beyond)
-        arrays["mirrored_depth"] = depth.reshape(stage.height, stage.width, 1)
+        depth = depth_along_axis(stage, si, ray, view, mirrored.beyond)
+        arrays[MIRRORED["depth"]] = depth.reshape(stage.height, stage.width, 1)
     return arrays

@@ -1,7 +1,4 @@
-"""The lights of a scene, chosen evenly. How many there are enters kernels as data."""
-
-# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
-# mypy: disable-error-code="arg-type, assignment, operator, return-value"
+"""Uniform choice among the lights of a scene, whose number enters kernels as data."""
 
 from typing import ClassVar
 
@@ -11,17 +8,17 @@ from render.backend import dr, mi
 class Lights:
     """All emitters of a Mitsuba scene.
 
-    As Mitsuba's own `Scene.sample_emitter_direction`, `pdf_emitter_direction` and `SurfaceInteraction3f.emitter`, which
-    compile these numbers into every kernel.
+    Equivalent to Mitsuba's `Scene.sample_emitter_direction`, `pdf_emitter_direction` and
+    `SurfaceInteraction3f.emitter`, which compile the number of emitters into every kernel.
     """
 
     DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32}
 
     def __init__(self, scene: mi.Scene | None = None):
-        if scene is None:  # Dr.Jit makes empty ones
+        if scene is None:  # Dr.Jit creates empty instances
             return
         emitters = scene.emitters()
-        # The sky once more behind them all: a pointer of its own would be compiled in, and so would a single entry.
+        # The sky again at the end: a pointer of its own would be compiled in, and so would a single entry.
         self.emitters = mi.EmitterPtr([*emitters, scene.environment(), None])
         self.count = mi.UInt32(len(emitters))
         dr.make_opaque(self.emitters, self.count)
@@ -29,7 +26,7 @@ class Lights:
     def sample_direction(
         self, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
-        """A direction to a light, and radiance over the density of the choice. Nothing is tested for visibility."""
+        """A direction to a light, and radiance over the density of the choice, without a test of visibility."""
         scaled = u.x * mi.Float(self.count)
         index = dr.minimum(mi.UInt32(scaled), self.count - 1)
         active = active & (self.count > 0)
@@ -43,6 +40,6 @@ class Lights:
         return light.emitter.pdf_direction(si, light, active) / mi.Float(self.count)
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
-        """The light that shines at `si`, the sky's where nothing is hit; none elsewhere."""
+        """The emitter at `si`, the sky where nothing is hit; none elsewhere."""
         sky = dr.gather(mi.EmitterPtr, self.emitters, self.count)
         return dr.select(si.is_valid(), si.shape.emitter(), sky)

@@ -1,4 +1,4 @@
-"""Shapes and lights as Mitsuba's objects, from their descriptions."""
+"""Mitsuba objects from descriptions of shapes and lights."""
 
 import re
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ T = TypeVar("T", np.float32, np.uint32)
 
 
 def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba dictionary with its numpy arrays, the values and placement of bitmaps, as Mitsuba's types."""
+    """A Mitsuba dictionary with the numpy arrays of bitmaps as Mitsuba's types."""
 
     def convert(key: str, value: Any) -> object:
         if isinstance(value, dict):
@@ -40,7 +40,7 @@ def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
 
 
 def without_placement(bsdf: Bsdf) -> Bsdf:
-    """The material with all its bitmaps where the texture coordinates put them."""
+    """The material without the texture transforms of its bitmaps."""
     return {
         key: without_placement(value) if isinstance(value, dict) else value
         for key, value in bsdf.items()
@@ -49,23 +49,23 @@ def without_placement(bsdf: Bsdf) -> Bsdf:
 
 
 def with_placed_textures(shape: Shape) -> Shape:
-    """The same shape with its bitmaps' common placement in its texture coordinates.
+    """The same shape with its bitmaps' common transform applied to its texture coordinates.
 
-    Mitsuba compiles a bitmap's placement into kernels, while texture coordinates are data: so all textures share a
-    program. Bitmaps of one material that are placed differently stay as they are.
+    Mitsuba compiles the transform of a bitmap into kernels, while texture coordinates are data. Different transforms in
+    one material stay.
     """
     placements = [bitmap.get("to_uv", np.eye(3)) for bitmap in bitmaps_of(shape.bsdf)]
     uv = getattr(shape.mesh.visual, "uv", None)
     if uv is None or not placements or any((other != placements[0]).any() for other in placements):
         return shape
-    mesh = shape.mesh.copy(include_cache=True)  # without it the authored normals are lost
+    mesh = shape.mesh.copy(include_cache=True)  # keeps the authored normals
     assert isinstance(mesh.visual, TextureVisuals)
     mesh.visual.uv = uv @ placements[0][:2, :2].T + placements[0][:2, 2]
     return replace(shape, mesh=mesh, bsdf=without_placement(shape.bsdf))
 
 
 def load_mesh(shape: Shape) -> mi.Mesh:
-    """The shape in its rest pose, with its material, and lit as in frame 0."""
+    """The shape in its rest pose, with its material and the emission of frame 0."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
     if shape.radiance is not None:
@@ -92,7 +92,7 @@ def load_mesh(shape: Shape) -> mi.Mesh:
 
 
 def aligned(values: NDArray[T]) -> NDArray[T]:
-    """`values` (N,), of 4 bytes each, where a kernel for any other such array can read them.
+    """`values` (N,), of 4 bytes each, with 64-byte alignment.
 
     On the CPU Dr.Jit borrows numpy's memory and compiles its alignment into kernels.
     """
@@ -104,45 +104,42 @@ def aligned(values: NDArray[T]) -> NDArray[T]:
 
 
 def upload(values: NDArray[np.floating]) -> mi.Float:
-    """`values` (N,) as data for kernels: Python numbers would be compiled into them."""
+    """`values` (N,) as data for kernels; Python numbers would be compiled in."""
     return mi.Float(aligned(values.astype(np.float32)))
 
 
 def columns(vector: dr.AnyArray) -> NDArray[Any]:
-    """(N, C) of a Dr.Jit vector of C components and N lanes; its own dtype.
-
-    Taken at once they would be put together by a kernel that is compiled for this N.
-    """
+    """(N, C) of a Dr.Jit vector of C components and N lanes, without compiling a kernel for this N."""
     return np.stack([np.array(component) for component in vector], axis=-1)
 
 
 class StockLoader:
-    """Loads descriptions from scene files, `unit` world units to one of Mitsuba's; what they share is loaded once."""
+    """Loads descriptions from scene files, scaled by 1 / `unit`; shared parts are loaded once."""
 
     def __init__(self, unit: float = 1.0):
         self.unit = unit
-        self.loaded: dict[int, tuple[object, object]] = {}  # by id: the description, which keeps the id its, and object
-        self.groups: list[mi.Shape] = []  # that instances repeat, and
-        self.grouped: list[mi.Shape] = []  # the shapes in them
-        self.notes: list[str] = []  # what had to be left out
+        self.loaded: dict[int, tuple[object, object]] = {}  # by id: description, kept alive, and object
+        self.groups: list[mi.Shape] = []  # for instances
+        self.grouped: list[mi.Shape] = []  # the shapes in groups
+        self.notes: list[str] = []  # of omissions
 
     def made(self, description: dict[str, Any], what: str) -> Any:
-        """The Mitsuba object of a resolved dictionary, but for properties that mean nothing to it.
+        """The Mitsuba object of a resolved dictionary, without properties that its plugin does not have.
 
-        Raises BadInput, which begins with `what`, where it cannot be loaded.
+        Raises BadInput, which begins with `what`, if it cannot be loaded.
         """
         try:
             return mi.load_dict(description)
         except RuntimeError as error:
             unknown = unreferenced(error)
             if not unknown & description.keys():
-                raise BadInput(f"{what} is empty, damaged or cannot be used: {reason(error)}") from None
+                raise BadInput(f"{what} is empty, damaged or cannot be used: {mitsuba_reason(error)}") from None
         names = ", ".join(f"'{name}'" for name in sorted(unknown))
         self.notes.append(f"{what}: this Mitsuba does not know {names}: left out")
         return self.made({key: value for key, value in description.items() if key not in unknown}, what)
 
     def load(self, description: Mapping[str, Any]) -> Any:
-        """The Mitsuba object of a dictionary, in whose place others may nest."""
+        """The Mitsuba object of a dictionary with nested ones."""
         if id(description) not in self.loaded:
             what = str(description.get("filename", f"a {description['type']}"))
             loaded = self.made(self.resolved(description), what)
@@ -173,7 +170,7 @@ class StockLoader:
         return {**geometry, "to_world": np.diag([1 / self.unit] * 3 + [1.0]) @ geometry.get("to_world", np.eye(4))}
 
     def shape(self, shape: StockShape) -> mi.Shape:
-        """Raises BadInput, naming the shape and its file, where it cannot be loaded or is damaged."""
+        """Raises BadInput, naming the shape and its file, if it cannot be loaded or is damaged."""
         parts = {"bsdf": shape.bsdf, "emitter": shape.emitter}
         nested = {key: self.load(value) for key, value in parts.items() if value is not None}
         where = f"shape '{shape.name}'" + (f" ({shape.geometry['filename']})" if "filename" in shape.geometry else "")
@@ -182,7 +179,7 @@ class StockLoader:
         return loaded
 
     def light(self, light: StockLight) -> mi.Emitter:
-        """Raises BadInput, naming the light, where it cannot be loaded."""
+        """Raises BadInput, naming the light, if it cannot be loaded."""
         emitter = dict(light.emitter)
         if isinstance(emitter.get("position"), list):
             emitter["position"] = [x / self.unit for x in emitter["position"]]
@@ -192,24 +189,24 @@ class StockLoader:
 
 
 def unreferenced(error: RuntimeError) -> set[str]:
-    """The properties that Mitsuba does not know, where this is its complaint."""
+    """The properties that Mitsuba's error message lists as unknown, if it is about these."""
     text = str(error)
     return set(re.findall(r'^  - \w+ "([^"]+)":', text, re.MULTILINE)) if "unreferenced propert" in text else set()
 
 
-def reason(error: Exception) -> str:
-    """What Mitsuba says, in one line, without the places in its own code."""
+def mitsuba_reason(error: Exception) -> str:
+    """Mitsuba's error message in one line, without locations in its source code."""
     text = " ".join(str(error).split())
     text = re.sub(r".*\[\w+(\.(cpp|h):\d+)?\] |Error while loading string ", "", text)
     text = re.sub(r'^(At|While loading) dictionary node "\w*": |failed to instantiate .*?: ', "", text)
     return "it cannot be read" if not text or text.startswith("jit_") else text
 
 
-LARGEST = 1e18  # units from the origin: its square is a finite float32
+MAX_EXTENT = 1e18  # largest coordinate whose square is a finite float32
 
 
 def check_shape(shape: mi.Shape, where: str) -> None:
-    """Raise BadInput, which begins with `where`, for a shape that is nowhere, and a mesh that is empty or damaged."""
+    """Raise BadInput, which begins with `where`, for an empty, damaged or unbounded shape."""
     if not isinstance(shape, mi.Shape):
         raise BadInput(f"{where} is no shape")
     parameters = mi.traverse(shape)
@@ -221,10 +218,10 @@ def check_shape(shape: mi.Shape, where: str) -> None:
         if not np.isfinite(vertices).all():
             raise BadInput(f"{where} is damaged: it has vertices that are not finite")
     box = shape.bbox()
-    if shape.class_name() != "ShapeGroupPlugin" and not reach_of(box) < LARGEST:
+    if shape.class_name() != "ShapeGroupPlugin" and not extent_of(box) < MAX_EXTENT:
         raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
 
 
-def reach_of(box: mi.ScalarBoundingBox3f) -> float:
-    """How far a box reaches from the origin along an axis; NaN for one that is nowhere."""
+def extent_of(box: mi.ScalarBoundingBox3f) -> float:
+    """The largest absolute coordinate of a box; NaN if it has one."""
     return float(np.abs([np.array(box.min), np.array(box.max)]).max())

@@ -1,9 +1,9 @@
-"""One object of every kind that built-in scenes hold, so that their kernels are all the same program.
+"""One object of every kind in built-in scenes, so that all of them share the same kernels.
 
-Dr.Jit compiles into a kernel what every living object of a class may do when it is called, and how many such objects
-there may be; what they hold enters as data. So objects of all kinds are kept here, always in the same order, and the
-numbers of further ones are bounded. A scene then has the kernels of any other. What holds other kinds, more objects
-or a sky of another size gets kernels of its own.
+Dr.Jit compiles the virtual calls of all living objects of a class into a kernel, and the largest number of such
+objects; their content enters as data. So objects of all kinds are kept alive here, always in the same order, and the
+number of further ones is bounded. Scenes with other kinds, more objects or a sky of another size get kernels of their
+own.
 """
 
 from functools import cache
@@ -15,9 +15,8 @@ import numpy as np
 from render.backend import mi
 from scenes.sky import SKY_SIZE
 
-MOST_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
-
-COLOUR = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
+MAX_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
+HALF_GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
 
 
 def bitmap(channels: int) -> mi.Texture:
@@ -26,9 +25,9 @@ def bitmap(channels: int) -> mi.Texture:
 
 
 def materials() -> list[mi.BSDF]:
-    """Every kind of material, with numbers and with bitmaps."""
+    """Every kind of material, with constants and with bitmaps."""
     kinds: list[dict[str, Any]] = []
-    for colour in (COLOUR, bitmap(3)):
+    for colour in (HALF_GREY, bitmap(3)):
         plain = {"type": "diffuse", "reflectance": colour}
         kinds += [plain, {"type": "twosided", "bsdf": plain}]
         kinds += [{"type": kind, "diffuse_reflectance": colour} for kind in ("plastic", "roughplastic")]
@@ -41,12 +40,12 @@ def materials() -> list[mi.BSDF]:
     return [mi.load_dict(kind) for kind in kinds]
 
 
-def mesh(normals: bool, coordinates: bool, shines: bool) -> mi.Mesh:
-    """Two triangles: arrays of one entry are compiled in another way."""
+def mesh(normals: bool, coordinates: bool, emits: bool) -> mi.Mesh:
+    """Two triangles, because arrays of one entry are compiled differently."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "diffuse"})
-    if shines:
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": COLOUR})
+    if emits:
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": HALF_GREY})
     square = mi.Mesh("palette", 4, 2, props=properties, has_vertex_normals=normals, has_vertex_texcoords=coordinates)
     parameters = mi.traverse(square)
     parameters["vertex_positions"] = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0, 1, 1, 0])
@@ -61,18 +60,18 @@ def mesh(normals: bool, coordinates: bool, shines: bool) -> mi.Mesh:
 
 @cache
 def palette() -> list[object]:
-    """Objects of all kinds, and of each class the last one that there may be."""
+    """Objects of all kinds, and of each class the last of the maximum number."""
     flags = (False, True)
     objects: list[object] = [*materials()]
     objects += [mi.load_dict({"type": "uniform", "value": 0.5})]
-    objects += [mesh(normals, uv, shines) for shines in flags for normals in flags for uv in flags]
+    objects += [mesh(normals, uv, emits) for emits in flags for normals in flags for uv in flags]
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((*SKY_SIZE, 3), np.float32))}
-    objects += [mi.load_dict({"type": "scene", "sky": sky})]  # a sky knows the extent of its scene
+    objects += [mi.load_dict({"type": "scene", "sky": sky})]  # a sky depends on the extent of its scene
     fillers = {
         "BSDF": lambda: mi.load_dict({"type": "diffuse"}),
         "Texture": lambda: mi.load_dict({"type": "uniform", "value": 0.5}),
         "Shape": lambda: mesh(False, False, False),
-        "Emitter": lambda: mi.load_dict({"type": "area", "radiance": COLOUR}),
+        "Emitter": lambda: mi.load_dict({"type": "area", "radiance": HALF_GREY}),
     }
-    lasts = [[fillers[name]() for _ in range(most)][-1] for name, most in MOST_OBJECTS.items()]
+    lasts = [[fillers[name]() for _ in range(most)][-1] for name, most in MAX_OBJECTS.items()]
     return objects + lasts

@@ -1,11 +1,8 @@
 """The path tracer: direct and indirect radiance in one pass from shared, noise-free primary hits.
 
-Unidirectional with next-event estimation, multiple importance sampling and Russian roulette, as Mitsuba's `path`;
-but the primary ray is traced once however many samples a pixel gets, and the first bounce is kept apart.
+Unidirectional with next-event estimation, multiple importance sampling and Russian roulette, as Mitsuba's `path`; but
+the primary ray is traced once for all samples of a pixel, and direct light is returned separately.
 """
-
-# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
-# mypy: disable-error-code="arg-type, call-overload, operator, return-value"
 
 from typing import NamedTuple
 
@@ -20,7 +17,7 @@ from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
 
 AnySampler = Sampler | HaltonSampler
-ROULETTE = 3.0  # times the throughput is the chance that a path goes on
+ROULETTE = 3.0  # survival probability over throughput
 
 
 def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
@@ -37,11 +34,10 @@ def bounce(
     last: mi.Bool,
     sampler: AnySampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool]:
-    """(radiance, si, throughput, active): light that reaches `si` straight from emitters, and the path's next vertex.
+    """(radiance, si, throughput, active): direct light reflected at `si`, and the path's next vertex.
 
-    Both strategies of multiple importance sampling count: a point on an emitter, and the direction that goes on. But a
-    path's `last` ray, if it leaves a diffuse surface, is not traced: all it could find are emitters, whose points are
-    the better choice there.
+    Emitter and BSDF sampling are combined. But a path's `last` ray is not traced from a diffuse surface, where emitter
+    sampling alone is the better choice.
     """
     u_emitter = sampler.next_2d()
     u_lobe = sampler.next_1d()
@@ -55,14 +51,14 @@ def bounce(
     ends = last & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
     mis = dr.select(light.delta | ends, 1, mis_weight(light.pdf, bsdf_pdf))
     radiance = throughput * value * emitter_weight * mis
-    lit = smooth & (light.pdf != 0) & dr.any(radiance != 0)  # shadow rays only for light that would count
+    lit = smooth & (light.pdf != 0) & dr.any(radiance != 0)  # no shadow ray without contribution
     radiance = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit), radiance, 0)
 
     throughput = throughput * bsdf_weight
     active = dr.any(throughput != 0) & ~ends
     following = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
     emitter = lights.at(following)
-    towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in which light the sky is
+    towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in the index of the sky
     towards.emitter = emitter
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
@@ -72,10 +68,7 @@ def bounce(
 
 
 def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Float) -> tuple[mi.Color3f, mi.Bool]:
-    """Russian roulette from the second bounce on: (throughput, active) after most dim paths have ended.
-
-    `u` in [0, 1) decides.
-    """
+    """Russian roulette from the second bounce on, with the random number `u`: (throughput, active)."""
     chance = dr.select(depth > 1, dr.clip(ROULETTE * dr.max(throughput), 0.05, 1), 1)
     return throughput / chance, active & (u < chance)
 
@@ -95,13 +88,12 @@ def sample_mean(
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
-    Each ray draws the random numbers of its `pixel`, counted row by row. `seed`, `first` (the index of the first
-    sample), `spp` and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended goes
-    on with its next sample at once, so that short paths leave no lane idle. `draw` is the sampler; `blurred`
-    regularises (see PathTracer).
+    Each ray draws the random numbers of its `pixel` (row-major). `seed`, `first` (the index of the first sample), `spp`
+    and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended continues with its
+    next sample at once. `draw` is the sampler; `blurred` regularises (see PathTracer).
     """
     primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    # Hash the pixel before it meets the seed: a sum would make the pictures of some seeds shifted copies of each other.
+    # Hash the pixel before combining it with the seed: a sum would make images of some seeds shifted copies.
     key = hash32(hash32(pixel) ^ seed)
     direct = mi.Color3f(0)
     indirect = mi.Color3f(0)
@@ -126,24 +118,19 @@ def sample_mean(
     return direct / count, indirect / count
 
 
-def all_objects(*_: object, **__: object) -> list[object]:
-    """What Dr.Jit must know of beside the arguments of a frozen function: objects that kernels might call."""
-    return palette()
-
-
 class Draw(NamedTuple):
-    """Which samples of every pixel are drawn."""
+    """A range of samples of every pixel."""
 
     seed: int  # in [0, 2^32): different ones are independent
-    spp: int  # how many
-    first: int = 0  # index of the first, where they follow a sequence
+    spp: int
+    first: int = 0  # index of the first in a sequence
 
 
 class PathTracer:
-    """Path-traces the scene on a stage as the stage is posed at the time.
+    """Path-traces the scene of a stage in its current pose.
 
-    halton: draw from a cycle of 16 Halton points (see HaltonSampler); `radiance` starts at the point `first`.
-    regularise: blur glossy materials from the second vertex of a path on (see BlurredTable). Biased, less noisy.
+    halton: draw from a cycle of 16 Halton points (see HaltonSampler), from the point `first` on.
+    regularise: blur glossy materials from the second vertex of a path on (see BlurredTable); biased, less noisy.
     """
 
     def __init__(self, stage: Stage, halton: bool = False, regularise: bool = False):
@@ -153,22 +140,21 @@ class PathTracer:
         self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        # Dr.Jit 1.5 refuses to freeze the rest: Halton points, regularised paths, surfaces that shine by a picture, and
-        # scenes without shapes (these only while another scene is loaded).
-        self.freezes = bool(stage.shapes) and not halton and not regularise and not stage.has_pictured_lights
+        # Dr.Jit 1.5 cannot freeze the rest: Halton points, regularised paths, textured area lights, and scenes without
+        # shapes while another scene is loaded.
+        self.freezes = bool(stage.shapes) and not halton and not regularise and not stage.has_textured_lights
 
     def samples(
         self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """(direct, indirect) radiance along the primary rays `ray`, which need not be those of all pixels.
-
-        Each draws the random numbers of the `pixel`, counted row by row. For the rest see `radiance`.
-        """
+        """(direct, indirect) radiance along primary rays, each with the random numbers of its `pixel` (row-major)."""
         stage = self.stage
         if self.frozen_pose != stage.poses:
-            # Tracing the program in Python takes longer than running it at 1 spp: frozen, it is replayed. But a frozen
-            # function does not notice all changes of meshes (seen with Dr.Jit 1.5), so it lasts as long as a pose.
-            self.sample_mean = dr.freeze(sample_mean, state_fn=all_objects) if self.freezes else sample_mean
+            # Tracing the program in Python takes longer than running it at 1 spp, so it is frozen and replayed, with the
+            # palette, whose objects kernels may call, as state. Frozen functions miss some changes of meshes (Dr.Jit
+            # 1.5), so each is used for one pose only.
+            frozen = dr.freeze(sample_mean, state_fn=lambda *_, **__: palette())
+            self.sample_mean = frozen if self.freezes else sample_mean
             self.frozen_pose = stage.poses
         direct, indirect = self.sample_mean(
             stage.mitsuba_scene,
@@ -188,9 +174,9 @@ class PathTracer:
     def radiance(
         self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(direct, indirect) radiance (H, W, 3) toward the camera along the primary rays `ray` of all pixels.
+        """(direct, indirect) radiance (H, W, 3), without emission, along the primary rays of all pixels.
 
-        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes. Emission is not included.
+        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes.
         """
         direct, indirect = self.samples(ray, self.every_pixel, seed, spp, first)
         return self.stage.image(direct), self.stage.image(indirect)

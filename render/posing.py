@@ -1,4 +1,4 @@
-"""What of a loaded scene changes from frame to frame, as values of Mitsuba's parameters."""
+"""Changes of a loaded scene from frame to frame, as values of Mitsuba's parameters."""
 
 from typing import Any
 
@@ -13,21 +13,20 @@ from scenes.camera import Array
 
 Changes = dict[str, NDArray[np.float32]]  # by the parameter's name
 
-PLACES = ("to_world", "vertex_positions", "vertex_normals")
+PLACEMENT = ("to_world", "vertex_positions", "vertex_normals")
 BRIGHTNESS = ("radiance.value", "radiance.data", "intensity.value", "irradiance.value", "irradiance.data")
-POINTS = ("point", "spot", "projector")
-# Lights whose brightness has names of its own.
-SCALES = {"envmap": ("scale",), "projector": ("scale",), "sunsky": ("sun_scale", "sky_scale")}
+SCALES = {"envmap": ("scale",), "projector": ("scale",), "sunsky": ("sun_scale", "sky_scale")}  # instead of BRIGHTNESS
+POINT_LIGHTS = ("point", "spot", "projector")
 
 
 def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Changes:
-    """Of a mesh, its vertices where it `moves`, and the light that it emits."""
+    """A mesh's vertices, if it `moves`, and the light that it emits."""
     changes: Changes = {}
     if moves:
         matrix = shape.motion.matrix(frame)
         vertices = (shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]) / unit
         changes[f"{shape.name}.vertex_positions"] = np.float32(vertices).ravel()
-        if shape.smooth:  # in the same update: positions alone would recompute the authored normals
+        if shape.smooth:  # positions alone would recompute the authored normals
             normals = shape.mesh.vertex_normals @ matrix[:3, :3].T
             changes[f"{shape.name}.vertex_normals"] = np.float32(normals).ravel()
     if shape.radiance is not None:
@@ -36,10 +35,7 @@ def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Change
 
 
 class StockParameters:
-    """What a stock shape or light is at rest, to be moved and made brighter or darker from there.
-
-    Raises BadInput where it is to change and cannot.
-    """
+    """The parameters at rest of a stock shape or light that moves or changes. Raises BadInput if it cannot."""
 
     def __init__(self, described: StockShape | StockLight, parameters: mi.SceneParameters, unit: float):
         self.described = described
@@ -47,15 +43,13 @@ class StockParameters:
         name = described.name
         self.rest: dict[str, Array] = {}
         if isinstance(described, StockShape) and described.motion.varies():
-            self.rest = at_rest(
-                parameters, [f"{name}.{key}" for key in ("to_world", "vertex_positions", "vertex_normals")]
-            )
+            self.rest = at_rest(parameters, [f"{name}.{key}" for key in PLACEMENT])
             if not self.rest:
                 raise BadInput(f"shape '{name}' cannot move: it is of the kind {described.geometry['type']}")
         self.light: dict[str, Array] = {}
         kind = described.emitter["type"] if described.emitter else "none"
-        # What shines from a point is seen by the square of its distance, which is measured in Mitsuba's units.
-        self.factor = unit**-2 if kind in POINTS else 1.0
+        # Irradiance of point lights falls with the square of the distance, which is in Mitsuba's units.
+        self.factor = unit**-2 if kind in POINT_LIGHTS else 1.0
         if described.gain.varies() or self.factor != 1:
             prefix = f"{name}.emitter" if isinstance(described, StockShape) else name
             self.light = at_rest(parameters, [f"{prefix}.{key}" for key in SCALES.get(kind, BRIGHTNESS)])
@@ -63,7 +57,7 @@ class StockParameters:
                 raise BadInput(f"the light of '{name}' cannot change: it is of the kind {kind}")
 
     def changes(self, frame: float) -> Changes:
-        """Its parameters in a frame; none of a shape at rest under light that stays."""
+        """The parameters that change, in a frame."""
         values = {name: value * (self.factor * self.described.gain.at(frame)) for name, value in self.light.items()}
         if self.rest and isinstance(self.described, StockShape):
             matrix = self.described.motion.matrix(frame)
@@ -73,7 +67,7 @@ class StockParameters:
 
 
 def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array]:
-    """The values of those of the named parameters that there are; none of a mesh's normals where it has none."""
+    """The values of the named parameters that exist and are not empty."""
     values: dict[str, Array] = {}
     for name in names:
         if name in parameters:
@@ -84,7 +78,7 @@ def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array
 
 
 def moved(name: str, value: Array, matrix: Array) -> Array:
-    """A parameter of a shape that `matrix` (4, 4) moves: to_world (4, 4), vertices (3 N,) or their normals (3 N,)."""
+    """to_world (4, 4), vertices (3 N,) or normals (3 N,) of a shape transformed by `matrix` (4, 4)."""
     if name.endswith("to_world"):
         return matrix @ value.reshape(4, 4)
     shift = matrix[:3, 3] if name.endswith("positions") else 0
@@ -92,7 +86,7 @@ def moved(name: str, value: Array, matrix: Array) -> Array:
 
 
 def as_parameter(value: NDArray[np.float32], parameter: Any) -> Any:
-    """A value as data for kernels, of the type that the `parameter` has."""
+    """A value as data for kernels, of the type of `parameter`."""
     if isinstance(parameter, float):
         return float(value)
     if isinstance(parameter, mi.TensorXf):

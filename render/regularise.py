@@ -1,8 +1,8 @@
-"""Path-space regularisation: glossy materials are blurred where a path has scattered before.
+"""Path-space regularisation: glossy materials are blurred from the second vertex of a path on.
 
-Kaplanyan and Dachsbacher (2013, "Path Space Regularization for Holistic and Robust Light Transport"), as RAE §3.1 uses
-it: paths that meet a mirror or a sharp highlight only after a diffuse bounce are hardly ever sampled and become
-fireflies. With more roughness they are found often; caustics and reflections of reflections come out too soft.
+Kaplanyan and Dachsbacher 2013, "Path Space Regularization for Holistic and Robust Light Transport", as used by RAE
+§3.1: paths that hit a mirror or a sharp highlight after a diffuse bounce are hardly ever sampled and become fireflies.
+With more roughness they are sampled often; caustics and reflections of reflections become too soft.
 """
 
 from typing import Any
@@ -14,14 +14,13 @@ from render.loading import to_mitsuba
 from render.materials import registry_index, registry_table
 from render.stage import Stage
 
-LEAST_ALPHA = 0.3
-
-
+MIN_BLURRED_ALPHA = 0.3
+ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
 Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
 
 
 def at_least(roughness: Roughness, least: float) -> Roughness:
-    """The roughness, nowhere below `least`."""
+    """The roughness, clamped from below."""
     if not isinstance(roughness, dict):
         return max(roughness, least)
     if "data" in roughness:
@@ -29,37 +28,34 @@ def at_least(roughness: Roughness, least: float) -> Roughness:
     return roughness | {"value": max(roughness["value"], least)}
 
 
-ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
-
-
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The Mitsuba BSDF dictionary with a GGX alpha of at least LEAST_ALPHA; what has none stays as it is."""
+    """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, if it has one."""
     nested = {key: blurred(value) if is_bsdf(value) else value for key, value in bsdf.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
-        return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), LEAST_ALPHA)}
+        return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}
     if kind == "principled":
-        return nested | {"roughness": at_least(bsdf.get("roughness", 0.5), LEAST_ALPHA**0.5)}
+        return nested | {"roughness": at_least(bsdf.get("roughness", 0.5), MIN_BLURRED_ALPHA**0.5)}
     return nested
 
 
 def is_bsdf(value: object) -> bool:
-    """Whether a value in a Mitsuba dictionary is a BSDF that another one, such as `twosided`, may wrap."""
+    """Whether a value in a Mitsuba dictionary is a BSDF that may be nested in another."""
     return isinstance(value, dict) and value.get("type") in (*ROUGH, *ROUGH.values(), "principled", "diffuse")
 
 
 class BlurredTable:
-    """The blurred version of every BSDF of a stage, looked up by the BSDF's registry index."""
+    """The blurred versions of all BSDFs of a stage, by registry index."""
 
     def __init__(self, stage: Stage):
         described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
         self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape, _ in described])
-        # Objects live as long as the table does: pointers do not keep them.
+        # Keeps objects alive, which pointers do not.
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 
     def after_first(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> mi.BSDFPtr:
-        """The surface's own BSDF at depth 1, the blurred one from then on."""
+        """The surface's BSDF at depth 1, the blurred one from then on."""
         own = si.bsdf()
         row = dr.gather(mi.UInt32, self.row, registry_index(own), si.is_valid())
         return dr.select(depth > 1, dr.gather(mi.BSDFPtr, self.pointers, row, si.is_valid()), own)

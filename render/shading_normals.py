@@ -1,7 +1,4 @@
-"""Shading normals as materials see them: normal and bump maps bend those of a surface."""
-
-# In Mitsuba's stubs mi.Float and mi.Bool are other classes than those that its functions take and return.
-# mypy: disable-error-code="arg-type, assignment, misc, operator, return-value"
+"""Shading normals, perturbed by normal and bump maps."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -11,7 +8,7 @@ from render.materials import BsdfParameters, bsdfs_of, registry_index
 
 
 class Relief(NamedTuple):
-    """What bends the normals of one BSDF. On the back of a two-sided one the relief is that of the front, mirrored."""
+    """The normal or bump map of a BSDF. On the back of a two-sided one it is that of the front, mirrored."""
 
     texture: mi.Texture
     bump: float | None  # the scale of heights; None where the texture holds normals
@@ -33,7 +30,7 @@ class Relief(NamedTuple):
 
 
 def relief_of(bsdf: mi.BSDF, two_sided: bool = False) -> Relief | None:
-    """What bends the normals of a BSDF, or of the first that it wraps; None where nothing does."""
+    """The normal or bump map of a BSDF, or of the first that it wraps, if any."""
     parameters = BsdfParameters(bsdf)
     kind = bsdf.class_name()
     if kind == "NormalMap":
@@ -45,17 +42,15 @@ def relief_of(bsdf: mi.BSDF, two_sided: bool = False) -> Relief | None:
 
 
 class ShadingNormals:
-    """The shading normals of Mitsuba shapes."""
-
     def __init__(self, shapes: Iterable[mi.Shape]):
         reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs_of(shapes).items()}
         self.reliefs = {number: relief for number, relief in reliefs.items() if relief is not None}
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> mi.Vector3f:
-        """The shading normal (3,) in the world at `si`, of unit length, on whichever side."""
+        """The shading normal (3,) in the world at `si`, of unit length, on either side."""
         normal = mi.Vector3f(si.sh_frame.n)
         number = registry_index(si.bsdf())
-        for index, relief in self.reliefs.items():  # one after the other: a call by pointer would trace all textures
+        for index, relief in self.reliefs.items():  # sequential: a call by pointer would trace all textures
             here = hit & (number == index)
             normal = dr.select(here, si.to_world(relief.local_normal(si, here)), normal)
         return normal

@@ -1,4 +1,4 @@
-"""An animated scene in Mitsuba, posed at one frame at a time without recompiling a kernel."""
+"""An animated scene in Mitsuba, posed for one frame at a time without recompiling kernels."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.lights import Lights
-from render.loading import StockLoader, load_mesh, reach_of, upload, with_placed_textures
+from render.loading import StockLoader, extent_of, load_mesh, upload, with_placed_textures
 from render.materials import MaterialTable, bsdfs_of, registry_index, registry_table
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
@@ -16,48 +16,38 @@ from render.shading_normals import ShadingNormals
 from scenes.animation import Scene, Shape, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
-MOST_HOLES = 32  # that a ray from the eye goes through
-HOLE = 0.999  # of all light goes through
+MAX_CUTOUTS = 32  # that a primary ray passes
+CUTOUT = 0.999  # least transmission of a cut-out
 
 
-def unit_of(sizes: list[float]) -> float:
-    """How many world units a unit of Mitsuba's is: 1, or a power of two for very small and very large scenes.
+def unit_of(extents: list[float]) -> float:
+    """Mitsuba's unit in world units: 1, or a power of two for very small and very large scenes.
 
-    `sizes` are how far its shapes reach from the origin. Mitsuba keeps a ray from hitting the surface it leaves by a
-    step that suits scenes of human size.
+    `extents` are the largest coordinates of its shapes. Mitsuba's epsilon against self-intersection suits scenes of
+    human size only.
     """
-    extent = max(sizes, default=1.0)
+    extent = max(extents, default=1.0)
     if extent == 0 or 1 / 16 < extent < 1024:
         return 1.0
     return float(2.0 ** np.round(np.log2(extent)))
 
 
-def lets_through(bsdf: mi.BSDF) -> bool:
-    """Whether light may go straight through, as through the holes of a mask (but also through thin glass)."""
-    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
-
-
-def shines_by_picture(shape: StockShape) -> bool:
-    """Whether a shape emits what a texture says, place by place."""
-    radiance = (shape.emitter or {}).get("radiance")
+def has_texture(emitter: dict[str, Any] | None) -> bool:
+    """Whether emitted radiance varies over a surface."""
+    radiance = (emitter or {}).get("radiance")
     return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
 
 
-def size_of_mesh(shape: Shape) -> float:
-    """How far a mesh reaches from the origin, at most, in frame 0."""
+def extent_of_mesh(shape: Shape) -> float:
+    """An upper bound of the mesh's coordinates in frame 0."""
     return float(np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max())
-
-
-def size_of_stock(shape: mi.Shape) -> float:
-    """The same of a shape that Mitsuba has loaded."""
-    return reach_of(shape.bbox())
 
 
 class Stage:
     """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
 
-    It stands as in one frame at a time: `pose` it before every use of `mitsuba_scene`. `notes` say which properties of
-    stock shapes and lights mean nothing to Mitsuba. Raises BadInput, naming the shape or light, where one cannot be
+    It has the pose of one frame at a time: `pose` it before every use of `mitsuba_scene`. `notes` list properties of
+    stock shapes and lights that Mitsuba does not support. Raises BadInput, naming the shape or light, if one cannot be
     loaded, moved or changed.
     """
 
@@ -68,7 +58,7 @@ class Stage:
         palette()
         loader = StockLoader()
         loaded = [loader.shape(shape) for shape in scene.stock]
-        self.unit = unit_of([*map(size_of_mesh, scene.shapes), *map(size_of_stock, loaded)])
+        self.unit = unit_of([*map(extent_of_mesh, scene.shapes), *(extent_of(shape.bbox()) for shape in loaded)])
         if self.unit != 1:
             loader = StockLoader(self.unit)
             loaded = [loader.shape(shape) for shape in scene.stock]
@@ -80,28 +70,29 @@ class Stage:
         content |= {light.name: loader.light(light) for light in scene.lights}
         if scene.sky is not None:
             content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(scene.sky.astype(np.float32))}
-        # Without optimize=False meshes that share a material are merged, and their ids vanish.
+        # By default meshes that share a material are merged, and lose their ids.
         self.mitsuba_scene = mi.load_dict(content, optimize=False)
         self.lights = Lights(self.mitsuba_scene)
         self.parameters = mi.traverse(self.mitsuba_scene)
         by_name = {shape.id(): shape for shape in self.mitsuba_scene.shapes()}
         self.shapes = [by_name[shape.name] for shape in scene.meshes]
-        moving: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
-        self.stock = [StockParameters(each, self.parameters, self.unit) for each in moving]
+        described: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
+        self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
         visible = [*self.shapes, *loader.grouped]
         self.materials = MaterialTable(visible)
         self.has_mirrors = self.materials.has_mirrors
         self.normals = ShadingNormals(visible)
-        self.has_holes = any(map(lets_through, bsdfs_of(visible).values()))
+        # Masks have null transmission; so has thin glass.
+        self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(visible).values())
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
         self.has_instances = bool(loader.grouped)
-        self.has_pictured_lights = any(map(shines_by_picture, scene.stock))
+        self.has_textured_lights = any(has_texture(shape.emitter) for shape in scene.stock)
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
-        """Which of the scene's shapes a surface interaction lies on: its index + 1, or 0 for none."""
+        """The mesh id at a surface interaction: the shape's index + 1, or 0 for none."""
         shape = registry_index(si.shape)
         if self.has_instances:
             instance = registry_index(si.instance)
@@ -109,7 +100,7 @@ class Stage:
         return dr.gather(mi.UInt32, self.mesh_id_of_shape, shape, si.is_valid())
 
     def pose(self, frame: float) -> None:
-        """Move the meshes and set the lights as in `frame`. All changes enter the kernels as data."""
+        """Move the meshes and set the lights as in `frame`. Changes enter kernels as data."""
         first = not self.posed
         changes: Changes = {}
         for shape in self.scene.shapes:
@@ -124,24 +115,24 @@ class Stage:
         for name, value in changes.items():
             self.parameters[name] = as_parameter(value, self.parameters[name])
         if changes:
-            self.parameters.update()  # once a pose: every update rebuilds the top level of the ray-tracing structure
+            self.parameters.update()  # every update rebuilds the top level of the acceleration structure
             self.posed.update(changes)
             self.poses += 1
 
     def image(self, value: dr.AnyArray) -> NDArray[Any]:
-        """(H, W, C) of a Dr.Jit value of C components with a lane for each pixel, or one for all; its own dtype."""
+        """(H, W, C) of a Dr.Jit value of C components with a lane for each pixel, or one for all."""
         array = np.array(value)
         planes = np.atleast_2d(array).reshape(-1, array.shape[-1])
         return np.broadcast_to(planes.T, (self.height * self.width, len(planes))).reshape(self.height, self.width, -1)
 
     def view(self, frame: float) -> View:
-        """Camera and meshes of `frame`, whatever the stage is posed for."""
+        """Camera and object poses of `frame`, independent of the current pose."""
         return self.scene.view(frame, self.height, self.width)
 
     def rays(self, view: View, pixels: Array | None = None) -> mi.Ray3f:
-        """Rays through `pixels` (N, 2) of `view`; without them through all pixel centres, row by row.
+        """Rays through `pixels` (N, 2) of `view`, by default all pixel centres in row-major order.
 
-        They begin at the eye, or behind the holes in surfaces (of masks) that they have passed through.
+        They begin at the eye, or behind the cut-outs (of masks) that they have passed.
         """
         if pixels is None:
             pixels = pixel_centres(self.height, self.width).reshape(-1, 2)
@@ -150,18 +141,18 @@ class Stage:
         origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:] / self.unit))
         ray = mi.Ray3f(origin, mi.Vector3f(*map(upload, towards.T)))
         dr.eval(ray)
-        return self.past_holes(ray)
+        return self.past_cutouts(ray)
 
-    def past_holes(self, ray: mi.Ray3f) -> mi.Ray3f:
-        """The rays from behind the last of the first MOST_HOLES surfaces that let all light through where they hit."""
-        if not self.has_holes:
+    def past_cutouts(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """The rays from behind the cut-outs that they hit first, up to MAX_CUTOUTS."""
+        if not self.has_cutouts:
             return ray
-        for _ in range(MOST_HOLES):
+        for _ in range(MAX_CUTOUTS):
             si = self.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
             hit = si.is_valid()
-            hole = hit & (dr.min(si.bsdf().eval_null_transmission(si, hit)) > HOLE)
-            if not dr.any(hole):
+            cutout = hit & (dr.min(si.bsdf().eval_null_transmission(si, hit)) > CUTOUT)
+            if not dr.any(cutout):
                 break
-            ray.o = dr.select(hole, si.spawn_ray(ray.d).o, ray.o)
+            ray.o = dr.select(cutout, si.spawn_ray(ray.d).o, ray.o)
             dr.eval(ray)
         return ray

@@ -1,6 +1,6 @@
-"""Animated scenes as data: shapes, lights and a camera that move and change, and what they are in any frame."""
+"""Animated scenes as data: shapes, lights and a camera, and their state in any frame."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,15 +8,15 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from scenes.bsdf import Bsdf
-from scenes.camera import Array, View, intrinsics, look_at
+from scenes.camera import Y_UP, Array, View, intrinsics, look_at
 
 
 @dataclass(frozen=True)
 class Track:
-    """A value over time: a spline through `keys` (N, D) or (N,), which are spread evenly over frames `first`..`last`.
+    """A value over time: a Catmull-Rom spline through `keys` (N, D) or (N,), evenly spaced over frames `first`..`last`.
 
-    It is that of Catmull and Rom 1974, "A class of local interpolating splines": its first derivative is continuous
-    between the ends. Before `first` and after `last` the ends are held. One key is a constant.
+    Catmull and Rom 1974, "A class of local interpolating splines". The first derivative is continuous between the ends;
+    before `first` and after `last` the end values are held. A single key is a constant.
     """
 
     keys: Array
@@ -25,18 +25,18 @@ class Track:
 
     @staticmethod
     def constant(value: ArrayLike) -> "Track":
-        """The same `value`, a scalar or (D,), for ever."""
+        """A constant `value`, a scalar or (D,)."""
         return Track(np.asarray(value, dtype=np.float64)[None])
 
     def at(self, frame: float) -> Array:
-        """The value, (D,) or a scalar, in a `frame`, which may lie between whole ones."""
+        """The value, (D,) or a scalar, in a `frame`, which may be fractional."""
         keys = self.keys
         if len(keys) == 1:
             return keys[0]
         position = np.clip((frame - self.first) / (self.last - self.first), 0, 1) * (len(keys) - 1)
         k = min(int(position), len(keys) - 2)
         u = position - k
-        # Ends are extended linearly, so that the path leaves and arrives at constant speed.
+        # The ends are extrapolated linearly, so that the path starts and stops at constant speed.
         before = keys[k - 1] if k > 0 else 2 * keys[0] - keys[1]
         after = keys[k + 2] if k + 2 < len(keys) else 2 * keys[-1] - keys[-2]
         a = keys[k]
@@ -52,23 +52,16 @@ class Track:
         """Whether the value ever changes."""
         return bool((self.keys != self.keys[0]).any())
 
-    def held(self) -> "Track":
-        """The value of frame 0, for ever."""
-        return Track.constant(self.at(0))
-
 
 @dataclass(frozen=True)
 class KeyframedTrack(Track):
-    """A Track whose `keys` are those of the frames `times` (N,), which rise: the same spline over uneven intervals.
-
-    Or straight lines, which go no higher and no lower than the keys.
-    """
+    """A Track with `keys` at the increasing frames `times` (N,), interpolated by a spline or by straight lines."""
 
     times: Array = field(default_factory=lambda: np.zeros(1))
     straight: bool = False
 
     def at(self, frame: float) -> Array:
-        """The value, (D,) or a scalar, in a `frame`, which may lie between whole ones."""
+        """The value, (D,) or a scalar, in a `frame`, which may be fractional."""
         keys = self.keys
         times = self.times
         if len(keys) == 1 or frame <= times[0]:
@@ -93,7 +86,7 @@ class KeyframedTrack(Track):
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """A turn by `angle` radians about the vertical axis through the shape's rest origin, then a shift."""
+    """A rotation by `angle` radians about the vertical axis through the shape's origin, then a translation."""
 
     position: Track  # (3,) world units
     angle: Track  # scalar, radians
@@ -107,20 +100,15 @@ class RigidMotion:
         return matrix
 
     def varies(self) -> bool:
-        """Whether it ever moves or turns anything."""
         return self.position.varies() or self.angle.varies()
-
-    def held(self) -> "RigidMotion":
-        """The pose of frame 0, for ever."""
-        return RigidMotion(self.position.held(), self.angle.held())
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Turns about the x, then the y, then the z axis through `pivot`, and then a shift."""
+    """Rotations about the x, then the y, then the z axis through `pivot`, and then a translation."""
 
     pivot: Array  # (3,) world units
-    position: Track  # (3,) world units, the shift
+    position: Track  # (3,) world units
     rotation: Track  # (3,) radians
 
     def matrix(self, frame: float) -> Array:
@@ -140,20 +128,15 @@ class FreeMotion:
         return matrix
 
     def varies(self) -> bool:
-        """Whether it ever moves or turns anything."""
         return self.position.varies() or self.rotation.varies()
-
-    def held(self) -> "FreeMotion":
-        """The pose of frame 0, for ever."""
-        return FreeMotion(self.pivot, self.position.held(), self.rotation.held())
 
 
 def still(place: ArrayLike, angle: float) -> RigidMotion:
-    """At rest at `place` (3,), turned by `angle` radians about the vertical axis."""
+    """At rest at `place` (3,), rotated by `angle` radians about the vertical axis."""
     return RigidMotion(Track.constant(place), Track.constant(angle))
 
 
-STILL = still([0.0, 0.0, 0.0], 0.0)
+AT_REST = still([0.0, 0.0, 0.0], 0.0)
 
 
 @dataclass(frozen=True)
@@ -164,12 +147,8 @@ class Shape:
     mesh: trimesh.Trimesh  # with texture coordinates in visual.uv where the material has a texture
     bsdf: Bsdf
     radiance: Track | None = None  # emitted radiance (3,), linear RGB; None does not emit
-    motion: RigidMotion | FreeMotion = STILL
+    motion: RigidMotion | FreeMotion = AT_REST
     smooth: bool = False  # shade with the mesh's vertex normals instead of its faces'
-
-    def held(self) -> "Shape":
-        """As in frame 0, for ever."""
-        return replace(self, radiance=self.radiance and self.radiance.held(), motion=self.motion.held())
 
 
 UNCHANGED = Track.constant(1.0)
@@ -177,21 +156,17 @@ UNCHANGED = Track.constant(1.0)
 
 @dataclass(frozen=True)
 class StockShape:
-    """A shape as a scene file describes it: Mitsuba's dictionaries, of whichever plugins.
+    """A shape as a scene file describes it: dictionaries of any Mitsuba plugins.
 
-    Dictionaries that are the same object are loaded once. Bitmaps and meshes may be names of files.
+    Dictionaries that are the same object are loaded once. Bitmaps and meshes may be file names.
     """
 
     name: str
     geometry: dict[str, Any]
     bsdf: dict[str, Any] | None  # None where shapes within the geometry (of an instance) have their own
     emitter: dict[str, Any] | None = None
-    gain: Track = UNCHANGED  # scalar, times the light that it emits
-    motion: RigidMotion | FreeMotion = STILL  # from where it stands in the file
-
-    def held(self) -> "StockShape":
-        """As in frame 0, for ever."""
-        return replace(self, gain=self.gain.held(), motion=self.motion.held())
+    gain: Track = UNCHANGED  # scalar, multiplies the light that it emits
+    motion: RigidMotion | FreeMotion = AT_REST  # relative to its pose in the file
 
 
 @dataclass(frozen=True)
@@ -202,31 +177,33 @@ class StockLight:
     emitter: dict[str, Any]
     gain: Track = UNCHANGED  # scalar
 
-    def held(self) -> "StockLight":
-        """As in frame 0, for ever."""
-        return replace(self, gain=self.gain.held())
-
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the camera is, what it looks at and how wide its view is, over time."""
-
     eye: Track  # (3,) world units
     target: Track  # (3,) world units
     x_fov: Track = field(default_factory=lambda: Track.constant(60.0))  # horizontal field of view, degrees
     up: Track = field(default_factory=lambda: Track.constant([0.0, 1.0, 0.0]))  # (3,), any length
 
-    def held(self) -> "Camera":
-        """As in frame 0, for ever."""
-        return Camera(self.eye.held(), self.target.held(), self.x_fov.held(), self.up.held())
+    @staticmethod
+    def at_rest(eye: ArrayLike, target: ArrayLike, x_fov: float, up: ArrayLike = Y_UP) -> "Camera":
+        return Camera(*map(Track.constant, (eye, target, x_fov, up)))
+
+
+def frozen(value: Any) -> Any:
+    """A Track as in frame 0 for ever; of dataclasses and tuples, the same with all Tracks in them frozen."""
+    if isinstance(value, Track):
+        return Track.constant(value.at(0))
+    if isinstance(value, tuple):
+        return tuple(map(frozen, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{each.name: frozen(getattr(value, each.name)) for each in fields(value)})
+    return value
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that a renderer needs in any frame.
-
-    The id of a mesh is its index in `shapes`, followed by `stock`, plus one; 0 is the background.
-    """
+    """An animated scene. A mesh id is the index in `meshes` plus one; 0 is the background."""
 
     shapes: tuple[Shape, ...]
     camera: Camera
@@ -237,11 +214,11 @@ class Scene:
 
     @property
     def meshes(self) -> tuple[Shape | StockShape, ...]:
-        """Whatever has a mesh id, in its order."""
+        """All that have a mesh id, in its order."""
         return (*self.shapes, *self.stock)
 
     def view(self, frame: float, height: int, width: int) -> View:
-        """The projection and the objects' poses in a `frame`, for an image of `height` x `width` pixels."""
+        """Camera and object poses of a `frame`, for an image of `height` x `width` pixels."""
         return View(
             K=intrinsics(float(self.camera.x_fov.at(frame)), height, width),
             camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame), self.camera.up.at(frame)),
@@ -250,14 +227,8 @@ class Scene:
 
     def still(self) -> "Scene":
         """The scene of frame 0 for ever: nothing moves or changes, the camera included."""
-        return replace(
-            self,
-            shapes=tuple(shape.held() for shape in self.shapes),
-            stock=tuple(shape.held() for shape in self.stock),
-            camera=self.camera.held(),
-            lights=tuple(light.held() for light in self.lights),
-        )
+        still: Scene = frozen(self)
+        return still
 
     def moves(self) -> bool:
-        """Whether any object moves (the camera may move in any scene)."""
         return any(shape.motion.varies() for shape in self.meshes)

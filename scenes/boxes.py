@@ -6,12 +6,12 @@ from scenes.camera import Array
 
 
 def enclosing_box(boxes: Array) -> Array:
-    """The smallest box (2, 3) around `boxes` (N, 2, 3), N > 0."""
+    """The bounding box (2, 3) of `boxes` (N, 2, 3), N > 0."""
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
 def transformed_box(box: Array, matrix: Array) -> Array:
-    """The smallest box (2, 3) around `box` (2, 3) transformed by `matrix` (4, 4)."""
+    """The bounding box (2, 3) of `box` (2, 3) transformed by `matrix` (4, 4)."""
     corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
     transformed = corners @ matrix[:3, :3].T + matrix[:3, 3]
     return np.stack([transformed.min(axis=0), transformed.max(axis=0)])
@@ -29,15 +29,15 @@ def keeps_clearance(points: Array, boxes: Array, clearance: float) -> bool:
 
 
 def first_hit(origin: Array, targets: Array, boxes: Array) -> Array:
-    """At which share (N,) of the ways from `origin` (3,) to `targets` (N, 3) the first of `boxes` (M, 2, 3) begins.
+    """Ray parameters (N,) from `origin` (3,), 0, to `targets` (N, 3), 1, at the first of `boxes` (M, 2, 3).
 
-    Negative inside a box, above 1 behind the target, infinite where no box is met. The slab method of Kay and Kajiya
-    1986, "Ray tracing complex scenes".
+    Negative inside a box, infinite where no box is hit. The slab method of Kay and Kajiya 1986, "Ray tracing complex
+    scenes".
     """
-    ways = (targets - origin)[:, None, None]
-    ways = np.where(np.abs(ways) < 1e-9, 1e-9, ways)
-    near, far = np.sort((boxes[None] - origin) / ways, axis=2).transpose(2, 0, 1, 3)
+    rays = (targets - origin)[:, None, None]
+    rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+    near, far = np.sort((boxes[None] - origin) / rays, axis=2).transpose(2, 0, 1, 3)
     enter = near.max(axis=-1)
     leave = far.min(axis=-1)
-    met = (enter < leave) & (leave > 0)
-    return np.asarray(np.where(met, enter, np.inf).min(axis=1, initial=np.inf))
+    hit = (enter < leave) & (leave > 0)
+    return np.asarray(np.where(hit, enter, np.inf).min(axis=1, initial=np.inf))

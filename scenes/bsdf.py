@@ -1,4 +1,4 @@
-"""Materials as Mitsuba's dictionaries; a bitmap's values are a numpy array under "data"."""
+"""Materials as Mitsuba dictionaries; the values of a bitmap are a numpy array under "data"."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -1,4 +1,4 @@
-"""The pinhole camera: projection, its inverse, and where surfaces stand in another frame. Numpy only, in float64.
+"""The pinhole camera: projection, its inverse and motion of surfaces between frames. Numpy only, in float64.
 
 Camera frame (Mitsuba's): x left, y up, z forward. Pixel positions are (x right, y down), the centre of column c, row r
 at (c + 0.5, r + 0.5). With C = inverse(camera_to_world): pixel = (K C p)_xy / depth, depth = (K C p)_z.
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FAR_OUTSIDE = 1e5  # px, outside any image yet finite: stands for "behind the camera"
+FAR_OUTSIDE = 1e5  # px, outside any image yet finite: what is behind the camera projects there
 
 
 class View(NamedTuple):
-    """What projects the points of surfaces in one frame."""
+    """Camera and object poses of one frame."""
 
     K: Array  # (3, 3)
     camera_to_world: Array  # (4, 4)
@@ -57,16 +57,16 @@ def pixel_centres(height: int, width: int) -> Array:
 
 
 def directions(pixels: Array, view: View) -> Array:
-    """World directions (..., 3) through `pixels` (..., 2), not normalised: of length 1 along the viewing axis."""
+    """World directions (..., 3) through `pixels` (..., 2), of length 1 along the viewing axis."""
     x = (pixels[..., 0] - view.K[0, 2]) / view.K[0, 0]
     y = (pixels[..., 1] - view.K[1, 2]) / view.K[1, 1]
     return np.stack([x, y, np.ones_like(x)], axis=-1) @ view.camera_to_world[:3, :3].T
 
 
 def unproject(pixels: Array, depth: Array, view: View) -> Array:
-    """Points (..., 3) that are seen at `pixels` (..., 2) at `depth` (...,) along the viewing axis.
+    """Points (..., 3) visible at `pixels` (..., 2) at `depth` (...,) along the viewing axis.
 
-    Where the depth is 0 (background) these are directions: in homogeneous coordinates their fourth is 0 instead of 1.
+    Where the depth is 0 (background) they are directions: homogeneous points at infinity.
     """
     hit = (depth > 0)[..., None]
     ray = directions(pixels, view)
@@ -74,9 +74,9 @@ def unproject(pixels: Array, depth: Array, view: View) -> Array:
 
 
 def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
-    """Pixel positions (..., 2) of `points` (..., 3); of directions, projected at infinity, where `hit` (...,) is false.
+    """Pixel positions (..., 2) of `points` (..., 3), which are directions where `hit` (...,) is false.
 
-    What lies behind the camera projects to (FAR_OUTSIDE, FAR_OUTSIDE).
+    What is behind the camera projects to (FAR_OUTSIDE, FAR_OUTSIDE).
     """
     relative = points - np.where(hit[..., None], view.camera_to_world[:3, 3], 0)
     in_camera = relative @ view.camera_to_world[:3, :3]
@@ -89,13 +89,13 @@ def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
 
 
 def move(points: Array, mesh_id: NDArray[np.integer], source: View, target: View) -> Array:
-    """Where surface points (..., 3) of the frame `source` are in the frame `target`, moved along with their meshes.
+    """Surface points (..., 3) of the frame `source` moved with their meshes to the frame `target`.
 
-    Background directions, whose `mesh_id` (...,) is 0, stay.
+    Background directions (`mesh_id` (...,) 0) stay.
     """
     relative = target.object_to_world @ inverse_pose(source.object_to_world)
     relative = np.concatenate([np.eye(4)[None], relative])
-    # A mesh that does not move must not pick up rounding errors: M times its inverse is not exactly the identity.
+    # M times its inverse is not exactly the identity: a mesh at rest must not pick up rounding errors.
     same = (target.object_to_world == source.object_to_world).all(axis=(1, 2))
     relative[1:][same] = np.eye(4)
     if same.all():
@@ -105,10 +105,9 @@ def move(points: Array, mesh_id: NDArray[np.integer], source: View, target: View
 
 
 def motion_vectors(pixels: Array, depth: Array, mesh_id: NDArray[np.integer], now: View, other: View) -> Array:
-    """What to add to `pixels` (..., 2) of the frame `now` to find the same surface points in the frame `other`; pixels.
+    """Vectors, in pixels, from `pixels` (..., 2) of the frame `now` to the same surface points in the frame `other`.
 
-    With the previous frame as `other` this is the channel `motion`, with the next one the forward motion that reversed
-    playback needs. Background (depth 0) moves with its direction.
+    With the previous frame as `other` this is the channel `motion`. Background (depth 0) moves with its direction.
     """
     if all(np.array_equal(a, b) for a, b in zip(now, other, strict=True)):
         return np.zeros_like(pixels)

@@ -1,4 +1,4 @@
-"""Random colours for interiors: linear reflectances of surfaces, and the light of lamps."""
+"""Colours: the sRGB curve, random linear reflectances for interiors and random colours of lamps."""
 
 import colorsys
 
@@ -10,19 +10,24 @@ from scenes.draws import Rng
 MIN_REFLECTANCE = 0.02  # linear
 MAX_REFLECTANCE = 0.9
 
-# From candle light to daylight in the shade.
+# From candlelight to daylight in the shade.
 LIGHT_COLOURS = np.array([[1.0, 0.55, 0.25], [1.0, 0.75, 0.5], [1.0, 0.95, 0.85], [0.8, 0.9, 1.0]])
 COLOURED_LAMPS = 0.03  # share of lamps of any hue
 
 
+def srgb_to_linear(encoded: Array) -> Array:
+    """Linear values of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
 def hsv(hue: float, saturation: float, value: float) -> Array:
-    """Linear reflectance (3,) of a displayed colour (gamma 2.2); the hue wraps around, the rest is clipped to 0..1."""
+    """Linear reflectance (3,) of a displayed colour (gamma 2.2); the hue wraps, the rest is clipped to [0, 1]."""
     rgb = colorsys.hsv_to_rgb(hue % 1, float(np.clip(saturation, 0, 1)), float(np.clip(value, 0, 1)))
     return np.clip(np.array(rgb) ** 2.2, MIN_REFLECTANCE, MAX_REFLECTANCE)
 
 
 def hue_saturation_value(rng: Rng) -> tuple[float, float, float]:
-    """A displayed colour as interiors have them: white, grey, dark, of wood, muted or saturated."""
+    """A displayed colour typical of interiors: white, grey, dark, wood, muted or saturated."""
     hue = rng.uniform()
     earth = rng.normal(0.08, 0.025)
     kinds = (  # share, hue, saturation, value
@@ -44,26 +49,22 @@ def colour(rng: Rng) -> tuple[float, float, float]:
 
 
 def palette(rng: Rng, count: int) -> Array:
-    """Linear reflectances (count, 3): unrelated ones, tones of one hue, or such tones with an accent."""
+    """Linear reflectances (count, 3): unrelated, of one hue, or of one hue with an accent."""
     kind = rng.integers(4)
     if kind == 0:
         return np.array([colour(rng) for _ in range(count)])
     hue, saturation, value = hue_saturation_value(rng)
     values = value + rng.uniform(0.03, 0.4) * rng.permutation(np.linspace(-1, 1, count))
-    shades = zip(
-        hue + rng.normal(0, 0.04, count),
-        saturation * rng.uniform(0.7, 1.3, count),
-        np.clip(values, 0.08, 1),
-        strict=True,
-    )
-    colours = np.array([hsv(*shade) for shade in shades])
+    hues = hue + rng.normal(0, 0.04, count)
+    saturations = saturation * rng.uniform(0.7, 1.3, count)
+    colours = np.array([*map(hsv, hues, saturations, np.clip(values, 0.08, 1))])
     if kind == 1:
         colours[rng.integers(count)] = hsv(rng.uniform(), rng.uniform(0.5, 1), rng.uniform(0.4, 0.95))
     return colours
 
 
 def light_colour(rng: Rng) -> Array:
-    """A lamp's colour (3,) whose largest component is 1: nearly white, sometimes of candles, rarely of any hue."""
+    """A lamp's colour (3,) with maximum 1: nearly white, sometimes of candles, rarely of any hue."""
     if rng.random() < COLOURED_LAMPS:
         hue = rng.dirichlet(np.ones(3))
         return np.asarray(hue / hue.max())

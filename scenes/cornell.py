@@ -1,7 +1,7 @@
 """The Cornell box, two units wide, open towards +z, and a version in which its content moves.
 
-The box is that of Goral et al. 1984, "Modeling the interaction of light between diffuse surfaces". The reflectances and
-the light's colour are the RGB values that renderers commonly ship for the measured originals.
+Goral et al. 1984, "Modeling the interaction of light between diffuse surfaces". Reflectances and the light's colour are
+the RGB values that renderers commonly ship for the measured originals.
 """
 
 from collections.abc import Sequence
@@ -14,57 +14,49 @@ from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.draws import Rng
 
-WHITE_REFLECTANCE = (0.885, 0.699, 0.666)
-RED_REFLECTANCE = (0.570, 0.043, 0.044)
-GREEN_REFLECTANCE = (0.105, 0.378, 0.076)
+WHITE = diffuse_bsdf(rgb((0.885, 0.699, 0.666)))
+RED = diffuse_bsdf(rgb((0.570, 0.043, 0.044)))
+GREEN = diffuse_bsdf(rgb((0.105, 0.378, 0.076)))
 LIGHT_RADIANCE = np.array([18.4, 14.0, 6.8])
 FLOOR_HEIGHT = -1.0
 FRAMES_BETWEEN_KEYS = 48
 
 
 def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
-    """Two triangles; seen from where the corners run counter-clockwise, the normal points to the viewer."""
+    """Two triangles that face the side from which the corners run counter-clockwise."""
     return trimesh.Trimesh(vertices=np.array(corners), faces=[[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def block_mesh(width: float, height: float) -> trimesh.Trimesh:
-    """A square block standing on the origin, so that its rest pose turns about its own vertical axis."""
     mesh: trimesh.Trimesh = trimesh.creation.box((width, height, width))
     mesh.apply_translation((0, height / 2, 0))
     return mesh
 
 
 def empty_box() -> list[Shape]:
-    """Floor, ceiling and walls."""
-    white = diffuse_bsdf(rgb(WHITE_REFLECTANCE))
-    red = diffuse_bsdf(rgb(RED_REFLECTANCE))
-    green = diffuse_bsdf(rgb(GREEN_REFLECTANCE))
     return [
-        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), white),
-        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), white),
-        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), white),
-        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), red),
-        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), green),
+        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), WHITE),
+        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), WHITE),
+        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), WHITE),
+        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), RED),
+        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), GREEN),
     ]
 
 
 def light(position: Track, radiance: Track) -> Shape:
-    """A rectangle that shines down from positions (x, y, z)."""
     corners = [(-0.235, 0, -0.19), (0.235, 0, -0.19), (0.235, 0, 0.19), (-0.235, 0, 0.19)]
     motion = RigidMotion(position, Track.constant(0.0))
-    return Shape("light", quad(*corners), diffuse_bsdf(rgb(WHITE_REFLECTANCE)), radiance, motion)
+    return Shape("light", quad(*corners), WHITE, radiance, motion)
 
 
 def block(name: str, width: float, height: float, position: Track, angle: Track) -> Shape:
-    """A white block that passes through floor positions (x, y, z) and turns through angles."""
-    white = diffuse_bsdf(rgb(WHITE_REFLECTANCE))
-    return Shape(name, block_mesh(width, height), white, motion=RigidMotion(position, angle))
+    return Shape(name, block_mesh(width, height), WHITE, motion=RigidMotion(position, angle))
 
 
 class Keys:
-    """Tracks through random keys at equal intervals, of which a clip sees the middle.
+    """Tracks through random keys at equal intervals; a clip lies in their middle.
 
-    The interval is the same in clips of any length, and so are the speeds.
+    The interval, and with it the speed, is the same in clips of any length.
     """
 
     def __init__(self, rng: Rng, frames: int):
@@ -75,22 +67,21 @@ class Keys:
         self.last = self.first + spans * FRAMES_BETWEEN_KEYS
 
     def track(self, keys: Array) -> Track:
-        """Through `keys` (count, ...)."""
         return Track(keys, self.first, self.last)
 
     def between(self, low: Sequence[float], high: Sequence[float]) -> Track:
-        """Through random points of the box low..high."""
+        """Through random points of a box."""
         return self.track(self.rng.uniform(low, high, (self.count, len(low))))
 
 
 def fly(keys: Keys, low: Sequence[float], high: Sequence[float]) -> Camera:
-    """A smooth flight through random points of the box low..high that looks around the middle of the Cornell box."""
+    """A smooth flight through random points of a box that looks around the middle of the Cornell box."""
     target = keys.between([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4])
     return Camera(keys.between(low, high), target, Track.constant(75.0))
 
 
 def cornell_box(rng: Rng, frames: int) -> Scene:
-    """The classic box: two white blocks and a ceiling light; nothing moves but the camera, which flies around in it."""
+    """The classic box: two white blocks and a ceiling light; only the camera moves."""
     short = block("short-block", 0.6, 0.6, Track.constant([0.33, FLOOR_HEIGHT, 0.35]), Track.constant(-0.29))
     tall = block("tall-block", 0.6, 1.2, Track.constant([-0.33, FLOOR_HEIGHT, -0.28]), Track.constant(0.30))
     lamp = light(Track.constant([0.0, 0.99, 0.0]), Track.constant(LIGHT_RADIANCE))
@@ -98,10 +89,10 @@ def cornell_box(rng: Rng, frames: int) -> Scene:
 
 
 def cornell_box_moving(rng: Rng, frames: int) -> Scene:
-    """The blocks slide past each other and past the back wall and turn, each in its own lane; the light moves slowly.
+    """The blocks slide past each other and rotate, each in its own lane; the light moves slowly.
 
-    The lanes are farther apart than the blocks' diagonals reach, so nothing ever touches. Speeds are bounded so that a
-    dual motion vector, which looks one step of the occluder beside it, mostly finds the surface that came into view.
+    The lanes are farther apart than the blocks' diagonals reach, so nothing ever touches. Speeds are bounded so that
+    dual motion vectors, which reach one step of the occluder beside it, mostly find the disoccluded surface.
     """
     keys = Keys(rng, frames)
     sides = np.where(np.arange(keys.count) % 2 == 0, -1.0, 1.0) * rng.choice([-1.0, 1.0])

@@ -1,7 +1,4 @@
-"""Random draws that many scenes share.
-
-A scene is decided by the order of its draws: another order makes other data sets.
-"""
+"""Random draws. Their order determines a scene: another order makes other datasets."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -13,10 +10,14 @@ Option = TypeVar("Option")
 
 
 def one_of(rng: Rng, options: Sequence[Option]) -> Option:
-    """One of the options, each as likely as it is often among them."""
     return options[int(rng.integers(len(options)))]
 
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
-    """A number from `low` to `high`, both above 0, whose logarithm is uniformly distributed."""
+    """A number from `low` to `high`, both positive, with a uniformly distributed logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def uniforms(rng: Rng, *ranges: tuple[float, float]) -> list[float]:
+    """A number from each of the ranges (low, high)."""
+    return [rng.uniform(low, high) for low, high in ranges]

@@ -1,4 +1,4 @@
-"""Variations of the Cornell box at the limits of what number formats and denoisers bear."""
+"""Variations of the Cornell box at the limits of number formats and denoisers."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,19 +17,19 @@ TINY_LIGHT = 0.005  # of the size of the Cornell box's
 
 
 def repaint(scene: Scene, paint: Callable[[Shape], Bsdf]) -> Scene:
-    """The scene with the materials that `paint` gives to all shapes that emit no light."""
-    shapes = [s if s.radiance is not None else replace(s, bsdf=paint(s)) for s in scene.shapes]
-    return replace(scene, shapes=tuple(shapes))
+    """The scene with new materials for all shapes that emit no light."""
+    shapes = tuple(s if s.radiance is not None else replace(s, bsdf=paint(s)) for s in scene.shapes)
+    return replace(scene, shapes=shapes)
 
 
 def sharp_highlights(rng: Rng, frames: int) -> Scene:
-    """Blocks of metal so smooth (alpha 0.001) that their highlights are hardly ever sampled."""
+    """Blocks of metal (alpha 0.001) whose highlights are hardly ever sampled."""
     metal = {"type": "roughconductor", "material": "Al", "alpha": 0.001}
     return repaint(cornell_box(rng, frames), lambda shape: metal if "block" in shape.name else shape.bsdf)
 
 
 def tiny_light(rng: Rng, frames: int) -> Scene:
-    """A light of radiance 1e5, more than float16 holds, and hardly any size."""
+    """A tiny light of radiance 1e5, more than float16 can represent."""
     scene = cornell_box_moving(rng, frames)
     light = scene.shapes[-1]
     mesh = light.mesh.copy()
@@ -46,7 +46,7 @@ def black_and_white(rng: Rng, frames: int) -> Scene:
 
 
 def rescaled(scene: Scene, factor: float) -> Scene:
-    """The same scene in units that are 1 / `factor` as long."""
+    """The scene with all lengths times `factor`."""
 
     def grow(track: Track) -> Track:
         return replace(track, keys=track.keys * factor)
@@ -61,18 +61,8 @@ def rescaled(scene: Scene, factor: float) -> Scene:
     return replace(scene, shapes=tuple(map(larger, scene.shapes)), camera=camera)
 
 
-def small_numbers(rng: Rng, frames: int) -> Scene:
-    """The moving box with all lengths times 1e-3."""
-    return rescaled(cornell_box_moving(rng, frames), 1e-3)
-
-
-def large_numbers(rng: Rng, frames: int) -> Scene:
-    """The moving box with all lengths times 1e4."""
-    return rescaled(cornell_box_moving(rng, frames), 1e4)
-
-
 def only_sky(rng: Rng, frames: int) -> Scene:
-    """A sky with nothing before it; the camera turns."""
+    """A sky without any shape; the camera pans."""
     turn = rng.uniform(-np.pi, np.pi) + np.linspace(0, 0.02 * frames, 5)
     target = np.stack([np.cos(turn), np.full(5, 0.3), np.sin(turn)], axis=1)
     camera = Camera(Track.constant([0.0, 0.0, 0.0]), Track(target, 0, max(frames - 1, 1)))
@@ -94,8 +84,8 @@ EXTREME_SCENES: dict[str, SceneBuilder] = {
     "extremes-roughness": sharp_highlights,
     "extremes-light": tiny_light,
     "extremes-albedo": black_and_white,
-    "extremes-small": small_numbers,
-    "extremes-large": large_numbers,
+    "extremes-small": lambda rng, frames: rescaled(cornell_box_moving(rng, frames), 1e-3),
+    "extremes-large": lambda rng, frames: rescaled(cornell_box_moving(rng, frames), 1e4),
     "extremes-sky": only_sky,
     "extremes-mirrors": mirrors,
 }

@@ -1,4 +1,4 @@
-"""Camera flights through free space that look at things."""
+"""Camera flights through the free space of a room."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,16 @@ from scenes.camera import Array, intrinsics, look_at
 from scenes.draws import log_uniform
 from scenes.layout import Layout
 
-CLEARANCE = 0.3  # m, between the camera and what anything occupies
-MAX_SPEED = 20 / 256  # of things in the image, in its widths per frame
+EYE_CLEARANCE = 0.3  # m, between the camera and reserved boxes
+MAX_SPEED = 20 / 256  # of things in the image, in image widths per frame
 PATH_ATTEMPTS = 200
 TARGET_CANDIDATES = 200
 
 
 def flight_path(layout: Layout) -> Track:
-    """A smooth way (3,) of the eye, at a speed of its own; in some clips it ends early. Its surroundings are reserved.
+    """A smooth path (3,) of the camera at a random speed; in some clips it ends early. Its surroundings are reserved.
 
-    Call it before the room is full: what comes later keeps out of its way. Raises RuntimeError if no way is free.
+    To be called before the room is full. Raises RuntimeError if no path is free.
     """
     rng = layout.rng
     x, z = layout.size[[0, 2]] / 2 - 0.4
@@ -33,15 +33,15 @@ def flight_path(layout: Layout) -> Track:
         keys = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         track = Track(keys, 0, stop)
         points = np.stack([track.at(frame) for frame in range(layout.frames)])
-        if (points > low).all() and (points < high).all() and keeps_clearance(points, layout.boxes, CLEARANCE):
+        if (points > low).all() and (points < high).all() and keeps_clearance(points, layout.boxes, EYE_CLEARANCE):
             passed = [*points[:: max(1, layout.frames // 16)], points[-1]]
-            layout.reserve(*(np.stack([point - CLEARANCE, point + CLEARANCE]) for point in passed))
+            layout.reserve(*(np.stack([point - EYE_CLEARANCE, point + EYE_CLEARANCE]) for point in passed))
             return track
-    raise RuntimeError("no free way for the camera")
+    raise RuntimeError("no free path for the camera")
 
 
 def image_points(points: Array, eye: Array, target: Array, x_fov: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Positions (N, 2) of `points` (N, 3) in widths of a square image, and which of them (N,) lie in it."""
+    """Positions (N, 2) of `points` (N, 3) in widths of a square image, and whether they (N,) lie in it."""
     K = intrinsics(x_fov, 1, 1)
     in_camera = (points - eye) @ look_at(eye, target)[:3, :3]
     ahead = in_camera[:, 2] > 0.2
@@ -50,13 +50,12 @@ def image_points(points: Array, eye: Array, target: Array, x_fov: float) -> tupl
 
 
 def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
-    """A camera on the way `eye` that looks from one thing towards another.
+    """A camera on the path `eye` that pans from one thing towards another.
 
-    Of many candidates it is the one that keeps most things in view, moves them at about a speed that is drawn, and has
-    none of the `obstacles` (M, 2, 3) right before the lens.
+    The best of many candidates: most things visible, moving at about a random speed, and none of the `obstacles`
+    (M, 2, 3) close to the lens.
     """
-    rng = layout.rng
-    frames = layout.frames
+    rng, frames = layout.rng, layout.frames
     moments = sorted({0, frames // 4, frames // 2, 3 * frames // 4, frames - 1})
     things = np.stack(layout.centres)
     walls = layout.boxes[: layout.walls]
@@ -66,24 +65,21 @@ def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
     wanted_speed = log_uniform(rng, MAX_SPEED / 40, MAX_SPEED)
 
     def score(target: Track) -> float:
-        seen = []
-        speed = 0.0
-        sight = 1.0  # m, free before the lens
-        steepness = 0.0
-        nearest = np.inf
+        counts = []  # of visible things
+        speed, steepness, nearest = 0.0, 0.0, np.inf
+        sight = 1.0  # m, free in front of the lens
         for moment, unhidden in zip(moments, in_sight, strict=True):
-            here = eye.at(moment)
-            there = target.at(moment)
+            here, there = eye.at(moment), target.at(moment)
             distance = float(np.linalg.norm(there - here))
             now, visible = image_points(things, here, there, x_fov)
             then, _ = image_points(things, eye.at(moment + 1), target.at(moment + 1), x_fov)
-            seen.append((visible & unhidden).sum())
+            counts.append((visible & unhidden).sum())
             speed = max(speed, float(np.abs(now - then)[visible].max(initial=0)))
             sight = min(sight, float(first_hit(here, there[None], obstacles)[0]) * distance)
             steepness = max(steepness, abs(there[1] - here[1]) / distance)
             nearest = min(nearest, distance)
         faults = (speed > MAX_SPEED) + (nearest < 0.7) + (steepness > 0.7)
-        return min(*seen, 8) + 4 * min(sight, 0.7) - abs(np.log(max(speed, 1e-4) / wanted_speed)) - 50.0 * faults
+        return min(*counts, 8) + 4 * min(sight, 0.7) - abs(np.log(max(speed, 1e-4) / wanted_speed)) - 50.0 * faults
 
     def draw() -> Track:
         a, b = candidates[rng.integers(len(candidates), size=2)]

@@ -8,8 +8,8 @@ from scenes.animation import RigidMotion, Track, still
 from scenes.draws import one_of
 from scenes.layout import GAP, Group, Layout, laden
 from scenes.objects.catalogue import DECOR, FURNITURE
+from scenes.objects.fittings import make_picture
 from scenes.objects.furniture import make_table
-from scenes.objects.pictures import make_picture
 from scenes.objects.seating import make_chair
 from scenes.objects.thing import Maker
 from scenes.shell import wall_pose, wall_width
@@ -19,7 +19,7 @@ AGAINST_WALLS = ("sofa", "armchair", "bed", "shelf", "cabinet", "desk", "bench",
 
 
 def against_walls(layout: Layout, count: int) -> None:
-    """Up to `count` pieces of furniture with their backs to a wall."""
+    """Add up to `count` pieces of furniture with their backs to a wall."""
     rng = layout.rng
     for name in rng.choice(AGAINST_WALLS, count):
         group = laden(rng, FURNITURE[str(name)](rng))
@@ -37,7 +37,7 @@ def against_walls(layout: Layout, count: int) -> None:
 
 
 def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
-    """A slow turn, a slide or hops that start at a place on the floor."""
+    """A slow rotation, a slide or hops from a place on the floor."""
     rng = layout.rng
     last = layout.last_frame
     angle = rng.uniform(-np.pi, np.pi)
@@ -57,7 +57,7 @@ def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
 
 
 def movers(layout: Layout, count: int) -> None:
-    """Up to `count` things that move rigidly, each in space of its own."""
+    """Add up to `count` moving things."""
     rng = layout.rng
     makers = [*FURNITURE.values(), *DECOR.values()]
     goal = layout.moving + count
@@ -71,7 +71,7 @@ def movers(layout: Layout, count: int) -> None:
 
 
 def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
-    """Up to `count` things anywhere on the floor, turned any way."""
+    """Add up to `count` things anywhere on the floor."""
     rng = layout.rng
     half = layout.size[[0, 2]] / 2 - 0.15
     for _ in range(count):
@@ -83,7 +83,6 @@ def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
 
 
 def dining(layout: Layout) -> None:
-    """A table with chairs that face it."""
     rng = layout.rng
     group = laden(rng, make_table(rng))
     half = np.maximum(layout.size[[0, 2]] / 2 - 1.0, 0.1)
@@ -100,7 +99,7 @@ def dining(layout: Layout) -> None:
 
 
 def pictures(layout: Layout, count: int) -> None:
-    """Up to `count` pictures on walls without openings."""
+    """Add up to `count` pictures to walls without openings."""
     rng = layout.rng
     for _ in range(count):
         wall = int(rng.integers(4))
@@ -112,7 +111,6 @@ def pictures(layout: Layout, count: int) -> None:
 
 
 def furnish(layout: Layout) -> None:
-    """Furniture, decor and pictures anywhere in the room, some of it moving."""
     rng = layout.rng
     if rng.random() < 0.5:
         movers(layout, int(rng.integers(2, 5)))

@@ -1,4 +1,4 @@
-"""Putting things into a room so that nothing touches: everything reserves the box that it ever occupies."""
+"""Placing things in a room without contact: everything reserves the box that it ever occupies."""
 
 from dataclasses import dataclass, field
 
@@ -15,13 +15,13 @@ from scenes.objects.catalogue import DECOR
 from scenes.objects.thing import Support, Thing
 from scenes.shell import Opening, pose, wall_pose
 
-MAX_THINGS = 54  # before what hangs, for which a few are left
-GAP = 0.002  # m, between things that stand on or beside each other
+MAX_THINGS = 54  # not counting what hangs
+GAP = 0.002  # m, between neighbouring things
 
 
 @dataclass(frozen=True)
 class Group:
-    """A thing and what stands on it, in the frame of that thing: they move together."""
+    """A thing and what stands on it, which move together."""
 
     members: tuple[tuple[Thing, Array], ...]  # thing, its pose (4, 4) in the group
 
@@ -32,14 +32,12 @@ class Group:
 
     @staticmethod
     def of(thing: Thing) -> "Group":
-        """The thing alone."""
         return Group(((thing, np.eye(4)),))
 
 
 def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
-    """Up to `most` small things with their poses (4, 4) on a support, apart from each other."""
-    low = np.array(support.low)
-    high = np.array(support.high)
+    """Up to `most` small things with their poses (4, 4) on a support, without overlap."""
+    low, high = np.array(support.low), np.array(support.high)
     placed: list[tuple[Thing, Array]] = []
     taken = np.empty((0, 2, 3))
     makers = list(DECOR.values())
@@ -49,8 +47,7 @@ def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
         thing = one_of(rng, makers)(rng)
         angle = rng.uniform(-np.pi, np.pi)
         size = transformed_box(thing.bounds, pose(0, 0, 0, angle))
-        room_low = low - size[0, [0, 2]]
-        room_high = high - size[1, [0, 2]]
+        room_low, room_high = low - size[0, [0, 2]], high - size[1, [0, 2]]
         if (room_low >= room_high).any() or size[1, 1] + GAP >= support.clearance:
             continue
         x, z = rng.uniform(room_low, room_high)
@@ -63,7 +60,7 @@ def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
 
 
 def laden(rng: Rng, thing: Thing, share: float = 0.8) -> Group:
-    """The thing with small ones on that `share` of its supports, on average."""
+    """The thing with small ones on each of its supports with probability `share`."""
     members = [(thing, np.eye(4))]
     for support in thing.supports:
         if rng.random() < share:
@@ -73,7 +70,7 @@ def laden(rng: Rng, thing: Thing, share: float = 0.8) -> Group:
 
 @dataclass
 class Layout:
-    """What is in a room so far. The room spans x and z from -size / 2 to size / 2 and y from 0 to its height."""
+    """The content of a room so far. The room spans x and z from -size / 2 to size / 2, y from 0 to its height."""
 
     rng: Rng
     size: Array  # (3,) width, height, depth in metres
@@ -81,30 +78,29 @@ class Layout:
     gloss: float  # see scenes.finish
     shapes: list[Shape] = field(default_factory=list)
     boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # reserved
-    centres: list[Array] = field(default_factory=list)  # (3,) of things, worth looking at
+    centres: list[Array] = field(default_factory=list)  # (3,) of things
     moving: int = 0  # groups
     walls: int = 0  # inside the room; the first boxes are theirs
     openings: dict[int, list[Opening]] = field(default_factory=dict)  # of walls 0 to 3
-    missing_walls: set[int] = field(default_factory=set)  # these are openings all over
+    missing_walls: set[int] = field(default_factory=set)
     backs: list[tuple[RigidMotion, Array]] = field(default_factory=list)  # of furniture before walls: pose, bounds
 
     @property
     def things(self) -> int:
-        """How many there are."""
         return len(self.centres)
 
     @property
     def last_frame(self) -> int:
-        """At which tracks end; at least 1, so that they last in clips of one frame, too."""
+        """Where tracks end; at least 1, for clips of one frame."""
         return max(self.frames - 1, 1)
 
     def swept(self, bounds: Array, motion: RigidMotion) -> Array:
-        """The box (2, 3) that `bounds` (2, 3) ever occupies during the clip."""
+        """The bounding box (2, 3) of `bounds` (2, 3) during the whole clip."""
         frames = range(self.frames) if motion.varies() else range(1)
         return enclosing_box(np.stack([transformed_box(bounds, motion.matrix(frame)) for frame in frames]))
 
     def fits(self, box: Array) -> bool:
-        """Whether `box` (2, 3) lies in the room and overlaps nothing that is reserved."""
+        """Whether `box` (2, 3) lies in the room and overlaps no reserved one."""
         x, z = self.size[[0, 2]] / 2
         low = np.array([-x, 0, -z])
         high = np.array([x, self.size[1], z])
@@ -115,7 +111,7 @@ class Layout:
         self.boxes = np.concatenate([self.boxes, np.stack(boxes)])
 
     def try_add(self, group: Group, motion: RigidMotion) -> bool:
-        """Add the group where `motion` takes it, if nothing is in its way."""
+        """Add the group if it fits. Returns whether it does."""
         box = self.swept(group.bounds + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
         if not self.fits(box) or self.things + len(group.members) > MAX_THINGS:
             return False
@@ -123,7 +119,6 @@ class Layout:
         return True
 
     def add(self, group: Group, motion: RigidMotion) -> None:
-        """Add the group without looking what is in its way."""
         self.reserve(self.swept(group.bounds, motion))
         for thing, matrix in group.members:
             number = self.things
@@ -137,7 +132,7 @@ class Layout:
         self.moving += motion.varies()
 
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:
-        """Put a thing on a wall, if nothing is in its way, at (x, y) seen from inside and `z` before it."""
+        """Add a thing to a wall if it fits, at (x, y) as visible from inside and `z` in front of it."""
         place = wall_pose(wall, self.size) @ [x, y, z, 1]
         motion = still(place[:3], wall * np.pi / 2)
         group = Group.of(thing)
@@ -145,7 +140,7 @@ class Layout:
             self.add(group, motion)
 
     def build(self, name: str, surfaces: list[Surface], matrix: Array, bsdf: Bsdf | None = None) -> None:
-        """Add a fixed part of the building, given in the frame `matrix` (4, 4); finished like a wall by default."""
+        """Add a part of the building, transformed by `matrix` (4, 4); of a wall's material by default."""
         surface = join(surfaces)
         mesh = surface.mesh()
         mesh.apply_transform(matrix)

@@ -1,7 +1,6 @@
-"""Lamps for rooms, from plain panels to light that only arrives around corners.
+"""Lamps for rooms, from plain panels to indirect lighting.
 
-A fixture adds its body to the layout and returns the lamps in it, none where they do not fit. How strong they are is
-decided when all are known.
+A fixture adds its body to the layout and returns its lamps, none if it does not fit; `shine` decides their radiance.
 """
 
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 
-from scenes.animation import STILL, KeyframedTrack, RigidMotion, Shape, Track, still
+from scenes.animation import AT_REST, KeyframedTrack, RigidMotion, Shape, Track, still
 from scenes.boxes import transformed_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
@@ -18,7 +17,7 @@ from scenes.colours import light_colour
 from scenes.draws import log_uniform, one_of
 from scenes.layout import GAP, Group, Layout
 from scenes.meshes import lathe, slab, superellipsoid
-from scenes.objects.lamps import make_floor_lamp, make_pendant
+from scenes.objects.fittings import make_floor_lamp, make_pendant
 from scenes.objects.thing import Thing
 from scenes.shell import Opening, horizontal_rectangle, wall_pose, wall_width
 
@@ -27,25 +26,21 @@ BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
 
 @dataclass(frozen=True)
 class Lamp:
-    """A mesh that shines, moving with what it belongs to."""
+    """A mesh that emits light."""
 
     mesh: trimesh.Trimesh
-    motion: RigidMotion = STILL
-
-    def shape(self, number: int, radiance: Track) -> Shape:
-        """With its `radiance` (3,) over time."""
-        return Shape(f"lamp-{number}", self.mesh, BLACK, radiance, self.motion)
+    motion: RigidMotion = AT_REST
 
 
 def turn_then_shift(axis: int, angle: float, x: float, y: float, z: float) -> Array:
-    """A turn by `angle` radians about the x, y or z axis (0, 1, 2), then a shift: a matrix (4, 4)."""
+    """The matrix (4, 4) of a rotation by `angle` radians about x, y or z (0, 1, 2), then a translation."""
     matrix = np.asarray(trimesh.transformations.rotation_matrix(angle, np.eye(3)[axis]))
     matrix[:3, 3] = x, y, z
     return matrix
 
 
 def rectangle(width: float, depth: float, *matrices: Array) -> trimesh.Trimesh:
-    """A rectangle in the xz plane that faces up, transformed by the `matrices` (4, 4), the first one first."""
+    """A rectangle in the xz plane that faces up, transformed by each of the `matrices` (4, 4)."""
     mesh = horizontal_rectangle(width, depth)
     for matrix in matrices:
         mesh.apply_transform(matrix)
@@ -60,7 +55,6 @@ def floor_position(layout: Layout, margin: float) -> tuple[float, float]:
 
 
 def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Lamp]:
-    """A rectangle that shines down."""
     x, z = floor_position(layout, max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
@@ -82,7 +76,7 @@ def luminous_panel(layout: Layout) -> list[Lamp]:
 
 
 def downlight(layout: Layout) -> list[Lamp]:
-    """A lamp deep in a dark tube under the ceiling: a bright pool of light, the rest in shadow."""
+    """A lamp deep in a dark tube under the ceiling: a spot of light."""
     rng = layout.rng
     radius = log_uniform(rng, 0.05, 0.15)
     tall = radius * rng.uniform(0.7, 2.0)
@@ -98,7 +92,6 @@ def downlight(layout: Layout) -> list[Lamp]:
 
 
 def bulb(thing: Thing, radius: float, motion: RigidMotion) -> Lamp:
-    """A glowing ball in the middle of the thing's shade."""
     shade = next(part.mesh for part in thing.parts if part.slot == "shade")
     low, high = shade.bounds
     x, y, z = (low + high) / 2
@@ -108,7 +101,7 @@ def bulb(thing: Thing, radius: float, motion: RigidMotion) -> Lamp:
 
 
 def hanging(layout: Layout) -> list[Lamp]:
-    """A pendant with a bulb in its shade; a shade that is a closed ball glows itself instead."""
+    """A pendant with a bulb in its shade; a closed shade emits light itself instead."""
     thing = make_pendant(layout.rng)
     x, z = floor_position(layout, 0.5)
     motion = still((x, layout.size[1] - thing.bounds[1, 1] - GAP, z), 0.0)
@@ -134,7 +127,7 @@ def standing_lamp(layout: Layout) -> list[Lamp]:
 
 
 def orb(layout: Layout) -> list[Lamp]:
-    """A glowing ball in the air, which drifts in half of the cases."""
+    """A glowing ball in the air, in half of the cases moving."""
     rng = layout.rng
     radius = log_uniform(rng, 0.06, 0.3)
     x, z = floor_position(layout, 0.4)
@@ -151,7 +144,7 @@ def orb(layout: Layout) -> list[Lamp]:
 
 
 def cove(layout: Layout) -> list[Lamp]:
-    """A strip behind a ledge under the ceiling: only the ceiling sees it."""
+    """A strip behind a ledge under the ceiling, visible from the ceiling only."""
     rng = layout.rng
     wall = int(rng.integers(4))
     length = wall_width(wall, layout.size) * rng.uniform(0.4, 0.9)
@@ -170,7 +163,7 @@ def cove(layout: Layout) -> list[Lamp]:
 
 
 def behind_opening(layout: Layout) -> list[Lamp]:
-    """A panel outside that shines in through slits or a small hole in a wall."""
+    """A panel outside a wall with slits or a small hole."""
     rng = layout.rng
     wall = int(rng.integers(4))
     if wall in layout.openings:
@@ -198,7 +191,7 @@ def behind_opening(layout: Layout) -> list[Lamp]:
 
 
 def above_furniture(layout: Layout) -> list[Lamp]:
-    """A strip on top of furniture before a wall, near its back, that shines up or at the wall."""
+    """A strip on top of furniture at a wall, near its back, facing up or the wall."""
     if not layout.backs:
         return []
     motion, box = one_of(layout.rng, layout.backs)
@@ -209,42 +202,39 @@ def above_furniture(layout: Layout) -> list[Lamp]:
 
 
 def sky_panel(layout: Layout, wall: int, opening: Opening) -> Lamp:
-    """An overcast sky: a bright rectangle right behind a window, so large that its edges are hidden."""
+    """An overcast sky: a bright rectangle behind a window, with its edges hidden."""
     place = turn_then_shift(0, np.pi / 2, *opening.middle, -0.35)
     return Lamp(rectangle(opening.width + 0.8, opening.height + 0.8, place, wall_pose(wall, layout.size)))
 
 
 Fixture = Callable[[Layout], list[Lamp]]
 
-OPEN: tuple[Fixture, ...] = (ceiling_panel, ceiling_panel, ceiling_panel, ceiling_panel, downlight, hanging, orb)
-HIDDEN: tuple[Fixture, ...] = (cove, behind_opening, above_furniture, standing_lamp)
+OPEN_FIXTURES: tuple[Fixture, ...] = (*[ceiling_panel] * 4, downlight, hanging, orb)
+DAY_FIXTURES: tuple[Fixture, ...] = (luminous_panel, ceiling_panel, hanging, orb, standing_lamp)
+HIDDEN_FIXTURES: tuple[Fixture, ...] = (cove, behind_opening, above_furniture, standing_lamp)
 
 
 def brightness(layout: Layout) -> Track:
-    """A factor over time: 1 for most lamps; one in eight fades, maybe several times; one in eight is switched."""
+    """A factor over time: 1 for most lamps; one in eight fades, one in eight is switched between two frames."""
     rng = layout.rng
     kind = rng.random()
     if kind < 1 / 8:
         return Track(rng.uniform(0.3, 1.0, int(rng.integers(2, 5))), 0, layout.last_frame)
     if kind < 1 / 4 and layout.frames > 1:
-        return switched(rng, layout.frames)
+        before = int(rng.integers(layout.frames - 1))
+        levels = rng.permutation([1.0, log_uniform(rng, 0.01, 0.2)])
+        return KeyframedTrack(levels, times=np.array([before, before + 1.0]), straight=True)
     return Track.constant(1.0)
 
 
-def switched(rng: np.random.Generator, frames: int) -> Track:
-    """From one frame to the next, a lamp that is on goes nearly out, or comes on."""
-    before = int(rng.integers(frames - 1))
-    levels = rng.permutation([1.0, log_uniform(rng, 0.01, 0.2)])
-    return KeyframedTrack(levels, times=np.array([before, before + 1.0]), straight=True)
-
-
 def shine(layout: Layout, lamps: list[Lamp], flux: float) -> list[Shape]:
-    """The lamps as shapes that together give `flux` (pi times area times radiance), unevenly shared."""
+    """The lamps as shapes that together emit `flux` (pi times area times radiance), in random shares."""
     rng = layout.rng
     shares = rng.lognormal(0, 0.8, len(lamps))
     shapes = []
     for number, (lamp, share) in enumerate(zip(lamps, shares / shares.sum(), strict=True)):
         strength = brightness(layout)
         radiance = light_colour(rng) * share * flux / (np.pi * lamp.mesh.area)
-        shapes.append(lamp.shape(number, replace(strength, keys=np.outer(strength.keys, radiance))))
+        track = replace(strength, keys=np.outer(strength.keys, radiance))
+        shapes.append(Shape(f"lamp-{number}", lamp.mesh, BLACK, track, lamp.motion))
     return shapes

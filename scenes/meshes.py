@@ -1,7 +1,4 @@
-"""Surfaces to build objects from: boxes, superellipsoids, lathes, tubes, sheets and blobs.
-
-Metres, y up. Texture coordinates are in metres too, unless a function says otherwise.
-"""
+"""Surfaces to build objects from: boxes, superellipsoids, lathes, tubes, sheets, blobs. Metres, y up; uv in metres."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +20,7 @@ CREASE = np.cos(np.radians(40))  # profiles that bend more than this keep a shar
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles, counter-clockwise seen from outside, with a normal and texture coordinates at every vertex."""
+    """Triangles, counter-clockwise from outside, with a normal and texture coordinates at every vertex."""
 
     points: Array  # (V, 3)
     normals: Array  # (V, 3), unit length, outward
@@ -32,28 +29,27 @@ class Surface:
     smooth: bool  # shade with the interpolated normals
 
     def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Surface":
-        """Shifted by (x, y, z)."""
+        """Translated."""
         return replace(self, points=self.points + np.array([x, y, z]))
 
     def turned(self, angle: float, axis: int = 1) -> "Surface":
-        """Turned by `angle` radians about the line through the origin along x, y or z (`axis` 0, 1, 2)."""
+        """Rotated by `angle` radians about the x, y or z axis (`axis` 0, 1, 2)."""
         i = (axis + 1) % 3
         j = (axis + 2) % 3
         matrix = np.eye(3)
-        matrix[i, i] = np.cos(angle)
+        matrix[[i, j], [i, j]] = np.cos(angle)
         matrix[i, j] = -np.sin(angle)
         matrix[j, i] = np.sin(angle)
-        matrix[j, j] = np.cos(angle)
         return replace(self, points=self.points @ matrix.T, normals=self.normals @ matrix.T)
 
     def mesh(self) -> trimesh.Trimesh:
-        """With the normals and texture coordinates as they are."""
+        """As a mesh with these normals and texture coordinates."""
         visual = trimesh.visual.TextureVisuals(uv=self.uv)
         return trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """One surface of all triangles; smooth if any of them is (flat ones stay flat: their facets share no vertices)."""
+    """All triangles as one surface, smooth if any is (flat ones stay flat: their facets share no vertices)."""
     starts = np.cumsum([0] + [len(surface.points) for surface in surfaces])
     return Surface(
         np.concatenate([surface.points for surface in surfaces]),
@@ -65,22 +61,18 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def unit(vectors: Array) -> Array:
-    """The vectors (..., D) at length 1."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def area_vectors(points: Array, faces: Faces) -> Array:
     """Normals (F, 3) of the triangles, as long as twice their areas."""
-    a = points[faces[:, 0]]
-    b = points[faces[:, 1]]
-    c = points[faces[:, 2]]
+    a, b, c = (points[corner] for corner in faces.T)
     return np.cross(b - a, c - a)
 
 
 def arc_lengths(path: Array) -> Array:
-    """How far (N,) along a `path` (N, D) each of its points lies."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return np.concatenate([[0], np.cumsum(steps)])
+    """The length (N,) of a `path` (N, D) up to each of its points."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def full_turn(segments: int) -> Array:
@@ -95,10 +87,7 @@ def mean_normals(points: Array, faces: Faces) -> Array:
 
 
 def box_mapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Surface:
-    """Box mapping: every triangle's texture coordinates are its points, projected along the axis that it mostly faces.
-
-    Vertices of triangles that face several axes are duplicated.
-    """
+    """Box mapping: every triangle is projected along the axis that it mostly faces."""
     axis = np.abs(area_vectors(points, faces)).argmax(axis=1)
     keys, corners = np.unique(3 * faces + axis[:, None], return_inverse=True)
     vertex = keys // 3
@@ -108,13 +97,12 @@ def box_mapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Sur
 
 
 def flat_shaded(points: Array, faces: Faces) -> Surface:
-    """Facets: every triangle has its own vertices and normal."""
+    """Facets with vertices and normals of their own."""
     normals = np.repeat(unit(area_vectors(points, faces)), 3, axis=0)
     return box_mapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
 
 
 def smooth_shaded(points: Array, faces: Faces) -> Surface:
-    """A smooth closed surface: every vertex has the mean normal of its triangles."""
     return box_mapped(points, mean_normals(points, faces), faces, True)
 
 
@@ -141,9 +129,9 @@ def slab(width: float, height: float, depth: float) -> Surface:
 
 
 def superellipsoid(width: float, height: float, depth: float, power: float, subdivisions: int = 2) -> Surface:
-    """A box with soft edges, the unit sphere of the `power` norm, standing on the origin; with power 2 an ellipsoid.
+    """A box with soft edges, the unit sphere of the `power` norm, standing on the origin; an ellipsoid for power 2.
 
-    The special case of equal exponents of Barr 1981, "Superquadrics and angle-preserving transformations".
+    Barr 1981, "Superquadrics and angle-preserving transformations", with equal exponents.
     """
     points, faces = unit_box(subdivisions)
     points = np.sin(np.pi / 2 * points)  # more points near the edges
@@ -166,16 +154,13 @@ def gem(rng: Rng, radius: float, subdivisions: int) -> Surface:
 
 
 def sheet(points: Array, uv: Array, normals: Array | None = None) -> Surface:
-    """A grid of points (R, C, 3) with uv (R, C, 2), seen from where columns run right and rows run up.
+    """A grid of points (R, C, 3) with uv (R, C, 2), facing the side from which columns run right and rows run up.
 
-    Without `normals` (R, C, 3) it is smooth within itself. Triangles without area are left out.
+    Smooth, unless `normals` (R, C, 3) are given. Triangles without area are left out.
     """
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
-    a = index[:-1, :-1].ravel()
-    b = index[:-1, 1:].ravel()
-    c = index[1:, 1:].ravel()
-    d = index[1:, :-1].ravel()
+    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     points = points.reshape(-1, 3)
     faces = faces[np.linalg.norm(area_vectors(points, faces), axis=1) > 1e-12]
@@ -204,16 +189,15 @@ def profile_normals(profile: Array) -> tuple[Array, Array]:
 
 
 def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
-    """The surface that `profile` (N, 2), radii and heights, sweeps about the y axis; closed if it ends on the axis.
+    """The surface of revolution of `profile` (N, 2), radii and heights, about the y axis.
 
-    The outside is to the right of the way along the profile, which runs outward along the bottom, up, and inward along
-    the top. Texture coordinates: u runs around and repeats seamlessly, v runs along the profile at the same scale,
-    which is about a metre each.
+    The outside is to the right of the profile: it runs outward along the bottom, up, and inward along the top. u runs
+    around and repeats seamlessly, v runs along the profile at the same scale, about a metre each.
     """
     profile = np.asarray(profile, dtype=np.float64)
     along = arc_lengths(profile)
     start, end = profile_normals(profile)
-    # Every piece has two rows of vertices of its own, so that it can have its own normals. Gaps between have no area.
+    # Every segment has two rows of vertices of its own, for normals of its own. Gaps between them have no area.
     rows = np.stack([profile[:-1], profile[1:]], axis=1).reshape(-1, 2)
     normals = np.stack([start, end], axis=1).reshape(-1, 2)
     v = np.stack([along[:-1], along[1:]], axis=1).ravel()
@@ -233,7 +217,7 @@ def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
 
 
 def silhouette(radii: ArrayLike, height: float, count: int = 20) -> Array:
-    """A profile (count, 2) that rises to `height` and passes smoothly through `radii` at even heights."""
+    """A smooth profile (count, 2) up to `height` through `radii` at even heights."""
     spline = Track(np.asarray(radii, dtype=np.float64))
     t = np.linspace(0, 1, count)
     return np.stack([np.maximum([spline.at(x) for x in t], 0.002), t * height], axis=1)
@@ -246,7 +230,7 @@ def solid(outer: ArrayLike) -> Array:
 
 
 def hollow(outer: Array, wall: float, base: float) -> Array:
-    """The closed profile of a vessel whose side is `outer` (N, 2), with a `wall` that thick and a floor at `base`."""
+    """The closed profile of a vessel with the side `outer` (N, 2), `wall` thickness and a floor at `base`."""
     inner = outer[(outer[:, 1] > base) & (outer[:, 0] > 1.5 * wall)] - (wall, 0)
     return np.concatenate([[(0, outer[0, 1])], outer, inner[::-1], [(0, base)]])
 
@@ -266,7 +250,7 @@ def disc(radius: float, thickness: float, segments: int = 40) -> Surface:
 
 
 def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
-    """A closed round tube along `path` (N, 3), of one `radius` or of one (N,) at every point."""
+    """A closed round tube along `path` (N, 3), of constant `radius` or of one (N,) at every point."""
     path = np.asarray(path, dtype=np.float64)
     radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), len(path))
     step = unit(np.diff(path, axis=0))
@@ -274,7 +258,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
     right = np.empty_like(path)
     side = np.eye(3)[np.abs(tangent[0]).argmin()]
     for k, forward in enumerate(tangent):
-        side = unit(side - forward * (side @ forward))  # turns no more than it must
+        side = unit(side - forward * (side @ forward))  # twists as little as possible
         right[k] = side
     angle = full_turn(segments)[:, None]
     around = np.cos(angle) * right[:, None] + np.sin(angle) * np.cross(tangent, right)[:, None]
@@ -289,10 +273,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
 
 
 def leaf(path: Array, width: float, fold: float) -> Surface:
-    """A thin pointed leaf about `path` (N, 3), its middle `fold` * `width` lower than its edges; seen from above.
-
-    The path lies in a vertical plane and does not end straight above where it begins.
-    """
+    """A thin pointed leaf along `path` (N, 3) in a vertical plane, its middle `fold` * `width` lower than its edges."""
     across = unit(np.cross(path[-1] - path[0], UP))
     share = np.sin(np.pi * np.linspace(0.04, 0.98, len(path)) ** 0.8) * width / 2
     side = share[:, None] * across

@@ -6,10 +6,9 @@ import numpy as np
 
 from errors import BadInput
 from scenes.animation import Scene
-from scenes.closeup import closeup
 from scenes.cornell import cornell_box, cornell_box_moving
 from scenes.extremes import EXTREME_SCENES, SceneBuilder
-from scenes.rooms import room
+from scenes.rooms import closeup, room
 
 SCENES: dict[str, SceneBuilder] = {
     "cornell_box": cornell_box,
@@ -19,16 +18,16 @@ SCENES: dict[str, SceneBuilder] = {
 
 
 def build_scene(name: str, seed: int, frames: int) -> Scene:
-    """The animated scene `name` for a clip of `frames` frames, with the camera flight and motions that `seed` draws.
+    """The animated scene `name` for a clip of `frames` frames, with the camera flight and motions of `seed`.
 
-    The name is one of SCENES, or `room-N` or `closeup-N` with any integer N. Every number is another room with its own
-    flight, whatever the seed. The same arguments give the same scene. Raises BadInput for other names.
+    The name is one of SCENES, or `room-N` or `closeup-N` with any integer N, whose scenes depend on N instead of
+    `seed`. Raises BadInput for other names.
     """
     number = re.fullmatch(r"(room|closeup)-(-?\d+)", name)
     if number:
         n = int(number[2])
-        build = room if number[1] == "room" else closeup
-        return build(np.random.default_rng(2 * n if n >= 0 else -2 * n - 1), frames)
+        rng = np.random.default_rng(2 * n if n >= 0 else -2 * n - 1)
+        return room(rng, frames) if number[1] == "room" else closeup(rng, frames)
     if name not in SCENES:
         raise BadInput(
             f"unknown scene '{name}'; the scenes are {', '.join(SCENES)}, room-N and closeup-N with any integer N"

@@ -12,13 +12,13 @@ from scenes.meshes import Surface, flat_shaded, join, sheet, slab
 
 
 def pose(x: float, y: float, z: float, angle: float) -> Array:
-    """object_to_world (4, 4) of what is at rest at (x, y, z), turned by `angle` radians about the vertical axis."""
+    """object_to_world (4, 4) at (x, y, z), rotated by `angle` radians about the vertical axis."""
     return still((x, y, z), angle).matrix(0)
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A hole in a wall, seen from inside; metres."""
+    """A hole in a wall, as visible from inside; metres."""
 
     low: tuple[float, float]  # x to the right of the wall's middle, y above the floor
     high: tuple[float, float]
@@ -43,7 +43,7 @@ def wall_pose(wall: int, size: Array) -> Array:
 
 
 def wall_width(wall: int, size: Array) -> float:
-    """How wide wall 0 to 3 of a room of `size` (3,) is."""
+    """The width of wall 0 to 3 of a room of `size` (3,)."""
     return float(size[0] if wall % 2 == 0 else size[2])
 
 
@@ -54,8 +54,7 @@ def wall_with_openings(width: float, height: float, openings: list[Opening]) -> 
     cells = []
     for x0, x1 in pairwise(xs):
         for y0, y1 in pairwise(ys):
-            x = (x0 + x1) / 2
-            y = (y0 + y1) / 2
+            x, y = (x0 + x1) / 2, (y0 + y1) / 2
             if not any(o.low[0] < x < o.high[0] and o.low[1] < y < o.high[1] for o in openings):
                 points = np.array([[(x0, y0, 0), (x1, y0, 0)], [(x0, y1, 0), (x1, y1, 0)]])
                 cells.append(sheet(points, points[..., :2]))
@@ -77,7 +76,6 @@ def reveal(opening: Opening, thickness: float) -> Surface:
 
 def horizontal_rectangle(width: float, depth: float) -> trimesh.Trimesh:
     """A rectangle in the xz plane, facing up."""
-    x = width / 2
-    z = depth / 2
+    x, z = width / 2, depth / 2
     points = np.array([(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)])
     return flat_shaded(points, np.array([[0, 1, 2], [0, 2, 3]])).mesh()

@@ -1,10 +1,10 @@
-"""Skies and the sun, seen from everywhere outside a scene."""
+"""Skies as environment maps, and the sun."""
 
 import numpy as np
 
 from scenes.camera import Array
 from scenes.colours import light_colour
-from scenes.draws import Rng, log_uniform
+from scenes.draws import Rng, log_uniform, uniforms
 from scenes.shell import wall_pose
 
 SKY_SIZE = (64, 128)  # rows and columns; kernels of scenes with skies of the same size are shared
@@ -13,8 +13,7 @@ SKY_SIZE = (64, 128)  # rows and columns; kernels of scenes with skies of the sa
 def sky(rng: Rng, sun: Array | None) -> Array:
     """Radiance (*SKY_SIZE, 3) of a sky over dark ground: latitude-longitude, y up.
 
-    `sun` is the direction to the sun, (3,) with y up, or None under clouds. A clear day's sun gives a few times the
-    light of its sky (0.3 to 30 times here).
+    `sun` is the direction (3,) to the sun, or None under clouds. The sun gives 0.3 to 30 times the light of its sky.
     """
     height, width = SKY_SIZE
     rows = (np.arange(height) + 0.5) / height
@@ -34,7 +33,6 @@ def sky(rng: Rng, sun: Array | None) -> Array:
 
 
 def sun_through(rng: Rng, wall: int, size: Array) -> Array:
-    """A direction (3,) from which the sun shines in through openings of wall 0 to 3 of a room of `size` (3,)."""
-    aside = rng.uniform(-1, 1)
-    elevation = rng.uniform(0.2, 1.0)
+    """A direction (3,) to a sun that shines in through openings of wall 0 to 3 of a room of `size` (3,)."""
+    aside, elevation = uniforms(rng, (-1, 1), (0.2, 1.0))
     return np.asarray(wall_pose(wall, size)[:3, :3] @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])

@@ -1,7 +1,4 @@
-"""Random bitmap textures for interiors, of linear reflectances; all repeat seamlessly.
-
-In the shapes of arrays, S is TEXTURE_SIZE.
-"""
+"""Random bitmap textures of linear reflectances for interiors; all repeat seamlessly. S is TEXTURE_SIZE."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -21,9 +18,9 @@ X, Y = np.meshgrid((np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE, (np.arange(TE
 
 
 class Pattern(NamedTuple):
-    """What a texture shows before it has colours."""
+    """A texture before it has colours."""
 
-    tone: Array  # (S, S), 0..PALETTE_SIZE - 1: place in a palette, between whole numbers a mixture of neighbours
+    tone: Array  # (S, S), 0..PALETTE_SIZE - 1: position in a palette, interpolated between integers
     shade: Array  # (S, S), factor on the colour, about 1
 
 
@@ -31,10 +28,7 @@ UNSHADED = np.ones((TEXTURE_SIZE, TEXTURE_SIZE))
 
 
 def periodic_noise(rng: Rng, smoothness: float, stretch: float = 1.0) -> Array:
-    """Noise (S, S) that repeats, of mean 0 and standard deviation 1.
-
-    Its amplitude is frequency^-smoothness; it is `stretch` times as long along x.
-    """
+    """Periodic noise (S, S), mean 0, standard deviation 1, amplitude frequency^-smoothness, stretched along x."""
     frequency = np.hypot(np.fft.fftfreq(TEXTURE_SIZE)[:, None], np.fft.rfftfreq(TEXTURE_SIZE) * stretch)
     frequency[0, 0] = np.inf
     white = np.fft.rfft2(rng.standard_normal((TEXTURE_SIZE, TEXTURE_SIZE)))
@@ -43,7 +37,6 @@ def periodic_noise(rng: Rng, smoothness: float, stretch: float = 1.0) -> Array:
 
 
 def two_tones(rng: Rng) -> tuple[int, int]:
-    """Two different places in a palette."""
     a, b = rng.choice(PALETTE_SIZE, 2, replace=False)
     return int(a), int(b)
 
@@ -81,9 +74,9 @@ def stripes(rng: Rng) -> Pattern:
 
 
 def bond(columns: int, rows: int, shift: ArrayLike) -> tuple[NDArray[np.intp], Array]:
-    """A bond of bricks, its rows shifted by `shift` (rows,) bricks: brick numbers and distances to the nearest joint.
+    """A bond of bricks whose rows are shifted by `shift` (rows,) bricks.
 
-    Both are (S, S); numbers run from 0 to columns * rows - 1, distances are in widths of the texture.
+    Returns brick numbers (S, S), 0 to columns * rows - 1, and distances (S, S) to the nearest joint, in texture widths.
     """
     row = (Y * rows).astype(int)
     along = X * columns + np.broadcast_to(shift, rows)[row]
@@ -134,7 +127,7 @@ def marble(rng: Rng) -> Pattern:
 
 
 def weave(rng: Rng) -> Pattern:
-    """Cloth: threads that pass over and under each other, in a plain weave or a twill."""
+    """Cloth, in a plain weave or a twill."""
     threads = 12 * int(rng.integers(2, 6))
     twill = int(rng.integers(2, 5))
     i = (X * threads).astype(int)
@@ -147,7 +140,7 @@ def weave(rng: Rng) -> Pattern:
 
 
 def motif(rng: Rng, x: Array, y: Array, size: float) -> NDArray[np.bool_]:
-    """Which points `x`, `y` (...,) a random disc, ring, polygon or stroke of about `size` on the origin covers."""
+    """The mask of points `x`, `y` (...,) in a random disc, ring, polygon or stroke of about `size` at the origin."""
     kind = rng.integers(4)
     radius = size * rng.uniform(0.4, 1)
     if kind < 2:
@@ -174,7 +167,7 @@ def prints(rng: Rng) -> Pattern:
     tone = np.zeros((cell, cell))
     centres = rng.uniform(0, 1, (2, count))
     for cx, cy, label in zip(*centres, rng.integers(1, PALETTE_SIZE, count), strict=True):
-        # Wrapped around, so that motifs over the edge continue at the other side.
+        # Motifs wrap around at the edges.
         tone[motif(rng, (x - cx + 0.5) % 1 - 0.5, (y - cy + 0.5) % 1 - 0.5, size)] = label
     return Pattern(np.tile(tone, (repeats, repeats)), UNSHADED)
 
@@ -195,17 +188,8 @@ def scratches(rng: Rng) -> Pattern:
     return Pattern(tone, 1 + rng.uniform(0, 0.1) * periodic_noise(rng, 1))
 
 
-PATTERNS: tuple[Callable[[Rng], Pattern], ...] = (
-    checks,
-    stripes,
-    planks,
-    tiles,
-    clouds,
-    marble,
-    weave,
-    prints,
-    scratches,
-)
+Patterns = tuple[Callable[[Rng], Pattern], ...]
+PATTERNS: Patterns = (checks, stripes, planks, tiles, clouds, marble, weave, prints, scratches)
 
 
 def painted(rng: Rng, colours: Array) -> Array:
@@ -224,7 +208,7 @@ def texture(rng: Rng) -> NDArray[np.float32]:
 
 
 def gray_texture(rng: Rng, low: float, high: float) -> NDArray[np.float32]:
-    """A random bitmap (S, S, 1) of values from `low` to `high`, such as roughnesses; `low` alone in a few of them."""
+    """A random bitmap (S, S, 1) of values from `low` to `high`, such as roughness; constant `low` in a few cases."""
     values = painted(rng, rng.permutation(np.linspace(0.2, 1, PALETTE_SIZE))[:, None])
     values -= values.min()
     return (low + (high - low) * values / max(values.max(), 1e-9)).astype(np.float32)

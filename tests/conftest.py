@@ -1,5 +1,6 @@
 """What the tests share: a tiny data set rendered once, and a loaded moving scene."""
 
+import shutil
 from pathlib import Path
 
 import hypothesis
@@ -27,6 +28,12 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("data") / "tiny"
     generate(root, "tiny", seed=0, reads=channels_read())
     return root
+
+
+@pytest.fixture
+def tiny_copy(tiny: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny dataset, to damage."""
+    return Path(shutil.copytree(tiny, tmp_path / "copy"))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from eval.bench.sizes import bench_folder
 from eval.bench.stock import Render, stock_render
 from files import write_json
 from render.backend import VARIANT, dr
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 from timing import take_turns
@@ -78,15 +78,15 @@ class Compilations(NamedTuple):
     compiling: float  # seconds; 0 if they were cached on disk
 
 
-def first_frame(scene: str, size: int) -> tuple[Shot, Compilations]:
+def first_frame(scene: str, size: int) -> tuple[PosedFrame, Compilations]:
     """A frame of `size` x `size` pixels, ready to be sampled, and the compilations that it needed."""
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        shot = Shot(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
-        shot.radiance(0, 1)
+        posed = PosedFrame(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
+        posed.radiance(0, 1)
         launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     new = [kernel for kernel in launched if kernel["cache_disk"] or not kernel["cache_hit"]]
-    return shot, Compilations(len(new), sum(kernel["backend_time"] for kernel in new) / 1e3)
+    return posed, Compilations(len(new), sum(kernel["backend_time"] for kernel in new) / 1e3)
 
 
 def rendering_buffers(render: Render, spp: int) -> Callable[[], None]:
@@ -106,9 +106,9 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
 
     Both use the same exposure. Raises BadInput for an unknown scene.
     """
-    shot, compiled = first_frame(scene, size)
-    renders: dict[str, Render] = {STOCK: stock_render(shot), ONESPP: shot.radiance}
-    exposure = clip_exposure(luminance(shot.radiance(9, 256)))
+    posed, compiled = first_frame(scene, size)
+    renders: dict[str, Render] = {STOCK: stock_render(posed), ONESPP: posed.radiance}
+    exposure = clip_exposure(luminance(posed.radiance(9, 256)))
     target = 10 ** (-TARGET_DB / 10)
     reached = {renderer: samples_needed(render, exposure, target) for renderer, render in renders.items()}
     work = {renderer: rendering_buffers(render, reached[renderer][0]) for renderer, render in renders.items()}

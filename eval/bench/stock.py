@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import mi
-from render.shot import FloatImage, Shot, finite_or_zero
+from render.posed_frame import FloatImage, PosedFrame, finite_or_zero
 from render.stage import Stage
 from scenes.camera import View
 
@@ -34,13 +34,13 @@ def stock_sensor(stage: Stage, view: View) -> Any:
     return mi.load_dict(description)
 
 
-def stock_render(shot: Shot) -> Render:
-    """`mi.render` for a shot: radiance with emission; pixels that are not finite are 0."""
-    integrator = mi.load_dict({"type": "path", "max_depth": shot.stage.scene.max_depth})
-    sensor = stock_sensor(shot.stage, shot.view)
+def stock_render(posed: PosedFrame) -> Render:
+    """`mi.render` for a frame: radiance with emission; pixels that are not finite are 0."""
+    integrator = mi.load_dict({"type": "path", "max_depth": posed.stage.scene.max_depth})
+    sensor = stock_sensor(posed.stage, posed.view)
 
     def render(seed: int, spp: int) -> FloatImage:
-        scene = shot.stage.mitsuba_scene
+        scene = posed.stage.mitsuba_scene
         image = mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
         return finite_or_zero(np.array(image))
 

@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 from datasets.tonemap import clip_exposure, display, luminance
 from plotting import DPI, plt, save_figure
-from render.job.clip_scene import clip_of_own_scene
-from render.shot import Shot
+from render.job.plan import clip_of_own_scene
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -27,9 +27,9 @@ def displayed_frame(
     """
     own = name.endswith(".toml")
     scene = clip_of_own_scene(Path(name), "test", 0, frames, seed) if own else build_scene(name, seed, frames)
-    shot = Shot(Stage(scene, height, width), frame)
-    reflected = shot.reflected(seed, spp)
-    return display(reflected + shot.emission, clip_exposure(luminance(reflected)))
+    posed = PosedFrame(Stage(scene, height, width), frame)
+    reflected = posed.reflected(seed, spp)
+    return display(reflected + posed.emission, clip_exposure(luminance(reflected)))
 
 
 def contact_sheet(

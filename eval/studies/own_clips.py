@@ -7,7 +7,7 @@ from pathlib import Path
 from datasets.clip import Clip, is_clip
 from render.clip import Sampling
 from render.job.clip_job import write_clip
-from render.job.profiles import GENERATOR
+from render.job.plan import GENERATOR
 from scenes.animation import Scene
 
 SEED = 0

@@ -18,7 +18,7 @@ from models.denoiser import Denoiser, State
 from plotting import Image
 from render.clip import Sampling
 from render.job.clip_job import write_clip
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -77,10 +77,10 @@ def triptych(
         path.parent.mkdir(parents=True)
         write_clip(path, scene, (frame + 1, *size), NOISY_ONLY, seed, tuple(CHANNELS))
         noisy, denoised = last_frame(Clip(path), spec.build())
-    shot = Shot(Stage(scene, *size), frame)
-    reflected = shot.reflected(seed, spp)
+    posed = PosedFrame(Stage(scene, *size), frame)
+    reflected = posed.reflected(seed, spp)
     exposure = clip_exposure(luminance(reflected))
-    shown = [display(image, exposure) for image in (noisy, denoised, reflected + shot.emission)]
+    shown = [display(image, exposure) for image in (noisy, denoised, reflected + posed.emission)]
     picture = in_strips((shown[0], shown[1], shown[2]))
     with replacing(out) as temporary:
         Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(temporary, format="png", optimize=True)

@@ -14,9 +14,9 @@ from datasets.clip import Clip, Dataset
 from errors import BadInput
 from files import locked, read_json, write_json
 from render.clip import Options, Sampling, render_clip
-from render.job.clip_scene import scene_of_clip
 from render.job.generate import check_versions
-from render.job.profiles import GENERATOR, profile_of, source_of
+from render.job.plan import GENERATOR, scene_of_clip
+from render.job.profiles import profile_of, source_of
 from render.sampler import CYCLE
 from scenes.animation import Scene
 

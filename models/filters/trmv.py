@@ -2,7 +2,7 @@
 
 "Temporally Reliable Motion Vectors for Real-time Ray Tracing". Shadows move with the blocker, reflections with what is
 reflected, and what was hidden resembles what was beside the occluder. The renderer tracks blockers and reflected points
-(render/tracking.py) and hidden surfaces (dual motion).
+(render/motion.py) and hidden surfaces (dual motion).
 
 We do not have the paper's text; the three kinds of vectors follow its abstract and the authors' later paper (NTD §3.2,
 §6). We choose:

@@ -1,4 +1,4 @@
-"""Rendering clips on a Ray cluster: many machines share one folder, and a lost worker costs one clip."""
+"""Rendering clips on a Ray cluster: machines share one folder, and a lost worker costs one clip."""
 
 import os
 import signal
@@ -9,41 +9,41 @@ from typing import Any
 
 from datasets.clip import Dataset
 from errors import BadInput
-from render.backend import LEAST_THREADS, VARIANT, dr
+from render.backend import MIN_THREADS, VARIANT, dr
 from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
 from render.job.generate import check_versions
 
-WORKERS_PER_CLIP = 4  # that may die before the clip counts as failed
-SECONDS_TO_CLEAN_UP = 10  # for workers when the job is given up
+MAX_WORKERS_PER_CLIP = 4  # that may die before the clip counts as failed
+CLEAN_UP_SECONDS = 10  # for workers of an interrupted job
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Within the context the first Ctrl-C is put off to the end: amid Ray's start it would crash the process."""
+    """Delays the first Ctrl-C to the end of the context: it would crash the process while Ray starts."""
     interrupted = False
-    usual = signal.getsignal(signal.SIGINT)
+    previous = signal.getsignal(signal.SIGINT)
 
-    def put_off(*_: object) -> None:
+    def delay(*_: object) -> None:
         nonlocal interrupted
         interrupted = True
-        signal.signal(signal.SIGINT, usual)
+        signal.signal(signal.SIGINT, previous)
 
-    signal.signal(signal.SIGINT, put_off)
+    signal.signal(signal.SIGINT, delay)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual)
+        signal.signal(signal.SIGINT, previous)
     if interrupted:
         raise KeyboardInterrupt
 
 
 @contextmanager
 def connected_ray() -> Iterator[Any]:
-    """The ray module, connected to the cluster that RAY_ADDRESS names or that runs here, or else to a new one here.
+    """The ray module, connected to the cluster of RAY_ADDRESS, a local one, or a new local one.
 
-    Raises BadInput where Ray is not installed, or no cluster answers.
+    Raises BadInput if Ray is not installed, or no cluster answers.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
     try:
         import ray
     except ImportError:
@@ -57,7 +57,7 @@ def connected_ray() -> Iterator[Any]:
 
 
 def connect(ray: Any) -> None:
-    """Join a cluster or start one on this machine. Raises BadInput where RAY_ADDRESS names one that does not answer."""
+    """Connect to a cluster or start one on this machine. Raises BadInput if that of RAY_ADDRESS does not answer."""
     host, _, port = os.environ.get("RAY_ADDRESS", "").rpartition(":")
     try:
         if port.isdigit():
@@ -70,9 +70,9 @@ def connect(ray: Any) -> None:
 
 
 def reserved_resources() -> dict[str, Any]:
-    """What the task of a clip reserves: a GPU where this machine renders on one, else one core without sight of GPUs.
+    """Resources for a clip's task: a GPU if this machine renders on one, else one core without GPUs.
 
-    All workers render with the variant of this machine, or the bytes of their clips would differ.
+    All workers must use this machine's Mitsuba variant, because the bytes of others differ.
     """
     if VARIANT.startswith("cuda"):
         return {"num_cpus": 1, "num_gpus": 1}
@@ -80,20 +80,20 @@ def reserved_resources() -> dict[str, Any]:
 
 
 def render_on_worker(job: RenderJob) -> ClipOutcome:
-    """Render a clip on as few threads as can: clips side by side use cores better than threads do."""
-    dr.set_thread_count(LEAST_THREADS)
+    """Render a clip on few threads: concurrent clips use cores better than threads."""
+    dr.set_thread_count(MIN_THREADS)
     check_versions(Dataset(job.path.parents[2]))
     return run_clip_job(job)
 
 
 def render_on_cluster(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
-    """Render clips on a Ray cluster; yields their outcomes in the order in which they end.
+    """Render clips on a Ray cluster; yields their outcomes as they end.
 
-    Every clip has a worker process of its own, and a new one where that dies. All machines must reach the clips'
-    folder under the same path.
+    Every clip has a worker process of its own, and a new one if that dies. The clips' folder must have the same path on
+    all machines.
 
-    Raises BadInput where there is no cluster to use; and at once, giving up the rest, what a worker raises: OSError for
-    a full disk, BadInput for other versions of packages.
+    Raises BadInput if there is no usable cluster, and what workers raise: OSError for a full disk, BadInput for other
+    versions of packages.
     """
     with connected_ray() as ray:
         if VARIANT.startswith("cuda") and not ray.cluster_resources().get("GPU"):
@@ -103,7 +103,7 @@ def render_on_cluster(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
 
 def outcomes_of(ray: Any, jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
     """Run all jobs on the cluster to which `ray` is connected, as `render_on_cluster` does."""
-    task = ray.remote(max_calls=1, max_retries=WORKERS_PER_CLIP - 1, **reserved_resources())(render_on_worker)
+    task = ray.remote(max_calls=1, max_retries=MAX_WORKERS_PER_CLIP - 1, **reserved_resources())(render_on_worker)
     tasks = {task.remote(job._replace(path=job.path.absolute())): job for job in jobs}
     waiting = list(tasks)
     try:
@@ -112,16 +112,16 @@ def outcomes_of(ray: Any, jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
             yield outcome_of(ray, done, tasks[done])
     finally:
         for unfinished in waiting:
-            ray.cancel(unfinished)  # interrupts the worker, which then removes what it has begun
+            ray.cancel(unfinished)  # interrupts the worker, which removes its unfinished clip
         if waiting:
-            ray.wait(waiting, num_returns=len(waiting), timeout=SECONDS_TO_CLEAN_UP)
+            ray.wait(waiting, num_returns=len(waiting), timeout=CLEAN_UP_SECONDS)
 
 
 def outcome_of(ray: Any, reference: Any, job: RenderJob) -> ClipOutcome:
-    """The outcome of an ended task. Raises what the worker raised."""
+    """The outcome of a finished task. Raises the worker's exception."""
     try:
         return ray.get(reference)._replace(path=job.path)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from error
     except ray.exceptions.RayError as error:  # the worker died, or its machine
-        return ClipOutcome(job.path, "failed", f"{WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}")
+        return ClipOutcome(job.path, "failed", f"{MAX_WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}")

@@ -1,4 +1,4 @@
-"""The generation job: render the clips of a data set that are not there yet."""
+"""The rendering job: renders the missing clips of a dataset."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,14 +17,15 @@ from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
 from render.job.pilots import choose_rooms
-from render.job.profiles import NO_PILOTS, check_seed, plan, profile_of
+from render.job.plan import NO_PILOTS, check_seed, plan
+from render.job.profiles import profile_of
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
 class Share:
-    """Share `index` (from 1) of `count` disjoint ones of a data set's clips."""
+    """Share `index` (from 1) of `count` disjoint shares of a dataset's clips."""
 
     index: int
     count: int
@@ -35,18 +36,17 @@ class Share:
         match = re.fullmatch(r"(\d+)/(\d+)", text)
         if match and 1 <= int(match[1]) <= int(match[2]):
             return Share(int(match[1]), int(match[2]))
-        raise BadInput(f"'{text}' is not a part: write K/N with K from 1 to N, such as 2/8")
+        raise BadInput(f"'{text}' is not a share: write K/N with K from 1 to N, such as 2/8")
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """The items of this share: every `count`-th."""
+        """Every `count`-th item."""
         return items[self.index - 1 :: self.count]
 
 
-WHOLE_DATA_SET = Share(1, 1)
+WHOLE_DATASET = Share(1, 1)
 
 
 def render_here(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
-    """Render clips in this process, one after the other."""
     return map(run_clip_job, jobs)
 
 
@@ -54,25 +54,24 @@ def generate(
     root: Path,
     profile: str,
     seed: int,
-    share: Share = WHOLE_DATA_SET,
+    share: Share = WHOLE_DATASET,
     reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
     render: Callable[[Sequence[RenderJob]], Iterator[ClipOutcome]] = render_here,
 ) -> int:
-    """Render the clips that are missing from the share of a data set at `root`. Returns how many were rendered.
+    """Render the missing clips of a share of the dataset at `root`. Returns how many were rendered.
 
-    Clips for training and validation get the channels in `reads` and those that are always needed.
+    Clips for training and validation get the channels in `reads` and the essential ones.
 
-    Several jobs may work on one folder, on machines that share it or not: each clip is rendered by one of them, and
-    the folders of disjoint shares merge into the whole. A clip that fails is left out, and the rest goes on. A data set
-    that is whole gets its card.
+    Several jobs may work on one folder; each clip is rendered by one of them. Folders of disjoint shares can be merged.
+    A clip that fails is skipped. A complete dataset gets its card.
 
-    Raises BadInput at the end, naming the first clip that failed, and OSError at once: a full disk is full for all.
+    Raises BadInput at the end, naming the first clip that failed, and OSError (such as a full disk) at once.
     """
     check_seed(seed)
     check_folder(root)
     facts = root / "dataset.json"
-    if facts.exists():  # its rooms are chosen; whether they are those of this profile is checked below, without a pilot
+    if facts.exists():  # its rooms are chosen; write_or_check_plan compares the profile
         needed_spp = read_json(facts).get("needed_spp", {})
     else:
         needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
@@ -97,16 +96,16 @@ def generate(
 
 
 def check_folder(root: Path) -> None:
-    """Raise BadInput unless `root` is a new folder, an empty one or that of a data set."""
+    """Raise BadInput unless `root` is a new or empty folder, or that of a dataset."""
     if root.exists() and not root.is_dir():
         raise BadInput(f"{root} is a file, not a folder: choose another --data")
     visible = [path.name for path in root.glob("[!.]*")]
     if visible and "dataset.json" not in visible:
-        raise BadInput(f"{root} holds something else than a data set: choose an empty or new folder")
+        raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
 
 
 def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
-    """Write the plan into a new data set's folder. Raises BadInput where another plan is there already."""
+    """Write the plan into a new dataset's folder. Raises BadInput if it contains another plan."""
     if not (root / "dataset.json").exists():
         write_json(root / "dataset.json", wanted)
         return
@@ -117,7 +116,7 @@ def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
 
 
 def check_versions(dataset: Dataset) -> None:
-    """Raise BadInput where other packages are installed than rendered the data set: seeds may render other bytes."""
+    """Raise BadInput if the dataset was begun with other versions of packages, which may render other bytes."""
     here = versions(RENDERING)
     changed = [
         f"{name} {began_with}, here {here.get(name, 'none')}"
@@ -129,7 +128,7 @@ def check_versions(dataset: Dataset) -> None:
 
 
 def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
-    """Wait for all clips, tell of those that were not rendered, and count those that were.
+    """Wait for all clips, print which were not rendered, and count those that were.
 
     Raises BadInput at the end, naming the first clip that failed.
     """
@@ -139,7 +138,7 @@ def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
         if outcome.ending == "left":
             tqdm.write(f"{outcome.path}: {outcome.reason}")
         elif outcome.ending == "failed":
-            tqdm.write(f"{outcome.path}: failed, the rest goes on: {outcome.reason}")
+            tqdm.write(f"{outcome.path}: failed, the others continue: {outcome.reason}")
     if ended["failed"]:
         first = ended["failed"][0]
         clips = sum(map(len, ended.values()))

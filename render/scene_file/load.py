@@ -1,33 +1,71 @@
-"""A user's own scene: the file that a TOML names, its camera, motion and lights, as a Scene like the built-in ones."""
+"""A user's own scene: the file that a TOML names, with its camera, motion and lights, as a Scene."""
 
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.scene_file.camera import camera_of_sensor, camera_that_sees
+from render.loading import mitsuba_reason
 from render.scene_file.convert import convert
+from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
+from render.scene_file.mesh_file import load_mesh_file
 from render.stage import Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
 from scenes.camera import Array, look_at
-from scenes.description import camera_of, gain_of, motion_of, read_description
-from scenes.mesh_file import load_mesh_file
 
-DEFAULT_DEPTH = 3  # path edges, where neither file says: one indirect bounce
-WITHOUT_CAMERA = camera_that_sees(np.zeros(3), np.ones(3))  # until the size of the scene is known
-MOST_SHAPES = 65535  # mesh ids are 16 bits
-MOST_DEPTH = 64  # where the file asks for endless paths; Russian roulette ends them before
+DEFAULT_DEPTH = 3  # path edges: one indirect bounce
+MAX_DEPTH = 64  # for files with endless paths; Russian roulette ends them before
+MAX_SHAPES = 65535  # mesh ids have 16 bits
+FOV_WITHOUT_CAMERA = 50.0  # degrees
+
+
+def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[Camera, list[str]]:
+    """The static camera of a perspective sensor's dictionary, for images of this size, and notes on omissions.
+
+    Its field of view holds for the axis that the sensor names. Raises BadInput if the sensor is invalid.
+    """
+    film = {"type": "hdrfilm", "width": width, "height": height}
+    lens = {key: value for key, value in sensor.items() if key in ("fov", "fov_axis", "focal_length")}
+    try:
+        loaded = mi.load_dict({"type": "perspective", "film": film, **lens})
+    except RuntimeError as error:
+        raise BadInput(f"the camera cannot be used: {mitsuba_reason(error)}") from None
+    x_fov = float(np.array(mi.traverse(loaded)["x_fov"]).ravel()[0])
+    to_world = np.asarray(sensor.get("to_world", np.eye(4)), np.float64)
+    if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) == 0:
+        raise BadInput(f"the camera cannot be used: its to_world is {to_world.tolist()}")
+    axes = to_world[:3, :3] / np.linalg.norm(to_world[:3, :3], axis=0)
+    eye = to_world[:3, 3]
+    notes = []
+    if np.linalg.det(axes) < 0:
+        notes.append("the camera mirrors its image: not mirrored instead")
+    if "principal_point_offset_x" in sensor or "principal_point_offset_y" in sensor:
+        notes.append("the camera's principal point is off centre: in the centre instead")
+    return Camera.at_rest(eye, eye + axes[:, 2], x_fov, axes[:, 1]), notes
+
+
+def camera_framing(low: Array, high: Array) -> Camera:
+    """A static camera slightly above the box from `low` (3,) to `high` (3,), with all of it in view."""
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    away = np.array([0.3, 0.25, 1.0])
+    distance = radius / np.sin(np.radians(FOV_WITHOUT_CAMERA) / 2)
+    eye = centre + away / np.linalg.norm(away) * distance
+    return Camera.at_rest(eye, centre, FOV_WITHOUT_CAMERA)
+
+
+DEFAULT_CAMERA = camera_framing(np.zeros(3), np.ones(3))  # until the extent of the scene is known
 
 
 class OwnScene:
-    """What a TOML describes, as it stands in its file.
+    """The scene that a TOML describes, at rest.
 
-    `notes` say what is not honoured, and what stands in for it. Raises BadInput, naming the file, for what cannot be
-    used.
+    `notes` list what is not honoured, and its stand-ins. Raises BadInput, naming the file, if it cannot be used.
     """
 
     def __init__(self, path: Path):
@@ -40,22 +78,22 @@ class OwnScene:
         depth = scene.max_depth if self.described.bounces is None else self.described.bounces + 1
         self.scene = replace(scene, max_depth=depth)
         self.check_names()
-        if len(self.scene.meshes) > MOST_SHAPES:
-            raise BadInput(f"{self.file} has {len(self.scene.meshes)} shapes: at most {MOST_SHAPES} can be told apart")
+        if len(self.scene.meshes) > MAX_SHAPES:
+            raise BadInput(f"{self.file} has {len(self.scene.meshes)} shapes, the limit is {MAX_SHAPES}: merge some")
         try:
             self.stage = Stage(self.scene, self.height, self.width)  # at rest, to fly through
         except BadInput as error:
             raise BadInput(f"{self.file}: {error}") from None
         self.notes += self.stage.notes
         if not self.has_camera:
-            self.notes.append("there is no camera: one that sees the whole scene instead")
+            self.notes.append("there is no camera: one that frames the whole scene instead")
             space = Space(self.stage)
-            self.scene = replace(self.scene, camera=camera_that_sees(space.low, space.high))
+            self.scene = replace(self.scene, camera=camera_framing(space.low, space.high))
 
     def from_xml(self) -> tuple[Scene, list[str]]:
-        """The scene of a Mitsuba file, whose camera stands still, and what is not honoured."""
+        """The scene of a Mitsuba file, with a static camera, and notes."""
         found = convert(self.file)
-        camera, notes = WITHOUT_CAMERA, [*found.notes]
+        camera, notes = DEFAULT_CAMERA, [*found.notes]
         self.has_camera = found.sensor is not None
         if found.sensor:
             try:
@@ -63,33 +101,32 @@ class OwnScene:
             except BadInput as error:
                 raise BadInput(f"{self.file}: {error}") from None
             notes += more
-        depth = min(found.max_depth or DEFAULT_DEPTH, MOST_DEPTH)
+        depth = min(found.max_depth or DEFAULT_DEPTH, MAX_DEPTH)
         return Scene((), camera, depth, stock=tuple(found.shapes), lights=tuple(found.lights)), notes
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
-        """The scene of a glTF, OBJ or PLY file, and what is not honoured."""
+        """The scene of a glTF, OBJ or PLY file, and notes."""
         found = load_mesh_file(self.file, self.width / self.height)
         self.has_camera = found.camera is not None
-        scene = Scene(tuple(found.shapes), found.camera or WITHOUT_CAMERA, DEFAULT_DEPTH, sky=found.sky)
+        scene = Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky)
         return scene, found.notes
 
     def check_names(self) -> None:
-        """Raise BadInput for motion of a shape, or change of a light, that is not in the file."""
+        """Raise BadInput for keyframes of a shape or light that is not in the file."""
         shapes = {shape.name for shape in self.scene.meshes}
         lights = {light.name for light in self.scene.lights}
         lights |= {shape.name for shape in self.scene.stock if shape.emitter}
         lights |= {shape.name for shape in self.scene.shapes if shape.radiance}
-        for name in (each.shape for each in self.described.motion):
-            if name not in shapes:
-                raise BadInput(f"{self.path}: there is no shape '{name}'; {known(shapes)}")
-        for name in (each.light for each in self.described.light):
-            if name not in lights:
-                raise BadInput(f"{self.path}: there is no light '{name}'; {known(lights)}")
+        wanted = [("shape", motion.shape, shapes) for motion in self.described.motion]
+        wanted += [("light", change.light, lights) for change in self.described.light]
+        for kind, name, names in wanted:
+            if name not in names:
+                raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listing(names)}")
 
     def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
-        """The scene of a clip: flown by the keyframes of the TOML, or through free space from the file's camera.
+        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight through free space.
 
-        Where not `from_here`, the flight begins at another place that can be reached from there.
+        The flight begins with the file's camera, or unless `from_here` at another place that can be reached from it.
         """
         if by_keyframes:
             camera = camera_of(self.described.camera, self.scene.camera, frames)
@@ -103,10 +140,10 @@ class OwnScene:
         scene = self.scene
         by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
         motions = {
-            each.shape: motion_of(each.keyframes, centre_of(by_name[each.shape]) * self.stage.unit, frames)
-            for each in self.described.motion
+            motion.shape: motion_of(motion.keyframes, centre_of(by_name[motion.shape]) * self.stage.unit, frames)
+            for motion in self.described.motion
         }
-        gains = {each.light: gain_of(each.keyframes, frames) for each in self.described.light}
+        gains = {change.light: gain_of(change.keyframes, frames) for change in self.described.light}
         shapes = [replace(shape, motion=motions.get(shape.name, shape.motion)) for shape in scene.shapes]
         stock = [replace(shape, motion=motions.get(shape.name, shape.motion)) for shape in scene.stock]
         return replace(
@@ -118,31 +155,28 @@ class OwnScene:
 
 
 def check_camera(camera: Camera, frames: int, path: Path) -> None:
-    """Raise BadInput, naming the TOML, where a camera that flies by keyframes cannot see."""
+    """Raise BadInput, naming the TOML, if a camera by keyframes has no valid view."""
     for frame in range(frames):
         pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
         if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
-            raise BadInput(
-                f"{path}: in frame {frame} the camera is where it looks, looks along its up, or sees 180 degrees or "
-                "more: change its keyframes"
-            )
+            faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
+            raise BadInput(f"{path}: in frame {frame} the camera's {faults}: change its keyframes")
 
 
 def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:
-    """The shape with what it emits times `gain` over time."""
+    """The shape with its emission times `gain` over time."""
     if gain is None or shape.radiance is None:
         return shape
     return replace(shape, radiance=replace(gain, keys=np.outer(gain.keys, shape.radiance.at(0))))
 
 
 def centre_of(shape: mi.Shape) -> Array:
-    """The middle (3,) of a shape's box, in Mitsuba's units: about it the shape turns."""
+    """The centre (3,) of a shape's bounding box, about which it rotates, in Mitsuba's units."""
     box = shape.bbox()
     return (np.array(box.min, np.float64) + np.array(box.max, np.float64)).ravel() / 2
 
 
-def known(names: set[str]) -> str:
-    """The names there are, for messages."""
+def listing(names: set[str]) -> str:
     shown = sorted(names)
     more = f" and {len(shown) - 20} more" if len(shown) > 20 else ""
     return f"there are {', '.join(shown[:20])}{more}" if shown else "there are none"

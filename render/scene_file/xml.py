@@ -1,4 +1,4 @@
-"""Mitsuba's XML files as nodes, of this version and the ones before; nothing outside of their folder is read."""
+"""Parses Mitsuba's XML files of this and earlier versions; nothing outside of their folder is read."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,36 +12,37 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import VARIANT, mi
-from render.loading import reason
+from render.loading import mitsuba_reason
+from scenes.colours import srgb_to_linear
 
-LARGEST = 64 * 2**20  # bytes of XML, all included files together
-MOST_INCLUDES = 256
-DEEPEST_INCLUDE = 15  # includes within includes
-DEEPEST_ELEMENT = 64  # elements within elements: parsers overflow their stacks at many thousands
+MAX_BYTES = 64 * 2**20  # of XML, all included files together
+MAX_INCLUDES = 256
+MAX_INCLUDE_DEPTH = 15
+MAX_ELEMENT_DEPTH = 64  # parsers overflow their stacks at many thousands
 
 
-def inside(root: Path, name: str, said_by: Path) -> Path:
-    """The path of a file that a scene names. Raises BadInput where that leaves the scene's folder `root`."""
+def inside(root: Path, name: str, source: Path) -> Path:
+    """The path of a file that `source` names. Raises BadInput if it is outside of the scene's folder `root`."""
     try:
         path = (root / name).resolve()
         path.is_file()
     except (OSError, ValueError) as error:
-        raise BadInput(f"{said_by}: '{name[:80]}' cannot be the name of a file: {error}"[:300]) from None
+        raise BadInput(f"{source}: '{name[:80]}' cannot be the name of a file: {error}"[:300]) from None
     if not path.is_relative_to(root):
-        raise BadInput(f"{said_by}: '{name}' leaves the scene's folder {root}: move it into that folder")
+        raise BadInput(f"{source}: '{name}' leaves the scene's folder {root}: move it into that folder")
     return path
 
 
 def elements(file: Path, content: bytes) -> Iterator[Element]:
-    """All elements of an XML file, with their attributes. Raises BadInput where it is damaged or too deep."""
+    """All elements of an XML file, with their attributes. Raises BadInput if it is damaged or too deep."""
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content or b"\0" in content:
-        raise BadInput(f"{file} declares entities, which scene files have no use for, or is not in UTF-8")
+        raise BadInput(f"{file} declares entities, which scene files do not need, or is not in UTF-8")
     depth = 0
     try:
         for event, element in ElementTree.iterparse(BytesIO(content), ("start", "end")):
             depth += 1 if event == "start" else -1
-            if depth > DEEPEST_ELEMENT:
-                raise BadInput(f"{file}: more than {DEEPEST_ELEMENT} elements within each other")
+            if depth > MAX_ELEMENT_DEPTH:
+                raise BadInput(f"{file}: more than {MAX_ELEMENT_DEPTH} elements within each other")
             if event == "start":
                 yield element
     except ElementTree.ParseError as error:
@@ -49,7 +50,7 @@ def elements(file: Path, content: bytes) -> Iterator[Element]:
 
 
 def check_includes(path: Path) -> list[Path]:
-    """The folders that the file and all that it includes search for files.
+    """The folders in which the file and all that it includes search for files.
 
     Raises BadInput unless they are XML of bounded size and name nothing outside of their folder.
     """
@@ -61,17 +62,16 @@ def check_includes(path: Path) -> list[Path]:
     while waiting:
         file, depth = waiting.pop()
         included += 1
-        if depth > DEEPEST_INCLUDE or included > MOST_INCLUDES:
-            raise BadInput(
-                f"{path}: more than {MOST_INCLUDES} files are included, or more than {DEEPEST_INCLUDE} in each other"
-            )
+        if depth > MAX_INCLUDE_DEPTH or included > MAX_INCLUDES:
+            limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
+            raise BadInput(f"{path} includes more than {limits}: merge some")
         try:
             content = file.read_bytes()
         except OSError as error:
             raise BadInput(f"{file} cannot be read: {error.strerror}") from None
         total += len(content)
-        if total > LARGEST:
-            raise BadInput(f"{path}: more than {LARGEST >> 20} MiB of XML")
+        if total > MAX_BYTES:
+            raise BadInput(f"{path}: more than {MAX_BYTES >> 20} MiB of XML")
         for element in elements(file, content):
             name = element.get("value" if element.tag == "path" else "filename")
             if element.tag not in ("path", "include", "spectrum") or name is None:
@@ -88,7 +88,7 @@ def check_includes(path: Path) -> list[Path]:
 
 @contextmanager
 def searched_in(folder: Path) -> Iterator[None]:
-    """While Mitsuba looks for files in `folder` first."""
+    """Within the context Mitsuba searches `folder` first."""
     resolver = mi.file_resolver()  # type: ignore[operator]
     before = [resolver[i] for i in range(len(resolver))]
     resolver.prepend(str(folder))
@@ -96,18 +96,17 @@ def searched_in(folder: Path) -> Iterator[None]:
         yield
     finally:
         resolver.clear()
-        for each in before:
-            resolver.append(each)
+        for path in before:
+            resolver.append(path)
 
 
-def linear(colour: str) -> str:
+def linear_colour(colour: str) -> str:
     """The linear values of a colour of old files: #rrggbb, or three sRGB values."""
     if colour.startswith("#"):
         encoded = np.array([*bytes.fromhex(colour[1:7])]) / 255
     else:
         encoded = np.array([float(value) for value in colour.replace(",", " ").split()])
-    values = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return ", ".join(f"{value:.6f}" for value in values)
+    return ", ".join(f"{value:.6f}" for value in srgb_to_linear(encoded))
 
 
 def named_like(element: Element, tag: str, **attributes: str) -> Element:
@@ -116,7 +115,7 @@ def named_like(element: Element, tag: str, **attributes: str) -> Element:
 
 
 def upgrade(root: Element, path: Path) -> list[str]:
-    """Put what takes their place for elements of old files that Mitsuba's parser no longer knows. In words, too."""
+    """Replace elements of old files that Mitsuba's parser does not support any more. Returns notes."""
     notes = []
     for parent in root.iter():
         for place, child in enumerate([*parent]):
@@ -124,12 +123,12 @@ def upgrade(root: Element, path: Path) -> list[str]:
                 notes.append("subsurface scattering is left out: the surface alone is rendered")
                 parent[place] = ElementTree.Comment("subsurface")
             elif child.tag == "animation":
-                notes.append(f"an <animation> ('{child.get('name')}'): its first transform is held instead")
+                notes.append(f"an <animation> ('{child.get('name')}'): its first transform instead")
                 first = next(iter(child.findall("transform")), Element("transform"))
                 parent[place] = named_like(child, "transform")
                 parent[place].extend(first)
             elif child.tag == "srgb":
-                parent[place] = named_like(child, "rgb", value=linear(child.get("value", "")))
+                parent[place] = named_like(child, "rgb", value=linear_colour(child.get("value", "")))
             elif child.tag == "blackbody":
                 parent[place] = named_like(child, "spectrum", type="blackbody")
                 for name in ("temperature", "scale"):
@@ -142,15 +141,13 @@ def upgrade(root: Element, path: Path) -> list[str]:
 
 
 class Parsed(NamedTuple):
-    """The nodes of a scene file."""
-
     state: mi.parser.ParserState
-    searched: list[Path]  # folders where its files may be
-    notes: list[str]  # what had to be left out
+    searched: list[Path]  # folders for its files
+    notes: list[str]  # of omissions
 
 
 def parse(path: Path) -> Parsed:
-    """The nodes of a scene file, with references resolved. Raises BadInput, naming the file, for what is no scene."""
+    """The nodes of a scene file, with references resolved. Raises BadInput, naming the file, if it is invalid."""
     path = path.resolve()
     searched = check_includes(path)
     config = mi.parser.ParserConfig(VARIANT)
@@ -164,5 +161,5 @@ def parse(path: Path) -> Parsed:
             mi.parser.transform_upgrade(config, state)
             mi.parser.transform_resolve_references(config, state)
         except (RuntimeError, ValueError) as error:
-            raise BadInput(f"{path} cannot be read: {reason(error)}") from None
+            raise BadInput(f"{path} cannot be read: {mitsuba_reason(error)}") from None
     return Parsed(state, searched, notes)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scenes.camera import Array
-from scenes.draws import Rng
+from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, hollow, lathe, leaf, silhouette, tube
 from scenes.objects.thing import SurfacesBySlot, Thing, merged, standing
 
@@ -35,8 +35,7 @@ def shrub(rng: Rng, start: float, size: float) -> SurfacesBySlot:
     """Stems with many leaves that grow out of (0, `start`, 0), about `size` tall."""
     surfaces: SurfacesBySlot = {"stem": [], "leaf": []}
     length = size * rng.uniform(0.15, 0.35)
-    ratio = rng.uniform(0.3, 0.8)
-    fold = rng.uniform(0, 0.5)
+    ratio, fold = uniforms(rng, (0.3, 0.8), (0, 0.5))
     for azimuth in rng.uniform(0, 2 * np.pi, rng.integers(2, 7)):
         tall = size * rng.uniform(0.6, 1.0)
         lean = np.linspace(0, 1, 8)[:, None] ** 2 * rng.uniform(0.05, 0.35) * tall
@@ -64,10 +63,8 @@ def potted(rng: Rng, name: str, radius: float, height: float) -> Thing:
 
 
 def make_floor_plant(rng: Rng) -> Thing:
-    """A plant that stands on the floor."""
     return potted(rng, "floor_plant", rng.uniform(0.1, 0.22), rng.uniform(0.7, 1.7))
 
 
 def make_small_plant(rng: Rng) -> Thing:
-    """A plant that stands on something."""
     return potted(rng, "small_plant", rng.uniform(0.03, 0.07), rng.uniform(0.14, 0.42))

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from scenes.draws import Rng
+from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, lathe, silhouette, slab, solid, superellipsoid, tube
-from scenes.objects.furniture_parts import corners, legs, pedestal
+from scenes.objects.furniture import corners, legs, pedestal
 from scenes.objects.thing import Support, SurfacesBySlot, Thing, evenly, merged, shifted, standing, top_support
 
 
@@ -39,10 +39,7 @@ def back(rng: Rng, width: float, height: float) -> SurfacesBySlot:
 
 
 def make_chair(rng: Rng) -> Thing:
-    """A chair; its seat carries things."""
-    width = rng.uniform(0.4, 0.5)
-    depth = rng.uniform(0.4, 0.5)
-    height = rng.uniform(0.4, 0.47)
+    width, depth, height = uniforms(rng, (0.4, 0.5), (0.4, 0.5), (0.4, 0.47))
     base, thickness = seat(rng, width, depth)
     surfaces = merged(
         legs(rng, width, depth, height),
@@ -55,8 +52,7 @@ def make_chair(rng: Rng) -> Thing:
 
 def make_stool(rng: Rng) -> Thing:
     """A round stool; without a cushion it carries things."""
-    radius = rng.uniform(0.15, 0.22)
-    height = rng.uniform(0.42, 0.75)
+    radius, height = uniforms(rng, (0.15, 0.22), (0.42, 0.75))
     side = radius * math.sqrt(2)
     frame = pedestal(rng, radius, height) if rng.random() < 0.3 else legs(rng, side, side, height)
     board = {"wood": [disc(radius, 0.03).at(0, height)]}
@@ -68,10 +64,7 @@ def make_stool(rng: Rng) -> Thing:
 
 
 def make_bench(rng: Rng) -> Thing:
-    """A bench of planks that carries things."""
-    width = rng.uniform(0.8, 1.6)
-    depth = rng.uniform(0.3, 0.42)
-    height = rng.uniform(0.4, 0.48)
+    width, depth, height = uniforms(rng, (0.8, 1.6), (0.3, 0.42), (0.4, 0.48))
     count = int(rng.integers(1, 6))
     thickness = rng.uniform(0.02, 0.045)
     planks = [slab(width, thickness, depth / count - 0.008).at(0, height, z) for z in evenly(depth, count)]
@@ -81,14 +74,10 @@ def make_bench(rng: Rng) -> Thing:
 
 def upholstered(rng: Rng, name: str, seats: int) -> Thing:
     """A sofa with that many seats; one makes an armchair."""
-    place = rng.uniform(0.55, 0.75)
-    depth = rng.uniform(0.75, 0.95)
-    foot = rng.uniform(0.04, 0.16)
-    arm = rng.uniform(0.1, 0.22)
+    place, depth, foot, arm = uniforms(rng, (0.55, 0.75), (0.75, 0.95), (0.04, 0.16), (0.1, 0.22))
     soft = rng.uniform(3, 9)
     level = foot + rng.uniform(0.2, 0.28)
-    rise = rng.uniform(0.35, 0.55)
-    lean = rng.uniform(0.05, 0.25)
+    rise, lean = uniforms(rng, (0.35, 0.55), (0.05, 0.25))
     inner = seats * place
     width = seats * place + 2 * arm
     side = superellipsoid(arm, level + rng.uniform(0.12, 0.22) - foot, depth, soft)
@@ -108,21 +97,16 @@ def upholstered(rng: Rng, name: str, seats: int) -> Thing:
 
 
 def make_sofa(rng: Rng) -> Thing:
-    """A sofa for two or three."""
     return upholstered(rng, "sofa", int(rng.integers(2, 4)))
 
 
 def make_armchair(rng: Rng) -> Thing:
-    """A sofa for one."""
     return upholstered(rng, "armchair", 1)
 
 
 def make_bed(rng: Rng) -> Thing:
     """A bed with its head towards -z: frame, mattress, blanket and one or two pillows."""
-    width = rng.uniform(0.9, 1.8)
-    depth = rng.uniform(1.95, 2.15)
-    level = rng.uniform(0.22, 0.4)
-    thickness = rng.uniform(0.15, 0.26)
+    width, depth, level, thickness = uniforms(rng, (0.9, 1.8), (1.95, 2.15), (0.22, 0.4), (0.15, 0.26))
     head = rng.uniform(0.4, 0.8)
     frame = [slab(width + 0.06, 0.1, depth + 0.06).at(0, level - 0.1)]
     frame.append(slab(width + 0.06, level + head, 0.05).at(0, 0, -depth / 2 - 0.05))

@@ -1,4 +1,4 @@
-"""What things are made of, and what all their makers share."""
+"""Things, their parts and supports, and functions that their makers share."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,9 +19,8 @@ SurfacesBySlot = dict[str, list[Surface]]
 class ThingPart:
     """One mesh of a thing, with texture coordinates and unit outward vertex normals.
 
-    Parts of a thing have different slots, which hint at their materials: wood, front (doors, lids, panels), metal,
-    stone, ceramic, glass, wax, body (anything); fabric, cushion, blanket, shade; slat; leaf, stem, soil; paper,
-    cover-1 to cover-3; frame, and print, whose texture coordinates are 0..1.
+    Its slot suggests a material: wood, front (doors, lids, panels), metal, stone, ceramic, glass, wax, body (anything),
+    fabric, cushion, blanket, shade, slat, leaf, stem, soil, paper, cover-1 to cover-3, frame, or print (uv in 0..1).
     """
 
     mesh: trimesh.Trimesh
@@ -31,7 +30,7 @@ class ThingPart:
 
 @dataclass(frozen=True)
 class Support:
-    """A horizontal rectangle on which smaller things may stand; metres."""
+    """A horizontal rectangle for smaller things to stand on; metres."""
 
     low: tuple[float, float]  # x, z
     high: tuple[float, float]  # x, z
@@ -39,7 +38,7 @@ class Support:
     clearance: float = math.inf  # free height above
 
     def at(self, x: float, y: float, z: float) -> "Support":
-        """Shifted by (x, y, z)."""
+        """Translated."""
         low = (self.low[0] + x, self.low[1] + z)
         high = (self.high[0] + x, self.high[1] + z)
         return replace(self, low=low, high=high, height=self.height + y)
@@ -47,10 +46,9 @@ class Support:
 
 @dataclass(frozen=True)
 class Thing:
-    """An object in its rest pose, with one part for each slot.
+    """An object in its rest pose, with one part for each slot, its lowest point at y = 0.
 
-    Furniture and decor stand on y = 0, centred on the y axis. What hangs is centred on x = 0 with its lowest point at
-    y = 0.
+    Furniture and decor are centred on the y axis; what hangs is centred on x = 0.
     """
 
     name: str
@@ -67,7 +65,6 @@ Maker = Callable[[Rng], Thing]
 
 
 def shifted(surfaces: SurfacesBySlot, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> SurfacesBySlot:
-    """All surfaces, shifted by (x, y, z)."""
     return {slot: [surface.at(x, y, z) for surface in of_slot] for slot, of_slot in surfaces.items()}
 
 
@@ -81,16 +78,15 @@ def merged(*groups: SurfacesBySlot) -> SurfacesBySlot:
 
 
 def assembled(name: str, surfaces: SurfacesBySlot) -> Thing:
-    """A thing of these surfaces where they are; slots without surfaces are left out."""
+    """A thing of surfaces as they are, without empty slots."""
     joined = {slot: join(of_slot) for slot, of_slot in surfaces.items() if of_slot}
     return Thing(name, tuple(ThingPart(surface.mesh(), slot, surface.smooth) for slot, surface in joined.items()))
 
 
 def standing(name: str, surfaces: SurfacesBySlot, supports: Sequence[Support] = ()) -> Thing:
-    """A thing of these surfaces, shifted with its supports to stand on y = 0, centred on the y axis."""
+    """A thing of surfaces and supports, translated to stand on y = 0, centred on the y axis."""
     points = np.concatenate([surface.points for of_slot in surfaces.values() for surface in of_slot])
-    low = points.min(axis=0)
-    high = points.max(axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     shift = (float(-(low[0] + high[0]) / 2), float(-low[1]), float(-(low[2] + high[2]) / 2))
     thing = assembled(name, shifted(surfaces, *shift))
     return replace(thing, supports=tuple(support.at(*shift) for support in supports))
@@ -99,12 +95,11 @@ def standing(name: str, surfaces: SurfacesBySlot, supports: Sequence[Support] = 
 def top_support(
     width: float, depth: float, height: float, clearance: float = math.inf, margin: float = 0.01
 ) -> Support:
-    """The support on a board `width` x `depth` about the y axis whose upper side is at `height`, less a `margin`."""
-    x = width / 2 - margin
-    z = depth / 2 - margin
+    """The support on a board `width` x `depth` about the y axis with its top at `height`, less a `margin`."""
+    x, z = width / 2 - margin, depth / 2 - margin
     return Support((-x, -z), (x, z), height, clearance)
 
 
 def evenly(width: float, count: int) -> Array:
-    """Positions (count,) of the middles of `count` equal pieces of -width / 2..width / 2."""
+    """The centres (count,) of `count` equal intervals of -width / 2..width / 2."""
     return ((np.arange(count) + 0.5) / count - 0.5) * width

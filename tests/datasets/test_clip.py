@@ -13,7 +13,7 @@ from datasets.clip import Clip, Dataset
 from datasets.frame import ChannelTensor, Frame
 from errors import BadInput
 from render.clip import Sampling, render_clip
-from render.job.clip_scene import scene_of_clip
+from render.job.plan import scene_of_clip
 from render.job.profiles import profile_of
 
 

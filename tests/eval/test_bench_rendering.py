@@ -8,7 +8,7 @@ import pytest
 from errors import BadInput
 from eval.bench.rendering import MAX_SPP, bench_rendering
 from eval.bench.stock import stock_render
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -30,10 +30,10 @@ FIELDS = [
 def test_both_renderers_see_the_same_frame(name):
     size = 48
     block = 8
-    shot = Shot(Stage(build_scene(name, 0, 24), size, size), 8)
+    posed = PosedFrame(Stage(build_scene(name, 0, 24), size, size), 8)
     images = [
         render(1, 128).reshape(size // block, block, size // block, block, 3).mean(axis=(1, 3))
-        for render in (stock_render(shot), shot.radiance)
+        for render in (stock_render(posed), posed.radiance)
     ]
     a, b = (np.minimum(image, np.percentile(image, 90)) for image in images)  # without the edges of lamps
     assert np.abs(a - b).mean() < 0.05 * a.mean()

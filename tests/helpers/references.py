@@ -13,7 +13,7 @@ from datasets.frame import to_tensor
 from datasets.tonemap import clip_exposure, luminance
 from eval.comparison import Comparison
 from eval.metrics import METRICS, mse_unbiased
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -93,6 +93,6 @@ def reference_halves(
     Raises BadInput for an unknown scene.
     """
     height, width = size
-    shot = Shot(Stage(build_scene(name, seed, frames=1), height, width), 0)
+    posed = PosedFrame(Stage(build_scene(name, seed, frames=1), height, width), 0)
     for index, spp in enumerate(spps):
-        yield np.stack([shot.radiance(2 * index + half, spp // 2) for half in (0, 1)])
+        yield np.stack([posed.radiance(2 * index + half, spp // 2) for half in (0, 1)])

@@ -7,14 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import render.gradient
-from datasets import channels
-from models.history import strata
+from datasets.channels import STRATUM
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
-from render.gradient import STRATUM, Samples, luminance, one_of_each_stratum
+from render.gradient import GradientSamples, pixel_of_each_stratum, sample_luminance
 from render.path import Draw, PathTracer
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.animation import RigidMotion, Scene, Track
 from scenes.cornell import cornell_box
@@ -23,34 +21,28 @@ from scenes.registry import build_scene
 SIZE = 32
 
 
-def samples_of(tracer: PathTracer, frame: int, seed: int) -> Samples:
+def samples_of(tracer: PathTracer, frame: int, seed: int) -> GradientSamples:
     """Samples of a frame for which the stage is posed; the same `seed` draws and chooses them."""
     stage = tracer.stage
     view = stage.view(frame)
     light = tracer.radiance(stage.rays(view), seed, 1)
-    return Samples.of(render_gbuffer(stage, view), *light, view, stage.poses, Draw(seed, 1), seed)
+    return GradientSamples.of(render_gbuffer(stage, view), *light, view, stage.poses, Draw(seed, 1), seed)
 
 
 def still_camera(scene: Scene) -> Scene:
     return replace(scene, camera=scene.still().camera)
 
 
-def test_renderer_and_denoisers_mean_the_same_strata_and_luminance():
-    """The renderer imports nothing of what reads its channels."""
-    assert strata.STRATUM == STRATUM
-    assert tuple(render.gradient.LUMINANCE_WEIGHTS) == tuple(channels.LUMINANCE_WEIGHTS)
-
-
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 99))
 def test_every_stratum_has_one_sample(height, width, seed):
-    row, column = np.divmod(one_of_each_stratum(height, width, seed), width)
+    row, column = np.divmod(pixel_of_each_stratum(height, width, seed), width)
     strata = {(r // STRATUM, c // STRATUM) for r, c in zip(row, column, strict=True)}
     assert len(strata) == len(row) == -(-height // STRATUM) * -(-width // STRATUM)
     assert (row < height).all() and (column < width).all()
 
 
 def test_all_places_in_a_stratum_are_taken_alike():
-    counts = np.bincount(np.concatenate([one_of_each_stratum(3, 3, seed) for seed in range(900)]), minlength=9)
+    counts = np.bincount(np.concatenate([pixel_of_each_stratum(3, 3, seed) for seed in range(900)]), minlength=9)
     assert counts.min() > 60 and counts.max() < 140  # 100 each, standard deviation 9.4
 
 
@@ -83,7 +75,7 @@ def test_gradients_average_to_the_change_of_noise_free_light():
     dims = Track(lamp.radiance.at(0) * np.array([[1.0], [0.6]]))
     slides = RigidMotion(Track(np.array([[0.0, 0.99, 0.0], [0.3, 0.99, 0.2]])), lamp.motion.angle)
     stage = Stage(replace(scene, shapes=(*rest, replace(lamp, radiance=dims, motion=slides))), SIZE, SIZE)
-    references = [luminance(Shot(stage, frame).reflected(9, 1024).reshape(-1, 3)) for frame in (0, 1)]
+    references = [sample_luminance(PosedFrame(stage, frame).reflected(9, 1024).reshape(-1, 3)) for frame in (0, 1)]
     lamp_id = len(scene.shapes)
     seen = [render_gbuffer(stage, stage.view(frame))["mesh_id"].ravel() for frame in (0, 1)]
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from datasets.channels import HIT_CHANNELS
 from render.clip import Sampling, render_clip
-from render.hit_distance import HIT_CHANNELS, hit_channels
+from render.first_bounce import hit_channels
 from render.path import Draw, PathTracer
 from render.stage import Stage
 from scenes.registry import build_scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from render.backend import VARIANT, dr
-from render.shot import Shot
+from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -19,7 +19,7 @@ def large_kernels(scene: str) -> set[str]:
     stage = Stage(build_scene(scene, 0, 4), 8, 8)
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        Shot(stage, 0).reflected(1, 1)
+        PosedFrame(stage, 0).reflected(1, 1)
         history = dr.kernel_history()
     return {
         kernel["hash"]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenes.camera import directions, pixel_centres, project
-from scenes.closeup import LONGEST, OFF_CENTRE, SHORTEST
 from scenes.registry import build_scene
+from scenes.rooms import MAX_ZOOM, MIN_ZOOM, OFF_CENTRE
 
 FRAMES = 5
 SIZE = 64
@@ -27,7 +27,7 @@ def test_a_closeup_is_a_part_of_its_room_s_picture(number):
         middle = seen[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean(axis=(0, 1)) / (SIZE / 2) - 1
         assert np.abs(middle).max() < OFF_CENTRE + 0.05
         times.append((b.K[0, 0] / a.K[0, 0], *middle))
-    assert SHORTEST <= times[0][0] <= LONGEST
+    assert MIN_ZOOM <= times[0][0] <= MAX_ZOOM
     np.testing.assert_allclose(times, np.broadcast_to(times[0], (FRAMES, 3)), atol=0.02)
 
 

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 
 from scenes.meshes import blob, circle, disc, gem, hollow, lathe, leaf, silhouette, slab, solid, superellipsoid, tube
 from scenes.objects.catalogue import DECOR, FURNITURE
-from scenes.objects.lamps import make_pendant
-from scenes.objects.pictures import make_picture
+from scenes.objects.fittings import make_blind, make_curtain, make_pendant, make_picture
 from scenes.objects.thing import Thing
-from scenes.objects.window_dressing import make_blind, make_curtain
 from tests.helpers.scenes import SEEDS
 
 STANDING = {**FURNITURE, **DECOR}

@@ -5,7 +5,7 @@ import pytest
 
 from errors import BadInput
 from render.backend import mi
-from render.scene_file.camera import FOV_WITHOUT_CAMERA, camera_of_sensor, camera_that_sees
+from render.scene_file.load import FOV_WITHOUT_CAMERA, camera_framing, camera_of_sensor
 from scenes.animation import Scene
 from scenes.camera import directions, pixel_centres, project
 from tests.helpers.scene_files import own, xml
@@ -35,7 +35,7 @@ def test_rays_are_those_of_mitsubas_sensor(lens, width, height):
 
 def test_what_a_camera_cannot_do_is_said():
     assert camera_of_sensor({"to_world": np.diag([-1.0, 1, 1, 1])}, 4, 4)[1] == [
-        "the camera mirrors its image: seen the right way round instead"
+        "the camera mirrors its image: not mirrored instead"
     ]
     assert "centre" in camera_of_sensor({"principal_point_offset_x": 0.1}, 4, 4)[1][0]
     for lens in ({"fov": 0.0}, {"fov": 180.0}, {"fov": 40.0, "fov_axis": "z"}):
@@ -49,7 +49,7 @@ def test_what_a_camera_cannot_do_is_said():
 @pytest.mark.parametrize("aspect", [1.0, 3.0])
 def test_a_scene_without_camera_is_seen_whole(aspect):
     low, high = np.array([-1.0, 0, 2]), np.array([3.0, 1, 5])
-    camera = camera_that_sees(low, high)
+    camera = camera_framing(low, high)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     view = Scene((), camera).view(0, 100, int(100 / aspect))
     seen = project(corners, np.ones(8, bool), view)
@@ -61,4 +61,4 @@ def test_a_scene_without_camera_is_seen_whole(aspect):
 def test_other_sensors_are_no_cameras(tmp_path, camera):
     scene = own(tmp_path, xml(camera=f'<sensor type="{camera}"/>'))
     assert not scene.has_camera and any("not a perspective camera" in note for note in scene.notes)
-    assert "there is no camera: one that sees the whole scene instead" in scene.notes
+    assert "there is no camera: one that frames the whole scene instead" in scene.notes

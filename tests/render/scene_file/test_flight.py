@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render.scene_file.flight import Space, fly, place_of, upright
+from render.scene_file.flight import Space, fly, start_at, upright
 from render.stage import Stage
 from scenes.animation import Camera, Scene, StockLight, StockShape, Track
 
@@ -62,7 +62,7 @@ def stages():
 @pytest.mark.parametrize("place", ["outdoors", "in a room"])
 def test_flights_keep_their_distance_and_are_smooth(stages, place):
     boxes = BOXES if place == "outdoors" else [ROOM, *BOXES]
-    clearance = place_of(Space(stages[place]), CAMERA).clearance
+    clearance = start_at(Space(stages[place]), CAMERA).clearance
     assert clearance > 0.05
     moves = 0
     for seed in SEEDS:

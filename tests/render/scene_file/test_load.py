@@ -6,8 +6,8 @@ import trimesh
 
 from errors import BadInput
 from render.gbuffer import render_gbuffer
+from render.posed_frame import PosedFrame
 from render.scene_file.load import OwnScene
-from render.shot import Shot
 from render.stage import Stage
 from scenes.camera import motion_vectors, pixel_centres
 from tests.helpers.scene_files import own, painted, xml
@@ -117,7 +117,7 @@ def test_keyframes_move_and_brighten(tmp_path):
     clip = scene.clip(2, 0, by_keyframes=True, from_here=True)
     assert clip.max_depth == 2
     stage = Stage(clip, 24, 32)
-    first, last = (Shot(stage, frame).emission.max() for frame in (0, 1))
+    first, last = (PosedFrame(stage, frame).emission.max() for frame in (0, 1))
     assert last == pytest.approx(3 * first)
     centres = []
     for frame in (0, 1):
@@ -162,12 +162,12 @@ def test_the_smallest_images_and_clips(tmp_path):
     scene.described.resolution = (1, 1)
     for frames in (1, 2):
         clip = scene.clip(frames, 0, False, False)
-        assert np.isfinite(Shot(Stage(clip, 1, 1), frames - 1).radiance(0, 2)).all()
+        assert np.isfinite(PosedFrame(Stage(clip, 1, 1), frames - 1).radiance(0, 2)).all()
 
 
 def test_points_of_no_size_and_deep_mixtures(tmp_path):
     point = own(tmp_path, xml(shape=painted('<float name="radius" value="0"/>'), camera=""))
-    assert np.isfinite(Shot(Stage(point.clip(2, 0, False, False), 4, 4), 1).radiance(0, 2)).all()
+    assert np.isfinite(PosedFrame(Stage(point.clip(2, 0, False, False), 4, 4), 1).radiance(0, 2)).all()
     blends = '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse"/>'
     deep = own(tmp_path, xml(shape=painted(blends * 30 + '<bsdf type="plastic"/>' + "</bsdf>" * 30)))
     assert deep.stage.materials.depth == 6

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from render.backend import mi
-from render.scene_file.stand_ins import black_body, mixture, phong, sky_alone, turned_to_y
-from render.shot import Shot
+from render.posed_frame import PosedFrame
+from render.scene_file.stand_ins import OLD_PLUGINS, black_body, mixture, phong, turned_to_y
 from render.stage import Stage
 from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
 
 
 def rendered(scene) -> np.ndarray:
     """A frame's light (H, W, 3), with what is seen directly."""
-    shot = Shot(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
-    return np.add(*shot.tracer.radiance(shot.ray, 0, 2)) + shot.emission
+    posed = PosedFrame(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
+    return np.add(*posed.tracer.radiance(posed.ray, 0, 2)) + posed.emission
 
 
 def old(bsdf: str) -> str:
@@ -72,7 +72,7 @@ CASES = {
     "lost volume": (new('<bsdf type="diffuse"><texture type="volume" name="reflectance"/></bsdf>'), "volume", 1, 1),
     "lost measurements": (new(named("bsdf", "measured", "no.bsdf")), "grey diffuse", 1, 1),
     "lost mesh": (xml(shape("obj", '<string name="filename" value="no.obj"/>')), "no.obj is missing", 1, 1),
-    "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "even white sky", 1, 1),
+    "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "uniform white sky", 1, 1),
     "lost spectrum": (
         new('<bsdf type="diffuse"><spectrum name="reflectance" filename="no.spd"/></bsdf>'),
         "no.spd of a spectrum is missing",
@@ -94,11 +94,11 @@ CASES = {
         1,
     ),
     "unknown light": (old_xml('<emitter type="collimated"/>'), "has no emitter 'collimated': nothing", 1, 1),
-    "no light": (xml(light=""), "nothing shines: an even white sky", 1, 1),
+    "no light": (xml(light=""), "there is no light: a uniform white sky", 1, 1),
     "two skies": (xml(SKY), "a second sky is left out", 1, 1),
     "spot without picture": (
         xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
-        "without its picture",
+        "without its texture",
         1,
         2,
     ),
@@ -148,13 +148,18 @@ CASES = {
     ),
     "orthographic": (
         xml(camera=CAMERA.replace("perspective", "orthographic").replace('name="fov"', 'name="near_clip"')),
-        "sees the whole scene",
+        "frames the whole scene",
         1,
         1,
     ),
-    "no camera": (xml(camera=""), "there is no camera: one that sees the whole scene", 1, 1),
+    "no camera": (xml(camera=""), "there is no camera: one that frames the whole scene", 1, 1),
     "sensor on a shape": (xml(shape("disk", '<sensor type="irradiancemeter"/>')), "a sensor on a shape", 2, 1),
-    "shining group": (xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')), "do not shine", 2, 1),
+    "shining group": (
+        xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')),
+        "do not emit light",
+        2,
+        1,
+    ),
     "empty group": (
         xml(GROUP.format('<shape type="obj"><string name="filename" value="no.obj"/></shape>')),
         "an instance of nothing",
@@ -169,7 +174,7 @@ CASES = {
         2,
         1,
     ),
-    "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun stands still", 1, 1),
+    "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun does not move", 1, 1),
     "bitmap of nothing": (
         new('<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>'),
         "its file is not named",
@@ -181,7 +186,7 @@ CASES = {
             '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="plastic"/></texture>'
             "</bsdf>"
         ),
-        "a bsdf means nothing here",
+        "a bsdf cannot be nested here",
         1,
         1,
     ),
@@ -190,7 +195,12 @@ CASES = {
     "no place": (xml(shape("cube", '<float name="to_world" value="2"/>')), "its to_world is no transform", 2, 1),
     "material merged": (xml('<shape type="merge"><bsdf type="diffuse"/></shape>'), "merged shapes", 1, 1),
     "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
-    "animation": (old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')), "held", 2, 1),
+    "animation": (
+        old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')),
+        "its first transform instead",
+        2,
+        1,
+    ),
 }
 
 
@@ -277,7 +287,7 @@ def test_black_bodies_shine_as_planck_says():
 
 
 def test_old_skies_have_their_zenith_at_y():
-    made, _ = sky_alone(turned_to_y({"type": "sky", "turbidity": 3.0, "sun_direction": [0.0, 1.0, 0.2]}))
+    made, _ = OLD_PLUGINS["sky"](turned_to_y({"type": "sky", "turbidity": 3.0, "sun_direction": [0.0, 1.0, 0.2]}))
     made["to_world"] = mi.ScalarTransform4f(made["to_world"])
     sky = mi.load_dict({"type": "scene", "sky": made}).emitters()[0]
     si = mi.SurfaceInteraction3f()

@@ -3,7 +3,7 @@
 import pytest
 
 from errors import BadInput
-from render.scene_file.xml import DEEPEST_INCLUDE, MOST_INCLUDES, linear, parse
+from render.scene_file.xml import MAX_INCLUDE_DEPTH, MAX_INCLUDES, linear_colour, parse
 from tests.helpers.scene_files import old_xml, xml
 
 
@@ -71,10 +71,10 @@ def test_names_that_depend_on_parameters(tmp_path):
 def test_bombs(tmp_path):
     for name, next_ in (("a", "b"), ("b", "a")):
         (tmp_path / f"{name}.xml").write_text(included(f"{next_}.xml"))
-    assert str(DEEPEST_INCLUDE) in refusal(tmp_path, included("a.xml"))
+    assert str(MAX_INCLUDE_DEPTH) in refusal(tmp_path, included("a.xml"))
     (tmp_path / "wide.xml").write_text(xml(*['<include filename="leaf.xml"/>'] * 40))
     (tmp_path / "leaf.xml").write_text(xml())
-    assert str(MOST_INCLUDES) in refusal(tmp_path, xml(*['<include filename="wide.xml"/>'] * 40))
+    assert str(MAX_INCLUDES) in refusal(tmp_path, xml(*['<include filename="wide.xml"/>'] * 40))
     laughs = "<!DOCTYPE s [<!ENTITY a 'ha'><!ENTITY b '&a;&a;&a;'>]>" + xml("&b;")
     assert "entities" in refusal(tmp_path, laughs)
     assert "UTF-8" in refusal(tmp_path, laughs.encode("utf-16"))
@@ -120,5 +120,5 @@ def test_elements_of_old_files(tmp_path):
 
 
 def test_colours_of_old_files_become_linear():
-    assert [float(x) for x in linear("#ff8000").split(",")] == pytest.approx([1, 0.2158605, 0], abs=1e-6)
-    assert [float(x) for x in linear("0.5, 0 1").split(",")] == pytest.approx([0.2140411, 0, 1], abs=1e-6)
+    assert [float(x) for x in linear_colour("#ff8000").split(",")] == pytest.approx([1, 0.2158605, 0], abs=1e-6)
+    assert [float(x) for x in linear_colour("0.5, 0 1").split(",")] == pytest.approx([0.2140411, 0, 1], abs=1e-6)

@@ -1,4 +1,4 @@
-"""One frame of a scene, posed and ready to be path-traced as often as one likes."""
+"""One frame of a scene, ready to be path-traced repeatedly."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,12 @@ FloatImage = NDArray[np.float64]  # (H, W, 3)
 
 
 def finite_or_zero(image: NDArray[np.floating]) -> FloatImage:
-    """float64; what is infinite or not a number becomes 0."""
+    """The image in float64, with non-finite values set to 0."""
     return np.nan_to_num(image.astype(np.float64), nan=0, posinf=0, neginf=0)
 
 
-class Shot:
-    """One frame of a scene, which the constructor poses `stage` for: valid until the stage is posed anew."""
+class PosedFrame:
+    """One frame of a scene. The constructor poses `stage`; valid until it is posed again."""
 
     def __init__(self, stage: Stage, frame: int, regularise: bool = False):
         stage.pose(frame)
@@ -31,5 +31,5 @@ class Shot:
         return finite_or_zero(np.add(*self.tracer.radiance(self.ray, seed, spp)))
 
     def radiance(self, seed: int, spp: int) -> FloatImage:
-        """All radiance (H, W, 3): emission, which costs no samples, plus what is reflected."""
+        """Emitted + reflected radiance (H, W, 3)."""
         return self.reflected(seed, spp) + self.emission

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from errors import BadInput
 from provenance import ROOT
 from render.job.profiles import OWN_CLIPS, OWN_QUALITY
+from render.scene_file.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Track
-from scenes.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
 
 EVERYTHING = """
 file = "a.xml"
@@ -90,7 +90,7 @@ REFUSED = {
     "file = 'a'\n[[camera]]\ntime = 0\nposition = [0,0,0]\ntarget = [0,0,inf]": "infinite",
     "file = 'a'\n[[camera]]\ntime = 0\nposition = [0,0,0]\ntarget = [0,0,1]\nfov = 180": "fov",
     "file = 'a'\n[[motion]]\nshape = 'b'\nkeyframes = []": "keyframes",
-    "file = 'a'\n[[motion]]\nshape = 'b'\nkeyframes = [{time=1},{time=0}]": "do not rise",
+    "file = 'a'\n[[motion]]\nshape = 'b'\nkeyframes = [{time=1},{time=0}]": "do not increase",
     "file = 'a'\n[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=-1}]": "gain",
     "file = 'a'\n" + 2 * "[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=1}]\n": "'b' has keyframes twice",
     "file = 'a": "docs/scenes.md",

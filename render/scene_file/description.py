@@ -1,4 +1,4 @@
-"""A user's own scene, described by a TOML file: which file it is, how the camera flies, what moves, what to render."""
+"""The TOML description of a user's own scene: its file, camera flight, motion and what to render."""
 
 import math
 from collections.abc import Sequence
@@ -10,58 +10,58 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from datasets.clip import SPLITS
 from errors import BadInput
 from scenes.animation import Camera, FreeMotion, KeyframedTrack
 from scenes.camera import Array
 
-SPLITS = ("train", "val", "test")
 Vector = tuple[float, float, float]
 Positive = Annotated[int, Meta(ge=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame, 1 its last
 Even = Annotated[int, Meta(ge=2, multiple_of=2)]
 
 
-class CameraKey(msgspec.Struct, forbid_unknown_fields=True):
-    """Where the camera is at a time, what it looks at, which way is up, and its horizontal field of view in degrees."""
+class Table(msgspec.Struct, forbid_unknown_fields=True):
+    """A table of the TOML."""
+
+
+class CameraKey(Table):
+    """The camera at a time; `fov` is horizontal, in degrees."""
 
     time: Fraction
     position: Vector
     target: Vector
-    up: Vector | None = None  # the file's where none is given
+    up: Vector | None = None  # by default the file's, as `fov`
     fov: Annotated[float, Meta(gt=0, lt=180)] | None = None
 
 
-class PoseKey(msgspec.Struct, forbid_unknown_fields=True):
-    """How far a shape is, at a time, from where it stands in the file; degrees about x, then y, then z."""
+class PoseKey(Table):
+    """The pose of a shape at a time, relative to the file; rotations in degrees about x, then y, then z."""
 
     time: Fraction
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
 
 
-class GainKey(msgspec.Struct, forbid_unknown_fields=True):
-    """How bright a light is at a time, times what the file says."""
+class GainKey(Table):
+    """The brightness of a light at a time, relative to the file."""
 
     time: Fraction
     gain: Annotated[float, Meta(ge=0)]
 
 
-class Motion(msgspec.Struct, forbid_unknown_fields=True):
-    """The keyframes of one shape."""
-
+class Motion(Table):
     shape: str
     keyframes: Annotated[list[PoseKey], Meta(min_length=1)]
 
 
-class LightChange(msgspec.Struct, forbid_unknown_fields=True):
-    """The keyframes of one light."""
-
+class LightChange(Table):
     light: str
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
 
-class Split(msgspec.Struct, forbid_unknown_fields=True):
-    """The clips of a split. What is left out is as docs/scenes.md says."""
+class SplitRequest(Table):
+    """The clips of a split, with the defaults of docs/scenes.md."""
 
     clips: Annotated[int, Meta(ge=0)] | None = None
     camera: Literal["auto", "keyframes"] | None = None
@@ -71,50 +71,48 @@ class Split(msgspec.Struct, forbid_unknown_fields=True):
     most_spp: Even | None = None
 
 
-class Description(msgspec.Struct, forbid_unknown_fields=True):
-    """The content of the TOML file."""
-
+class Description(Table):
     file: str  # a Mitsuba XML, glTF, OBJ or PLY; relative to the TOML
     resolution: tuple[Positive, Positive] = (256, 144)  # width, height
     frames: Positive = 16
-    bounces: Positive | None = None  # of light, 1 is direct light alone; the file's own where it says
+    bounces: Positive | None = None  # of light, 1 is direct light alone; by default the file's
     camera: list[CameraKey] = []
     motion: list[Motion] = []
     light: list[LightChange] = []
-    splits: dict[str, Split] = {}  # train, val, test
+    splits: dict[str, SplitRequest] = {}  # train, val, test
 
 
 def read_description(path: Path) -> Description:
-    """Raises BadInput, naming the file and the place in it, where it is missing or says what cannot be."""
+    """Raises BadInput, naming the file and the position in it, if it is missing or invalid."""
     try:
         described = msgspec.toml.decode(path.read_bytes(), type=Description)
     except OSError as error:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, ValueError) as error:
-        raise BadInput(f"{path}: {error}; docs/scenes.md shows what it may say") from None
-    if not finite(msgspec.to_builtins(described)):
+        raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
+    if not all_finite(msgspec.to_builtins(described)):
         raise BadInput(f"{path}: a number is infinite or not a number")
     unknown = set(described.splits) - set(SPLITS)
     if unknown:
         raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
-    times_of_all = [[key.time for key in described.camera]]
-    times_of_all += [[key.time for key in motion.keyframes] for motion in described.motion]
-    times_of_all += [[key.time for key in change.keyframes] for change in described.light]
-    for times in times_of_all:
+    all_keys: list[Sequence[CameraKey | PoseKey | GainKey]] = [described.camera]
+    all_keys += [motion.keyframes for motion in described.motion]
+    all_keys += [change.keyframes for change in described.light]
+    for times in ([key.time for key in keys] for keys in all_keys):
         if times != sorted(set(times)):
-            raise BadInput(f"{path}: the times {times} of keyframes do not rise: put them in order, each time once")
+            raise BadInput(f"{path}: the times {times} of keyframes do not increase: put them in order, each time once")
     for names in ([motion.shape for motion in described.motion], [change.light for change in described.light]):
         if len(set(names)) < len(names):
-            raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: put them into one table")
+            raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: merge them into one table")
     if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
-        raise BadInput(f"{path}: a split flies by keyframes, but there are none: add [[camera]] tables")
+        raise BadInput(f"{path}: a split's camera uses keyframes, but there are none: add [[camera]] tables")
     return described
 
 
-def finite(value: Any) -> bool:
-    """Whether all numbers in plain data are."""
+def all_finite(value: Any) -> bool:
+    """Whether all numbers in plain data are finite."""
     if isinstance(value, dict | list | tuple):
-        return all(map(finite, value.values() if isinstance(value, dict) else value))
+        return all(map(all_finite, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, float) or math.isfinite(value)
 
 
@@ -124,7 +122,7 @@ def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frame
 
 
 def camera_of(keys: list[CameraKey], file: Camera, frames: int) -> Camera:
-    """The camera that flies by `keys`; what they leave out is as in the `file`."""
+    """The camera with keyframes `keys`; what they omit is as in the `file`."""
     times = [key.time for key in keys]
     x, y, z = file.up.at(0).tolist()
     fov = float(file.x_fov.at(0))
@@ -137,7 +135,7 @@ def camera_of(keys: list[CameraKey], file: Camera, frames: int) -> Camera:
 
 
 def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
-    """The motion of a shape that turns about `pivot` (3,), its centre in the file."""
+    """The motion of a shape that rotates about `pivot` (3,), its centre in the file."""
     times = [key.time for key in keys]
     turns = spline([key.rotation for key in keys], times, frames)
     turns = replace(turns, keys=np.radians(turns.keys))
@@ -145,5 +143,5 @@ def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
 
 
 def gain_of(keys: list[GainKey], frames: int) -> KeyframedTrack:
-    """What a light is multiplied by: along straight lines, for a spline could fall below 0."""
+    """A factor on a light, interpolated linearly because a spline could become negative."""
     return replace(spline([key.gain for key in keys], [key.time for key in keys], frames), straight=True)

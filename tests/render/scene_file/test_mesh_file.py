@@ -10,7 +10,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from errors import BadInput
-from scenes.mesh_file import linear, load_mesh_file, texture
+from render.scene_file.mesh_file import linear_image, load_mesh_file, texture
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
 OBJ = f"mtllib m.mtl\n{TRIANGLE}usemtl red\nf 1/1 2/2 3/3\n"
@@ -64,11 +64,11 @@ def test_materials_of_gltf(tmp_path):
     assert box.mesh.visual.uv.shape == (len(box.mesh.vertices), 2)
     bsdf = box.bsdf["bsdf"]
     assert bsdf["type"] == "principled"
-    np.testing.assert_allclose(bsdf["base_color"]["data"], linear(picture())[::-1], rtol=1e-6)
+    np.testing.assert_allclose(bsdf["base_color"]["data"], linear_image(picture())[::-1], rtol=1e-6)
     channels = np.asarray(picture(1), float)[::-1] / 255
     np.testing.assert_allclose(bsdf["roughness"]["data"], channels[..., 1:2] * 0.25, rtol=1e-5)
     np.testing.assert_allclose(bsdf["metallic"]["data"], channels[..., 2:3] * 0.5, rtol=1e-5)
-    assert found.sky is not None and found.notes == ["nothing shines: a clear sky with the sun, y up"]
+    assert found.sky is not None and found.notes == ["there is no light: a clear sky with the sun, y up"]
 
 
 def test_factors_relief_and_light_of_gltf(tmp_path):
@@ -93,7 +93,7 @@ def test_factors_relief_and_light_of_gltf(tmp_path):
 
 def test_srgb_pictures_become_linear():
     """As IEC 61966-2-1 has it: byte 188 is half of white, 10 lies on the straight part."""
-    values = linear(Image.fromarray(np.uint8([[[0, 10, 188]], [[255, 255, 255]]])))
+    values = linear_image(Image.fromarray(np.uint8([[[0, 10, 188]], [[255, 255, 255]]])))
     np.testing.assert_allclose(values, [[[0, 10 / 255 / 12.92, 0.5029]], [[1, 1, 1]]], atol=1e-4)
     assert texture(values)["data"][0, 0, 0] == 1  # the last row is v = 0
 
@@ -140,7 +140,9 @@ def test_materials_of_obj(tmp_path):
     assert ["gloss" in note for note in found.notes] == [True, False] and "transparency" in found.notes[1]
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0 0 0\nd 1\nmap_Kd tex.png\n")
     found = load_mesh_file(tmp_path / "scene.obj", 1.0)
-    np.testing.assert_allclose(found.shapes[0].bsdf["bsdf"]["reflectance"]["data"], linear(picture())[::-1], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.shapes[0].bsdf["bsdf"]["reflectance"]["data"], linear_image(picture())[::-1], rtol=1e-6
+    )
     assert len(found.notes) == 1  # of the sky
 
 

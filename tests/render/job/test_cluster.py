@@ -52,7 +52,7 @@ def test_a_killed_worker_costs_nothing_but_time(tiny, tiny_copy):
     assert not [path for path in tiny_copy.rglob(".*") if path.name != ".dataset.json"]
 
 
-@pytest.mark.slow  # tests/datasets/test_generate.py has both without a cluster
+@pytest.mark.slow  # test_generate.py has both without a cluster
 def test_a_failing_clip_does_not_stop_the_others_but_a_full_disk_does(tiny, tmp_path):
     """A negative seed fails in the renderer; a file where a folder should be stands in for trouble with the disk."""
     root = tmp_path / "data"

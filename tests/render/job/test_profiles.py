@@ -15,18 +15,14 @@ from errors import BadInput
 from models.registry import channels_read, create
 from render.clip import NO_OPTIONS
 from render.job import pilots
-from render.job.adaptive_spp import noise_of_reference, samples_needed
 from render.job.clip_job import render_to_folder
 from render.job.generate import Share, generate
-from render.job.pilots import choose_rooms
+from render.job.pilots import choose_rooms, noise_of_reference, samples_needed
+from render.job.plan import clips_of, plan, rooms_of
 from render.job.profiles import (
     DataProfile,
     SamplingQuality,
-    clips_of,
-    plan,
     profile_of,
-    rendered_channels,
-    rooms_of,
 )
 from render.stage import Stage
 from scenes.registry import build_scene
@@ -170,7 +166,7 @@ def test_references_stop_at_the_most(tmp_path):
 
 
 def test_rooms_that_would_need_too_many_samples_are_passed_over():
-    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, passes_over=True)
+    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 3}, quality={"test": bounded})
     needed = choose_rooms(profile, 0, NO_OPTIONS, {})
     chosen = [f"test/{room}" for room in rooms_of(profile, "test", 0, needed)]
@@ -183,7 +179,7 @@ def test_rooms_that_would_need_too_many_samples_are_passed_over():
 
 def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
     monkeypatch.setattr(pilots, "needed_for", lambda *_: 4096)
-    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, passes_over=True)
+    bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 2}, quality={"test": bounded})
     with pytest.raises(BadInput, match="fewer than 2 in 64 rooms reach 90 dB within 128 spp"):
         choose_rooms(profile, 0, NO_OPTIONS, {})
@@ -212,7 +208,7 @@ def static_box(root: Path, split: str) -> Clip:
 
 def test_what_nobody_reads_is_not_rendered(lean):
     clip = static_box(lean, "train")
-    assert set(clip.channels) == set(rendered_channels(READS)) < set(CHANNELS)
+    assert set(clip.channels) == set(plan("tiny", 0, READS)["channels"]["train"]) < set(CHANNELS)
     with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
         clip.read("dual_motion", 1)
     assert set(static_box(lean, "test").channels) == set(USUAL_CHANNELS)

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 import render.job.clip_job
-import render.job.clip_scene
+import render.job.plan
 from datasets.clip import Dataset, is_clip
 from datasets.info import summarise
 from errors import BadInput
 from files import locked
 from render.job.clip_job import RenderJob
 from render.job.generate import Share, generate
-from render.job.profiles import plan
+from render.job.plan import plan
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 
 
@@ -156,14 +156,14 @@ def test_what_is_no_share_is_refused(text):
 
 def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
     failing, other = remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = render.job.clip_scene.build_scene
+    genuine = render.job.plan.build_scene
 
     def broken(name, seed, frames):
         if name == "cornell_box":
             raise RuntimeError("no such texture")
         return genuine(name, seed, frames)
 
-    monkeypatch.setattr(render.job.clip_scene, "build_scene", broken)
+    monkeypatch.setattr(render.job.plan, "build_scene", broken)
     with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
         generate_tiny(tiny_copy)
     assert is_clip(other)
@@ -221,7 +221,7 @@ def test_a_data_set_is_not_continued_with_other_versions(tiny_copy):
 
 def test_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(BadInput, match="something else"):
+    with pytest.raises(BadInput, match="something other"):
         generate_tiny(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="is a file"):

@@ -1,0 +1,116 @@
+"""The plan of a dataset: its clips, their seeds, scenes and channels."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
+from datasets.clip import SCHEMA, SPLITS
+from datasets.clip_kind import ClipKind
+from errors import BadInput
+from provenance import RENDERING, versions
+from render.clip import NO_OPTIONS, Options
+from render.job.profiles import DataProfile, profile_of, source_of
+from render.scene_file.description import SplitRequest
+from render.scene_file.load import own_scene
+from scenes.animation import Scene
+from scenes.registry import build_scene
+
+GENERATOR = 8  # to be increased when the same seed renders different bytes
+NeededSpp = Mapping[str, int]  # SPLIT/SCENE/CLIP: samples a pixel that references need, where a pilot has measured it
+NO_PILOTS: NeededSpp = {}
+BOXES = ("cornell_box", "cornell_box_moving")
+FIRST_ROOM = {"train": 0, "val": 1000, "test": 2000}  # the number of a split's first room, for seed 0
+ROOMS_OF_A_SEED = 10_000
+
+
+def rooms_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp) -> list[str]:
+    """The rooms of a split, each as SCENE/CLIP: the first ones that are not skipped."""
+    quality = profile.quality[split]
+    names = (f"room-{number}/000" for number in count(ROOMS_OF_A_SEED * seed + FIRST_ROOM[split]))
+    if quality.skips_noisy_rooms:
+        names = (name for name in names if needed_spp.get(f"{split}/{name}", 0) <= quality.most_spp)
+    return list(islice(names, profile.rooms[split]))
+
+
+def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp = NO_PILOTS) -> list[str]:
+    """All clips of a split, each as SCENE/CLIP, for the dataset with that seed. Close-ups are of other rooms."""
+    boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes[split])]
+    rooms = rooms_of(profile, split, seed, needed_spp)
+    first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms[split]
+    closeups = [f"closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
+    return boxes + rooms + closeups + profile.special.get(split, [])
+
+
+def check_seed(seed: int) -> None:
+    """Raise BadInput for a negative seed of a dataset."""
+    if seed < 0:
+        raise BadInput(f"the seed {seed} is negative: use 0 or more")
+
+
+def plan(
+    profile: str,
+    seed: int,
+    reads: Sequence[str] = USUAL_CHANNELS,
+    options: Options = NO_OPTIONS,
+    needed_spp: NeededSpp = NO_PILOTS,
+) -> dict[str, Any]:
+    """The content of dataset.json.
+
+    Clips for training and validation get the essential channels and those in `reads`; test clips get all for metrics,
+    but sample buffers only if `reads` names them. Raises BadInput for an unknown profile or a negative seed.
+    """
+    check_seed(seed)
+    described = profile_of(profile)
+    splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
+    if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are sampled together
+        reads = (*reads, *SAMPLE_BUFFERS.values())
+    train = [name for name, channel in CHANNELS.items() if channel.essential or name in reads]
+    test = [name for name in CHANNELS if name in USUAL_CHANNELS or name in reads]
+    return {
+        "schema": SCHEMA,
+        "profile": profile,
+        "generator": GENERATOR,
+        "versions": versions(RENDERING),
+        "seed": seed,
+        "scenes": list(dict.fromkeys(clip.split("/")[0] for clips in splits.values() for clip in clips)),
+        "options": options._asdict(),
+        "channels": {"train": train, "val": train, "test": test},
+        "splits": splits,
+        "needed_spp": dict(needed_spp),
+        "source": source_of(described),
+        "notes": [] if described.own is None else own_scene(described.own).notes,
+    }
+
+
+def clip_seed(seed: int, scene: str, split: str, number: int) -> int:
+    """The 64-bit seed of a clip, independent of other clips. `seed` is that of the dataset."""
+    words = [seed, zlib.crc32(scene.encode()), zlib.crc32(split.encode()), number]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
+
+
+def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tuple[Scene, int]:
+    """The scene and the seed of the clip whose path ends in SPLIT/SCENE/CLIP.
+
+    Raises BadInput for an unknown scene or clip name, and for a user's own scene that cannot be used.
+    """
+    split, scene_name, clip_name = folder.parts[-3:]
+    kind = ClipKind.of(clip_name)
+    seed = clip_seed(dataset_seed, scene_name, split, kind.number)
+    if profile.own is None:
+        scene = build_scene(scene_name, seed, profile.frames)
+    else:
+        scene = clip_of_own_scene(profile.own, split, kind.number, profile.frames, seed)
+    return (scene.still() if kind.still else scene), seed
+
+
+def clip_of_own_scene(path: Path, split: str, number: int, frames: int, seed: int) -> Scene:
+    """A clip of the scene that a TOML describes; the first test clip begins with the file's camera."""
+    own = own_scene(path)
+    camera = own.described.splits.get(split, SplitRequest()).camera
+    by_keyframes = camera == "keyframes" or (camera is None and bool(own.described.camera))
+    return own.clip(frames, seed, by_keyframes, from_here=split == "test" and number == 0)
