@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -21,12 +21,30 @@ from eval.metrics import Values, measure, noise_floors, temporal_error_floor
 from eval.results import REFERENCE, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
-from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import denoise_with_error
 from models.wrappers.shrinkage import JamesStein
 from provenance import file_digest
 
 METRICS_CHANNELS = ("motion", "dual_motion")
+
+
+class RunnableSpec(Protocol):
+    """What a run needs of a models.spec.DenoiserSpec.
+
+    That module imports all denoisers, and results of one must not depend on the code of the others.
+    """
+
+    @property
+    def returns(self) -> Signal: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def weights(self) -> Path | None: ...
+    @property
+    def device(self) -> str: ...
+    @property
+    def modules(self) -> tuple[str, ...]: ...
+    def build(self) -> Denoiser: ...
 
 
 @dataclass
@@ -37,7 +55,7 @@ class NamedDenoiser:
         saves_error: whether to store error maps, where it is a NAME+js and frames have two sample buffers.
     """
 
-    spec: DenoiserSpec
+    spec: RunnableSpec
     name: str
     saves_error: bool = False
 

@@ -150,7 +150,7 @@ class PathTracer:
         """(direct, indirect) radiance along primary rays, each with the random numbers of its `pixel` (row-major)."""
         stage = self.stage
         if self.frozen_pose != stage.poses:
-            # Tracing the program in Python takes longer than running it at 1 spp, so it is frozen and replayed, with the
+            # Tracing the program in Python takes longer than running it at 1 spp, so it is frozen and replayed with the
             # palette, whose objects kernels may call, as state. Frozen functions miss some changes of meshes (Dr.Jit
             # 1.5), so each is used for one pose only.
             frozen = dr.freeze(sample_mean, state_fn=lambda *_, **__: palette())

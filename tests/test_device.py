@@ -12,7 +12,7 @@ from denoise.job import Job
 from denoise.run import denoise
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.harness import entrant, evaluate_clip
+from eval.harness import evaluate_clip, named_denoisers
 from models.registry import DENOISERS
 from models.spec import DenoiserSpec
 from tests.helpers import foreign
@@ -62,7 +62,7 @@ def test_evaluation_on_a_device(tiny, tmp_path):
     clip = Dataset(tiny).clips("test")[0]
     with other_device() as device:
         specs = [DenoiserSpec.named("eaw", device=each) for each in ("cpu", device)]
-        results = [evaluate_clip(clip, [entrant(spec)], tmp_path, quiet=True)[0] for spec in specs]
+        results = [evaluate_clip(clip, named_denoisers([spec]), tmp_path, quiet=True)[0] for spec in specs]
     assert results[0].key != results[1].key
     assert results[1].metrics["rmse"] == pytest.approx(results[0].metrics["rmse"], rel=1e-4)
 

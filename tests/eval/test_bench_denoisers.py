@@ -174,8 +174,8 @@ def test_repvgg_is_counted_as_it_runs():
 
 
 def test_what_is_measured(monkeypatch, capsys):
-    gone = "gone fishing"
-    monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: gone if name == "oidn" else None)
+    gone = "it is not installed"
+    monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: gone if str(name) == "oidn" else None)
     assert "oidn" not in {spec.name for spec in timed_specs(())}
     assert f"oidn: skipped, {gone}" in capsys.readouterr().out
     assert "oidn" not in {spec.name for spec in timed_specs(["noisy"])}

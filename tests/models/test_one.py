@@ -147,7 +147,7 @@ def test_a_still_wall_stays_what_it_is(fresh):
 def test_the_state_is_small(fresh):
     _, state = play(fresh, frames(noise(1)))
     images = [state.output, state.accumulated, state.length, state.latent, state.alpha]
-    tensors = [*images, state.surfaces.depth, state.surfaces.normal, state.surfaces.mesh_id]
+    tensors = [*images, state.gbuffer.depth, state.gbuffer.normal, state.gbuffer.mesh_id]
     bytes_a_pixel = sum(tensor.nbytes for tensor in tensors) / (SIZE[0] * SIZE[1])
     assert bytes_a_pixel * 1280 * 720 <= BYTES_AT_720P
 

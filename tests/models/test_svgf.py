@@ -377,9 +377,9 @@ def test_the_output_stays_in_the_range_of_the_input(denoiser, size, seed, level)
         if visible.numel():
             low = min(low, visible.min().item())
             high = max(high, visible.max().item())
-            output, state = made(frame, state)
-    shown = output[0, :, mesh > 0]
-    assert (shown >= low * (1 - 1e-5)).all() and (shown <= high * (1 + 1e-5)).all()
+        output, state = made(frame, state)
+        shown = output[0, :, mesh > 0]
+        assert (shown >= low * (1 - 1e-5)).all() and (shown <= high * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("denoiser", [SVGF, EAW])
