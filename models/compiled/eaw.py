@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled.arrays import Image, Index, Row, Scalar, f32
+from models.compiled.arrays import RGB, Image, Index, Row, Rows, Scalar, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
-from models.compiled.lines import add_square, add_weighted, divide_line, fill_line, triple, triple_of_lines, window_taps
+from models.compiled.lines import add_square, divide_line, fill_line, triple, triple_of_lines, window_taps
 from models.filters.atrous import B3_SPLINE, RADIUS
 
 SPLINE = np.array(B3_SPLINE, np.float32)
@@ -22,26 +22,36 @@ def decay(a: Scalar) -> Scalar:
 
 
 @jit_in_any_order
-def decay_line(line: Row, scale: Scalar) -> None:
-    """Distances become weights: scale exp(-distance)."""
-    for x in range(line.size):
-        line[x] = scale * decay(line[x])
+def add_tap(sums: RGB, total: Row, h: Scalar, distance: Row, colour: RGB) -> None:
+    """Add one tap of n pixels, weighted by h exp(-distance), to the sums of colours and of weights."""
+    red, green, blue = sums
+    from_red, from_green, from_blue = colour
+    for i in range(distance.size):
+        w = h * decay(distance[i])
+        total[i] += w
+        red[i] += w * from_red[i]
+        green[i] += w * from_green[i]
+        blue[i] += w * from_blue[i]
 
 
-@jit_with_memory
-def filter_row(out: Image, row: Index, colour: Image, features: Image, step: int) -> None:
+@jit_in_any_order
+def sum_row(sums: Rows, space: Row, row: Index, colour: Image, features: Image, step: int) -> None:
+    """Add all taps of a row to sums (4, W), of colours and of weights; space (W) is scratch."""
     _, height, width = colour.shape
-    sums = np.zeros((4, width), np.float32)
-    space = np.empty(width, np.float32)
     for dx, dy, left, right in window_taps(row, RADIUS, step, height, width):
         distance = space[: right - left]
         fill_line(distance, f32(0))
         for c in range(len(features)):
             add_square(distance, features[c, row, left:right], features[c, row + dy, left + dx : right + dx])
         h = SPLINE[dy // step + RADIUS] * SPLINE[dx // step + RADIUS]
-        decay_line(distance, h)
         there = triple(colour, row + dy, left + dx, right + dx)
-        add_weighted(triple_of_lines(sums, left, right), sums[3, left:right], distance, there)
+        add_tap(triple_of_lines(sums, left, right), sums[3, left:right], h, distance, there)
+
+
+@jit_with_memory
+def filter_row(out: Image, row: Index, colour: Image, features: Image, step: int) -> None:
+    sums = np.zeros((4, colour.shape[2]), np.float32)
+    sum_row(sums, np.empty(colour.shape[2], np.float32), row, colour, features, step)
     for c in range(3):
         divide_line(out[c, row], sums[c], sums[3])
 

@@ -466,16 +466,19 @@ def add_spatial_tap(sums: RGB, weight: Row, centre: Row, mean: Row, variance: Ro
         squares[i] += weight[i] * (off * off + variance[i])
 
 
-@jit_with_memory
+@jit_in_any_order
 def sum_spatial_block(
-    sums: Image, row: Index, first: Index, last: Index, variance: Image, mean: Image, geometry: Image
+    sums: Image, space: Row, row: Index, first: Index, last: Index, variance: Image, mean: Image, geometry: Image
 ) -> None:
-    """sums (S, 3, SPATIAL_BLOCK) over the windows of the pixels `first` to `last` - 1 of a row of (S, H, W)."""
+    """sums (S, 3, SPATIAL_BLOCK) over the windows of the pixels `first` to `last` - 1 of a row of (S, H, W).
+
+    space (SPATIAL_BLOCK) is scratch.
+    """
     signals, height, width = variance.shape
-    space = np.empty(SPATIAL_BLOCK, np.float32)
-    sums[:, 0] = 1
-    sums[:, 1] = 0
-    sums[:, 2, : last - first] = variance[:, row, first:last]
+    for s in range(signals):
+        sums[s, 0] = 1
+        sums[s, 1] = 0
+        copy_line(sums[s, 2, : last - first], variance[s, row, first:last])
     for dx, dy, inside, outside in window_taps(row, SPATIAL_RADIUS, 1, height, width):
         left = max(inside, first)
         right = min(outside, last)
@@ -496,11 +499,12 @@ def spatial_variance_row(out: Image, row: Index, variance: Image, mean: Image, g
     """A row of out (S, H, W) `where` (H, W) it is wanted."""
     signals, _, width = variance.shape
     sums = np.empty((signals, 3, SPATIAL_BLOCK), np.float32)
+    space = np.empty(SPATIAL_BLOCK, np.float32)
     for first in range(0, width, SPATIAL_BLOCK):
         last = min(first + SPATIAL_BLOCK, width)
         if not where[row, first:last].any():
             continue
-        sum_spatial_block(sums, row, first, last, variance, mean, geometry)
+        sum_spatial_block(sums, space, row, first, last, variance, mean, geometry)
         for s in range(signals):
             for x in range(first, last):
                 if where[row, x]:
