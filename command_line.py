@@ -45,7 +45,7 @@ Threads = Annotated[int | None, arg(metavar="N", help="by default as many as PyT
 Flag = Annotated[bool, FlagCreatePairsOff]
 Png = Annotated[Path, arg(metavar="PNG", help="the image to write")]
 RUNS = Path("runs")
-SAMPLES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+DEFAULT_SPP = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
 def data_folder(data: Path | None, name: str) -> Path:
@@ -230,22 +230,6 @@ def show(
         print(path)
 
 
-def study_triptych(
-    scene: Annotated[str, Positional, arg(metavar="SCENE", help="a built-in one")] = "room-2014",
-    denoiser: Annotated[str, arg(metavar="NAME")] = "one",
-    out: Png = RUNS / "triptych.png",
-    runs: Runs = RUNS,
-    frame: Annotated[int, arg(metavar="N", help="frame number; history begins at 0")] = 12,
-    spp: Annotated[int, arg(metavar="N", help="samples per pixel of the reference")] = 512,
-) -> None:
-    """Draw a 1280 x 720 frame in three strips: noisy, denoised, reference. Takes minutes."""
-    from eval.studies.triptych import triptych
-
-    out.parent.mkdir(parents=True, exist_ok=True)
-    triptych(out, scene, denoiser, runs, frame, spp)
-    print(out)
-
-
 def export(
     name: Annotated[
         str, Positional, arg(metavar="DENOISER", help="wskp3, wskp6 or one; NAME@BUDGET for weights in RUNS")
@@ -263,18 +247,6 @@ def export(
     from eval.export import export as write
 
     print(write(name, to, runs, weights, precision, warp, out))
-
-
-def bench_export(
-    name: Annotated[str, Positional, arg(metavar="DENOISER", help="wskp3 or wskp6")] = "wskp6",
-    runs: Runs = RUNS,
-    size: Size = "1280x720",
-    threads: Threads = None,
-) -> None:
-    """Time an exported denoiser under onnxruntime beside ours."""
-    from eval.bench.export import bench_export as bench
-
-    print(bench(runs, name, size, threads))
 
 
 def bench_denoisers(
@@ -299,34 +271,14 @@ def bench_rendering(names: Scenes = (), runs: Runs = RUNS) -> None:
     print(bench(runs, names))
 
 
-def study_light(names: Denoisers = (), runs: Runs = RUNS, budget: Budget = "quick") -> None:
-    """How many frames the output lags after a light changes, by its quality under steady light.
+def bench_light(names: Denoisers = (), runs: Runs = RUNS, budget: Budget = "quick") -> None:
+    """Measure how many frames the output lags after a light changes.
 
-    Renders four clips of the Cornell box in a few minutes; table, plot and results.json in RUNS/study/light.
+    Renders four clips of the Cornell box in a few minutes; table, plot and results.json in RUNS/bench/light.
     """
-    from eval.studies.light import study_light as study
+    from eval.bench.light import bench_light as bench
 
-    print(study(runs, names, budget))
-
-
-def study_error(names: Denoisers = (), runs: Runs = RUNS) -> None:
-    """How close estimated errors and predicted sample counts are to the true ones.
-
-    Renders four clips in about ten minutes and filters them at 4 to 128 spp; table, plots and results.json in
-    RUNS/study/error.
-    """
-    from eval.studies.error import study_error as study
-
-    print(study(runs, names))
-
-
-def bench_training(
-    names: Denoisers = (), data: DataOfBudget = None, runs: Runs = RUNS, budget: Budget = "quick"
-) -> None:
-    """Measure where the time of a training step goes, by default of rae, wskp6 and ntd."""
-    from eval.bench.training import bench_training as bench
-
-    print(bench(data_folder(data, budget), runs, budget, names))
+    print(bench(runs, names, budget))
 
 
 def stress(
@@ -354,7 +306,7 @@ def trade(
     budget: Budget = "quick",
     size: Annotated[str, arg(metavar="WxH", help="of the images that were timed")] = "1280x720",
     threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
-    spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = SAMPLES,
+    spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = DEFAULT_SPP,
 ) -> None:
     """Compare quality with milliseconds, by denoiser, precision and samples per pixel: tables, plots, trade.json.
 
@@ -411,21 +363,12 @@ GROUPS: dict[str, Commands] = {
         "show": show,
         "trade": trade,
         "stress": stress,
-        "bench": {
-            "denoisers": bench_denoisers,
-            "rendering": bench_rendering,
-            "training": bench_training,
-            "export": bench_export,
-        },
+        "bench": {"denoisers": bench_denoisers, "light": bench_light, "rendering": bench_rendering},
     },
 }
-STUDIES: Commands = {"light": study_light, "error": study_error, "triptych": study_triptych}
 TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
-SUMMARIES = {
-    "bench": "Measure this machine: denoisers, rendering, training, export.",
-    "study": "Repeat a study that the documentation cites: light, error, triptych.",
-}
+SUMMARIES = {"bench": "Measure speed and memory of denoisers, their lag after a light changes, and the renderer."}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -450,7 +393,7 @@ def run(words: list[str]) -> None:
     """Call the command that `words` begin with; print an overview where they ask for help."""
     path = "onespp"
     groups = GROUPS
-    commands = {name: command for group in GROUPS.values() for name, command in group.items()} | {"study": STUDIES}
+    commands = {name: command for group in GROUPS.values() for name, command in group.items()}
     while words and words[0] not in ("-h", "--help"):
         name, *words = words
         if name not in commands:
@@ -479,8 +422,6 @@ def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
             yield from (f"{'':<{MARGIN}}{line}" for line in rest)
         yield ""
     yield f"`{path} COMMAND --help` shows the options of each."
-    if path == "onespp":
-        yield "`onespp study --help` lists the studies that the documentation cites."
 
 
 def complain(message: str) -> int:

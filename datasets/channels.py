@@ -78,7 +78,7 @@ IMAGES = ("F", "H", "W")
 REALISATIONS = ("F", "S", "H", "W")
 NOISY = Channel("noisy", (*REALISATIONS, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True)
 BUFFERS = replace(NOISY, kind="buffers", axes=("F", "S", 2, "H", "W", 3), essential=False)
-REFERENCE = replace(NOISY, kind="reference", axes=("F", 2, "H", "W", 3))
+REFERENCE_LIGHT = replace(NOISY, kind="reference", axes=("F", 2, "H", "W", 3))
 MOTION = Channel("motion", (*IMAGES, 2), "<f4", "px", "XY")
 TRACKED = replace(MOTION, step="shadow_motion", renderer_only=True)  # motion of what causes a pixel's light
 HIT = Channel("hit", (*REALISATIONS, 1), "<f2", LENGTH, "Z", widens=True, step="hit_distance", renderer_only=True)
@@ -88,8 +88,8 @@ CHANNELS: dict[str, Channel] = {
     "indirect": NOISY,
     "direct_halves": replace(BUFFERS, of="direct"),
     "indirect_halves": replace(BUFFERS, of="indirect"),
-    "direct_reference": replace(REFERENCE, of="direct"),
-    "indirect_reference": replace(REFERENCE, of="indirect"),
+    "direct_reference": replace(REFERENCE_LIGHT, of="direct"),
+    "indirect_reference": replace(REFERENCE_LIGHT, of="indirect"),
     "emission": Channel("emission", (*IMAGES, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True),
     "albedo": Channel("surface", (*IMAGES, 3), "<f2", "1", "RGB", essential=True),
     "normal": Channel("surface", (*IMAGES, 3), "<f2", "1", "XYZ"),
@@ -132,4 +132,5 @@ MOTION_CHANNELS = channels_of("motion")
 CAMERA_CHANNELS = channels_of("camera")
 SAMPLE_BUFFERS = forms_of("buffers")
 MIRRORED = forms_of("mirrored")
+OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))  # of rendering
 USUAL_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].kind not in ("buffers", "mirrored"))

@@ -7,14 +7,12 @@ import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, USUAL_CHANNELS
+from datasets.channels import CHANNELS, OPTIONAL_STEPS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
 from errors import BadInput
 from files import read_json
-
-OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))
 
 SecondsByStep = dict[str, float]
 

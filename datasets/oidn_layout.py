@@ -18,7 +18,7 @@ from datasets.exr import write_planes
 from errors import BadInput
 from files import read_json, write_json
 
-FOLDERS = {"train": "train", "val": "valid", "test": "test"}  # as its options are called by default
+SPLIT_FOLDERS = {"train": "train", "val": "valid", "test": "test"}  # as its options are called by default
 TARGET = "reference"  # comes after all numbers
 
 
@@ -36,7 +36,7 @@ def export_dataset(root: Path, out: Path) -> int:
     claim_folder(out, dataset)
     images = 0
     for split, clip in tqdm(clips, "exr", unit="clip"):
-        folder = out / FOLDERS[split]
+        folder = out / SPLIT_FOLDERS[split]
         folder.mkdir(exist_ok=True)
         for frame in range(clip.frames):
             for realisation in range(clip.realisations):

@@ -17,7 +17,7 @@ from denoise.sequence import FrameFiles
 from denoise.sources import Sources
 from errors import BadInput
 
-PAIRS = 4  # of frames that move, by which the convention of motion vectors is detected
+MAX_PAIRS = 4  # of frames that move, by which the convention of motion vectors is detected
 FRAMES = 12  # that are read at most to find them
 
 Report = list[tuple[str, str]]  # a quantity, and where it comes from
@@ -106,7 +106,7 @@ def motion_convention(
     for shot in shots:
         before: Image | None = None
         for files in shot:
-            if count == FRAMES or detector.pairs == PAIRS:
+            if count == FRAMES or detector.pairs == MAX_PAIRS:
                 break
             frame, _ = read_foreign_frame(files, sources)
             now = guides(frame)

@@ -17,8 +17,8 @@ from eval.comparison import Comparison
 from eval.metrics import METRICS
 from files import write_csv
 
-MEASURED = ("rmse", "psnr", "ssim")
-FILE = "metrics.csv"
+COMPARED_METRICS = ("rmse", "psnr", "ssim")
+METRICS_FILE = "metrics.csv"
 
 
 def compare(
@@ -35,14 +35,15 @@ def compare(
         if reference_pair.shape[1:] != denoised.shape[1:]:
             raise BadInput(f"{reference} is of another size than {out / files.name}")
         comparison = Comparison(denoised, reference_pair, exposure)
-        rows.append([files.number, *(METRICS[name].of(comparison) for name in MEASURED)])
-    write_csv(out / FILE, ["frame", *MEASURED], rows)
+        rows.append([files.number, *(METRICS[name].of(comparison) for name in COMPARED_METRICS)])
+    write_csv(out / METRICS_FILE, ["frame", *COMPARED_METRICS], rows)
     columns = zip(*(row[1:] for row in rows), strict=True)
     means = [None if None in column else float(np.mean(column)) for column in columns]
     cells = [
-        "-" if mean is None else METRICS[name].form.format(mean) for name, mean in zip(MEASURED, means, strict=True)
+        "-" if mean is None else METRICS[name].form.format(mean)
+        for name, mean in zip(COMPARED_METRICS, means, strict=True)
     ]
-    return tabulate([cells], [f"mean {METRICS[name].title}" for name in MEASURED], disable_numparse=True)
+    return tabulate([cells], [f"mean {METRICS[name].title}" for name in COMPARED_METRICS], disable_numparse=True)
 
 
 def radiance(path: Path, target: Sequence[str]) -> NDArray[np.float32]:

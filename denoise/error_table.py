@@ -11,7 +11,7 @@ from errors import BadInput
 from files import write_csv
 from models.wrappers.error_estimate import ErrorEstimate
 
-FILE = "error.csv"
+ERROR_FILE = "error.csv"
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ErrorTable:
     """The rows of a folder's frames, written after each. Raises BadInput where the file there is damaged."""
 
     def __init__(self, folder: Path):
-        self.path = folder / FILE
+        self.path = folder / ERROR_FILE
         self.rows: dict[int, FrameError] = {}
         if self.path.exists():
             try:

@@ -12,14 +12,14 @@ from scenes.camera import FAR_OUTSIDE
 
 Image = NDArray[np.float32]
 
-PAIRS = {"XY": slice(0, 2), "ZW": slice(2, 4)}  # Blender's Vector has two: one to each neighbouring frame
+PAIR_COMPONENTS = {"XY": slice(0, 2), "ZW": slice(2, 4)}  # Blender's Vector has two: one to each neighbouring frame
 SIGNS = {"+": 1.0, "-": -1.0}
 UNITS = {  # with their descriptions
     "pixels": "pixels",
     "fractions": "fractions of the image",
     "half-fractions": "fractions of half of it",  # [-1, 1] across
 }
-SAMPLES = 1 << 16  # pixels of a frame that are compared
+COMPARED_PIXELS = 1 << 16  # pixels of a frame that are compared
 MAX_DIFFERENCE = 0.25  # of one pixel's guides: surfaces come into view under any convention
 CLEAR = 0.9  # a detection is certain if its error is below this part of that without motion, and of the runner-up's
 
@@ -53,7 +53,7 @@ class MotionConvention:
         size = np.array([width, height], np.float32)
         units: dict[str, NDArray[np.floating]] = {"pixels": np.ones(2), "fractions": size, "half-fractions": size / 2}
         signs = np.array([SIGNS[self.x], SIGNS[self.y]], np.float32)
-        vectors = motion[..., PAIRS[self.pair]] * units[self.unit] * signs
+        vectors = motion[..., PAIR_COMPONENTS[self.pair]] * units[self.unit] * signs
         return np.nan_to_num(vectors, nan=0, posinf=0, neginf=0).clip(-FAR_OUTSIDE, FAR_OUTSIDE).astype(np.float32)
 
     def description(self) -> str:
@@ -65,7 +65,7 @@ class MotionConvention:
 
 def conventions(components: int) -> list[MotionConvention]:
     """All conventions that vectors of 2 or 4 components may follow, the usual ones first."""
-    pairs = list(PAIRS)[: components // 2]
+    pairs = list(PAIR_COMPONENTS)[: components // 2]
     return [MotionConvention(pair, x, y, unit) for unit, pair, (x, y) in product(UNITS, pairs, product("+-", repeat=2))]
 
 
@@ -77,7 +77,7 @@ def warp_errors(
     Pixels that a vector takes out of the image count as if they had not moved.
     """
     height, width = now.shape[:2]
-    stride = max(1, int(np.ceil(np.sqrt(height * width / SAMPLES))))
+    stride = max(1, int(np.ceil(np.sqrt(height * width / COMPARED_PIXELS))))
     rows, columns = np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
     here = now[rows, columns]
     unmoved = difference(here, before[rows, columns])

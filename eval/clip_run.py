@@ -18,7 +18,7 @@ from eval.comparison import Comparison, Luminances
 from eval.disocclusion_crops import densest_crop
 from eval.means import mean_floor, means
 from eval.metrics import Values, measure, noise_floors, temporal_error_floor
-from eval.results import REFERENCE, Result, result_key, save_error, save_picture
+from eval.results import NOISE_FLOOR, Result, result_key, save_error, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.wrappers.error_estimate import denoise_with_error
@@ -136,7 +136,7 @@ class ReferenceRun:
     """The reference's run through one clip: its noise floors, and the crops with most disocclusions."""
 
     signal: Signal
-    name: str = REFERENCE
+    name: str = NOISE_FLOOR
     reads: tuple[str, ...] = ()
     before: Luminances | None = None
     frames: list[Values] = field(default_factory=list)

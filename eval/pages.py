@@ -18,7 +18,7 @@ from errors import BadInput
 from eval.bench.denoisers import BASELINE
 from eval.metrics import METRICS, Values
 from eval.report.table_rows import TableRow, clip_rows, mean_rows
-from eval.results import REFERENCE, ClipResults, Result, of_one_spp, read_results
+from eval.results import NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
 from eval.text_table import PRINTED
 from eval.tradeoff.samples import SampleTrade
@@ -140,7 +140,7 @@ def evaluated_clips(signal: str = "total") -> list[ClipResults]:
         if row["signal"] == signal:
             place = {"key": "", "signal": signal, "scene": row["scene"], "clip": row["clip"], "frames": []}
             results = [Result(denoiser=name, metrics=values, **place) for name, values in row["results"].items()]
-            reference = Result(denoiser=REFERENCE, metrics=row["floors"], **place)
+            reference = Result(denoiser=NOISE_FLOOR, metrics=row["floors"], **place)
             clips.append(ClipResults(row["scene"], row["clip"], row["signal"], results, reference))
     return clips
 

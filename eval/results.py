@@ -28,7 +28,7 @@ from files import read_json, write_file, write_json
 from provenance import DENOISING, code_digest, versions
 
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
-REFERENCE = "reference"  # the folder of the noise floors
+NOISE_FLOOR = "reference"  # the folder of the noise floors
 FLOOR = "(noise floor)"  # their name in tables
 MAX_SHOWN_ERROR = 0.25  # of exposed radiance
 RESULT_FILE = "result.json"
@@ -105,7 +105,7 @@ class Result:
 
     @property
     def floor(self) -> bool:
-        return self.denoiser == REFERENCE
+        return self.denoiser == NOISE_FLOOR
 
     def save(self, runs: Path) -> None:
         write_json(folder_of(runs, self.scene, self.clip, self.denoiser, self.signal) / RESULT_FILE, asdict(self))
@@ -237,7 +237,7 @@ def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     for row in content["rows"]:
         facts = {name: row[name] for name in KEYS}
         folders = [
-            folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in (row["denoiser"], REFERENCE)
+            folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in (row["denoiser"], NOISE_FLOOR)
         ]
         ours, reference = (load_result(folder) for folder in folders)
         if ours.metrics != row["metrics"]:

@@ -5,12 +5,12 @@ from pathlib import Path
 from errors import BadInput
 from models.registry import DENOISERS
 
-FOLDER = Path(__file__).parent / "shipped"
+SHIPPED_FOLDER = Path(__file__).parent / "shipped"
 
 
 def shipped_weights(name: str) -> Path | None:
     """The shipped weights of a denoiser of the registry; None where there are none."""
-    path = FOLDER / f"{name}.safetensors"
+    path = SHIPPED_FOLDER / f"{name}.safetensors"
     return path if path.exists() else None
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, SAMPLE_BUFFERS
+from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS
 from render.backend import mi
 from render.first_bounce import hit_channels
 from render.gbuffer import render_gbuffer
@@ -191,7 +191,6 @@ MAKERS: dict[str, Callable[[SampledChannels, FrameInProgress], Arrays]] = {
     "gradient": SampledChannels.gradient,
     "reference": SampledChannels.reference,
 }
-OPTIONAL_STEPS = {channel.step for channel in CHANNELS.values() if channel.step}
 
 
 def render_clip(
@@ -214,7 +213,7 @@ def render_clip(
     timer = StepTimer()
     wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
     wanted |= {MIRRORED[name] for name in wanted & MIRRORED.keys()}
-    skipped = OPTIONAL_STEPS - {CHANNELS[name].step for name in wanted}
+    skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
     makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
     sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted)
     for frame in noise_free_frames(stage, frames, "dual_motion" not in skipped, timer):

@@ -40,7 +40,7 @@ def tiny_copy(tiny: Path, tmp_path: Path) -> Path:
 def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of shipped weights, empty here: no test that takes it depends on what is shipped."""
     folder = tmp_path_factory.mktemp("shipped")
-    monkeypatch.setattr(shipped_weights, "FOLDER", folder)
+    monkeypatch.setattr(shipped_weights, "SHIPPED_FOLDER", folder)
     return folder
 
 

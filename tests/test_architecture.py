@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ MAY_IMPORT = {
         *("eval.comparison", "eval.metrics", "eval.bench.memory"),
     },
 }
-RENDERING = {"bench", "figures", "studies", "tradeoff"}  # folders of eval that render
+RENDERING = {"bench", "figures", "tradeoff"}  # folders of eval that render
 
 
 def modules() -> list[Path]:
@@ -54,6 +55,24 @@ def test_arrows_point_one_way(file):
 def test_every_file_begins_with_what_it_holds():
     for file in modules():
         assert ast.get_docstring(ast.parse((ROOT / file).read_text())), f"{file} has no docstring"
+
+
+def test_a_class_or_constant_name_is_used_once():
+    """Importing a constant is no second definition; top-level files count, too."""
+    classes: dict[str, set[str]] = defaultdict(set)
+    constants: dict[str, set[str]] = defaultdict(set)
+    for file in [*modules(), *(path.relative_to(ROOT) for path in ROOT.glob("*.py"))]:
+        tree = ast.parse((ROOT / file).read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                classes[node.name].add(str(file))
+        for node in tree.body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            for target in targets:
+                if isinstance(target, ast.Name) and target.id.isupper():
+                    constants[target.id].add(str(file))
+    repeated = {name: files for name, files in {**classes, **constants}.items() if len(files) > 1}
+    assert not repeated
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ def test_help_begins_with_the_pipeline(capsys):
     places = [shown.index(f"\n  {name} ") for name in ("preview", "dataset", "train", "eval", "report")]
     assert places == sorted(places) and places[-1] < shown.index("Datasets")
     assert all(f"\n  {name} " in shown for group in GROUPS.values() for name in group)
-    assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "rendering", "training"))
+    assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "light", "rendering"))
 
 
 def test_help_names_every_profile_and_budget(capsys):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import provenance
-from models.compiled.jit import FOLDER, KERNELS
+from models.compiled.jit import KERNEL_FOLDER, KERNELS
 from provenance import DENOISING, RENDERING, ROOT, code_digest, file_digest, imported_by, sources, versions
 
 
@@ -54,7 +54,7 @@ def test_results_do_not_depend_on_other_denoisers():
 
 
 def test_the_digest_of_kernels_includes_their_imports():
-    modules = [f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))]
+    modules = [f"models.compiled.{file.stem}" for file in sorted(KERNEL_FOLDER.glob("*.py"))]
     assert code_digest(*modules) == KERNELS
     assert {"models.operators", "models.compiled.exponential", "datasets.channels"} <= set(sources(*modules))
 

@@ -16,7 +16,7 @@ from train.sequences import Batch
 FLOAT32 = "float32"
 BFLOAT16 = "bfloat16"  # by autocast; the weights are float32 all the same
 FABRIC_NAMES = {FLOAT32: "32-true", BFLOAT16: "bf16-mixed"}
-TURNS = 3
+STEP_TURNS = 3
 
 
 def fabric_here(precision: str = FLOAT32) -> Fabric:
@@ -53,5 +53,5 @@ def fastest_precision(loss: NetworkLoss, batch: Batch | Crops, device: str) -> s
     work = {precision: partial(forward_and_backward, loss, batch, device, precision) for precision in FABRIC_NAMES}
     clock = time.process_time if device == "cpu" else partial(device_clock, device)
     with thread_count(1):
-        seconds = take_turns(work, TURNS, clock=clock, label="measuring precisions")
+        seconds = take_turns(work, STEP_TURNS, clock=clock, label="measuring precisions")
     return BFLOAT16 if min(seconds[FLOAT32]) > MIN_SPEEDUP * min(seconds[BFLOAT16]) else FLOAT32

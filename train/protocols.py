@@ -23,17 +23,17 @@ class AccumulatingState(ScaledState, Protocol):
     def history(self) -> Accumulation: ...
 
 
-S = TypeVar("S", bound=ScaledState)
+Scaled = TypeVar("Scaled", bound=ScaledState)
 A = TypeVar("A", bound=AccumulatingState)
 
 
 @runtime_checkable
-class RecurrentNetwork(Protocol[S]):
+class RecurrentNetwork(Protocol[Scaled]):
     """A network that is trained on sequences, through time."""
 
     signal: Signal
 
-    def predict(self, frame: Frame, state: S | None) -> tuple[Tensor, S]:
+    def predict(self, frame: Frame, state: Scaled | None) -> tuple[Tensor, Scaled]:
         """The network's output for a frame, (B, 3, H, W) in its own space, not clamped, and the next state."""
 
     def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ class RecurrentNetwork(Protocol[S]):
 
 
 @runtime_checkable
-class CompressingNetwork(RecurrentNetwork[S], Protocol[S]):
+class CompressingNetwork(RecurrentNetwork[Scaled], Protocol[Scaled]):
     """One whose loss compares images in the space of its inputs."""
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:

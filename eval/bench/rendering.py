@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 from itertools import count
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
 
 from tabulate import tabulate
 from tqdm import tqdm
@@ -42,7 +41,6 @@ class TimeToFloor:
         seconds: to the target, by the law that noise falls as 1 / spp.
         extrapolated: whether `spp` was not enough.
         ratio: to the seconds of stock Mitsuba.
-        kernels, compiling: see Compilations; None for stock Mitsuba.
     """
 
     scene: str
@@ -53,8 +51,6 @@ class TimeToFloor:
     seconds: float
     extrapolated: bool
     ratio: float
-    kernels: int | None = None
-    compiling: float | None = None  # seconds
 
 
 def noise_mse(render: Render, exposure: float, spp: int) -> float:
@@ -69,24 +65,6 @@ def samples_needed(render: Render, exposure: float, target: float) -> tuple[int,
     while (noise := noise_mse(render, exposure, spp)) > target and spp < MAX_SPP:
         spp *= 2
     return spp, noise
-
-
-class Compilations(NamedTuple):
-    """Kernels that a scene's first frame needed and that this process had not compiled before."""
-
-    kernels: int
-    compiling: float  # seconds; 0 if they were cached on disk
-
-
-def first_frame(scene: str, size: int) -> tuple[PosedFrame, Compilations]:
-    """A frame of `size` x `size` pixels, ready to be sampled, and the compilations that it needed."""
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        posed = PosedFrame(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
-        posed.radiance(0, 1)
-        launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
-    new = [kernel for kernel in launched if kernel["cache_disk"] or not kernel["cache_hit"]]
-    return posed, Compilations(len(new), sum(kernel["backend_time"] for kernel in new) / 1e3)
 
 
 def rendering_buffers(render: Render, spp: int) -> Callable[[], None]:
@@ -106,7 +84,7 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
 
     Both use the same exposure. Raises BadInput for an unknown scene.
     """
-    posed, compiled = first_frame(scene, size)
+    posed = PosedFrame(Stage(build_scene(scene, 0, SCENE_FRAMES), size, size), FRAME)
     renders: dict[str, Render] = {STOCK: stock_render(posed), ONESPP: posed.radiance}
     exposure = clip_exposure(luminance(posed.radiance(9, 256)))
     target = 10 ** (-TARGET_DB / 10)
@@ -126,7 +104,6 @@ def times_to_floor(scene: str, size: int, measured: int) -> list[TimeToFloor]:
             seconds=to_target,
             extrapolated=noise > target,
             ratio=to_target / rows[0].seconds if rows else 1.0,
-            **(compiled._asdict() if renderer == ONESPP else {}),
         )
         rows.append(row)
     dr.flush_malloc_cache()
@@ -142,19 +119,11 @@ def bench_rendering(
     """
     names = tqdm(scenes or BENCH_SCENES, "scenes", leave=False)
     rows = [asdict(row) for name in names for row in times_to_floor(name, size, measured)]
-    content = {
-        "variant": VARIANT,
-        "size": size,
-        "frame": FRAME,
-        "target_db": TARGET_DB,
-        "rows": rows,
-    }
+    content = {"variant": VARIANT, "size": size, "frame": FRAME, "target_db": TARGET_DB, "rows": rows}
     write_json(bench_folder(runs) / "rendering.json", content)
     heads = {
         "samples_per_second": "samples/s",
         "floor": "floor dB",
         "seconds": f"seconds to {TARGET_DB:.0f} dB",
-        "kernels": "new kernels",
-        "compiling": "compiling s",
     }
-    return tabulate(rows, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f", ".0f", ".2f"))
+    return tabulate(rows, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f"))

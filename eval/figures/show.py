@@ -23,7 +23,7 @@ from models.registry import create
 from plotting import save_figure
 
 SHOWN_FRAMES = 4  # including the first and the last of the clip
-MAX_DIFFERENCE = 0.25  # of displayed values; larger ones have the same colour
+BRIGHTEST_DIFFERENCE = 0.25  # of displayed values; larger ones have the same colour
 
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
@@ -68,7 +68,7 @@ class DenoiserView:
             difference = image - as_displayed(reference_of(frame, signal), exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
-            self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=MAX_DIFFERENCE))
+            self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=BRIGHTEST_DIFFERENCE))
         self.images.append(Panel(image, caption))
         assert self.state
         for name, picture in self.state.pictures().items():

@@ -32,7 +32,7 @@ FEATURE_GROUPS = (3, 3, 3, 1, 1)  # channels of each feature: position, normal, 
 COLOUR_SHARPNESS = 1 / (2 * 7**2)  # 1 / 2 β²
 MAX_EXPONENT = -MIN_EXPONENT
 GROUP_COUNT = len(FEATURE_GROUPS)
-FIRST = tuple(np.cumsum((0, *FEATURE_GROUPS)).tolist())  # channel of each group, and beyond the last
+FIRST_OF_GROUP = tuple(np.cumsum((0, *FEATURE_GROUPS)).tolist())  # channel of each group, and beyond the last
 
 
 class Planes(NamedTuple):
@@ -75,7 +75,7 @@ def weigh_tap(
     fill_line(distances[0], f32(dy * dy + dx * dx))
     for group in range(GROUP_COUNT):
         fill_line(distances[1 + group], f32(0))
-        for f in range(FIRST[group], FIRST[group + 1]):
+        for f in range(FIRST_OF_GROUP[group], FIRST_OF_GROUP[group + 1]):
             add_square(distances[1 + group], features[f, row, here], features[f, to, there])
     for s in range(1 + GROUP_COUNT):
         add_product(exponent, sharpness[s, row, here], distances[s])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.compiled.fusion import OUTSIDE_LOGIT
 
-OUTSIDE = tl.constexpr(OUTSIDE_LOGIT)
+TRITON_OUTSIDE_LOGIT = tl.constexpr(OUTSIDE_LOGIT)
 PROGRAM_WIDTH = 128  # pixels of a row that one program filters
 
 
@@ -51,7 +51,7 @@ def fuse_rows(
     for i in range(COUNT):
         logits = importance + i * plane
         radius = tl.load(radii + i)
-        largest = tl.full((BLOCK,), OUTSIDE, tl.float32)
+        largest = tl.full((BLOCK,), TRITON_OUTSIDE_LOGIT, tl.float32)
         for v in range(tl.maximum(y - radius, 0), tl.minimum(y + radius + 1, height)):
             for dx in range(-radius, radius + 1):
                 inside = (x + dx >= 0) & (x + dx < width)

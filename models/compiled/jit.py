@@ -13,11 +13,11 @@ from torch import Tensor
 
 from provenance import code_digest
 
-FOLDER = Path(__file__).parent
+KERNEL_FOLDER = Path(__file__).parent
 # Numba recompiles a kernel when its file changes, but not when another does that it takes functions or numbers from. So
 # the cache's folder is named by a digest of the sources of all kernels.
-KERNELS = code_digest(*(f"models.compiled.{file.stem}" for file in sorted(FOLDER.glob("*.py"))))
-os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "__pycache__" / f"kernels-{KERNELS[:16]}"))
+KERNELS = code_digest(*(f"models.compiled.{file.stem}" for file in sorted(KERNEL_FOLDER.glob("*.py"))))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(KERNEL_FOLDER / "__pycache__" / f"kernels-{KERNELS[:16]}"))
 
 import numba  # noqa: E402 - reads the folder when it is imported
 

@@ -22,7 +22,14 @@ if TYPE_CHECKING:
 
 LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
-STEPS = (32, 16, 8, 4, 2, 1)  # px between taps of each filter level: the last ones smooth the first ones' pattern
+TAP_SPACINGS = (
+    32,
+    16,
+    8,
+    4,
+    2,
+    1,
+)  # px between taps of each filter level: the last ones smooth the first ones' pattern
 MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
 MAX_LOGIT = 10.0  # of the weights of taps
 SIDE_MULTIPLE = 8  # of the sides of the network's images
@@ -30,7 +37,7 @@ MIN_LENGTH = 1e-3  # samples of a history, to divide by
 
 
 class NetworkInput(NamedTuple):
-    """A row of INPUTS.
+    """A row of ONE_INPUTS.
 
     Attributes:
         transform: "log exposed": log(1 + exposure · irradiance); "per pixel": models.networks.one.per_pixel_inputs;
@@ -45,7 +52,7 @@ class NetworkInput(NamedTuple):
 
 
 # The inputs of the network, in order. PyTorch, kernel and export all take their order from here.
-INPUTS = (
+ONE_INPUTS = (
     NetworkInput("noisy", 3, "log exposed"),
     NetworkInput("mean_3x3", 3, "log exposed"),
     NetworkInput("mean_9x9", 3, "log exposed"),
@@ -61,7 +68,7 @@ INPUTS = (
     NetworkInput("depth", 1, "surface"),
     NetworkInput("roughness", 1, "surface"),
 )
-INPUT_CHANNELS = {row.name: row.channels for row in INPUTS}
+INPUT_CHANNELS = {row.name: row.channels for row in ONE_INPUTS}
 
 
 def first_channels(channels: dict[str, int]) -> dict[str, int]:
@@ -82,12 +89,21 @@ def filter_levels(outputs: int) -> int:
 
 
 # Constants of the kernels, where Numba finds them.
-FIRST = first_channels(INPUT_CHANNELS)
-NOISY, MEAN_3X3, MEAN_9X9 = FIRST["noisy"], FIRST["mean_3x3"], FIRST["mean_9x9"]
-OUTPUT, ACCUMULATED = FIRST["output"], FIRST["accumulated"]
-DEVIATION, NEWEST, OLDEST = FIRST["deviation"], FIRST["1/samples"], FIRST["1/(length + samples)"]
-HAS_HISTORY, LATENT_INPUT = FIRST["has_history"], FIRST["latent"]
-ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = FIRST["albedo"], FIRST["view_normal"], FIRST["depth"], FIRST["roughness"]
+FIRST_CHANNEL = first_channels(INPUT_CHANNELS)
+NOISY, MEAN_3X3, MEAN_9X9 = FIRST_CHANNEL["noisy"], FIRST_CHANNEL["mean_3x3"], FIRST_CHANNEL["mean_9x9"]
+OUTPUT, ACCUMULATED = FIRST_CHANNEL["output"], FIRST_CHANNEL["accumulated"]
+DEVIATION, NEWEST, OLDEST = (
+    FIRST_CHANNEL["deviation"],
+    FIRST_CHANNEL["1/samples"],
+    FIRST_CHANNEL["1/(length + samples)"],
+)
+HAS_HISTORY, LATENT_INPUT = FIRST_CHANNEL["has_history"], FIRST_CHANNEL["latent"]
+ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = (
+    FIRST_CHANNEL["albedo"],
+    FIRST_CHANNEL["view_normal"],
+    FIRST_CHANNEL["depth"],
+    FIRST_CHANNEL["roughness"],
+)
 ONE = np.float32(1)
 ZERO = np.float32(0)
 TWO = np.float32(2)
@@ -204,7 +220,7 @@ class InputImages(NamedTuple):
 
 @jit_in_any_order
 def fill_lines(lines: Rows, images: InputImages, y: Index, x: Index, n: int) -> None:
-    """The network's inputs (C, ·) of n pixels of a row from x on, in the order of INPUTS."""
+    """The network's inputs (C, ·) of n pixels of a row from x on, in the order of ONE_INPUTS."""
     row = slice(x, x + n)
     valid = images.has_history[y, row]
     history = images.history

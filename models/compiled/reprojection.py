@@ -19,7 +19,7 @@ from models.compiled.jit import array, jit_parallel, jit_with_memory, jit_with_r
 from models.compiled.lines import add_product, block_count, rows_of_block, triple, triple_of_lines
 from models.history.geometry import BACKGROUND_ID, GBuffer, to_previous_camera
 
-PLANE_TOLERANCE = 0.01  # of the depth: largest distance of a tap's surface from the point's plane
+HISTORY_PLANE_TOLERANCE = 0.01  # of the depth: largest distance of a tap's surface from the point's plane
 NORMAL_TOLERANCE = 0.9  # smallest cosine of the angle between a tap's normal and the point's
 SHORTEST_RUN = 8  # px; loops over less are slower than pixel by pixel
 
@@ -190,7 +190,7 @@ def is_consistent(x: Index, y: Index, pixel: Index, mesh: Scalar, taps: RowTaps,
         visible = depth * (axes[0, i] * px + axes[1, i] * py + axes[2, i])
         off_plane += (taps.point[i, pixel] - visible) * n
         cosine += n * taps.normal[i, pixel]
-    return abs(off_plane) <= f32(PLANE_TOLERANCE) * depth and cosine >= f32(NORMAL_TOLERANCE)
+    return abs(off_plane) <= f32(HISTORY_PLANE_TOLERANCE) * depth and cosine >= f32(NORMAL_TOLERANCE)
 
 
 @jit_with_reciprocals
@@ -224,7 +224,7 @@ def compare_planes(good: Row, point: RGB, depth: Row, normal: RGB, axes: Matrix,
         off_plane = (px[i] - d * (ax * column + bx)) * x[i]
         off_plane += (py[i] - d * (ay * column + by)) * y[i]
         off_plane += (pz[i] - d * (az * column + bz)) * z[i]
-        good[i] = good[i] if abs(off_plane) <= f32(PLANE_TOLERANCE) * d else f32(0)
+        good[i] = good[i] if abs(off_plane) <= f32(HISTORY_PLANE_TOLERANCE) * d else f32(0)
 
 
 @jit_with_reciprocals

@@ -45,7 +45,7 @@ NEGLIGIBLE_WEIGHT = np.float32(1e-15)
 NEGLIGIBLE_EXPONENT = np.float32(40)  # e^-40 is below NEGLIGIBLE_WEIGHT
 MIN_GAUSSIAN_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
 SPLINE = np.array(B3_SPLINE, np.float32)
-TAPS = 2 * RADIUS + 1  # of a row
+VARIANCE_TAPS = 2 * RADIUS + 1  # of a row
 LEVEL_BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
 GEOMETRY = 7  # channels of pack_geometry: unit normal (3), depth, σ_z ∇z (2), tolerance
 SIGNAL = 6  # channels of a signal: red, green, blue, variance, luminance, edge_scale
@@ -256,7 +256,7 @@ class TapRow(NamedTuple):
 
 @jit_in_any_order
 def weigh_taps(weights: Row, h: Row, surfaces: Image, taps: TapRow) -> None:
-    """weights (2 * TAPS * LEVEL_BLOCK): for each tap h (TAPS) times w_n, and the exponent, of geometry_terms."""
+    """weights (2 * VARIANCE_TAPS * LEVEL_BLOCK): of each tap h times w_n, and the exponent, of geometry_terms."""
     row, to, step, first, count = taps
     x, y, z = surfaces[row, 0], surfaces[row, 1], surfaces[row, 2]
     depth, along_x, along_y, tolerance = surfaces[row, 3], surfaces[row, 4], surfaces[row, 5], surfaces[row, 6]
@@ -265,7 +265,7 @@ def weigh_taps(weights: Row, h: Row, surfaces: Image, taps: TapRow) -> None:
     for i in range(count):
         p = unsigned(first + i)
         here = (x[p], y[p], z[p], depth[p], along_x[p], along_y[p], tolerance[p])
-        for tap in range(TAPS):
+        for tap in range(VARIANCE_TAPS):
             dx = (tap - RADIUS) * step
             q = unsigned(first + i + dx)
             w_n, exponent = geometry_terms(here, (to_x[q], to_y[q], to_z[q], to_depth[q]), f32(dx), dy)
@@ -290,7 +290,7 @@ def add_taps(sums: Row, weights: Row, signals: Signals, s: int, taps: TapRow) ->
         blue = f32(0)
         spread = f32(0)
         total = f32(0)
-        for tap in range(TAPS):
+        for tap in range(VARIANCE_TAPS):
             q = unsigned(first + i + (tap - RADIUS) * step)
             exponent = weights[unsigned((2 * tap + 1) * LEVEL_BLOCK + i)]
             w = weight(weights[unsigned(2 * tap * LEVEL_BLOCK + i)], abs(y[p] - to_y[q]) * scale[p] + exponent)
@@ -328,8 +328,8 @@ def divide_sums(filtered: Signals, signals: Signals, row: Index, s: int, first: 
 def filter_row(filtered: Signals, signals: Signals, surfaces: Image, row: Index, margin: int, step: int) -> None:
     height, count_signals, _, width = signals.shape
     sums = np.empty((count_signals, 5 * LEVEL_BLOCK), np.float32)
-    weights = np.empty(2 * TAPS * LEVEL_BLOCK, np.float32)
-    h = np.empty(TAPS, np.float32)
+    weights = np.empty(2 * VARIANCE_TAPS * LEVEL_BLOCK, np.float32)
+    h = np.empty(VARIANCE_TAPS, np.float32)
     for first in range(margin, width - margin, LEVEL_BLOCK):
         count = min(LEVEL_BLOCK, width - margin - first)
         sums[:] = 0

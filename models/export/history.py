@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from models.compiled.reprojection import NORMAL_TOLERANCE, PLANE_TOLERANCE
+from models.compiled.reprojection import HISTORY_PLANE_TOLERANCE, NORMAL_TOLERANCE
 from models.history.geometry import BACKGROUND_ID
 from models.history.running_scale import LUMINANCE_BLOCK, MEDIAN_GRID, MIDDLE_GREY, MIN_RATE
 from models.operators import image_luminance
@@ -19,7 +19,7 @@ OUTSIDE_ID = -1.0  # mesh id around the image
 MIN_LUMINANCE = 1e-37  # normal in float32
 # Zeros that fill up the last block of rows and columns, and one more, which shows tracers that there are two.
 BLOCK_PADDING = (0, 2 * LUMINANCE_BLOCK - 1, 0, 2 * LUMINANCE_BLOCK - 1)
-MIN_SURFACE_SHARE = LUMINANCE_BLOCK**-2 / 2  # of a block that shows a surface
+MIN_BLOCK_SHARE = LUMINANCE_BLOCK**-2 / 2  # of a block that shows a surface
 
 
 class GraphGBuffer(NamedTuple):
@@ -59,7 +59,7 @@ def reprojection_table(history: Tensor, previous: GraphGBuffer, pixels: Tensor) 
     height, width = previous.depth.shape[-2:]
     normals = previous.normals()
     offset = (normals * previous.points(pixels)).sum(dim=0).view(1, 1, height, width)
-    tolerance = PLANE_TOLERANCE * previous.depth
+    tolerance = HISTORY_PLANE_TOLERANCE * previous.depth
     parts = [normals.view(1, 3, height, width), offset, tolerance, previous.mesh_id.to(offset), history]
     images = F.pad(torch.cat(parts, dim=1), (1, 1, 1, 1), value=OUTSIDE_ID)
     return images[0].flatten(1).T.contiguous()
@@ -132,7 +132,7 @@ def measured_luminance(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]
     # The padding lowers both means alike: their quotient is that of the image.
     total, share = F.avg_pool2d(both, LUMINANCE_BLOCK).flatten(2).split(1, dim=1)  # (1, 1, blocks) each
     has_surface = (share > 0).to(total)
-    y = total / share.clamp(min=MIN_SURFACE_SHARE)
+    y = total / share.clamp(min=MIN_BLOCK_SHARE)
     blocks = has_surface.sum(dim=(0, 2)).clamp(min=1)
     mean = y.sum(dim=(0, 2)) / blocks
     log_y = torch.log(torch.maximum(y, 1e-4 * mean).clamp(min=MIN_LUMINANCE) / MIDDLE_GREY) * has_surface

@@ -68,10 +68,12 @@ for (;;) {
 }
 """
 
-INSIDE = """Inputs named `previous_…` are those of the previous frame: double-buffer them, without copying. Multiply the
+WARP_INSIDE = """\
+Inputs named `previous_…` are those of the previous frame: double-buffer them, without copying. Multiply the
 matrices of `to_previous_camera` in float64 and round the product to float32, since translations can be large."""
 
-OUTSIDE = """Before each frame but the first, reproject `history`: each pixel gets the `new_history` of the pixel that
+WARP_OUTSIDE = """\
+Before each frame but the first, reproject `history`: each pixel gets the `new_history` of the pixel that
 showed its surface in the previous frame, and 0 in all channels where the surface was not visible there. One of the
 channels is a length: where it is 0, the denoiser starts anew."""
 
@@ -106,7 +108,7 @@ file. Test an integration with the sequence in `golden/`, whose arrays are named
 
 {state}
 
-All state is 0 before the first frame and after a cut. {INSIDE if manifest["warp"] == "inside" else OUTSIDE}
+All state is 0 before the first frame and after a cut. {WARP_INSIDE if manifest["warp"] == "inside" else WARP_OUTSIDE}
 Non-finite values in `noisy` count as 0; all other inputs must be finite.
 
 ## Calls

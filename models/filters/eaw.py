@@ -19,17 +19,17 @@ from models.history.geometry import frame_rays
 from models.history.running_scale import RunningScale, running_scale
 
 SIGMA_COLOUR = 4.0  # exposed irradiance, at the first level; halved from level to level
-SIGMA_NORMAL = 0.4
+EAW_SIGMA_NORMAL = 0.4
 SIGMA_POSITION = 0.1  # of the median depth
 BACKGROUND_POSITION = -1e3  # in σ, far from all surfaces
-MAX_EXPOSED = 1e15  # in σ; its square must stay finite
+MAX_SIGMAS = 1e15  # in σ; its square must stay finite
 
 
 def guides(frame: Frame, scale: RunningScale) -> Tensor:
     """Normals and positions in units of their σ, (B, 6, H, W); background is far from all surfaces."""
     unit = SIGMA_POSITION * torch.exp(scale.log_depth.value)[:, None, None, None]
     position = torch.where(frame.depth > 0, frame_rays(frame).movedim(-1, 1) * frame.depth / unit, BACKGROUND_POSITION)
-    return torch.cat([frame.normal / SIGMA_NORMAL, position], dim=1)
+    return torch.cat([frame.normal / EAW_SIGMA_NORMAL, position], dim=1)
 
 
 @compiled.by(kernels.eaw_level)
@@ -68,5 +68,5 @@ class EAW(Accumulating):
         colour = history.irradiance
         for step in ATROUS_STEPS:
             exposed = colour * (scale.exposure() * step / SIGMA_COLOUR)
-            colour = eaw_level(colour, torch.cat([exposed.clamp(max=MAX_EXPOSED), geometry], dim=1), step)
+            colour = eaw_level(colour, torch.cat([exposed.clamp(max=MAX_SIGMAS), geometry], dim=1), step)
         return frame.remodulate(colour, self.signal), EAWState(frame.moment, history, scale)

@@ -35,7 +35,7 @@ from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 BANK = tuple(2 ** (i / 2) for i in range(7))  # px; σ_s from 1 to 8
 RISK_SIGMA = 8.0  # px
-SIGMA_NORMAL = 0.8
+SBF_SIGMA_NORMAL = 0.8
 SIGMA_ALBEDO = 0.25
 SIGMA_DEPTH = 0.6  # of the frame's maximum
 BACKGROUND_DEPTH = 1e3  # in σ; outside the image it is the negative of this
@@ -55,7 +55,7 @@ def guides(frame: Frame) -> Tensor:
     """Features f (B, 7, H, W), scaled such that exp(-|f(p) - f(q)|²) is the product of their Gaussians."""
     max_depth = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
     depth = torch.where(frame.depth > 0, frame.depth / max_depth / SIGMA_DEPTH, BACKGROUND_DEPTH)
-    return torch.cat([frame.normal / SIGMA_NORMAL, frame.albedo / SIGMA_ALBEDO, depth], dim=1) / math.sqrt(2)
+    return torch.cat([frame.normal / SBF_SIGMA_NORMAL, frame.albedo / SIGMA_ALBEDO, depth], dim=1) / math.sqrt(2)
 
 
 @compiled.by(kernels.window_sums)

@@ -8,7 +8,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import reprojection as kernels
-from models.compiled.reprojection import NORMAL_TOLERANCE, PLANE_TOLERANCE
+from models.compiled.reprojection import HISTORY_PLANE_TOLERANCE, NORMAL_TOLERANCE
 from models.history.geometry import BACKGROUND_ID, GBuffer, pixel_centres, rays, to_previous_camera
 
 
@@ -48,7 +48,7 @@ class Reprojection:
         mesh = self.gbuffer[4, index]
         position = depth[..., None] * rays(self.previous_K, column + 0.5, row + 0.5)
         off_plane = ((self.point[pixels] - position) * normal).sum(dim=-1).abs()
-        same_plane = off_plane <= PLANE_TOLERANCE * depth
+        same_plane = off_plane <= HISTORY_PLANE_TOLERANCE * depth
         same_normal = (normal * self.normal[pixels]).sum(dim=-1) >= NORMAL_TOLERANCE
         background = self.mesh[pixels] == BACKGROUND_ID
         return self.image[:, index], inside & (mesh == self.mesh[pixels]) & (background | same_plane & same_normal)

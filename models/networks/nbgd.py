@@ -25,7 +25,7 @@ from models.compiled.features import FEATURE_CHANNELS
 from models.networks.bilateral_grid import grid_mean
 from models.networks.wskp import KernelPredictor
 
-WIDTH = 20  # channels between the two layers
+NBGD_WIDTH = 20  # channels between the two layers
 KERNEL = 5  # px
 LEAK = 0.2  # slope of the leaky ReLU below 0
 SPACINGS = (4, 8, 16)  # px, and values of a guide, from cell to cell
@@ -38,9 +38,9 @@ class NBGD(KernelPredictor):
         super().__init__(signal=signal)
         outputs = len(SPACINGS) + len(SPACINGS) - 1
         self.network = nn.Sequential(
-            nn.Conv2d(sum(FEATURE_CHANNELS.values()), WIDTH, KERNEL, padding=KERNEL // 2),
+            nn.Conv2d(sum(FEATURE_CHANNELS.values()), NBGD_WIDTH, KERNEL, padding=KERNEL // 2),
             nn.LeakyReLU(LEAK, inplace=True),
-            nn.Conv2d(WIDTH, outputs, KERNEL, padding=KERNEL // 2),
+            nn.Conv2d(NBGD_WIDTH, outputs, KERNEL, padding=KERNEL // 2),
         )
         # A pixel's cells reach up to two cells away.
         self.reach = 2 * (KERNEL // 2) + 2 * max(SPACINGS)

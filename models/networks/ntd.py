@@ -15,9 +15,9 @@ from models.networks.convolution import ConvReLU
 from models.networks.pixel_kernels import apply_kernels
 from models.operators import halve, halve_surface, pad_to_multiple
 
-INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
+NTD_INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper does not print its own
-TAPS = 25  # of a 5 x 5 kernel
+KERNEL_TAPS = 25  # of a 5 x 5 kernel
 Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, over surface pixels
 MIN_SURFACE_SHARE = 1e-6  # of bilinear taps that show a surface; with less the result is invalid
 NTD_SIDE_MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of the network's images
@@ -47,12 +47,12 @@ class KernelNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inputs = (sum(INPUTS.values()), *WIDTHS[:-1])
+        inputs = (sum(NTD_INPUTS.values()), *WIDTHS[:-1])
         self.encode = nn.ModuleList(
             nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
         )
         self.decode = nn.ModuleList(Decode(WIDTHS[i + 1], WIDTHS[i]) for i in reversed(range(len(WIDTHS) - 1)))
-        outputs = (TAPS + 1, TAPS + 1, 2 * TAPS + 1)
+        outputs = (KERNEL_TAPS + 1, KERNEL_TAPS + 1, 2 * KERNEL_TAPS + 1)
         self.heads = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(WIDTHS[2::-1], outputs, strict=True))
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d):
@@ -136,11 +136,13 @@ def reconstruct_image(
     alpha: Tensor | None = None
     for image, valid, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
-        filtered = apply_kernels(image, prediction[:, :TAPS], valid)
+        filtered = apply_kernels(image, prediction[:, :KERNEL_TAPS], valid)
         output = filtered if alpha is None else combine_levels(filtered, output, alpha, valid, pool)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
-    return torch.lerp(apply_kernels(warped, prediction[:, TAPS : 2 * TAPS], surface), output, alpha), alpha
+    return torch.lerp(
+        apply_kernels(warped, prediction[:, KERNEL_TAPS : 2 * KERNEL_TAPS], surface), output, alpha
+    ), alpha
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ class NTD(Denoiser):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = dict(INPUTS)
+        self.inputs = dict(NTD_INPUTS)
         if self.signal == "total":
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -13,13 +13,13 @@ from models import compiled
 from models.compiled import one as kernels
 from models.compiled.one import (
     INPUT_CHANNELS,
-    INPUTS,
     LATENT,
     MAX_EXPOSED,
     MAX_LOGIT,
     MIN_LENGTH,
+    ONE_INPUTS,
     SIDE_MULTIPLE,
-    STEPS,
+    TAP_SPACINGS,
     NetworkInput,
     filter_levels,
     head_channels,
@@ -171,7 +171,7 @@ def exposed_images(inputs: PixelInputs) -> list[Tensor]:
         other = row.without_history
         return torch.where(inputs.has_history > 0, images[row.name], images[other]) if other else images[row.name]
 
-    return [image(row) for row in INPUTS if row.transform == "log exposed"]
+    return [image(row) for row in ONE_INPUTS if row.transform == "log exposed"]
 
 
 def per_pixel_inputs(inputs: PixelInputs, samples: Tensor) -> list[Tensor]:
@@ -184,18 +184,18 @@ def per_pixel_inputs(inputs: PixelInputs, samples: Tensor) -> list[Tensor]:
         "has_history": inputs.has_history,
         "latent": latent * inputs.has_history,
     }
-    return [values[row.name] for row in INPUTS if row.transform == "per pixel"]
+    return [values[row.name] for row in ONE_INPUTS if row.transform == "per pixel"]
 
 
 def surface_inputs(albedo: Tensor, view_normal: Tensor, depth: Tensor, roughness: Tensor) -> list[Tensor]:
     """The inputs (B, ·, H, W) of the G-buffer, in order; normals in view space, depth normalised."""
     values = {"albedo": albedo, "view_normal": view_normal, "depth": depth, "roughness": roughness}
-    return [values[row.name] for row in INPUTS if row.transform == "surface"]
+    return [values[row.name] for row in ONE_INPUTS if row.transform == "surface"]
 
 
 @compiled.by(kernels.network_inputs)
 def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidden: nn.Linear) -> tuple[Tensor, Tensor]:
-    """patches_of the network's inputs (see INPUTS), and ReLU of the layer `hidden` of each pixel, (B, ·, H, W)."""
+    """patches_of the network's inputs (see ONE_INPUTS), and ReLU of the layer `hidden` of each pixel, (B, ·, H, W)."""
     exposed = torch.stack(exposed_images(inputs), dim=1).clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
     colours = torch.log1p(exposed.clamp(max=MAX_EXPOSED)).flatten(1, 2)
     depth = scale.normalised_depth(frame.depth)
@@ -214,7 +214,7 @@ class One(Denoiser):
     convex = True
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
-    def __init__(self, *, steps: Sequence[int] = STEPS, signal: Signal | None = None):
+    def __init__(self, *, steps: Sequence[int] = TAP_SPACINGS, signal: Signal | None = None):
         """`steps` are the pixels between the taps of each filter level."""
         super().__init__(signal=signal)
         self.steps = steps

@@ -20,7 +20,7 @@ from models.networks.pixel_kernels import apply_kernels
 from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.operators import halve, halve_surface, pad_to_multiple
 
-WIDTH = 24  # ours: the paper does not print its widths
+WSKP_WIDTH = 24  # ours: the paper does not print its widths
 MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips
 STRIP_PIXELS = 1 << 20
 
@@ -125,7 +125,7 @@ class KernelPredictor(Accumulating):
 
 def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
     """`layers` RepVGG blocks from the inputs to `outputs` channels."""
-    return repvgg([sum(FEATURE_CHANNELS.values()), *[WIDTH] * (layers - 1), outputs], sizes)
+    return repvgg([sum(FEATURE_CHANNELS.values()), *[WSKP_WIDTH] * (layers - 1), outputs], sizes)
 
 
 class WSKP(KernelPredictor):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from denoise.analysis import blurred
-from denoise.motion_convention import PAIRS, SIGNS, UNITS, ConventionDetector, MotionConvention, conventions
+from denoise.motion_convention import PAIR_COMPONENTS, SIGNS, UNITS, ConventionDetector, MotionConvention, conventions
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from tests.helpers.foreign import image
@@ -24,9 +24,9 @@ def encoded_as(
     size = {"pixels": (1, 1), "fractions": (WIDTH, HEIGHT), "half-fractions": (WIDTH / 2, HEIGHT / 2)}[convention.unit]
     scale = [SIGNS[convention.x], SIGNS[convention.y]] / np.array(size)
     vectors = np.zeros((HEIGHT, WIDTH, components))
-    vectors[..., PAIRS[convention.pair]] = to_previous * scale
+    vectors[..., PAIR_COMPONENTS[convention.pair]] = to_previous * scale
     if components == 4:
-        vectors[..., PAIRS["ZW" if convention.pair == "XY" else "XY"]] = to_next * scale
+        vectors[..., PAIR_COMPONENTS["ZW" if convention.pair == "XY" else "XY"]] = to_next * scale
     return vectors.astype(np.float32)
 
 

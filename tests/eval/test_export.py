@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from command_line import main
-from eval.bench.export import EXPORTED, bench_export
 from models.export.page import CPP, PYTHON
 from models.registry import create
 from models.weights import save_weights
@@ -54,14 +53,3 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
 def test_the_docs_have_the_calls_that_are_tested():
     page = Path(ROOT / "docs" / "export.md").read_text()
     assert PYTHON["onnx"] in page and CPP.replace("FILE", "wskp6.onnx") in page
-
-
-@onnx_only
-@pytest.mark.slow
-def test_bench_export(tmp_path):
-    table = bench_export(tmp_path, "wskp3", "48x32", threads=1, measured=2)
-    assert all(way in table for way in EXPORTED)
-    rows = json.loads((tmp_path / "bench" / "export.json").read_text())["rows"]
-    assert len(rows) == 4 and all(row["ms"] > 0 and row["largest difference"] < 1e-4 for row in rows)
-    inside, outside = (row["operators"] for row in rows if row["way"] in EXPORTED)
-    assert outside < inside

@@ -14,7 +14,7 @@ from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.harness import clips_of_one_spp
 from eval.means import ClipScores, compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
-from eval.results import REFERENCE, ClipResults, Result, load_result
+from eval.results import NOISE_FLOOR, ClipResults, Result, load_result
 from eval.tradeoff.candidates import candidates
 from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.feeding import check_levels
@@ -110,7 +110,9 @@ def clip_results(**psnr: float) -> ClipResults:
     def result(name: str, value: float) -> Result:
         return Result("", name, "total", "cornell_box", "000", {"psnr": value, "mse_unbiased": 0.0}, [])
 
-    return ClipResults("cornell_box", "000", "total", [result(*pair) for pair in psnr.items()], result(REFERENCE, 99.0))
+    return ClipResults(
+        "cornell_box", "000", "total", [result(*pair) for pair in psnr.items()], result(NOISE_FLOOR, 99.0)
+    )
 
 
 def test_samples_that_are_not_worth_their_time(tmp_path):

@@ -1,11 +1,9 @@
 """The frame in three strips: which picture is where, and a small one from end to end."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from errors import BadInput
-from eval.studies.triptych import in_strips, triptych
+from eval.figures.triptych import in_strips, triptych
 
 
 def test_strips_are_in_their_order_and_slant_to_the_left():
@@ -25,10 +23,3 @@ def test_a_small_one(tmp_path):
         assert image.size == (40, 24)
         pixels = np.asarray(image).astype(float)
     assert pixels.std() > 10
-    with pytest.raises(BadInput, match="unknown scene"):
-        triptych(out, "no_scene", "svgf", tmp_path, frame=1, spp=2)
-    for frame, spp in ((-1, 4), (2, 0)):
-        with pytest.raises(BadInput, match="name a frame from 0 on"):
-            triptych(out, "cornell_box", "svgf", tmp_path, frame, spp)
-    with pytest.raises(BadInput, match="indirect light alone"):
-        triptych(out, "cornell_box", "ntd", tmp_path, frame=2, spp=4)

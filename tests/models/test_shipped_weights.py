@@ -12,12 +12,12 @@ import torch
 
 from errors import BadInput
 from models import registry
-from models.shipped_weights import FOLDER, require_shipped, shipped_names, shipped_weights
+from models.shipped_weights import SHIPPED_FOLDER, require_shipped, shipped_names, shipped_weights
 from models.spec import load
 from provenance import ROOT
 from tests.helpers.frames import flat_frame, run
 
-FILES = sorted(FOLDER.iterdir())
+FILES = sorted(SHIPPED_FOLDER.iterdir())
 WEIGHTS = [path for path in FILES if path.suffix == ".safetensors"]
 TOGETHER = 20e6  # bytes at most
 
@@ -34,7 +34,7 @@ def test_they_are_small_and_each_has_a_card():
     assert {path.name for path in FILES} == {
         path.stem + end for path in WEIGHTS for end in (".safetensors", ".md", ".json")
     }
-    assert shipped_names() == [name for name in registry.DENOISERS if FOLDER / f"{name}.safetensors" in WEIGHTS]
+    assert shipped_names() == [name for name in registry.DENOISERS if SHIPPED_FOLDER / f"{name}.safetensors" in WEIGHTS]
     assert len(shipped_names()) == len(WEIGHTS)
 
 

@@ -435,7 +435,7 @@ def test_eaw_s_features(monkeypatch):
     hit = (frame.depth > 0)[0, 0]
     for level, (features, _) in enumerate(calls):
         torch.testing.assert_close(features[:, :3], irradiance * exposure * 2**level / eaw.SIGMA_COLOUR)
-        torch.testing.assert_close(features[:, 3:6], frame.normal / eaw.SIGMA_NORMAL)
+        torch.testing.assert_close(features[:, 3:6], frame.normal / eaw.EAW_SIGMA_NORMAL)
         positions = features[0, 6:] * eaw.SIGMA_POSITION * median
         torch.testing.assert_close(positions[2, hit], frame.depth[0, 0, hit], rtol=0.02, atol=0)
         # Projected back, positions are where their pixels are.

@@ -1,5 +1,6 @@
-"""`onespp study light`: how many frames a denoiser lags after a light changes."""
+"""`onespp bench light`: how many frames a denoiser lags after a light changes."""
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,11 +11,11 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS
-from datasets.clip import Clip
+from datasets.clip import Clip, is_clip
 from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display, psnr
+from eval.bench.sizes import bench_folder
 from eval.selection import evaluated
-from eval.studies.own_clips import SEED, own_clip
 from files import write_file, write_json
 from models.denoiser import Denoiser, State
 from models.operators import finite
@@ -22,6 +23,8 @@ from models.spec import DenoiserSpec
 from plotting import DPI, Figure, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling
+from render.job.clip_job import write_clip
+from render.job.plan import GENERATOR
 from scenes.animation import KeyframedTrack, RigidMotion, Scene, Track
 from scenes.camera import Array
 from scenes.registry import build_scene
@@ -31,10 +34,10 @@ AFTER = (0, 1, 2, 4, 8)  # frames after it that the table shows
 LIGHT_CLIP_SIZE = (CHANGE + AFTER[-1] + 1, 128, 128)  # frames, height, width
 LIGHT_CLIP_SAMPLING = Sampling(realisations=1, noisy_spp=1, reference_spp=1024)
 LIGHT_SCENE = "cornell_box"
-UNCHANGED = "still"
+STEADY = "still"
 # The lamp before the change: the factor of its radiance, and its displacement.
 BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
-    UNCHANGED: (1.0, (0.0, 0.0, 0.0)),
+    STEADY: (1.0, (0.0, 0.0, 0.0)),
     "switched-on": (0.05, (0.0, 0.0, 0.0)),
     "switched-down": (8.0, (0.0, 0.0, 0.0)),
     "moved": (1.0, (0.6, 0.0, -0.5)),
@@ -51,9 +54,7 @@ class Lag:
     def loss(self, after: int) -> float:
         """The largest loss of PSNR against unchanged light, in dB, `after` frames after the change."""
         frame = CHANGE + after
-        return max(
-            self.psnr[UNCHANGED][frame] - values[frame] for name, values in self.psnr.items() if name != UNCHANGED
-        )
+        return max(self.psnr[STEADY][frame] - values[frame] for name, values in self.psnr.items() if name != STEADY)
 
 
 def stepped(before: Array, after: Array) -> Track:
@@ -64,7 +65,7 @@ def stepped(before: Array, after: Array) -> Track:
 
 def changed(change: str) -> Scene:
     """The Cornell box, whose lamp has its usual radiance and position from frame CHANGE on."""
-    scene = build_scene(LIGHT_SCENE, SEED, LIGHT_CLIP_SIZE[0])
+    scene = build_scene(LIGHT_SCENE, 0, LIGHT_CLIP_SIZE[0])
     *others, lamp = scene.shapes
     gain, shift = BEFORE[change]
     assert lamp.radiance is not None and isinstance(lamp.motion, RigidMotion)
@@ -76,17 +77,14 @@ def changed(change: str) -> Scene:
 
 
 def clip_of(change: str, folder: Path) -> Clip:
-    """The clip of a change, rendered if missing."""
-    made_of = CHANGE, BEFORE[change]
-    return own_clip(
-        folder,
-        f"{LIGHT_SCENE}-{change}",
-        lambda: changed(change),
-        LIGHT_CLIP_SIZE,
-        LIGHT_CLIP_SAMPLING,
-        tuple(CHANNELS),
-        made_of,
-    )
+    """The clip of a change, rendered if missing, in a folder named by a digest of everything that determines it."""
+    name = f"{LIGHT_SCENE}-{change}"
+    made_of = GENERATOR, name, LIGHT_CLIP_SIZE, LIGHT_CLIP_SAMPLING, *CHANNELS, CHANGE, BEFORE[change]
+    path = folder / f"{zlib.crc32(repr(made_of).encode()):08x}" / name / "000"
+    if not is_clip(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_clip(path, changed(change), LIGHT_CLIP_SIZE, LIGHT_CLIP_SAMPLING, 0, tuple(CHANNELS))
+    return Clip(path)
 
 
 @torch.inference_mode()
@@ -105,7 +103,7 @@ def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[floa
 def lag_of(spec: DenoiserSpec, clips: dict[str, Clip]) -> Lag:
     """PSNR of a denoiser on all clips, at the exposure of the one whose light does not change."""
     denoiser = spec.build()
-    exposure = clips[UNCHANGED].exposure
+    exposure = clips[STEADY].exposure
     return Lag(spec.name, {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()})
 
 
@@ -113,7 +111,7 @@ def lag_table(lags: Sequence[Lag]) -> str:
     """One row per denoiser, sorted by the loss in the last column."""
     heads = ["denoiser", f"steady light, frame {LIGHT_CLIP_SIZE[0] - 1}", *(f"loss {n} frames after" for n in AFTER)]
     rows = [
-        [lag.denoiser, f"{lag.psnr[UNCHANGED][-1]:.1f} dB", *(f"{lag.loss(n):.1f} dB" for n in AFTER)]
+        [lag.denoiser, f"{lag.psnr[STEADY][-1]:.1f} dB", *(f"{lag.loss(n):.1f} dB" for n in AFTER)]
         for lag in sorted(lags, key=lambda lag: lag.loss(AFTER[-1]))
     ]
     return tabulate(rows, heads, tablefmt="github", disable_numparse=True)
@@ -135,13 +133,13 @@ def lag_figure(lags: Sequence[Lag]) -> Figure:
     return figure
 
 
-def study_light(runs: Path, names: Sequence[str], budget: str) -> str:
-    """Measure the lag of denoisers, by default of all that can run; writes RUNS/study/light.
+def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
+    """Measure the lag of denoisers, by default of all that can run; writes RUNS/bench/light.
 
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     specs = evaluated(names, runs, budget)
-    folder = runs / "study" / "light"
+    folder = bench_folder(runs) / "light"
     clips = {change: clip_of(change, folder) for change in BEFORE}
     lags = [lag_of(spec, clips) for spec in tqdm(specs, "denoisers", unit="denoiser")]
     save_figure(folder / "plot.png", lag_figure(lags))

@@ -1,17 +1,17 @@
-"""One large frame in three slanted strips: noisy, denoised, and reference."""
+"""One frame in three slanted strips: noisy, denoised, reference. `python -m eval.figures.triptych --help`."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+import tyro
 from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from datasets.frame import read_frame
 from datasets.tonemap import clip_exposure, display, luminance
-from errors import BadInput
 from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
 from models.denoiser import Denoiser, State
@@ -54,23 +54,19 @@ def in_strips(pictures: tuple[Picture, Picture, Picture]) -> Picture:
 
 def triptych(
     out: Path,
-    scene_name: str,
-    denoiser: str,
-    runs: Path,
-    frame: int,
-    spp: int,
+    scene_name: str = "room-2014",
+    denoiser: str = "one",
+    runs: Path = Path("runs"),
+    frame: int = 12,
+    spp: int = 512,
     size: tuple[int, int] = (720, 1280),
     seed: int = 0,
 ) -> None:
     """Write a PNG of a built-in scene's frame, whose reference has `spp` samples a pixel, in `size` (height, width).
 
-    Raises BadInput for an unknown scene or denoiser, a frame before the first, and no samples.
+    History begins at frame 0. Raises BadInput for an unknown scene or denoiser.
     """
-    if frame < 0 or spp < 1:
-        raise BadInput(f"frame {frame} of {spp} spp: name a frame from 0 on, and 1 sample a pixel or more")
     (spec,) = evaluated([denoiser], runs, USUAL_BUDGET)
-    if spec.returns != "total":
-        raise BadInput(f"{denoiser} returns indirect light alone, which is not the picture: name another")
     scene = build_scene(scene_name, seed, 2 * frame)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "test" / scene_name / "000"
@@ -84,3 +80,7 @@ def triptych(
     picture = in_strips((shown[0], shown[1], shown[2]))
     with replacing(out) as temporary:
         Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(temporary, format="png", optimize=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(triptych)

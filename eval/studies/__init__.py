@@ -1,1 +1,0 @@
-"""Studies that the documentation cites: run when their finding is in doubt."""
