@@ -314,7 +314,7 @@ def trade(
     """
     from eval.tradeoff.run import trade as compare
 
-    print(compare(data_folder(data, budget), runs, budget, names, size, threads, spp))
+    print(compare(data_folder(data, budget), runs, budget, spp, names, size, threads))
 
 
 def denoise(job: Annotated[Job, arg(name="")], runs: Runs = RUNS, threads: Threads = None) -> None:

@@ -5,11 +5,11 @@ import multiprocessing
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from signal import SIG_IGN, SIGINT
 from signal import signal as on_signal
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tqdm import tqdm
@@ -24,7 +24,6 @@ from eval.results import (
     Result,
     by_clip,
     folder_of,
-    folders_of,
     is_finished,
     load_picture,
     load_result,
@@ -38,6 +37,9 @@ from models.spec import DenoiserSpec
 from process import set_up_process
 from provenance import device_in_words
 from timing import thread_count, threads_for
+
+if TYPE_CHECKING:
+    from plotting import Figure
 
 COMPILED_SIZE = (32, 48)  # px: a frame on which denoisers are run to compile their kernels
 SMALLEST_SHARE = 500_000  # pixels of all frames, evaluated in about the time in which another process starts
@@ -130,15 +132,30 @@ def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs
             pass
 
 
-def save_strips(runs: Path, results: ClipResults) -> None:
-    """Write a PNG with the outputs of all denoisers for a frame at three quarters of the clip."""
-    from eval.strip import save_strip
+def strip(runs: Path, results: ClipResults) -> "Figure":
+    """The outputs of all denoisers for a frame at three quarters of the clip, and its reference, side by side."""
+    from eval.figures.panel_grid import Panel, draw_grid
 
     index = len(results.reference.frames) * 3 // 4
-    images = {name: load_picture(folder, index) for name, folder in folders_of(runs, results).items()}
-    errors = {result.denoiser: result.frames[index] for result in results.results}
-    name = signal_label(f"{results.scene}-{results.clip}", results.signal)
-    save_strip(runs / "eval" / f"{name}.png", images, errors)
+    columns = []
+    for result in (*results.results, results.reference):
+        errors = (f"{key.upper()} {value:.3f}" for key in ("rmse", "ssim") if (value := result.frames[index].get(key)))
+        caption = f"{result.denoiser}\n{'' if result.floor else '  '.join(errors)}"
+        picture = load_picture(folder_of(runs, result.scene, result.clip, result.denoiser, result.signal), index)
+        columns.append([Panel(picture / 255, caption)])
+    return draw_grid(columns, [f"frame {index}"])
+
+
+def save_strips(runs: Path, clips: Iterable[ClipResults]) -> None:
+    """Write a PNG per clip and signal, if the extra `report` is installed."""
+    if not can_draw():
+        print("no pictures: they need `pip install 'onespp[report]'`")
+        return
+    from plotting import save_figure
+
+    for clip in clips:
+        name = signal_label(f"{clip.scene}-{clip.clip}", clip.signal)
+        save_figure(runs / "eval" / f"{name}.png", strip(runs, clip))
 
 
 def evaluate(
@@ -170,10 +187,6 @@ def evaluate(
     results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(device), results, weights)
-    if can_draw():
-        for group in by_clip(results):
-            save_strips(runs, group)
-    else:
-        print("no pictures: they need `pip install 'onespp[report]'`")
+    save_strips(runs, by_clip(results))
     print(results_table(list(by_clip(results))))
     return content

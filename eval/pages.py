@@ -1,9 +1,8 @@
 """Tables and numbers of the documentation, generated from the measurements in docs/measured.
 
-In a page, what stands between `<!-- measured: NAME ARGUMENT... -->` and `<!-- end -->` is the text that
-GENERATORS[NAME] returns. `python -m eval.pages RUNS` extracts the measurements that commands left in RUNS and writes
-the pages anew;
-without RUNS it only writes the pages.
+The text of a page between `<!-- measured: NAME ARGUMENT... -->` and `<!-- end -->` is that of GENERATORS[NAME].
+`python -m eval.pages RUNS` extracts the measurements that commands left in RUNS and rewrites the pages; without RUNS it
+only rewrites the pages.
 """
 
 import re
@@ -21,8 +20,7 @@ from eval.report.table_rows import TableRow, clip_rows, mean_rows
 from eval.results import NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
 from eval.text_table import PRINTED
-from eval.tradeoff.samples import SampleTrade
-from eval.tradeoff.shrinkage import Gain, gains_rows
+from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
 
@@ -43,12 +41,12 @@ SOURCES = {
 
 
 def rounded(values: Any) -> Any:
-    """JSON content with numbers of six digits."""
+    """JSON content with numbers of nine digits: no second rounding changes what is printed."""
     if isinstance(values, dict):
         return {key: rounded(value) for key, value in values.items()}
     if isinstance(values, list | tuple):
         return [rounded(value) for value in values]
-    return float(f"{values:.6g}") if isinstance(values, float) else values
+    return float(f"{values:.9g}") if isinstance(values, float) else values
 
 
 def extract_eval(runs: Path) -> dict[str, Any]:
@@ -75,9 +73,7 @@ def extract_bench(runs: Path) -> dict[str, Any]:
 
 def extract_trade(runs: Path) -> dict[str, Any]:
     content = read_json(runs / "report" / "trade.json")
-    samples = content["samples"]
-    kept = {key: content[key] for key in ("device", "size", "threads", "clips")}
-    return kept | {"samples": samples["rows"], "gains": samples["shrinkage"]}
+    return {key: content[key] for key in ("device", "size", "threads", "clips", "samples")}
 
 
 def extract_stress(runs: Path) -> dict[str, Any]:
@@ -225,25 +221,20 @@ def ratio(denoiser: str) -> str:
 def samples() -> str:
     """PSNR of denoisers fed more samples a pixel."""
     lines: dict[str, dict[str, str]] = {}
-    for row in (SampleTrade(**row) for row in measured("trade")["samples"]):
+    for row in (Trade(**row) for row in measured("trade")["samples"]):
         if row.signal == "total":
-            lines.setdefault(row.label, {"denoiser": f"`{row.label}`"})[f"{row.spp} spp"] = row.cell("psnr")
+            lines.setdefault(row.denoiser, {"denoiser": f"`{row.denoiser}`"})[f"{row.spp} spp"] = row.cell("psnr")
     return table([*lines.values()])
 
 
 def front() -> str:
     """Where milliseconds of rendering and filtering are best spent."""
-    rows = [SampleTrade(**row) for row in measured("trade")["samples"]]
-    best = sorted((row.ms, row) for row in rows if row.signal == "total" and row.dominated_by is None and row.ms)
+    rows = [Trade(**row) for row in measured("trade")["samples"]]
     lines = [
-        {"ms": f"{ms:.0f}", "spent on": f"`{row.label}`, {row.spp} spp", "PSNR": row.cell("psnr")} for ms, row in best
+        {"ms": f"{ms:.0f}", "spent on": f"`{row.denoiser}`, {row.spp} spp", "PSNR": row.cell("psnr")}
+        for ms, row in psnr_front(rows, "total")
     ]
     return table(lines)
-
-
-def gains() -> str:
-    """What +js gains on the better of noise and denoiser."""
-    return table(gains_rows([Gain(**row) for row in measured("trade")["gains"]]))
 
 
 def stress() -> str:
@@ -274,7 +265,7 @@ def minutes(what: str) -> str:
 
 GENERATORS: dict[str, Callable[..., str]] = {
     each.__name__: each
-    for each in (clip, quality, value, shipped, times, ratio, samples, front, gains, stress, device, minutes)
+    for each in (clip, quality, value, shipped, times, ratio, samples, front, stress, device, minutes)
 }
 
 
@@ -282,7 +273,7 @@ GENERATORS: dict[str, Callable[..., str]] = {
 
 
 def generate(match: re.Match[str]) -> str:
-    """What is to stand at a mark."""
+    """The text of a marked part."""
     name, *arguments = match[1].split()
     try:
         text = GENERATORS[name](*arguments)
@@ -292,7 +283,7 @@ def generate(match: re.Match[str]) -> str:
 
 
 def generated(page: str) -> str:
-    """A page with all that is marked generated anew."""
+    """A page with all marked parts generated."""
     return MARKED.sub(generate, page)
 
 

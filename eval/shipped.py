@@ -166,13 +166,13 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     weights = require_shipped(name)
     path = runs / "eval" / RESULTS_FILE
     content, clips = read_results(runs)
-    found = [clip for clip in clips if results_of([clip], name)]
+    evaluated = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
-    if not of_one_spp(found) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
+    if not of_one_spp(evaluated) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
         command = f"onespp eval {' '.join((*baselines(), name))} --runs {runs}"
         raise BadInput(f"{path} has no results of {weights} as it is now, on clips at 1 spp: run `{command}`")
     wanted = (*baselines(), name)
-    return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in found]
+    return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in evaluated]
 
 
 def means_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:

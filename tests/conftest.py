@@ -1,5 +1,6 @@
-"""What the tests share: a tiny data set rendered once, and a loaded moving scene."""
+"""What tests share: compiled kernels, a tiny dataset, and a loaded moving scene."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -9,22 +10,40 @@ import pytest
 import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
+from eval.harness import compile_kernels
 from models import shipped_weights
-from models.registry import channels_read
+from models.registry import DENOISERS, channels_read, prototype
+from models.spec import DenoiserSpec
 from render.job.generate import generate
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.registry import build_scene
 
-# Of tests that do not say themselves how many examples to try; `make test-all` takes the thorough ones.
+# For tests without a number of examples of their own; `make test-all` takes the thorough profile.
 hypothesis.settings.register_profile("quick", max_examples=10)
 hypothesis.settings.register_profile("thorough", max_examples=100)
 hypothesis.settings.load_profile("quick")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kernels() -> None:
+    """Under pytest-xdist, share out compiling: one process starts with the first denoiser, another with the last.
+
+    Each loads from disk what the other has compiled already; a file marks that all are.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    all_compiled = Path(os.environ["NUMBA_CACHE_DIR"], "all-compiled")
+    if not worker or all_compiled.exists():
+        return
+    names = [name for name in (*DENOISERS, "eaw+adaptive", "svgf+js") if not prototype(name).unavailable()]
+    for name in names if worker == "gw0" else reversed(names):
+        compile_kernels(DenoiserSpec.named(name))
+    all_compiled.touch()
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `onespp dataset --profile tiny` makes. Read only: tests that damage it copy it first."""
+    """The dataset of profile `tiny`. Read only: tests that damage it copy it first."""
     root = tmp_path_factory.mktemp("data") / "tiny"
     generate(root, "tiny", seed=0, reads=channels_read())
     return root
@@ -46,7 +65,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
 
 @pytest.fixture(scope="session", params=["cornell_box", "cornell_box_moving"])
 def stage(request: pytest.FixtureRequest) -> Stage:
-    """A built-in scene at 64 x 64, posed by whoever uses it."""
+    """A built-in scene at 64 x 64, which tests pose."""
     return Stage(build_scene(request.param, seed=3, frames=24), 64, 64)
 
 

@@ -52,7 +52,7 @@ def test_arrows_point_one_way(file):
     assert not strangers, f"{file} may not import {strangers}"
 
 
-def test_every_file_begins_with_what_it_holds():
+def test_every_file_has_a_docstring():
     for file in modules():
         assert ast.get_docstring(ast.parse((ROOT / file).read_text())), f"{file} has no docstring"
 
@@ -91,7 +91,7 @@ def examples(monkeypatch):
             del table[name]
 
 
-def test_its_denoiser_denoises(examples):
+def test_the_example_denoiser_denoises(examples):
     frame = synthetic_frame(0, 24, 32)
     output, state = create("box")(frame, None)
     assert output.shape == (1, 3, 24, 32) and torch.isfinite(output).all()
@@ -101,15 +101,15 @@ def test_its_denoiser_denoises(examples):
     assert spread[0] < spread[1] / 2
 
 
-def test_its_scene_is_darker(examples):
+def test_the_example_scene_is_darker(examples):
     night, day = (build_scene(name, 0, 8) for name in ("cornell_box_at_night", "cornell_box"))
     assert [shape.name for shape in night.shapes] == [shape.name for shape in day.shapes]
     assert (night.shapes[-1].radiance.at(0) < 0.02 * day.shapes[-1].radiance.at(0)).all()
     np.testing.assert_array_equal(night.view(3, 8, 8).camera_to_world, day.view(3, 8, 8).camera_to_world)
 
 
-def test_its_metric_is_measured(examples):
-    halves = torch.zeros(2, 3, 4, 4)
+def test_the_example_metric_is_measured(examples):
+    buffers = torch.zeros(2, 3, 4, 4)
     output = torch.zeros(1, 3, 4, 4)
     output[0, 0, 1, 2] = 0.5
-    assert measure(Comparison(output, halves, 1.0))["largest_error"] == pytest.approx(0.5 ** (1 / 2.2))
+    assert measure(Comparison(output, buffers, 1.0))["largest_error"] == pytest.approx(0.5 ** (1 / 2.2))

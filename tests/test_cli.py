@@ -61,7 +61,7 @@ def test_a_bench_refuses_unknown_options(capsys):
 
 def test_unknown_commands(capsys):
     assert "unknown command 'onespp fly'" in fails(capsys, "fly")
-    assert "denoisers, rendering" in fails(capsys, "bench", "everything")
+    assert "denoisers, light, rendering" in fails(capsys, "bench", "everything")
 
 
 def test_unknown_names(capsys, tiny, tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from command_line import GROUPS, STUDIES
+from command_line import GROUPS
 from eval.pages import MARKED, PAGES, generated
 from eval.shipped import BEGIN, END, card_file, facts
 from models.shipped_weights import shipped_names
@@ -62,12 +62,12 @@ def commands(groups: dict) -> dict:
 def test_commands_exist(page):
     for words in re.findall(r"(?:`|^)onespp ([a-z]+(?: [a-z]+)?)", page.read_text(), re.MULTILINE):
         name, _, rest = words.partition(" ")
-        command = (commands(GROUPS) | {"study": STUDIES}).get(name)
+        command = commands(GROUPS).get(name)
         assert command, f"{page.name} names `onespp {name}`"
         if isinstance(command, dict):
             assert rest in command, f"{page.name} names `onespp {words}`"
 
 
-def test_no_picture_is_left_over():
+def test_every_picture_is_used():
     pages = "".join(page.read_text() for page in PAGES)
     assert all(picture.name in pages for picture in Path(ROOT / "docs").glob("*.png"))

@@ -45,7 +45,7 @@ def test_training_and_evaluation(tiny: Path, tmp_path: Path):
     assert not [path for ending in ("png", "webp", "tfevents*") for path in tmp_path.rglob(f"*{ending}")]
 
 
-def test_what_draws_names_the_extra(tmp_path):
+def test_drawing_commands_name_the_extra(tmp_path):
     commands = (["report"], ["show", "clip"], ["preview"], ["denoise", "*.exr", "--png", "--out", str(tmp_path / "o")])
     code = f"""
 import contextlib, io

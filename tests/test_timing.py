@@ -24,7 +24,7 @@ class Clock:
         return self.now
 
 
-def test_functions_take_turns_and_warm_up_does_not_count():
+def test_functions_take_turns_after_warm_up():
     clock = Clock()
     rounds = []
     work = {"a": clock.work("a", 1.0), "b": clock.work("b", 2.0)}

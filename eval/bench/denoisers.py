@@ -20,7 +20,7 @@ from eval.selection import cannot_run, choose, with_indirect_baselines
 from files import read_json, write_json
 from models.filters.oidn import OIDN
 from models.names import DenoiserName
-from models.registry import DENOISERS, create, parse_name
+from models.registry import DENOISERS, parse_name
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory
@@ -38,13 +38,11 @@ class DenoiserCost(Timing):
     Attributes:
         peak_mb: growth of memory during two frames: the state and all intermediate tensors.
         parameters: of the network in its form for inference.
-        prediction: the network's share of the time, between 0 and 1.
     """
 
     peak_mb: float | None
     parameters: int | None
     macs_per_pixel: float | None
-    prediction: float | None
 
     @property
     def conditions(self) -> tuple[int, int, int]:
@@ -143,7 +141,6 @@ def cost(timed: TimedDenoiser, size: Size, peak_mb: float | None) -> DenoiserCos
         peak_mb=peak_mb,
         parameters=None if isinstance(unwrapped(timed.denoiser), OIDN) else timed.denoiser.parameter_count(),
         macs_per_pixel=macs_per_pixel(timed.spec),
-        prediction=timed.network_share(),
     )
 
 
@@ -226,11 +223,10 @@ def measure_rows(
 
 
 def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
-    """The lines of the table: times, relative to OIDN's, and the shares of the network and of the rest."""
+    """The lines of the table."""
     baselines = {row.conditions: row.ms_median for row in rows if row.denoiser == BASELINE}
     for row in rows:
         baseline = baselines.get(row.conditions)
-        share = row.prediction
         yield {
             "denoiser": row.denoiser,
             "size": size_name((row.height, row.width)),
@@ -240,10 +236,7 @@ def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
             "p10": row.ms_p10,
             "p90": row.ms_p90,
             "times oidn": row.ms_median / baseline if baseline else None,
-            "prediction": None if share is None else f"{share:.0%}",
-            "reconstruction": None if share is None else f"{1 - share:.0%}",
             "peak MB": row.peak_mb,
             "parameters": row.parameters,
-            "as trained": None if share is None else create(row.denoiser.partition(" (")[0]).parameter_count(),
             "MACs/pixel": row.macs_per_pixel,
         }

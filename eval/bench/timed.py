@@ -43,29 +43,17 @@ class TimedDenoiser:
     """A denoiser, its state, and the times that were measured.
 
     Attributes:
-        in_network: seconds of each frame in the network; empty without one.
         seconds: of each frame after warm-up.
     """
 
     spec: DenoiserSpec
     denoiser: Denoiser
     state: State | None = None
-    in_network: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
     @staticmethod
     def of(spec: DenoiserSpec) -> "TimedDenoiser":
-        timed = TimedDenoiser(spec, spec.build())
-        if network := network_of(timed.denoiser):
-            network.register_forward_pre_hook(lambda *_: timed.enter_network())
-            network.register_forward_hook(lambda *_: timed.leave_network())
-        return timed
-
-    def enter_network(self) -> None:
-        self.in_network.append(-device_clock(self.spec.device))
-
-    def leave_network(self) -> None:
-        self.in_network[-1] += device_clock(self.spec.device)
+        return TimedDenoiser(spec, spec.build())
 
     def step(self, frame: Frame) -> None:
         """Denoise the next frame, which is on the device already."""
@@ -77,13 +65,6 @@ class TimedDenoiser:
         return Timing(
             self.spec.way, *size, self.spec.precision, torch.get_num_threads(), len(self.seconds), median, p10, p90
         )
-
-    def network_share(self) -> float | None:
-        """The network's share of a frame's time, between 0 and 1; None without a network."""
-        if not self.in_network:
-            return None
-        timed = self.in_network[-len(self.seconds) :]
-        return float(np.median(np.divide(timed, self.seconds)))
 
 
 def network_of(denoiser: Denoiser) -> nn.Module | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from eval.means import scores_of
 from eval.results import ClipResults, by_signal, of_one_spp
-from eval.tradeoff.pareto import TimedScores, dominated_by_name
+from eval.tradeoff.pareto import Point, dominated_by_name
 from eval.tradeoff.times import Times
 from models.spec import DenoiserSpec
 
@@ -41,21 +41,22 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[TradePlot]:
 
 def trade_plot(times: Times, clips: Sequence[ClipResults], metric: str) -> TradePlot:
     """A point for each denoiser that was timed in the precision in which it was evaluated. Clips are of one signal."""
-    offers = {}
+    compared: dict[str, Point | None] = {}
+    means: dict[str, Point] = {}
     for result in clips[0].results:
-        spec = DenoiserSpec.named(result.denoiser, signal=result.signal, precision=result.precision)
-        offers[result.denoiser] = TimedScores(times.of(spec), scores_of(clips, result.denoiser))
-    beaten = dominated_by_name(offers, metric)
-    points = [
-        PlotPoint(name, mean.ms, mean.quality, beaten[name])
-        for name, offer in offers.items()
-        if (mean := offer.mean(metric))
-    ]
+        name = result.denoiser
+        ms = times.of(DenoiserSpec.named(name, signal=result.signal, precision=result.precision))
+        scores = scores_of(clips, name)
+        compared[name] = Point.of(ms, scores.compared(metric))
+        if mean := Point.of(ms, scores.means[metric]):
+            means[name] = mean
+    beaten = dominated_by_name(compared, metric)
+    points = [PlotPoint(name, mean.ms, mean.quality, beaten[name]) for name, mean in means.items()]
     height, width = times.size
     return TradePlot(
         signal=clips[0].signal,
         metric=metric,
         points=sorted(points, key=lambda point: point.ms),
-        missing=[name for name in offers if name not in beaten],
+        missing=[name for name in compared if name not in beaten],
         size=f"{width} × {height}",
     )

@@ -104,8 +104,8 @@ STRESS_CASES = (
         "no surface at all", surfaces=channels_at(albedo=1.0, normal=0.0, depth=0.0, roughness=1.0, mesh_id=0.0)
     ),
     StressCase("a mirror", surfaces=channels_at(albedo=1.0, roughness=0.0)),
-    StressCase("depth around 1e-4", surfaces=lengths_times(2e-5)),
-    StressCase("depth around 1e6", surfaces=lengths_times(2e5)),
+    StressCase("depth near 1e-4", surfaces=lengths_times(2e-5)),
+    StressCase("depth near 1e6", surfaces=lengths_times(2e5)),
     StressCase("depth 1e-4 to 1e6", surfaces=near_to_far),
     StressCase("motion far outside", surfaces=channels_at(**dict.fromkeys(MOTION_CHANNELS, (1e5, -1e30)))),
     StressCase("1 x 1 px", size=(1, 1)),

@@ -1,7 +1,7 @@
 """One denoiser in one stress case: its errors, and the requirements that it breaks."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,13 +13,13 @@ from eval.stress.changes import FrameChange, PixelChange, unchanged
 from eval.stress.irradiance_range import ROUNDING, range_violation
 from eval.stress.lit_frames import NOISE_PERIOD
 from eval.stress.logits import largest_logits
-from eval.stress.outcome import StressOutcome
 from models.denoiser import Denoiser
 from models.spec import PRECISIONS
 
 MAX_RESIDUE = 1e-3  # of the brightest pixel: smaller changes count as none
 ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by its power of 5 alone
 ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
+FRESH = "fresh"  # instead of a file: random weights
 BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
 REQUIREMENTS = {
     "finite": "outputs are finite where inputs are finite",
@@ -54,13 +54,39 @@ def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[T
 
 def largest_finite(errors: Iterable[Tensor]) -> float | None:
     """The largest finite value; None without any."""
-    found = [error[torch.isfinite(error)] for error in errors]
-    return max((float(error.max()) for error in found if len(error)), default=None)
+    finite = [error[torch.isfinite(error)] for error in errors]
+    return max((float(error.max()) for error in finite if len(error)), default=None)
 
 
 def max_residue(precision: str) -> float:
     """The largest change, relative to the brightest pixel, that counts as none in a precision of PRECISIONS."""
     return max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
+
+
+@dataclass(frozen=True)
+class StressRow:
+    """A denoiser in a stress case: a row of results.json.
+
+    Attributes:
+        weights: their file, FRESH, or None for a denoiser without.
+        extreme: the name of the case.
+        error: the largest, relative to the brightest expected pixel, absolute if that is black; None where no pixel is
+            finite.
+        nonfinite: output pixels that are not finite, in all frames.
+        violation: largest distance from the range, relative to its end (convex filters), or below 0 (others).
+        recovery: frames until the effect of a bad pixel ends, 0 if it has none; None if it does not end, and in cases
+            without a bad pixel.
+        broken: the requirements that are not kept, keys of REQUIREMENTS.
+    """
+
+    denoiser: str
+    weights: str | None
+    extreme: str
+    error: float | None
+    nonfinite: int
+    violation: float
+    recovery: int | None
+    broken: tuple[str, ...]
 
 
 class StressCheck:
@@ -104,7 +130,8 @@ class StressCheck:
         frames = changed[-1] + 1 - SPOILED_FRAME if changed else 0
         return frames if frames <= RECOVERY_LIMIT else None
 
-    def outcome(self) -> StressOutcome:
+    def row(self, denoiser: str, weights: str | None) -> StressRow:
+        """The results under the denoiser's name, with the file of its weights."""
         errors = self.errors()
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
         good_input = [finite_pixels(frame, self.denoiser.reads) for frame in self.frames]
@@ -117,7 +144,10 @@ class StressCheck:
             "spread": poison is not None and self.spreads(poison),
             "recovery": poison is not None and recovery is None,
         }
-        return StressOutcome(
+        return StressRow(
+            denoiser,
+            weights,
+            self.case.name,
             error=largest_finite(errors),
             nonfinite=sum(int(where.sum()) for where in bad),
             violation=violation,

@@ -1,7 +1,7 @@
 """`onespp stress`: every denoiser in every stress case, and the requirements that it breaks."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -11,9 +11,8 @@ from tqdm import tqdm
 from errors import BadInput
 from eval.selection import cannot_run, choose, untrained, weights_file
 from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
-from eval.stress.check import StressCheck
+from eval.stress.check import FRESH, StressCheck, StressRow
 from eval.stress.logits import last_layers
-from eval.stress.outcome import FRESH, StressRow
 from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
@@ -77,8 +76,7 @@ def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> lis
             build = cache(partial(build_in, spec))
             for case in ours:
                 progress.set_postfix_str(f"{spec.name}: {case.name}")
-                outcome = StressCheck(build, case).outcome()
-                rows.append(StressRow(spec.name, weights_label(spec), case.name, outcome))
+                rows.append(StressCheck(build, case).row(spec.name, weights_label(spec)))
                 progress.update()
     return rows
 
@@ -103,11 +101,11 @@ def stress(
         "device": "cpu, 1 thread",
         "versions": versions(DENOISING),
         "precision": precision,
-        "rows": [row.as_json() for row in rows],
+        "rows": [asdict(row) for row in rows],
     }
     write_json(folder / "results.json", results)
     write_file(folder / "table.md", (details(rows, cases, "pipe") + "\n").encode())
     save_figure(folder / "errors.png", heat_map(rows, cases))
     print(error_table(rows, cases))
     print("\n" + verdict_text(rows, cases))
-    return not any(row.outcome.broken for row in rows)
+    return not any(row.broken for row in rows)

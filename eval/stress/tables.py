@@ -6,8 +6,7 @@ import numpy as np
 from tabulate import tabulate
 
 from eval.stress.cases import RECOVERY_LIMIT, StressCase
-from eval.stress.check import REQUIREMENTS
-from eval.stress.outcome import FRESH, StressRow
+from eval.stress.check import FRESH, REQUIREMENTS, StressRow
 from plotting import Figure, plt
 
 
@@ -22,14 +21,14 @@ def recovery_time(row: StressRow, case: StressCase) -> str:
     """Frames until the effect of the case's bad pixel ends."""
     if case.only is None:
         return "-"
-    return f"> {RECOVERY_LIMIT}" if row.outcome.recovery is None else str(row.outcome.recovery)
+    return f"> {RECOVERY_LIMIT}" if row.recovery is None else str(row.recovery)
 
 
 def error_cell(row: StressRow | None) -> str:
     """The largest error, with a ! where a requirement is broken; empty where the case does not apply."""
     if row is None:
         return ""
-    return short(row.outcome.error) + (" !" if row.outcome.broken else "")
+    return short(row.error) + (" !" if row.broken else "")
 
 
 def weights_cell(weights: str | None) -> str:
@@ -41,18 +40,18 @@ def weights_cell(weights: str | None) -> str:
 def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
     """One column per denoiser: its error in each case, and a summary of the rest."""
     weights = {row.denoiser: row.weights for row in rows}
-    found = {(row.denoiser, row.extreme): row for row in rows}
-    outcomes = {name: [row.outcome for row in rows if row.denoiser == name] for name in weights}
+    by_case = {(row.denoiser, row.extreme): row for row in rows}
+    by_denoiser = {name: [row for row in rows if row.denoiser == name] for name in weights}
 
     lines = [["weights", *(weights_cell(file) for file in weights.values())]]
-    lines += [[case.name, *(error_cell(found.get((name, case.name))) for name in weights)] for case in cases]
+    lines += [[case.name, *(error_cell(by_case.get((name, case.name))) for name in weights)] for case in cases]
     for case in cases:
         if case.only is not None:
-            times = [recovery_time(found[name, case.name], case) for name in weights]
+            times = [recovery_time(by_case[name, case.name], case) for name in weights]
             lines.append([f"frames until recovery: {case.name}", *times])
-    nonfinite = [sum(outcome.nonfinite for outcome in of) for of in outcomes.values()]
+    nonfinite = [sum(row.nonfinite for row in ours) for ours in by_denoiser.values()]
     lines.append(["pixels that are not finite", *map(str, nonfinite)])
-    violations = [max(outcome.violation for outcome in of) for of in outcomes.values()]
+    violations = [max(row.violation for row in ours) for ours in by_denoiser.values()]
     lines.append(["largest range violation", *map(short, violations)])
     return tabulate(lines, ["worst error", *weights], disable_numparse=True, maxheadercolwidths=11)
 
@@ -65,11 +64,11 @@ def details(rows: Sequence[StressRow], cases: Sequence[StressCase], form: str = 
             "denoiser": row.denoiser,
             "weights": row.weights or "-",
             "extreme": row.extreme,
-            "worst error": short(row.outcome.error),
-            "non-finite": row.outcome.nonfinite,
-            "range violation": short(row.outcome.violation),
+            "worst error": short(row.error),
+            "non-finite": row.nonfinite,
+            "range violation": short(row.violation),
             "recovery": recovery_time(row, by_name[row.extreme]),
-            "broken": ", ".join(row.outcome.broken),
+            "broken": ", ".join(row.broken),
         }
         for row in rows
     ]
@@ -78,10 +77,10 @@ def details(rows: Sequence[StressRow], cases: Sequence[StressCase], form: str = 
 
 def verdict_text(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
     """The requirements that are broken, and where; or that all are kept."""
-    broken = [row for row in rows if row.outcome.broken]
+    broken = [row for row in rows if row.broken]
     if not broken:
         return "All requirements are kept."
-    missed = {name for row in broken for name in row.outcome.broken}
+    missed = {name for row in broken for name in row.broken}
     explained = [f"{name}: {text}" for name, text in REQUIREMENTS.items() if name in missed]
     return "\n".join(["Broken requirements:", "", details(broken, cases), "", *explained])
 
@@ -95,8 +94,8 @@ def heat_map(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> Figure:
     for row in rows:
         y = names.index(row.denoiser)
         x = columns.index(row.extreme)
-        errors[y, x] = np.nan if row.outcome.error is None else np.log10(max(row.outcome.error, 1e-8))
-        if row.outcome.broken:
+        errors[y, x] = np.nan if row.error is None else np.log10(max(row.error, 1e-8))
+        if row.broken:
             axes.plot(x, y, "x", color="red", markersize=12, markeredgewidth=3)
     image = axes.imshow(errors, cmap="viridis", vmin=-8, vmax=2)
     axes.set_facecolor("lightgrey")  # where there is no error to show

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 from eval.metrics import METRICS
-from eval.tradeoff.denoisers import Trade
 from eval.tradeoff.pareto import Point
-from eval.tradeoff.samples import SampleTrade
+from eval.tradeoff.trades import Trade
 from plotting import DPI, Axes, Figure, plt, ticker
 
 MARKERS = {"float32": "o", "bfloat16": "s", "float16": "^"}
@@ -65,7 +64,7 @@ def draw_panel(axis: Axes, rows: Sequence[tuple[Trade, Point]], metric: str) -> 
     axis.legend(fontsize=8)
 
 
-def draw_samples(rows: Sequence[SampleTrade], title: str) -> Figure:
+def draw_samples(rows: Sequence[Trade], title: str) -> Figure:
     """PSNR against samples per pixel, and against milliseconds of rendering and filtering; one row per signal."""
     signals = list(dict.fromkeys(row.signal for row in rows))
     size = (11, 4.5 * len(signals))

@@ -1,9 +1,9 @@
-"""Clips with more samples per pixel: a dataset's clips with other noisy input, rendered or averaged, and stored."""
+"""Clips with more samples per pixel: a dataset's clips with other noisy input, rendered and stored."""
 
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from render.job.profiles import profile_of, source_of
 from render.sampler import CYCLE
 from scenes.animation import Scene
 
-Source = Literal["averaged", "rendered"]
 NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS (H, W, 3), of SAMPLE_BUFFERS (2, H, W, 3)
 
 
@@ -38,18 +37,6 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     return scene_of_clip(clip.path, profile, dataset.facts["seed"])
 
 
-def averaged(clip: Clip, count: int, with_buffers: bool) -> Iterator[NoisyFrame]:
-    """The mean of the clip's first `count` independent noise realisations, frame by frame."""
-    for frame in range(clip.frames):
-        noisy = {}
-        for name in NOISY_CHANNELS:
-            drawn = np.stack([clip.read(name, frame, realisation=i).astype(np.float32) for i in range(count)])
-            noisy[name] = drawn.mean(axis=0)
-            if with_buffers:
-                noisy[SAMPLE_BUFFERS[name]] = np.stack([part.mean(axis=0) for part in np.split(drawn, 2)])
-        yield noisy
-
-
 def rendered(clip: Clip, dataset: Dataset, spp: int, with_buffers: bool) -> Iterator[NoisyFrame]:
     """Noisy frames rendered with `spp` stratified samples, the same as those of a clip such as 000-4spp.
 
@@ -62,12 +49,7 @@ def rendered(clip: Clip, dataset: Dataset, spp: int, with_buffers: bool) -> Iter
         yield {name: np.nan_to_num(arrays[name][0], nan=0, posinf=0, neginf=0) for name in channels}
 
 
-def source(clip: Clip, most: int) -> Source:
-    """How the input of a clip is made for all numbers of samples per pixel up to `most`."""
-    return "averaged" if clip.realisations * clip.facts["noisy_spp"] >= most else "rendered"
-
-
-def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path, with_buffers: bool = False) -> Clip:
+def with_samples(clip: Clip, dataset: Dataset, spp: int, root: Path, with_buffers: bool = False) -> Clip:
     """`clip` with `spp` samples per pixel as its noisy input: a clip of one realisation below the folder `root`.
 
     `with_buffers` adds two sample buffers, if `spp` is an even multiple of the clip's own. The clip is made if missing
@@ -77,7 +59,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     own = clip.facts["noisy_spp"]
     if spp == own:
         return clip
-    if how == "rendered" and Options(**dataset.facts["options"]).halton and spp > CYCLE:
+    if Options(**dataset.facts["options"]).halton and spp > CYCLE:
         raise BadInput(
             f"{dataset.path} is of --halton, which has {CYCLE} different samples a pixel: {spp} are too many"
         )
@@ -88,8 +70,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     made_of = {
         "clip": str(clip.path.resolve()),
         "crc32": clip.fingerprint,
-        "how": how,
-        "halves": with_buffers,
+        "buffers": with_buffers,
     }
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)
@@ -97,10 +78,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, how: Source, root: Path
     with locked(path.with_name(f".{path.name}.lock")) as ours:
         if not ours:
             raise BadInput(f"another process is making {path}: wait for it")
-        count = spp // own
-        frames = (
-            averaged(clip, count, with_buffers) if how == "averaged" else rendered(clip, dataset, spp, with_buffers)
-        )
+        frames = rendered(clip, dataset, spp, with_buffers)
         progress = tqdm(frames, f"{clip.scene}/{path.name}", clip.frames, unit="frame", leave=False)
         write_resampled(path, clip, list(progress), {"noisy_spp": spp, "made_of": made_of})
     return Clip(path)

@@ -2,25 +2,34 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
-from datasets.clip import Dataset
-from eval.bench.sample_cost import RENDERER
+import numpy as np
+from tqdm import tqdm
+
+from datasets.channels import SAMPLE_BUFFERS
+from datasets.clip import Clip, Dataset
+from errors import BadInput
+from eval.bench.sample_cost import RENDERER, Cost, sample_cost
 from eval.bench.sizes import parse_size
 from eval.clip_run import NamedDenoiser
 from eval.harness import clips_of_one_spp, evaluate_clip
-from eval.results import by_clip
-from eval.selection import with_indirect_baselines
-from eval.tradeoff.candidates import candidates
-from eval.tradeoff.denoisers import TRADED, Trade, front_table, trades
-from eval.tradeoff.feeding import SPP_LEVELS, SampleTrades, by_samples, check_levels, sampled
+from eval.results import ClipResults, Result, by_clip
+from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.samples import samples_table
-from eval.tradeoff.shrinkage import gains_table
+from eval.tradeoff.resampled_clips import scene_of, with_samples
 from eval.tradeoff.times import Times
+from eval.tradeoff.trades import TRADED, Trade, front_table, samples_table, trades
 from files import write_json
+from models.names import DenoiserName
+from models.registry import DENOISERS
+from models.shipped_weights import shipped_names
+from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions
+from render.clip import Options
 
 FRONTS = "Fronts count a clip within its noise floor as at the floor's edge: a worse mean can dominate a better one."
 
@@ -29,34 +38,34 @@ def trade(
     data: Path,
     runs: Path,
     budget: str,
+    levels: Sequence[int],
     names: Sequence[str] = (),
     size: str = "1280x720",
     threads: int | None = None,
-    levels: Sequence[int] = SPP_LEVELS,
 ) -> str:
-    """Evaluate all candidates on the test clips. Returns tables, writes RUNS/report/trade.json and figures.
+    """Evaluate all candidates on the test clips, with `levels` of samples per pixel.
 
-    Times are those of RUNS/bench at `size` and `threads`. Clips and results are stored in RUNS/trade and reused.
-    Raises BadInput where there are no times or clips, for a bad size or numbers of samples, and as `candidates`.
+    Returns tables; writes RUNS/report/trade.json and figures. Times are those of RUNS/bench at `size` and `threads`.
+    Clips and results are stored in RUNS/trade and reused. Raises BadInput where there are no times or clips, for a bad
+    size or numbers of samples, and as `candidates`.
     """
     check_levels(levels)
     dataset = Dataset(data)
     times = Times(runs, parse_size(size), threads, RENDERER)
     clips = clips_of_one_spp(dataset)
     chosen = candidates(names, runs, budget)
+    folder = runs / "trade"
 
     specs = with_indirect_baselines(chosen)
-    denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
-    results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs / "trade")]
-    rows = trades(specs, list(by_clip(results)), times)
-    samples = by_samples(sampled(chosen, bool(names)), clips, dataset, levels, times, runs / "trade")
+    rows = trades(specs, results_by_spp(specs, clips, dataset, (1,), folder), {1: 0.0}, times)
+    fed = with_indirect_baselines(with_more_samples(chosen, bool(names)))
+    results = results_by_spp(fed, clips, dataset, levels, folder)
+    costs = sample_costs(clips, dataset, times)
+    render_ms = {spp: float(np.mean([cost.of(spp) for cost in costs.values()])) for spp in levels}
+    sample_rows = trades(fed, results, render_ms, times)
 
-    figures = runs / "report" / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
     title = f"{times.name}, {RENDERER}, {times.threads} threads; mean of {len(clips)} clips of {data}"
-    for metric in TRADED:
-        save_figure(figures / f"trade-{metric}.png", draw_front(rows, metric, title))
-    save_figure(figures / "trade-samples.png", draw_samples(samples.rows, title))
+    save_figures(runs / "report" / "figures", rows, sample_rows, title)
     content = {
         "schema": 1,
         "dataset": str(data),
@@ -67,21 +76,80 @@ def trade(
         "size": times.name,
         "threads": times.threads,
         "rows": [asdict(row) for row in rows],
-        "samples": asdict(samples),
+        "render_ms": {name: cost._asdict() for name, cost in costs.items()},
+        "samples": [asdict(row) for row in sample_rows],
     }
     write_json(runs / "report" / "trade.json", content)
-    return tables(rows, samples, title, times)
+    return tables(rows, sample_rows, title, times)
 
 
-def tables(rows: Sequence[Trade], samples: SampleTrades, title: str, times: Times) -> str:
+def check_levels(levels: Sequence[int]) -> None:
+    """Raise BadInput unless they are at least 1 and rise."""
+    if not levels or levels[0] < 1 or any(a >= b for a, b in pairwise(levels)):
+        raise BadInput(f"{' '.join(map(str, levels))} are no samples a pixel to compare: name rising numbers from 1")
+
+
+def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec]:
+    """The named denoisers, or all that can run and are trained, in each precision that they compute in.
+
+    Raises BadInput for an unknown name and one that cannot run or is not trained.
+    """
+    obstacles = (cannot_run, partial(untrained, runs, budget))
+    return [
+        DenoiserSpec(name, precision=precision, weights=weights_file(name, runs, budget))
+        for name in choose(names, map(DenoiserName, DENOISERS), *obstacles)
+        for precision in precisions_of(name)
+    ]
+
+
+def with_more_samples(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
+    """The named candidates, or baselines and networks with shipped weights, in the precision of `onespp eval`."""
+    usual = (*baselines(), *shipped_names())
+    return [
+        candidate
+        for candidate in chosen
+        if (named or candidate.name in usual) and candidate.precision == fastest_precision(candidate.denoiser)
+    ]
+
+
+def results_by_spp(
+    specs: Sequence[DenoiserSpec], clips: Sequence[Clip], dataset: Dataset, levels: Sequence[int], folder: Path
+) -> dict[int, list[ClipResults]]:
+    """Results on the clips by samples per pixel; clips and results are stored in `folder`."""
+    denoisers = [NamedDenoiser(spec, spec.label) for spec in specs]
+    with_buffers = any(not set(SAMPLE_BUFFERS.values()).isdisjoint(spec.facts.reads) for spec in specs)
+    results: dict[int, list[Result]] = {spp: [] for spp in levels}
+    jobs = [(clip, spp) for clip in clips for spp in levels]
+    for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
+        results[spp] += evaluate_clip(
+            with_samples(clip, dataset, spp, folder / "data", with_buffers), denoisers, folder
+        )
+    return {spp: list(by_clip(ours)) for spp, ours in results.items()}
+
+
+def sample_costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[str, Cost]:
+    """The cost of samples in the scene of each clip, at the size and with the threads of the bench."""
+    options = Options(**dataset.facts["options"])
+    return {
+        f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads, options)
+        for clip in tqdm(clips, f"rendering {times.name}", unit="scene", leave=False)
+    }
+
+
+def save_figures(folder: Path, rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str) -> None:
+    """Write trade-METRIC.png of denoisers alone, and trade-samples.png."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for metric in TRADED:
+        save_figure(folder / f"trade-{metric}.png", draw_front(rows, metric, title))
+    save_figure(folder / "trade-samples.png", draw_samples(sample_rows, title))
+
+
+def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, times: Times) -> str:
     """The output of `onespp trade`."""
     parts = [title, FRONTS]
     for signal in dict.fromkeys(row.signal for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row.signal == signal])}")
     if untimed := [row.label for row in rows if row.ms is None]:
         parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command} --all`.")
-    parts.append(f"samples per pixel\n{samples_table(samples.rows)}")
-    if samples.shrinkage:
-        heading = "gain of shrinkage over the better of noisy frame and denoiser, dB: mean of the clips (worst)"
-        parts.append(f"{heading}\n{gains_table(samples.shrinkage)}")
+    parts.append(f"samples per pixel\n{samples_table(sample_rows)}")
     return "\n\n".join(parts)

@@ -450,7 +450,7 @@ def test_impossible_errors_are_refused(buffers, tmp_path, capsys, words, complai
 
 def test_our_own_frames_contain_their_buffers(tiny, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
-    two = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "clips", with_buffers=True)
+    two = with_samples(clip, Dataset(tiny), 2, tmp_path / "clips", with_buffers=True)
     export_clip(two.path, tmp_path / "exr")
     found = denoised(tmp_path / "exr", tmp_path / "out", "eaw+js", error=True, until=0.5)
     denoiser = load("eaw+js", None, signal="total")

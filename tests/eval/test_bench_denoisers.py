@@ -36,14 +36,13 @@ FIELDS = [
     "peak_mb",
     "parameters",
     "macs_per_pixel",
-    "prediction",
 ]
 NOISY = DenoiserSpec.named("noisy")
 
 
 def test_results_have_the_agreed_form(tmp_path):
     table = bench_denoisers(tmp_path, ["accumulated", "rae"], ["64x32"], threads=[1], measured=2, every_way=True)
-    assert "times oidn" in table and "reconstruction" in table and "accumulated (PyTorch)" in table
+    assert "times oidn" in table and "accumulated (PyTorch)" in table
     (path,) = (tmp_path / "bench").iterdir()  # nothing is left of what keeps unfinished races
     results = json.loads(path.read_text())
     assert path.name == "results.json"
@@ -61,18 +60,17 @@ def test_results_have_the_agreed_form(tmp_path):
         assert 0 < row["ms_p10"] <= row["ms_median"] <= row["ms_p90"]
         counts = {"rae": 1_951_935, "oidn": None}
         assert row["parameters"] == counts.get(row["denoiser"], 0)
-        assert (row["macs_per_pixel"] is None) == (row["prediction"] is None) == (row["denoiser"] != "rae")
-        assert row["prediction"] is None or 0 < row["prediction"] < 1
+        assert (row["macs_per_pixel"] is None) == (row["denoiser"] != "rae")
         assert row["frames"] == 2
 
 
 def test_every_number_of_threads_has_its_rows(tmp_path):
     races = measure_rows([NOISY], [(8, 8), (8, 16)], [1, 2], tmp_path / "unfinished.json", measured=1)
-    seen = []
+    measured = []
     for (row,) in races:
         assert row.denoiser == "noisy"
-        seen.append((row.width, row.threads))  # the number that PyTorch took
-    assert seen == [(8, 1), (8, 2), (16, 1), (16, 2)]
+        measured.append((row.width, row.threads))  # threads of PyTorch
+    assert measured == [(8, 1), (8, 2), (16, 1), (16, 2)]
     assert thread_counts(()) == [torch.get_num_threads()]
     assert thread_counts((2, 1, 2)) == [1, 2]
 
@@ -85,7 +83,7 @@ def test_the_head_of_results_is_of_the_most_threads(tmp_path, capsys):
     assert [row["threads"] for row in results["rows"] if row["denoiser"] == "noisy"] == [1, 2]
 
 
-def test_an_interrupted_bench_goes_on(tmp_path):
+def test_an_interrupted_bench_resumes(tmp_path):
     unfinished = tmp_path / "unfinished.json"
 
     def races(*specs, measured=1):
@@ -102,7 +100,7 @@ def test_an_interrupted_bench_goes_on(tmp_path):
     assert all(row.frames == 2 for row in chain.from_iterable(races(NOISY, measured=2)))
 
 
-def test_a_bench_goes_on_where_the_same_call_was_interrupted(tmp_path):
+def test_only_the_same_call_resumes_a_bench(tmp_path):
     unfinished = tmp_path / "bench" / "unfinished-results.json"
     unfinished.parent.mkdir()
     first = next(measure_rows(timed_specs(["noisy"]), [(4, 8)], [1, 2], unfinished, measured=1))
@@ -118,15 +116,15 @@ def test_oidn_has_no_parameters_to_count():
     for name in ("oidn", "oidn+taa"):
         (timed,) = time_in_turns([DenoiserSpec.named(name)], (8, 8), measured=1)
         row = cost(timed, (8, 8), 1.0)
-        assert (row.peak_mb, row.parameters, row.macs_per_pixel, row.prediction) == (1.0, None, None, None)
+        assert (row.peak_mb, row.parameters, row.macs_per_pixel) == (1.0, None, None)
 
 
-def test_a_race_that_takes_long_measures_fewer_frames():
+def test_slow_denoisers_are_timed_on_fewer_frames():
     (timed,) = time_in_turns([NOISY], (4, 8), max_seconds=0)
     assert timed.timing((4, 8)).frames == FEWEST_FRAMES < TIMED_FRAMES
 
 
-def test_weights_make_no_difference_to_times():
+def test_times_do_not_depend_on_weights():
     assert timed_specs(["kp@quick", "kp"]) == timed_specs(["kp"])
     assert other_ways(DenoiserSpec.named("svgf", device="cuda")) == []
 
@@ -173,7 +171,7 @@ def test_repvgg_is_counted_as_it_runs():
     assert macs_per_pixel(DenoiserSpec.named("wskp6", precision="bfloat16")) == expected
 
 
-def test_what_is_measured(monkeypatch, capsys):
+def test_rows_by_default_and_on_request(monkeypatch, capsys):
     gone = "it is not installed"
     monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: gone if str(name) == "oidn" else None)
     assert "oidn" not in {spec.name for spec in timed_specs(())}
@@ -186,7 +184,7 @@ def test_what_is_measured(monkeypatch, capsys):
         assert [spec.way for spec in timed_specs(["oidn"])] == ["oidn"]
 
 
-def test_sizes_and_threads_that_cannot_be(tmp_path):
+def test_invalid_sizes_and_threads(tmp_path):
     for text in ("720p", "0x5", "5x", "-1x3"):
         with pytest.raises(BadInput, match="not a size"):
             bench_denoisers(tmp_path, ["noisy"], [text])
@@ -204,7 +202,7 @@ def test_synthetic_frames_are_reproducible():
     assert not torch.equal(a.direct, other.direct)
 
 
-def test_synthetic_frames_look_like_rendered_ones():
+def test_synthetic_frames_resemble_rendered_ones():
     """Several meshes and sky; noise that is mostly black and spiked; motion that finds its surface again."""
     before = synthetic_frame(9, 90, 160)
     frame = synthetic_frame(10, 90, 160)

@@ -45,8 +45,8 @@ def test_a_process_that_dies_is_an_error():
         alone(os._exit, 1)
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells")
-def test_growth_is_that_of_what_was_touched():
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux only")
+def test_growth_is_that_of_touched_memory():
     megabytes = growth_mb(lambda: np.ones(20_000_000))  # 160 MB
     assert 150 < megabytes < 180
     assert growth_mb(lambda: None) < 20

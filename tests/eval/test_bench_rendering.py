@@ -16,7 +16,7 @@ FIELDS = ["scene", "renderer", "spp", "samples_per_second", "floor", "seconds", 
 
 
 @pytest.mark.parametrize("name", ["cornell_box_moving", "extremes-large", "room-2"])
-def test_both_renderers_see_the_same_frame(name):
+def test_both_renderers_render_the_same_frame(name):
     size = 48
     block = 8
     posed = PosedFrame(Stage(build_scene(name, 0, 24), size, size), 8)

@@ -103,7 +103,7 @@ def test_the_table_sorts_and_filters(page):
     assert column(page, 1) == sorted(column(page, 1), key=str.lower)
 
 
-def test_the_comparer_switches_images_by_mouse(page):
+def test_the_viewer_switches_images_by_mouse(page):
     Select(page.find_element(By.ID, "left")).select_by_value("noisy")
     Select(page.find_element(By.ID, "right")).select_by_value("eaw")
     shows(page, "slider", "noisy", "eaw")

@@ -9,13 +9,12 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from datasets.clip import Dataset
 from errors import BadInput
 from eval import selection
-from eval.harness import evaluate, named_denoisers
-from eval.results import load_picture
+from eval.harness import evaluate, named_denoisers, strip
+from eval.results import load_picture, read_results
 from files import read_json, write_json
 from models import registry
 from models.registry import create
@@ -79,8 +78,8 @@ def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
     for i in range(clip.frames):
         noisy = sum(np.float32(clip.read(name, i)) for name in lights)
         references = (name if name == "emission" else f"{name}_reference" for name in lights)
-        halves = sum(np.float64(clip.read(name, i)) for name in references)
-        x, r, a, b = (np.clip(clip.exposure * v, 0, 1) ** (1 / 2.2) for v in (noisy, halves.mean(0), *halves))
+        buffers = sum(np.float64(clip.read(name, i)) for name in references)
+        x, r, a, b = (np.clip(clip.exposure * v, 0, 1) ** (1 / 2.2) for v in (noisy, buffers.mean(0), *buffers))
         mse.append(((x - r) ** 2).mean())
         rmse.append(np.sqrt(mse[-1]))
         floor.append(((a - b) ** 2).mean() / 4)
@@ -91,26 +90,16 @@ def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
     assert float(printed[4]) == pytest.approx(np.mean(np.sqrt(floor)), abs=1e-4)
 
 
-def blocks(image: np.ndarray) -> np.ndarray:
-    """Mean colours of 8 x 8 equal parts of a square image."""
-    size = image.shape[0] // 8
-    return image[: 8 * size, : 8 * size].reshape(8, size, 8, size, 3).mean(axis=(1, 3))
-
-
 def test_strips_show_every_denoiser_and_the_reference(runs):
-    shown = {
-        "": ("noisy", "accumulated", "rae", "reference"),
-        "-indirect": ("ntd", "noisy", "accumulated", "reference"),
-    }
-    for scene in ("cornell_box", "cornell_box_moving"):
-        for ending, names in shown.items():
-            strip = np.array(Image.open(runs / "eval" / f"{scene}-000{ending}.png").convert("RGB"))
-            width = strip.shape[1] / len(names)
-            for place, name in enumerate(names):
-                left = round(place * width)
-                panel = strip[-256:, left : left + 256]  # pictures of 64 x 64 pixels, enlarged
-                picture = load_picture(runs / "eval" / "clips" / f"{scene}-000" / f"{name}{ending}", 6)
-                assert np.abs(blocks(panel) - blocks(picture)).mean() < 8, f"{scene}{ending}: {name}"
+    _, clips = read_results(runs)
+    for clip in clips:
+        axes = strip(runs, clip).axes
+        ending = "" if clip.signal == "total" else "-indirect"
+        assert (runs / "eval" / f"{clip.scene}-000{ending}.png").exists()
+        for result, panel in zip((*clip.results, clip.reference), axes, strict=True):
+            picture = load_picture(runs / "eval" / "clips" / f"{clip.scene}-000" / f"{result.denoiser}{ending}", 6)
+            np.testing.assert_array_equal(panel.images[0].get_array(), picture / 255)
+            assert panel.get_title().startswith(result.denoiser) and ("RMSE" in panel.get_title()) != result.floor
 
 
 @pytest.mark.parametrize(
@@ -121,7 +110,7 @@ def test_strips_show_every_denoiser_and_the_reference(runs):
         (["ntd"], {("ntd", "indirect")}),
     ],
 )
-def test_baselines_of_indirect_light_run_only_beside_who_needs_them(names, expected):
+def test_baselines_of_indirect_light_run_only_where_needed(names, expected):
     denoisers = named_denoisers([DenoiserSpec.named(name) for name in names])
     assert {(named_denoiser.name, named_denoiser.denoiser.signal) for named_denoiser in denoisers} == expected
     assert len(denoisers) == len(expected)

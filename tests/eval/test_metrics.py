@@ -29,11 +29,11 @@ def shown(x: torch.Tensor, exposure: float) -> np.ndarray:
 
 
 def test_metrics_equal_independent_implementations():
-    output, halves = pair()
+    output, buffers = pair()
     exposure = 1.3
-    metrics = measure(Comparison(output, halves, exposure))
+    metrics = measure(Comparison(output, buffers, exposure))
     a = shown(output, exposure)
-    b = shown(halves[:1], exposure)
+    b = shown(buffers[:1], exposure)
     assert metrics["mse"] == pytest.approx(((a - b) ** 2).mean())
     assert metrics["rmse"] == pytest.approx(math.sqrt(metrics["mse"]))
     assert metrics["l1"] == pytest.approx(np.abs(a - b).mean())
@@ -55,14 +55,14 @@ def test_metrics_equal_independent_implementations():
     _, mean, _ = flip_evaluator.evaluate(b.astype(np.float32), a.astype(np.float32), "LDR")
     assert metrics["flip"] == pytest.approx(mean, abs=1e-6)
     x = exposure * output.double().numpy()
-    r = exposure * halves[:1].double().numpy()
+    r = exposure * buffers[:1].double().numpy()
     assert metrics["smape"] == pytest.approx((np.abs(x - r) / (np.abs(x) + np.abs(r) + 0.01)).mean())
     assert metrics["rel_mse"] == pytest.approx(((x - r) ** 2 / (r**2 + 0.01)).mean())
 
 
 def test_identical_constant_and_one_pixel_images():
-    _, halves = pair()
-    same = measure(Comparison(halves[:1], halves, 1.0))
+    _, buffers = pair()
+    same = measure(Comparison(buffers[:1], buffers, 1.0))
     assert (same["mse"], same["psnr"], same["mse_unbiased"]) == (0, 100, 0) and same["ssim"] == pytest.approx(1)
     black = torch.zeros(1, 3, 16, 16)
     white = torch.ones(2, 3, 16, 16)
@@ -90,15 +90,15 @@ def test_metrics_are_finite_and_bounded_on_constant_images(size, level, other):
 
 
 def test_non_finite_output_counts_as_zero():
-    output, halves = pair()
+    output, buffers = pair()
     zeroed = output.clone()
     output[0, :, 3, 4] = torch.tensor([math.nan, math.inf, -math.inf])
     zeroed[0, :, 3, 4] = 0
-    assert measure(Comparison(output, halves, 1.0)) == measure(Comparison(zeroed, halves, 1.0))
+    assert measure(Comparison(output, buffers, 1.0)) == measure(Comparison(zeroed, buffers, 1.0))
 
 
 def test_unbiased_mse_estimates_the_error_to_the_truth():
-    """Closed form: truth t, output t + d, halves t + noise of variance v. E = d^2; the plain MSE is biased by v / 2."""
+    """Closed form: truth t, output t + d, buffers t + noise of variance v; E = d², the plain MSE is biased by v / 2."""
     truth = 0.4
     offset = 0.05
     deviation = 0.2
@@ -106,10 +106,10 @@ def test_unbiased_mse_estimates_the_error_to_the_truth():
     unbiased = []
     plain = []
     for _ in range(200):
-        halves = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
+        buffers = torch.from_numpy(truth + rng.normal(0, deviation, (2, 3, 32, 32)))
         output = torch.full((1, 3, 32, 32), truth + offset)
-        unbiased.append(METRICS["mse_unbiased"].of(Comparison(output, halves, 1.0)))
-        plain.append(float((output - halves.mean(0)).square().mean()))
+        unbiased.append(METRICS["mse_unbiased"].of(Comparison(output, buffers, 1.0)))
+        plain.append(float((output - buffers.mean(0)).square().mean()))
     error = np.std(unbiased) / np.sqrt(len(unbiased))
     assert abs(np.mean(unbiased) - offset**2) < 4 * error < 0.1 * offset**2
     assert np.mean(plain) == pytest.approx(offset**2 + deviation**2 / 2, rel=0.02)
@@ -135,15 +135,15 @@ def test_temporal_metrics_by_hand():
 
 def test_disocclusion_counts_only_where_vectors_differ():
     output = torch.full((1, 3, 2, 2), 1.0)
-    halves = torch.zeros(2, 3, 2, 2)
-    halves[:, :, 0, 0] = 1
+    buffers = torch.zeros(2, 3, 2, 2)
+    buffers[:, :, 0, 0] = 1
     motion = torch.zeros(1, 2, 2, 2)
     dual = torch.zeros(1, 2, 2, 2)
     l1 = METRICS["disocclusion_l1"].of
-    assert l1(Comparison(output, halves, 1.0, disoccluded(motion, dual))) is None
+    assert l1(Comparison(output, buffers, 1.0, disoccluded(motion, dual))) is None
     dual[0, 0, 0] = 0.5
     dual[0, 1, 1, 1] = 0.015  # less than 1/64
-    assert l1(Comparison(output, halves, 1.0, disoccluded(motion, dual))) == pytest.approx(0.5)
+    assert l1(Comparison(output, buffers, 1.0, disoccluded(motion, dual))) == pytest.approx(0.5)
 
 
 def test_display_and_luminance():

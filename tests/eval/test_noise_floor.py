@@ -1,4 +1,4 @@
-"""Noise floors: what the truth scores, in closed form and where it is known."""
+"""Noise floors are the scores of the true image, in closed form and on references of many samples."""
 
 import math
 
@@ -14,12 +14,12 @@ from tests.helpers.references import measure_references, spread
 HIDDEN = torch.zeros(1, 1, 48, 64, dtype=torch.bool).index_fill(3, torch.arange(8), True)
 
 
-def floors_of(halves: torch.Tensor, disoccluded: torch.Tensor | None = None) -> dict[str, float | None]:
-    return noise_floors(Comparison(halves[:1], halves, 1.0, disoccluded))
+def floors_of(buffers: torch.Tensor, disoccluded: torch.Tensor | None = None) -> dict[str, float | None]:
+    return noise_floors(Comparison(buffers[:1], buffers, 1.0, disoccluded))
 
 
 def scene(deviation: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A smooth truth (1, 3, 48, 64) with an edge, and noisy halves of it."""
+    """A smooth truth (1, 3, 48, 64) with an edge, and noisy buffers of it."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:48, :64] / 64
     truth = np.stack([0.3 + 0.2 * np.sin(6 * x), 0.25 + 0.3 * (x > y), 0.4 + 0.1 * y])[None]
@@ -27,13 +27,13 @@ def scene(deviation: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("deviation", [0.005, 0.03])
-def test_floors_are_what_the_truth_scores(deviation):
+def test_floors_are_the_scores_of_the_truth(deviation):
     found = []
     scored = []
     for seed in range(6):
-        truth, halves = scene(deviation, seed)
-        found.append(floors_of(halves, HIDDEN))
-        scored.append(measure_frame(Comparison(truth, halves, 1.0)))
+        truth, buffers = scene(deviation, seed)
+        found.append(floors_of(buffers, HIDDEN))
+        scored.append(measure_frame(Comparison(truth, buffers, 1.0)))
     for metric in ("mse", "rmse", "l1", "ssim", "flip", "smape", "rel_mse"):
         lacking = 1.0 if metric == "ssim" else 0.0  # SSIM errs in what it lacks of 1
         estimate, truth = (abs(lacking - np.mean([row[metric] for row in rows])) for rows in (found, scored))
@@ -42,14 +42,14 @@ def test_floors_are_what_the_truth_scores(deviation):
     assert found[0]["disocclusion_l1"] == pytest.approx(found[0]["l1"], rel=0.2)
 
 
-def test_halves_or_one_against_the_mean_would_take_noise_for_structure():
+def test_ssim_between_buffers_would_count_noise_as_structure():
     """Why SSIM has an estimate of its own: on a flat wall its floor is far below the SSIM of a half and the mean."""
     rng = np.random.default_rng(0)
     truth = torch.full((1, 3, 48, 64), 0.4, dtype=torch.float64)
-    halves = truth + torch.from_numpy(rng.normal(0, 0.1, (2, 3, 48, 64)))
-    floor = floors_of(halves)["ssim"]
-    naive = measure_frame(Comparison(halves[:1], halves.mean(dim=0, keepdim=True).expand(2, -1, -1, -1), 1.0))["ssim"]
-    assert floor == pytest.approx(measure_frame(Comparison(truth, halves, 1.0))["ssim"], abs=0.1)
+    buffers = truth + torch.from_numpy(rng.normal(0, 0.1, (2, 3, 48, 64)))
+    floor = floors_of(buffers)["ssim"]
+    naive = measure_frame(Comparison(buffers[:1], buffers.mean(dim=0, keepdim=True).expand(2, -1, -1, -1), 1.0))["ssim"]
+    assert floor == pytest.approx(measure_frame(Comparison(truth, buffers, 1.0))["ssim"], abs=0.1)
     assert naive > floor + 0.2
 
 
@@ -62,8 +62,8 @@ def test_error_of_the_unbiased_mse(correlated):
     errors = []
     for _ in range(400):
         noise = torch.from_numpy(rng.normal(0, 0.1, (2, 1 if correlated else 3, 24, 24))).expand(2, 3, -1, -1)
-        halves = truth + noise
-        comparison = Comparison(truth, halves, 1.0)
+        buffers = truth + noise
+        comparison = Comparison(truth, buffers, 1.0)
         values.append(METRICS["mse_unbiased"].of(comparison))
         errors.append(METRICS["mse_unbiased"].floor(comparison))
     ratio = np.mean(errors) / np.std(values)
@@ -96,7 +96,7 @@ def test_floors_at_the_extremes():
         ("temporal_error", 0.0, 0.0, 1e-9),
     ],
 )
-def test_within_the_floor_means_as_close_to_the_truth_as_the_reference(metric, floor, inside, outside):
+def test_values_within_the_floor_are_as_close_to_the_truth_as_the_reference(metric, floor, inside, outside):
     assert within_floor(metric, inside, floor) and not within_floor(metric, outside, floor)
 
 

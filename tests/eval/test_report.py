@@ -24,7 +24,6 @@ from eval.report.page import report
 from eval.report.page_data import page_clip
 from eval.report.table_rows import TableRow, best_denoisers
 from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_picture, load_result
-from eval.tradeoff.pareto import Point, dominators
 from eval.tradeoff.resampled_clips import with_samples
 from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import denoise_with_error
@@ -114,7 +113,7 @@ def row(name: str, floor: float | None = None, **values: float | None) -> TableR
     return TableRow("cornell_box/000", name, "total", values, dict.fromkeys(values, floor))
 
 
-def test_who_is_best():
+def test_best_denoisers():
     rows = [row("a", psnr=30.0, rmse=0.1), row("b", psnr=31.0, rmse=0.1), row("c", psnr=None, rmse=0.2)]
     assert best_denoisers(rows, "psnr") == {"b"} and best_denoisers(rows, "rmse") == {"a", "b"}
     assert best_denoisers(rows, "flicker") == set()
@@ -128,7 +127,7 @@ def test_who_is_best():
     assert best_denoisers(rows, "ssim") == {"b"}
 
 
-def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
+def test_the_page_embeds_the_pictures_of_the_evaluation(page, evaluated):
     clip = next(clip for clip in page.data["clips"] if clip["name"] == "cornell_box_moving/000 (indirect light)")
     assert list(clip["images"]) == ["ntd", "noisy", "accumulated", "reference"] and clip["frames"] == list(range(8))
     folders = {
@@ -145,7 +144,7 @@ def test_pictures_in_the_page_are_those_of_the_evaluation(page, evaluated):
 
 def test_estimated_errors_have_their_own_view(tiny, page, tmp_path):
     clip = next(clip for clip in Dataset(tiny).clips("train") if clip.scene == "cornell_box")
-    fed = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path / "data", with_buffers=True)
+    fed = with_samples(clip, Dataset(tiny), 2, tmp_path / "data", with_buffers=True)
     specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw+js")]
     (results,) = by_clip(evaluate_clip(fed, named_denoisers(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
@@ -173,7 +172,7 @@ def test_curves_are_the_frames(page, evaluated):
         assert len(clip["curves"][metric]["reference"]) == 8
 
 
-def test_crops_lie_inside_and_in_frames_apart(page):
+def test_crops_are_inside_and_in_separate_frames(page):
     crops = page.data["clips"][-2]["crops"]
     assert crops
     for crop in crops:
@@ -256,9 +255,3 @@ def test_densest_crop():
     assert densest_crop(mask) == Crop(60, 0, 20, 1)
     assert densest_crop(torch.ones(3, 50, dtype=torch.bool)).size == 3
     assert densest_crop(torch.ones(1, 1, dtype=torch.bool)) == Crop(0, 0, 1, 1)
-
-
-def test_pareto_front():
-    points = {"a": Point(1, 0.5), "b": Point(2, 0.6), "c": Point(3, 0.2), "d": Point(3, 0.2), "e": Point(4, 0.3)}
-    assert dominators(points, more_is_better=False) == {"a": None, "b": "a", "c": None, "d": None, "e": "c"}
-    assert dominators(points, more_is_better=True) == {"a": None, "b": None, "c": "b", "d": "b", "e": "b"}

@@ -1,4 +1,4 @@
-"""Results frame by frame, and an evaluation that goes on where it was interrupted."""
+"""Results frame by frame, and an evaluation that resumes."""
 
 import csv
 import json
@@ -61,7 +61,7 @@ def played(monkeypatch):
     return calls
 
 
-def test_a_line_a_frame_whose_means_are_the_results(once, tiny):
+def test_results_are_the_means_of_the_csv(once, tiny):
     with open(once / "eval" / "frames.csv") as file:
         lines = list(csv.DictReader(file))
     assert list(lines[0]) == ["denoiser", "signal", "scene", "clip", "frame", *METRICS]
@@ -81,7 +81,7 @@ def test_a_line_a_frame_whose_means_are_the_results(once, tiny):
     assert floors[0]["temporal_error"] == "" and float(floors[1]["temporal_error"]) > 0
 
 
-def test_pictures_are_what_is_shown(once, tiny):
+def test_pictures_are_displayed_outputs(once, tiny):
     clip = Dataset(tiny).clips("test")[0]
     for name, radiance in (
         ("noisy", sum(np.float32(clip.read(part, 5)) for part in ("direct", "indirect", "emission"))),
@@ -92,13 +92,13 @@ def test_pictures_are_what_is_shown(once, tiny):
         assert np.abs(saved - shown).max() <= 0.51
 
 
-def test_what_is_there_is_kept(once, runs, tiny, played):
+def test_finished_results_are_kept(once, runs, tiny, played):
     before = content(once)
     evaluate([tiny], runs, "tiny", NAMES)
     assert played == [] and content(runs) == before
 
 
-def test_only_what_changed_is_done_again(runs, tiny, played):
+def test_only_changed_denoisers_are_evaluated_again(runs, tiny, played):
     save_fresh(runs, 1)
     evaluate([tiny], runs, "tiny", [*NAMES, "eaw"])
     assert played == [("cornell_box", ["eaw", "rae@tiny"]), ("cornell_box_moving", ["eaw", "rae@tiny"])]
@@ -117,7 +117,7 @@ def test_another_clip_under_the_same_name_is_another_result(runs, tiny, tmp_path
 
 
 @pytest.mark.parametrize("damage", ["missing result", "half a result", "missing picture"])
-def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
+def test_damaged_results_are_evaluated_again(once, runs, tiny, played, damage):
     before = content(once)
     folder = runs / "eval" / "clips" / "cornell_box-000" / "accumulated"
     if damage == "missing picture":
@@ -131,14 +131,14 @@ def test_what_is_damaged_is_done_again(once, runs, tiny, played, damage):
 
 
 @pytest.mark.parametrize("frame", [0, 5, 11])
-def test_interrupted_and_run_again_it_ends_with_the_same(once, tiny, tmp_path, monkeypatch, frame):
+def test_an_interrupted_evaluation_resumes_to_equal_results(once, tiny, tmp_path, monkeypatch, frame):
     """`frame` of the 16 of both clips is the one in which it is killed."""
-    seen = []
+    frames = []
     save = clip_run.save_picture
 
     def killed(folder, index, image):
-        seen.append(index)
-        if len(seen) > frame * (len(NAMES) + 1) + 1:
+        frames.append(index)
+        if len(frames) > frame * (len(NAMES) + 1) + 1:
             raise KeyboardInterrupt
         save(folder, index, image)
 

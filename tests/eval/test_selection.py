@@ -1,4 +1,4 @@
-"""Who runs and who does not, and what a description of a denoiser tells before anything is built."""
+"""Which denoisers run, and the facts that a spec gives before anything is built."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def test_choose_all_that_can_run_and_print_the_others(capsys):
     assert capsys.readouterr().out == "svgf: skipped, it is not ours\n"
 
 
-def test_what_takes_seconds_a_frame_runs_only_where_named(capsys):
+def test_offline_denoisers_run_only_where_named(capsys):
     assert choose([], [SVGF, NFOR]) == [SVGF]
     assert capsys.readouterr().out == "nfor: skipped, it takes seconds a frame: name it to run it\n"
     assert choose(["nfor"], [SVGF]) == [NFOR]
@@ -110,7 +110,7 @@ def test_shipped_weights_come_first_unless_a_budget_is_named(tmp_path, shipped):
         weights_of(parse_name("wskp3@tiny"), tmp_path)
 
 
-def test_all_are_the_shipped_ones_and_what_was_trained_beside_them(tmp_path, shipped, monkeypatch, capsys):
+def test_the_default_includes_shipped_networks_and_those_trained_here(tmp_path, shipped, monkeypatch, capsys):
     few = {name: DENOISERS[name] for name in ("noisy", "rae", "wskp3", "wskp6", "kp")}
     monkeypatch.setattr(selection, "DENOISERS", few)
     ours = {name: write_weights(name, shipped / f"{name}.safetensors") for name in ("wskp3", "wskp6")}
@@ -140,7 +140,7 @@ def test_weights_of_a_budget_are_loaded(tmp_path):
     assert all(map(torch.equal, a, again))
 
 
-def test_baselines_join_whoever_returns_indirect_light():
+def test_baselines_of_indirect_light_are_added():
     specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw")]
     assert with_indirect_baselines(specs) == specs
     together = with_indirect_baselines([*specs, DenoiserSpec.named("ntd")])
@@ -169,7 +169,7 @@ def test_names_of_the_ways_to_run():
     assert DenoiserSpec.named("rae", precision="bfloat16").label == "rae-bfloat16"
 
 
-def test_fresh_weights_are_always_the_same():
+def test_fresh_weights_are_deterministic():
     first, second = (DenoiserSpec.named("wskp3", precision="bfloat16").build() for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     assert first.precision == PRECISIONS["bfloat16"]

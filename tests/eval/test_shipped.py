@@ -49,12 +49,12 @@ def test_the_table_has_a_line_for_each(wskp3, capsys):
     assert file_digest(wskp3)[:12] in lines[0] and "my.toml, 2 scenes" in lines[0] and "0.1235" in lines[0]
 
 
-def test_no_card_of_what_is_not_shipped(shipped, capsys):
+def test_no_card_without_shipped_weights(shipped, capsys):
     assert "no weights of 'rae' are shipped; those are none" in fails(capsys, "weights", "rae")
     assert table() == ""
 
 
-def test_facts_are_written_and_the_rest_stays(wskp3, tiny, tmp_path, capsys):
+def test_only_the_generated_part_of_a_card_changes(wskp3, tiny, tmp_path, capsys):
     evaluate([tiny], tmp_path, "tiny", ["noisy", "accumulated", "eaw", "wskp3"])
     card = wskp3.with_suffix(".md")
     with pytest.raises(BadInput, match=r"wskp3.md: write the network's intended use.*the lines"):
@@ -104,7 +104,7 @@ def test_cards_are_generated_from_weights_and_measurements(name):
     assert card.partition(BEGIN)[2].partition(END)[0].strip() == facts(name)
 
 
-def test_only_the_weights_as_they_are_count(wskp3, tiny, tmp_path):
+def test_results_of_other_weights_are_refused(wskp3, tiny, tmp_path):
     """Not those of a training, and not those that were shipped before."""
     wskp3.with_suffix(".md").write_text(HAND)
     evaluate([tiny], tmp_path, "tiny", ["noisy", "wskp3"])

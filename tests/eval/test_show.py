@@ -64,7 +64,7 @@ def test_panels_stand_where_they_belong(tmp_path):
     assert all(top[column, 0] + 0.75 * 192 < top[column, 1] for column in (0, 1, 2))
 
 
-def test_what_the_panels_hold(tiny):
+def test_panels(tiny):
     """Captions are measured against the reference; states are pictured in the same colours in all frames."""
     clip = Clip(clip_of(tiny))
     (noisy, accumulated), references = view_clip(
@@ -107,7 +107,7 @@ def test_states_in_colour(tiny):
 
 
 def test_clip_without_reference_or_some_channel(tiny, tmp_path, capsys, shipped):
-    """What can run is shown; the rest is skipped with a word, or an error where it was asked for."""
+    """Denoisers that cannot run are skipped with a message, or refused where they are named."""
     copy = shutil.copytree(clip_of(tiny), tmp_path / "clip")
     facts = json.loads((copy / "clip.json").read_text())
     for channel in ("direct_reference", "motion"):

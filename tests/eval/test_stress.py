@@ -14,11 +14,10 @@ from command_line import main
 from errors import BadInput
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
 from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
-from eval.stress.check import MAX_RESIDUE, StressCheck
+from eval.stress.check import FRESH, MAX_RESIDUE, StressCheck, StressRow
 from eval.stress.irradiance_range import IrradianceRange
 from eval.stress.lit_frames import NOISE_PERIOD
 from eval.stress.logits import largest_logits, last_layers
-from eval.stress.outcome import FRESH, StressOutcome, StressRow
 from eval.stress.run import applies, cases_in, check_all, stressed, weights_label
 from eval.stress.tables import heat_map, verdict_text
 from models import registry
@@ -41,17 +40,17 @@ def all_break(cases: Iterable[str], *requirements: str) -> dict[str, tuple[str, 
 
 def broken_in(rows: Iterable[StressRow]) -> dict[str, tuple[str, ...]]:
     """The requirements that are broken, by case."""
-    return {row.extreme: row.outcome.broken for row in rows if row.outcome.broken}
+    return {row.extreme: row.broken for row in rows if row.broken}
 
 
 class Simple(Denoiser):
     """The noisy frame, with bad pixels as they come."""
 
     reads = LIGHT_CHANNELS
-    mended = False
+    repaired = False
 
     def __call__(self, frame, state):
-        return self.forward(frame.finite() if self.mended else frame, state)
+        return self.forward(frame.finite() if self.repaired else frame, state)
 
     def forward(self, frame, state):
         return self.answer(frame.radiance("total"), frame), State(frame.moment)
@@ -63,7 +62,7 @@ class Simple(Denoiser):
 class Overflows(Simple):
     """NaN where it is bright."""
 
-    mended = True
+    repaired = True
 
     def answer(self, radiance, frame):
         return torch.where(radiance > 2e4, torch.nan, radiance)
@@ -90,7 +89,7 @@ class KeepsBadPixels(Simple):
 class Brightens(Simple):
     """By 0.1 % of the irradiance."""
 
-    mended = True
+    repaired = True
 
     def answer(self, radiance, frame):
         return torch.lerp(frame.emission, radiance, 1.001)
@@ -101,7 +100,7 @@ class BrightensConvex(Brightens):
 
 
 class GoesNegative(Simple):
-    mended = True
+    repaired = True
 
     def answer(self, radiance, frame):
         return radiance - 1e-9
@@ -125,7 +124,7 @@ class Remembers(Denoiser):
         return radiance, Mean(frame.moment, radiance)
 
 
-class Halves(Remembers):
+class FadesByHalf(Remembers):
     alpha = 0.5
 
 
@@ -157,7 +156,7 @@ def check(monkeypatch) -> Check:
     ("name", "code", "printed"),
     [("accumulated", 0, "All requirements are kept."), ("broken", 1, "Broken requirements:")],
 )
-def test_the_exit_code_says_whether_all_is_kept(tmp_path, monkeypatch, capsys, name, code, printed):
+def test_exit_code_and_files(tmp_path, monkeypatch, capsys, name, code, printed):
     monkeypatch.setitem(registry.DENOISERS, "broken", GoesNegative)
     try:
         main(["stress", name, "--runs", str(tmp_path)])
@@ -177,7 +176,7 @@ def test_the_exit_code_says_whether_all_is_kept(tmp_path, monkeypatch, capsys, n
         picture.verify()
 
 
-def test_what_cannot_be_stressed(capsys, tmp_path):
+def test_refusals(capsys, tmp_path):
     for arguments, message in (
         (["nonsense"], "unknown denoiser 'nonsense'"),
         (["svgf", "--precision", "bfloat16"], "none of svgf computes in bfloat16"),
@@ -213,7 +212,7 @@ def test_cases_apply_to_precisions_and_logits_that_a_denoiser_has():
     assert taken_by("svgf") == set()
 
 
-def test_half_precision_and_the_long_sequence_are_asked_for():
+def test_cases_of_half_precision_and_the_long_sequence():
     assert cases_in("float32", long=False) == list(STRESS_CASES)
     assert cases_in("float32", long=True) == [*STRESS_CASES, LONG_CASE]
     half = cases_in("bfloat16", long=True)
@@ -221,10 +220,12 @@ def test_half_precision_and_the_long_sequence_are_asked_for():
     assert [case.name for case in half] == [*(name for name in NAMES if "float1" not in name), LONG_CASE.name]
 
 
-def test_the_picture_shows_errors_and_what_is_broken():
+def test_heat_map():
     cases = STRESS_CASES[:2]
-    outcomes = (StressOutcome(0.01, 0, 0.0, None, ()), StressOutcome(None, 3, 0.0, None, ("finite",)))
-    rows = [StressRow("noisy", None, case.name, outcome) for case, outcome in zip(cases, outcomes, strict=True)]
+    rows = [
+        StressRow("noisy", None, cases[0].name, 0.01, 0, 0.0, None, ()),
+        StressRow("noisy", None, cases[1].name, None, 3, 0.0, None, ("finite",)),
+    ]
     figure = heat_map(rows, cases)
     axes = figure.axes[0]
     errors = np.ma.filled(axes.images[0].get_array(), np.nan)
@@ -234,7 +235,7 @@ def test_the_picture_shows_errors_and_what_is_broken():
     plt.close(figure)
 
 
-# --- What is found ----------------------------------------------------------------------------------------------------
+# --- Broken denoisers -------------------------------------------------------------------------------------------------
 
 
 def test_nan_is_found(check):
@@ -257,7 +258,7 @@ def test_a_bad_pixel_may_stay_bad_for_a_frame(check):
     assert broken_in(check(KeepsBadPixels)) == {}
 
 
-def test_leaving_the_range_is_found_where_it_is_promised(check):
+def test_leaving_the_range_is_found_where_required(check):
     lit = [name for name in NAMES if name not in ("all black", "no surface at all", "logits to ±1e4")]
     assert broken_in(check(BrightensConvex)) == all_break(lit, "range")
     assert broken_in(check(Brightens)) == {}
@@ -279,23 +280,23 @@ def test_a_state_that_does_not_recover_is_found(check):
 def test_recovery_is_counted_in_frames():
     """The mean's error halves from frame to frame."""
     case = CASES[IN_LIGHT[0]]
-    outcome = StressCheck(lambda _: Halves(), case).outcome()
+    row = StressCheck(lambda _: FadesByHalf(), case).row("fading", None)
     frames = list(case.frames())
     whole = frames[0].radiance("total")
     lost = float((whole - frames[SPOILED_FRAME].finite().radiance("total")).abs().max() / whole.max())
     expected = next(n for n in range(100) if lost * 0.5 ** (n + 1) <= MAX_RESIDUE)
-    assert outcome.recovery == expected and outcome.error == pytest.approx(lost / 2)
+    assert row.recovery == expected and row.error == pytest.approx(lost / 2)
 
 
 def test_long_sequences_show_drift(check):
     long = replace(LONG_CASE, frame_count=4 * NOISE_PERIOD)
-    (kept,) = check(Halves, cases=[long])
-    assert kept.outcome.error < 1e-6 and kept.outcome.broken == ()
+    (kept,) = check(FadesByHalf, cases=[long])
+    assert kept.error < 1e-6 and kept.broken == ()
     (drifted,) = check(GrowsBrighter, cases=[long])
-    assert drifted.outcome.error == pytest.approx(1.01 ** (2 * NOISE_PERIOD) - 1, rel=1e-3)
+    assert drifted.error == pytest.approx(1.01 ** (2 * NOISE_PERIOD) - 1, rel=1e-3)
 
 
-# --- The cases are what they say --------------------------------------------------------------------------------------
+# --- Cases ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", (*STRESS_CASES, replace(LONG_CASE, frame_count=3)), ids=lambda case: case.name)
@@ -325,7 +326,7 @@ def test_cases_reach_their_values():
     assert values("a firefly of 65504", "direct", SPOILED_FRAME).max() == 65504
     assert (values("albedo 0", "albedo") == 0).all() and (values("no surface at all", "mesh_id") == 0).all()
     assert not values("all black", "direct").any() and not values("all black", "emission").any()
-    low, high = spans(values("depth around 1e-4", "depth"))
+    low, high = spans(values("depth near 1e-4", "depth"))
     assert 2e-5 < low < high < 3e-4
     poisoned = {name for case in STRESS_CASES if case.poison for name in case.poison.channels}
     assert poisoned == {*LIGHT_CHANNELS, *SURFACE_CHANNELS}
@@ -349,17 +350,17 @@ def test_logits_are_scaled_and_left_as_they_were(name):
     denoiser.prepare()
     layers = last_layers(denoiser)
     frame = next(STRESS_CASES[0].frames())
-    seen = []
+    largest = []
     with largest_logits(denoiser, 1e4):
-        hooks = [layer.register_forward_hook(lambda *args: seen.append(args[2].abs().max())) for layer in layers]
+        hooks = [layer.register_forward_hook(lambda *args: largest.append(args[2].abs().max())) for layer in layers]
         denoiser(frame, None)
-    assert seen and all(float(top) == pytest.approx(1e4) for top in seen)
+    assert largest and all(float(top) == pytest.approx(1e4) for top in largest)
     for hook in hooks:
         hook.remove()
     assert not any(layer._forward_hooks for layer in layers)
 
 
-def test_the_range_is_of_every_colour_and_of_what_svgf_adds_up():
+def test_the_range_of_each_colour_and_of_separate_lights():
     """Hand-made: direct light of 1 to 3, indirect of 0 to 2, in other pixels."""
     frame = next(STRESS_CASES[0].frames())
     tensors = {

@@ -12,18 +12,15 @@ from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.harness import clips_of_one_spp
-from eval.means import ClipScores, compared_mean, joint_floor
+from eval.means import compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
-from eval.results import NOISE_FLOOR, ClipResults, Result, load_result
-from eval.tradeoff.candidates import candidates
-from eval.tradeoff.denoisers import Trade
-from eval.tradeoff.feeding import check_levels
-from eval.tradeoff.pareto import TimedScores, dominated_by_name
+from eval.results import NOISE_FLOOR, ClipResults, Result
+from eval.tradeoff.pareto import Point, dominated_by_name
 from eval.tradeoff.plots import draw_front, draw_samples
-from eval.tradeoff.resampled_clips import averaged, rendered, scene_of, source, with_samples
-from eval.tradeoff.run import trade
-from eval.tradeoff.samples import SampleTrade, sample_trades
+from eval.tradeoff.resampled_clips import rendered, scene_of, with_samples
+from eval.tradeoff.run import candidates, check_levels, trade
 from eval.tradeoff.times import Times
+from eval.tradeoff.trades import Trade, trades
 from files import read_json, write_json
 from models.registry import create
 from models.spec import DenoiserSpec
@@ -34,8 +31,8 @@ from train.task import WEIGHTS_FILE, run_folder
 SIZE = (32, 48)
 
 
-def a_clip(tiny, split: str = "test") -> Clip:
-    return Dataset(tiny).clips(split)[1]
+def a_clip(tiny) -> Clip:
+    return Dataset(tiny).clips("test")[1]
 
 
 def bench_of(runs, labels, ms=lambda index: 1.0 + index, threads=(1, 2)) -> None:
@@ -59,13 +56,8 @@ def test_fronts_by_brute_force(metric, sign):
     rng = np.random.default_rng(0)
     ms = rng.integers(1, 9, 40)  # with ties
     values = rng.integers(20, 30, 40)
-    offers = {
-        str(i): TimedScores(float(a), ClipScores([{metric: float(b)}], [{}]))
-        for i, (a, b) in enumerate(zip(ms, values, strict=True))
-    }
-    offers["untimed"] = TimedScores(None, ClipScores([{metric: 0.0}], [{}]))
-    offers["undefined"] = TimedScores(0.0, ClipScores([{metric: None}], [{}]))
-    found = dominated_by_name(offers, metric)
+    points = {str(i): Point.of(float(a), float(b)) for i, (a, b) in enumerate(zip(ms, values, strict=True))}
+    found = dominated_by_name(points | {"untimed": Point.of(None, 0.0), "undefined": Point.of(0.0, None)}, metric)
     assert not {"untimed", "undefined"} & found.keys() and None in found.values() and len(set(found.values())) > 1
     for i, (a, b) in enumerate(zip(ms, values, strict=True)):
         better = {
@@ -77,12 +69,12 @@ def test_fronts_by_brute_force(metric, sign):
         assert found[str(i)] is None or found[str(i)] in better
 
 
-def test_digits_that_nobody_sees_do_not_make_a_front():
-    seen = [compared_mean("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
-    assert seen == [30.0, 30.0, 30.01]
+def test_digits_that_are_not_shown_do_not_make_a_front():
+    shown = [compared_mean("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    assert shown == [30.0, 30.0, 30.01]
 
 
-def test_what_is_within_the_noise_floor_is_on_a_par():
+def test_values_within_the_noise_floor_are_equal():
     floor = [{"psnr": 40.0}]
     assert [compared_mean("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [
         30,
@@ -108,17 +100,25 @@ def clip_results(**psnr: float) -> ClipResults:
     """Results of total light on a clip, by denoiser."""
 
     def result(name: str, value: float) -> Result:
-        return Result("", name, "total", "cornell_box", "000", {"psnr": value, "mse_unbiased": 0.0}, [])
+        return Result(
+            "",
+            name,
+            "total",
+            "cornell_box",
+            "000",
+            {"psnr": value, "ssim": None, "rmse": None, "mse_unbiased": 0.0},
+            [],
+        )
 
     return ClipResults(
         "cornell_box", "000", "total", [result(*pair) for pair in psnr.items()], result(NOISE_FLOOR, 99.0)
     )
 
 
-def test_samples_that_are_not_worth_their_time(tmp_path):
+def test_samples_can_cost_more_than_they_gain(tmp_path):
     bench_of(tmp_path, ["noisy", "rae"], ms=lambda index: 0.5 + 4 * index, threads=(1,))
     fed = {1: [clip_results(noisy=20.0, rae=30.0)], 4: [clip_results(noisy=26.0, rae=29.0)]}
-    rows = sample_trades(
+    rows = trades(
         [DenoiserSpec.named("noisy"), DenoiserSpec.named("rae")], fed, {1: 0.5, 4: 8.5}, Times(tmp_path, SIZE)
     )
     assert [(row.name, row.ms) for row in rows] == [
@@ -127,7 +127,7 @@ def test_samples_that_are_not_worth_their_time(tmp_path):
         ("noisy, 4 spp", 9.0),
         ("rae, 4 spp", 13.0),
     ]
-    assert [row.dominated_by for row in rows] == [None, None, "rae, 1 spp", "rae, 1 spp"]
+    assert [row.dominated_by["psnr"] for row in rows] == [None, None, "rae, 1 spp", "rae, 1 spp"]
     assert [row.metrics["psnr"] for row in rows] == [20, 30, 26, 29]
 
 
@@ -142,44 +142,25 @@ def test_two_trainings_of_a_network_are_two_points(tmp_path):
 # --- Samples ----------------------------------------------------------------------------------------------------------
 
 
-def test_realisations_are_averaged(tiny, tmp_path):
-    clip = a_clip(tiny, "train")  # of two realisations
-    assert source(clip, 2) == "averaged" and source(clip, 4) == "rendered"
-    two = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path)
-    stored = np.load(clip.path / "indirect.npy").astype(np.float64)
-    assert stored.shape[1] == 2
-    np.testing.assert_allclose(np.load(two.path / "indirect.npy")[:, 0], stored.mean(axis=1), rtol=1e-6)
-    assert two.facts["noisy_spp"] == 2 and two.realisations == 1
-    assert "indirect_halves" not in two.channels
-    assert len(list(averaged(clip, 1, False))) == clip.frames
-
-
-def test_realisations_make_halves_too(tiny, tmp_path):
-    clip = a_clip(tiny, "train")
-    halves = with_samples(clip, Dataset(tiny), 2, "averaged", tmp_path, with_buffers=True).read("indirect_halves", 1)
-    for half, drawn in zip(halves, (clip.read("indirect", 1, realisation=i) for i in range(2)), strict=True):
-        np.testing.assert_array_equal(half, drawn)
-
-
-def test_everything_but_the_noise_is_the_clips_own(tiny, tmp_path):
+def test_only_the_noisy_input_differs(tiny, tmp_path):
     clip = a_clip(tiny)
-    four = with_samples(clip, Dataset(tiny), 4, "rendered", tmp_path)
+    four = with_samples(clip, Dataset(tiny), 4, tmp_path)
     assert (four.scene, four.name) == (clip.scene, "000-4spp")
     assert np.array_equal(four.reference(3), clip.reference(3)) and four.exposure == clip.exposure
     channels = [name for name in clip.channels if name not in ("direct", "indirect", "direct_reference")]
     ours, theirs = (read_frame(c, 3, [n for n in channels if n != "indirect_reference"]) for c in (four, clip))
     assert all(np.array_equal(ours.channels[name], theirs.channels[name]) for name in theirs.channels)
     assert not np.array_equal(four.read("direct", 3), clip.read("direct", 3))
-    assert with_samples(clip, Dataset(tiny), 1, "rendered", tmp_path) is clip
+    assert with_samples(clip, Dataset(tiny), 1, tmp_path) is clip
 
 
-def test_the_renderer_goes_on_where_the_clip_began(tiny):
-    """With as many samples as the clip has it makes the clip's own bytes: so scene, frames and seed are right."""
+def test_with_the_clips_own_samples_its_bytes_are_reproduced(tiny):
+    """So scene, frames and seed are right."""
     clip = a_clip(tiny)
     frames = list(rendered(clip, Dataset(tiny), 1, False))
     for frame in (0, clip.frames - 1):
-        half = frames[frame]["indirect"].astype(np.float16)
-        assert np.array_equal(half, clip.read("indirect", frame).astype(np.float16))
+        stored = frames[frame]["indirect"].astype(np.float16)
+        assert np.array_equal(stored, clip.read("indirect", frame).astype(np.float16))
 
 
 def test_noise_falls_with_samples(tiny):
@@ -192,32 +173,32 @@ def test_noise_falls_with_samples(tiny):
     assert errors[1] < 0.5 * errors[0] and errors[2] < 0.5 * errors[1]
 
 
-def test_clips_are_kept_until_what_they_are_made_of_changes(tiny, tmp_path):
+def test_clips_are_reused_until_their_source_changes(tiny, tmp_path):
     copy = shutil.copytree(tiny, tmp_path / "data")
     dataset = Dataset(copy)
     clip = a_clip(copy)
-    path = with_samples(clip, dataset, 2, "rendered", tmp_path / "more").path
+    path = with_samples(clip, dataset, 2, tmp_path / "more").path
     kept = (path / "direct.npy").stat().st_mtime_ns
-    with_samples(clip, dataset, 2, "rendered", tmp_path / "more")
+    with_samples(clip, dataset, 2, tmp_path / "more")
     assert (path / "direct.npy").stat().st_mtime_ns == kept
     (path / "clip.json").unlink()  # killed before it was whole
-    with_samples(clip, dataset, 2, "rendered", tmp_path / "more")
+    with_samples(clip, dataset, 2, tmp_path / "more")
     again = (path / "direct.npy").stat().st_mtime_ns
     assert again != kept
     write_json(clip.path / "clip.json", clip.facts | {"exposure": 2 * clip.exposure})
-    changed = with_samples(Clip(clip.path), dataset, 2, "rendered", tmp_path / "more")
+    changed = with_samples(Clip(clip.path), dataset, 2, tmp_path / "more")
     assert changed.exposure == 2 * clip.exposure and (path / "direct.npy").stat().st_mtime_ns != again
 
 
-def test_samples_that_cannot_be_had(tiny, tmp_path):
+def test_impossible_numbers_of_samples(tiny, tmp_path):
     clip = a_clip(tiny)
     dataset = Dataset(tiny)
-    four = with_samples(clip, dataset, 4, "rendered", tmp_path)
+    four = with_samples(clip, dataset, 4, tmp_path)
     dataset.facts["options"] = {"halton": True, "regularise": False}
     with pytest.raises(BadInput, match="16 different samples a pixel: 32 are too many"):
-        with_samples(clip, dataset, 32, "rendered", tmp_path)
+        with_samples(clip, dataset, 32, tmp_path)
     with pytest.raises(BadInput, match="has 4 samples a pixel: 6 are no multiple"):
-        with_samples(four, dataset, 6, "rendered", tmp_path)
+        with_samples(four, dataset, 6, tmp_path)
     dataset.facts["generator"] = 0
     with pytest.raises(BadInput, match=r"another version.*onespp dataset"):
         scene_of(clip, dataset)
@@ -236,7 +217,7 @@ def test_cost_of_samples(tiny):
 # --- Candidates -------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys, shipped):
+def test_untrained_networks_are_refused_with_a_remedy(tmp_path, capsys, shipped):
     with pytest.raises(BadInput, match=r"rae: it has no weights.*`onespp train rae --budget tiny --runs"):
         candidates(["rae"], tmp_path, "tiny")
     with pytest.raises(BadInput, match="unknown denoiser 'magic'"):
@@ -246,7 +227,7 @@ def test_what_is_not_trained_is_named_with_its_command(tmp_path, capsys, shipped
     assert re.search(r"\bwskp3\b.*: skipped, it has no weights", capsys.readouterr().out)
 
 
-def test_only_what_was_named_is_a_candidate(tmp_path):
+def test_only_named_denoisers_are_candidates(tmp_path):
     assert [candidate.label for candidate in candidates(["svgf"], tmp_path, "tiny")] == ["svgf"]  # no baseline, no ways
 
 
@@ -273,23 +254,22 @@ def traded(tiny, tmp_path_factory):
     runs = tmp_path_factory.mktemp("runs")
     folder = run_folder(runs, "wskp6", "tiny")
     folder.mkdir(parents=True)
-    save_weights(create("wskp6"), "wskp6", {"epochs": 7}, folder / WEIGHTS_FILE)
+    save_weights(create("wskp6"), "wskp6", {}, folder / WEIGHTS_FILE)
     bench_of(runs, ["noisy", "accumulated", "svgf", "wskp6", "svgf+js"])
-    text = trade(tiny, runs, "tiny", ("noisy", "accumulated", "svgf", "svgf+js", "wskp6@tiny"), "48x32", levels=(1, 4))
+    text = trade(tiny, runs, "tiny", (1, 4), ("noisy", "accumulated", "svgf", "svgf+js", "wskp6@tiny"), "48x32")
     return runs, text
 
 
-def test_trade_holds_every_precision_and_size(traded):
+def test_trade_has_every_precision(traded):
     runs, text = traded
     content = read_json(runs / "report" / "trade.json")
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
     rows = {row["label"]: row for row in content["rows"]}
     assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16"} <= rows.keys()
-    assert rows["wskp6@tiny"]["epochs"] == 7 and rows["noisy"]["epochs"] is None
     assert rows["wskp6@tiny"]["ms"] == rows["wskp6@tiny-float16"]["ms"] == 2.0
     assert (
         rows["wskp6@tiny"]["metrics"]["psnr"] != rows["wskp6@tiny-bfloat16"]["metrics"]["psnr"]
-    )  # judged as it computes
+    )  # evaluated in its precision
     assert rows["wskp6@tiny"]["metrics"]["psnr"] == pytest.approx(
         rows["wskp6@tiny-bfloat16"]["metrics"]["psnr"], abs=0.1
     )
@@ -300,18 +280,18 @@ def test_trade_holds_every_precision_and_size(traded):
     }
 
 
-def test_more_samples_cost_more_and_show_more(traded):
-    samples = read_json(traded[0] / "report" / "trade.json")["samples"]
-    rows = {(row["denoiser"], row["spp"]): row for row in samples["rows"]}
-    assert samples["sources"] == {"cornell_box/000": "rendered", "cornell_box_moving/000": "rendered"}
+def test_more_samples_cost_more_and_gain_quality(traded):
+    content = read_json(traded[0] / "report" / "trade.json")
+    rows = {(row["denoiser"], row["spp"]): row for row in content["samples"]}
+    assert content["render_ms"].keys() == {"cornell_box/000", "cornell_box_moving/000"}
     for name in ("noisy", "accumulated", "svgf"):
         one = rows[name, 1]
         four = rows[name, 4]
         assert four["metrics"]["psnr"] > one["metrics"]["psnr"] and four["render_ms"] >= one["render_ms"]
         assert four["ms"] == pytest.approx(four["render_ms"] + four["filter_ms"])
-    quality = {row["label"]: row["metrics"]["psnr"] for row in read_json(traded[0] / "report" / "trade.json")["rows"]}
+    quality = {row["label"]: row["metrics"]["psnr"] for row in content["rows"]}
     assert rows["noisy", 1]["metrics"]["psnr"] == quality["noisy"]  # 1 spp is the clip itself
-    assert all(math.isfinite(row["metrics"]["psnr"]) for row in samples["rows"])
+    assert all(math.isfinite(row["metrics"]["psnr"]) for row in content["samples"])
 
 
 def test_the_plot_draws_the_front(traded):
@@ -327,7 +307,7 @@ def test_the_plot_draws_the_front(traded):
 
 
 def test_the_plot_of_samples(traded):
-    rows = [SampleTrade(**row) for row in read_json(traded[0] / "report" / "trade.json")["samples"]["rows"]]
+    rows = [Trade(**row) for row in read_json(traded[0] / "report" / "trade.json")["samples"]]
     left, right = draw_samples(rows, "title").axes
     labels = [line.get_label() for line in left.lines]
     assert set(labels) == {row.label for row in rows}
@@ -335,25 +315,6 @@ def test_the_plot_of_samples(traded):
         ours = [row for row in rows if row.label == label]
         assert by_spp.get_xydata().tolist() == [[row.spp, row.metrics["psnr"]] for row in ours]
         assert by_ms.get_xydata().tolist() == [[row.ms, row.metrics["psnr"]] for row in ours]
-
-
-def test_what_shrinkage_gains_is_of_the_worst_clip_too(traded):
-    runs, text = traded
-    by_psnr, by_mse = read_json(runs / "report" / "trade.json")["samples"]["shrinkage"]
-    assert (by_psnr["metric"], by_mse["metric"]) == ("psnr", "mse_unbiased")
-    for gain, value in ((by_psnr, decibels_of), (by_mse, lambda r: -10 * math.log10(r["mse_unbiased"]))):
-        assert (gain["label"], gain["spp"], len(gain["clips"])) == ("svgf+js", 4, 2)
-        for clip, gained in gain["clips"].items():
-            folder = runs / "trade" / "eval" / "clips" / clip.replace("/", "-")
-            shown = {name: value(load_result(folder / name).metrics) for name in ("noisy", "svgf", "svgf+js")}
-            assert gained == pytest.approx(shown["svgf+js"] - max(shown["noisy"], shown["svgf"]))
-    mean, worst = np.mean([*by_psnr["clips"].values()]), min(by_psnr["clips"].values())
-    assert f"{mean:+.2f} ({worst:+.2f})" in text
-
-
-def decibels_of(metrics: dict[str, float]) -> float:
-    """PSNR: none of these clips is within its noise floor."""
-    return metrics["psnr"]
 
 
 def test_clips_of_more_samples_are_left_out(tiny, tmp_path):

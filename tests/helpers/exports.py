@@ -1,4 +1,4 @@
-"""Exported folders, run by what their own page says."""
+"""Exported folders, run as their own page describes."""
 
 from collections.abc import Callable
 from pathlib import Path

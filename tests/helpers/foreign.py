@@ -1,4 +1,4 @@
-"""Sequences of OpenEXR files as other renderers write them, made of Frames whose truth is known.
+"""Sequences of OpenEXR files as other renderers write them, made of Frames.
 
 `python -m tests.helpers.foreign CLIP|WxH FOLDER` writes one under Blender's names.
 """

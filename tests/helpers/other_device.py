@@ -59,7 +59,7 @@ def mapped(function: Callable[[Tensor], Any], value: Any) -> Any:
 def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     """The result of an operator: on the device that it names, else on that of its tensors."""
     with Factories():
-        result = func.decompose(*args, **kwargs)  # inference mode leaves that to whoever intercepts operators
+        result = func.decompose(*args, **kwargs)  # inference mode leaves that to the interceptor
         if result is not NotImplemented:
             return result
     if func is aten._has_compatible_shallow_copy_type.default:  # what modules ask whose parameters are moved

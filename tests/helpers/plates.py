@@ -1,4 +1,4 @@
-"""Plates before a wall that the eye looks at straight on, where similar triangles tell what is seen."""
+"""Plates in front of a wall that faces the camera, where similar triangles give what is visible."""
 
 import numpy as np
 import trimesh
@@ -43,7 +43,7 @@ def frames_of(
     frames: int = 3,
     sampling: Sampling = SAMPLING,
 ) -> list[Arrays]:
-    """The eye looks along -z at a wall at z = 0."""
+    """The camera looks along -z at a wall at z = 0."""
     eye = np.array([[0.0, 0, DISTANCE], [3 * eye_slides, 0, DISTANCE]])
     camera = Camera(Track(eye, 0, 3), Track(eye - [0, 0, 1], 0, 3), Track.constant(90.0))
     scene = Scene(shapes, camera, sky=sky)

@@ -36,7 +36,7 @@ SHORT: dict[str, dict[str, Any]] = {
 def short_task(
     name: str, data: Path, runs: Path, seed: int = 0, precision: str | None = FLOAT32, **recipe: Any
 ) -> Task:
-    """A training of a few steps, or whatever else the changes to its recipe say."""
+    """A training of a few steps, or with other changes to its recipe."""
     task = task_for(name, data, runs, "tiny")
     return replace(task, recipe=replace(task.recipe, **(recipe or SHORT[name])), seed=seed, precision=precision)
 
