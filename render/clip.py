@@ -14,7 +14,7 @@ from render.first_bounce import hit_channels
 from render.gbuffer import render_gbuffer
 from render.gradient import GradientSamples
 from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
-from render.path import Draw, PathTracer
+from render.path import PathTracer, SampleRange
 from render.stage import Stage
 from scenes.animation import Scene
 from scenes.camera import View, motion_vectors, pixel_centres
@@ -145,7 +145,10 @@ class SampledChannels:
         first = frame.index * self.sampling.noisy_spp if halton else 0
         shift = 0 if halton else frame.index
         self.draws = [
-            [Draw(stream_seed(self.seed, shift, stream, i), spp, first + n * spp) for n, stream in enumerate(streams)]
+            [
+                SampleRange(stream_seed(self.seed, shift, stream, i), spp, first + n * spp)
+                for n, stream in enumerate(streams)
+            ]
             for i in range(self.sampling.realisations)
         ]
         drawn = np.array([[self.noisy_tracer.radiance(self.ray, *draw) for draw in draws] for draws in self.draws])

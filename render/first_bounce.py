@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.path import Draw, PathTracer
+from render.path import PathTracer, SampleRange
 from render.sampler import hash32
 from scenes.camera import View
 
@@ -68,7 +68,7 @@ def hits_of_sample(tracer: PathTracer, view: View, seed: int, index: int) -> NDA
     return np.concatenate([stage.image(value) for value in values], axis=-1).astype(np.float64)
 
 
-def hit_channels(tracer: PathTracer, view: View, draws: Sequence[Draw]) -> dict[str, NDArray[np.float64]]:
+def hit_channels(tracer: PathTracer, view: View, draws: Sequence[SampleRange]) -> dict[str, NDArray[np.float64]]:
     """Distances (H, W, C) over the samples that `tracer.radiance` takes in all `draws`, for a stage posed for `view`.
 
     In world units, means over the samples that hit something, 0 where none did.

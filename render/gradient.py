@@ -20,7 +20,7 @@ from render.backend import mi
 from render.gbuffer import trace_visible
 from render.loading import aligned, columns
 from render.motion import is_same_surface
-from render.path import Draw, PathTracer
+from render.path import PathTracer, SampleRange
 from scenes.camera import Array, View, move, project, unproject
 
 
@@ -48,7 +48,7 @@ class GradientSamples(NamedTuple):
     mesh_id: NDArray[np.integer]  # (N,)
     view: View
     poses: int  # of the stage, to detect changes
-    draw: Draw  # which samples of the tracer they are
+    draw: SampleRange  # which samples of the tracer they are
 
     @staticmethod
     def of(
@@ -57,7 +57,7 @@ class GradientSamples(NamedTuple):
         indirect: NDArray[np.float32],
         view: View,
         poses: int,
-        draw: Draw,
+        draw: SampleRange,
         seed: int,
     ) -> "GradientSamples":
         """One of each stratum of a `frame`, whose samples are `direct` and `indirect` (H, W, 3)."""

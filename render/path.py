@@ -118,7 +118,7 @@ def sample_mean(
     return direct / count, indirect / count
 
 
-class Draw(NamedTuple):
+class SampleRange(NamedTuple):
     """A range of samples of every pixel."""
 
     seed: int  # in [0, 2^32): different ones are independent

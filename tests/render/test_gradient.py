@@ -11,7 +11,7 @@ from datasets.channels import STRATUM
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import GradientSamples, pixel_of_each_stratum, sample_luminance
-from render.path import Draw, PathTracer
+from render.path import PathTracer, SampleRange
 from render.posed_frame import PosedFrame
 from render.stage import Stage
 from scenes.animation import RigidMotion, Scene, Track
@@ -26,7 +26,7 @@ def samples_of(tracer: PathTracer, frame: int, seed: int) -> GradientSamples:
     stage = tracer.stage
     view = stage.view(frame)
     light = tracer.radiance(stage.rays(view), seed, 1)
-    return GradientSamples.of(render_gbuffer(stage, view), *light, view, stage.poses, Draw(seed, 1), seed)
+    return GradientSamples.of(render_gbuffer(stage, view), *light, view, stage.poses, SampleRange(seed, 1), seed)
 
 
 def still_camera(scene: Scene) -> Scene:

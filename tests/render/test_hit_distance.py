@@ -7,7 +7,7 @@ from scipy.stats import kstest
 from datasets.channels import HIT_CHANNELS
 from render.clip import Sampling, render_clip
 from render.first_bounce import hit_channels
-from render.path import Draw, PathTracer
+from render.path import PathTracer, SampleRange
 from render.stage import Stage
 from scenes.registry import build_scene
 from tests.helpers.plates import DISTANCE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
@@ -68,8 +68,8 @@ def test_the_sky_is_infinitely_far_away_and_wide():
 def test_means_count_the_samples_that_met_something():
     stage = Stage(build_scene("cornell_box", 3, 24), 16, 16)
     tracer = PathTracer(stage)
-    one, other = (hit_channels(tracer, stage.view(0), [Draw(7, 1, first)]) for first in (0, 1))
-    both = hit_channels(tracer, stage.view(0), [Draw(7, 2)])
+    one, other = (hit_channels(tracer, stage.view(0), [SampleRange(7, 1, first)]) for first in (0, 1))
+    both = hit_channels(tracer, stage.view(0), [SampleRange(7, 2)])
     for name, means in both.items():
         pair = np.stack([one[name], other[name]])
         expected = np.ma.masked_equal(pair, 0).mean(axis=0).filled(0)
