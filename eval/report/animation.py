@@ -31,7 +31,7 @@ def side_by_side(folders: Sequence[Path], names: Sequence[str], index: int) -> I
     picture.paste(panels, (0, BANNER))
     for position, name in enumerate(names):
         left = position * panels.width // len(names)
-        ImageDraw.SampleRange(picture).text((left + 4, 3), name, "black", ImageFont.load_default(14))
+        ImageDraw.Draw(picture).text((left + 4, 3), name, "black", ImageFont.load_default(14))
     return picture
 
 
