@@ -82,8 +82,12 @@ def source_of(module: str) -> Path | None:
 
 
 def imported_by(path: Path) -> Iterator[str]:
-    """Names that a source file imports: modules, and members that may be modules themselves."""
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    """Names that a source file imports: modules, and members that may be modules themselves; not those for types."""
+    nodes: list[ast.AST] = [ast.parse(path.read_bytes())]
+    while nodes:
+        node = nodes.pop()
+        if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            nodes += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,26 +25,10 @@ from models.wrappers.error_estimate import denoise_with_error
 from models.wrappers.shrinkage import JamesStein
 from provenance import file_digest
 
+if TYPE_CHECKING:  # it imports all denoisers, and results of one must not depend on the code of the others
+    from models.spec import DenoiserSpec
+
 METRICS_CHANNELS = ("motion", "dual_motion")
-
-
-class RunnableSpec(Protocol):
-    """What a run needs of a models.spec.DenoiserSpec.
-
-    That module imports all denoisers, and results of one must not depend on the code of the others.
-    """
-
-    @property
-    def returns(self) -> Signal: ...
-    @property
-    def precision(self) -> str: ...
-    @property
-    def weights(self) -> Path | None: ...
-    @property
-    def device(self) -> str: ...
-    @property
-    def modules(self) -> tuple[str, ...]: ...
-    def build(self) -> Denoiser: ...
 
 
 @dataclass
@@ -55,7 +39,7 @@ class NamedDenoiser:
         saves_error: whether to store error maps, where it is a NAME+js and frames have two sample buffers.
     """
 
-    spec: RunnableSpec
+    spec: "DenoiserSpec"
     name: str
     saves_error: bool = False
 
