@@ -26,6 +26,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_no_semaphore_is_leaked(tmp_path):
     """Python's resource tracker would complain after the end, on standard error."""
     script = tmp_path / "locks.py"

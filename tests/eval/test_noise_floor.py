@@ -105,6 +105,7 @@ def test_no_floor_no_mark():
     assert not within_floor("temporal_error_floor", 0.1, 0.1)
 
 
+@pytest.mark.slow
 def test_unbiased_mse_on_rendered_references():
     """The figure in small: the plain MSE falls as references get better, the unbiased one stays, floors hold."""
     true, measured = measure_references({16: 24, 64: 8}, truth_spp=8192)
