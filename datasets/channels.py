@@ -129,7 +129,6 @@ NOISY_CHANNELS = channels_of("noisy")
 REFERENCE_CHANNELS = channels_of("reference")
 HIT_CHANNELS = channels_of("hit")
 MOTION_CHANNELS = channels_of("motion")
-CAMERA_CHANNELS = channels_of("camera")
 SAMPLE_BUFFERS = forms_of("buffers")
 MIRRORED = forms_of("mirrored")
 OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))  # of rendering

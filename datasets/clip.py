@@ -1,18 +1,18 @@
 """Clips and data sets on disk, read through memory maps."""
 
+import re
 import resource
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets import mirrors
-from datasets.channels import CHANNELS, NOISY_CHANNELS
+from datasets.channels import CHANNELS, MIRRORED, NOISY_CHANNELS
 from errors import BadInput
 from files import read_json
 from scenes.camera import View, motion_vectors, pixel_centres
@@ -28,6 +28,38 @@ WHOLE_IMAGE: ImageWindow = (slice(None), slice(None))
 def is_clip(path: Path) -> bool:
     """Whether there is a clip at `path`. A folder with clip.json is complete, because clips appear by renaming."""
     return (path / "clip.json").exists()
+
+
+class ClipKind(NamedTuple):
+    """What a clip's name describes: 000 is a number, in `still` nothing moves, 000-4spp has noisy input of 4 spp."""
+
+    number: int
+    still: bool
+    noisy_spp: int  # samples a pixel of the noisy channels
+
+    @staticmethod
+    def of(name: str) -> "ClipKind":
+        """The kind of the clip of that name. Raises BadInput where no clip is called so."""
+        match = re.fullmatch(r"(\d+|still)(?:-(\d+)spp)?", name)
+        if not match:
+            raise BadInput(f"'{name}' does not name a clip: clips are called 000, still or 000-4spp")
+        still = match[1] == "still"
+        return ClipKind(0 if still else int(match[1]), still, int(match[2] or 1))
+
+
+def visible_channel(name: str, stored: Container[str], read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
+    """A channel (..., H, W, C), in mirrors of the surfaces that these show, if the `stored` channels describe them.
+
+    All motion in a mirror is that of what the mirror shows, as if it stood behind the mirror. The renderer's gradient
+    is of the mirror itself: there it counts as 0.
+    """
+    if MIRRORED.get(name) in stored:
+        return read(MIRRORED[name])
+    own = read(name)
+    if not CHANNELS[name].is_temporal or MIRRORED["motion"] not in stored:
+        return own
+    in_mirror = read(MIRRORED["depth"]) != read("depth")
+    return np.where(in_mirror, 0 if CHANNELS[name].kind == "gradient" else read(MIRRORED["motion"]), own)
 
 
 class Clip:
@@ -52,7 +84,7 @@ class Clip:
 
     @property
     def name(self) -> str:
-        """The clip's name within its scene, such as "000" or "still"; see datasets.clip_kind."""
+        """The clip's name within its scene, such as "000" or "still"; see ClipKind."""
         return self.path.name
 
     @property
@@ -117,8 +149,8 @@ class Clip:
     def read_visible(
         self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
     ) -> NDArray[Any]:
-        """As `read`, but in mirrors of what these show: the input of denoisers. See datasets.mirrors."""
-        return mirrors.visible(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
+        """As `read`, but in mirrors of what these show: the input of denoisers. See `visible_channel`."""
+        return visible_channel(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
 
     def view(self, frame: int) -> View:
         """The camera and the poses of all meshes in one frame."""

@@ -80,20 +80,6 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     write_planes(path, planes, attributes)
 
 
-def read_exr(path: Path) -> tuple[dict[str, NDArray[Any]], View, dict[str, Any]]:
-    """A frame as `write_exr` wrote it: channels by name as `Clip.read` returns them, the view, and the header's facts.
-
-    Raises BadInput where the file is missing, damaged or was not written by onespp.
-    """
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = {name: channel.pixels for name, channel in file.channels().items()}
-            facts = json.loads(file.header()[FACTS_ATTRIBUTE])
-    except (RuntimeError, KeyError, ValueError) as error:
-        raise BadInput(f"{path} is missing, damaged or not written by onespp ({error})") from None
-    return channels_in(planes), view_of_facts(facts), facts
-
-
 def channels_in(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Those of our channels, as `Clip.read` returns them, that EXR channels (H, W) contain: inverts layers_of."""
     channels: dict[str, NDArray[Any]] = {}

@@ -253,7 +253,7 @@ def read_frame(
 ) -> Frame:
     """Frame `index` (B = 1) of a clip, with the named channels of one noise realisation, cut to `window`.
 
-    In mirrors they are of what these show (see datasets.mirrors). Sample buffers are left out where the clip has none.
+    In mirrors they are of what these show (clip.visible_channel). Sample buffers are left out where the clip has none.
 
     `previous` is the frame that is played before this one, by default the one before it in the clip. For another one
     (in reversed playback, or while the camera stands still), motion vectors are computed.
@@ -270,7 +270,13 @@ def read_frame(
         if not channel.is_image or (channel.kind == "buffers" and name not in clip.channels):
             continue
         if channel.is_temporal and previous != stored_previous:
-            array = temporal_channel(clip, name, index, previous, window)
+            # Only the renderer can compute what hid a surface and how light changes. But while time stands still
+            # nothing is hidden and nothing changes: dual motion equals motion, and both are 0 like the gradient.
+            if name != "motion" and previous != index:
+                raise BadInput(
+                    f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing"
+                )
+            array = clip.motion_to(index, previous, window)
         else:
             array = clip.read_visible(name, index, window, realisation)
         tensors[name] = to_tensor(array, has_buffers=channel.has_buffers)
@@ -281,18 +287,6 @@ def read_frame(
         source=str(clip.path),
         spp=torch.full((1, 1, 1, 1), float(clip.facts["noisy_spp"])),
     )
-
-
-def temporal_channel(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> NDArray[np.float32]:
-    """A temporal channel (h, w, 2), to a frame that is not the one before in the clip.
-
-    Dual motion vectors depend on what hid a surface and gradients on how light changes: only the renderer can compute
-    them. But while time stands still nothing is hidden and nothing changes: dual motion equals motion, and both are 0
-    like the gradient.
-    """
-    if name != "motion" and previous != index:
-        raise BadInput(f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing")
-    return clip.motion_to(index, previous, window)
 
 
 def to_tensor(array: NDArray[np.generic], has_buffers: bool = False) -> Tensor:

@@ -1,7 +1,9 @@
 """What is in a data set: its clips and how hard they are, how channels are stored, where the time went."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tabulate import tabulate
@@ -13,6 +15,11 @@ from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
 from datasets.tonemap import psnr
 from errors import BadInput
 from files import read_json
+
+if TYPE_CHECKING:
+    from plotting import Figure
+
+BINS = 16  # of histograms
 
 SecondsByStep = dict[str, float]
 
@@ -51,10 +58,28 @@ def plot_difficulties(root: Path, difficulties: list[Difficulty], path: Path) ->
     """Write the histograms to a PNG. Raises BadInput where there are no clips."""
     if not difficulties:
         raise BadInput(f"{root} has no clips yet: render some with `onespp dataset`")
-    from datasets.histogram import difficulty_histograms  # takes matplotlib, which nothing else here needs
-    from plotting import save_figure
+    from plotting import save_figure  # takes matplotlib, which tables do not need
 
     save_figure(path, difficulty_histograms(difficulties))
+
+
+def difficulty_histograms(clips: Sequence[Difficulty]) -> "Figure":
+    """A histogram of each measure over all clips, on logarithmic axes. Infinite and undefined values are left out."""
+    from plotting import plt
+
+    figure, axes = plt.subplots(1, len(MEASURES), figsize=(12, 2.6), layout="constrained")
+    for axis, (field, measure) in zip(axes, MEASURES.items(), strict=True):
+        values = np.array([getattr(clip, field) for clip in clips])
+        finite = np.maximum(values[np.isfinite(values)], measure.minimum)
+        maximum = max(finite.max(initial=measure.minimum), 2 * measure.minimum)
+        edges = np.geomspace(measure.minimum, maximum * 1.0001, BINS + 1)
+        axis.hist(finite, edges, color="#4477aa", edgecolor="white")
+        axis.set(xscale="log", xlabel=measure.title)
+        if len(finite):
+            low, middle, high = np.percentile(finite, [5, 50, 95])
+            axis.set_title(f"5 %: {low:.2g}   50 %: {middle:.2g}   95 %: {high:.2g}", fontsize=8)
+    axes[0].set_ylabel(f"clips of {len(clips)}")
+    return figure
 
 
 def clip_row(clip: Clip, difficulty: Difficulty, seconds: float) -> dict[str, object]:

@@ -16,7 +16,7 @@ MIN_THICKNESS = 1e-4  # of the positions, relative to their extent: flatter ones
 MAX_ORIGIN_DISTANCE = 0.01  # relative to the positions': a camera closer to (0, 0, 0) is taken to be there
 MAX_OBLONGNESS = 0.01  # by how much focal lengths may differ
 
-STILL = np.eye(4)[None]  # object_to_world: motion of objects is not known
+STILL = np.eye(4)[None]  # object_to_world: objects are taken not to move
 
 
 def view_of(projection: Array) -> View | None:

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets import mirrors
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
+from datasets.clip import visible_channel
 from datasets.exr import FACTS_ATTRIBUTE, channels_in, view_of_facts
 from datasets.frame import Frame, to_tensor
 from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
@@ -46,7 +46,7 @@ class InputConventions:
 
     @property
     def has_history(self) -> bool:
-        """Whether it is known where surfaces were in the previous frame."""
+        """Whether positions of surfaces in the previous frame are available."""
         return self.motion is not None or self.cameras is not None
 
 
@@ -125,7 +125,10 @@ class FrameBuilder:
         given = self.given_motion(foreign)
         view = views.world if views else self.parallel_view(foreign, depth, given)
         before = self.view if self.view is not None else view
-        motion = derived_motion(foreign, depth, view, before) if given is None else given
+        motion = given
+        if motion is None:  # of a world in which nothing moves but the camera
+            pixels, mesh_id = pixel_centres(*foreign.size), foreign.surface.astype(np.int64)
+            motion = motion_vectors(pixels, depth.astype(np.float64), mesh_id, view, before).astype(np.float32)
         channels = {
             **light_of(foreign),
             "albedo": foreign.arrays.get("albedo", np.ones((*foreign.size, 3), np.float32)),
@@ -201,13 +204,6 @@ def frame_of(
     )
 
 
-def derived_motion(foreign: ForeignFrame, depth: Image, view: View, before: View) -> Image:
-    """Motion (H, W, 2) of a world in which nothing moves but the camera."""
-    mesh_id = foreign.surface.astype(np.int64)
-    vectors = motion_vectors(pixel_centres(*foreign.size), depth.astype(np.float64), mesh_id, view, before)
-    return vectors.astype(np.float32)
-
-
 def light_of(foreign: ForeignFrame) -> dict[str, Image]:
     """Radiance as our channels: all reflected light is direct. Background is emission, which is never filtered.
 
@@ -264,7 +260,7 @@ class OwnFrameBuilder:
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
         view = view_of_facts(facts)
         arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
-        visible = {name: mirrors.visible(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
+        visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
         before = self.view if self.view is not None else view
         self.view = view
         return frame_of(visible, self.reads, view, before, str(image.path), float(facts["noisy_spp"]))

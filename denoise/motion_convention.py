@@ -112,7 +112,7 @@ def bilinear(image: Image, x: NDArray[np.floating], y: NDArray[np.floating]) -> 
 
 @dataclass(frozen=True)
 class Detection:
-    """The convention that warps best, whether it is beyond doubt, and a line for users that says why."""
+    """The convention that warps best, whether it is certain, and a line for users that explains it."""
 
     convention: MotionConvention
     certain: bool

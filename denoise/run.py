@@ -93,7 +93,7 @@ def check_error_estimate(job: Job, denoiser: Denoiser, sources: Sources, first: 
         raise BadInput(f"{job.denoiser} does not estimate its error: use {job.denoiser}+js")
     image = ExrImage(first.passes[COLOUR], header_only=True)
     if not (has_two_buffers(image) if sources.is_ours else sources.has("half")):
-        raise BadInput("--error and --until need two halves of the samples: name the other by --half")
+        raise BadInput("--error and --until need two sample buffers: name buffer B by --half")
     if job.until is not None and not 0 < job.until < math.inf:
         raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
 
@@ -138,7 +138,7 @@ def image_of(tensor: Tensor) -> NDArray[np.float32]:
 
 @dataclass
 class SequenceDenoiser:
-    """A job whose files and denoiser are known."""
+    """A job with its files and its denoiser."""
 
     job: Job
     spec: DenoiserSpec
@@ -205,7 +205,7 @@ class SequenceDenoiser:
                 yield from self.play_shot(shot, start, progress)
 
     def is_finished(self, files: FrameFiles) -> bool:
-        """Whether a frame's outputs, and its error if asked for, are there and no older than its inputs."""
+        """Whether a frame's outputs, and its error if requested, are there and no older than its inputs."""
         outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.png else [])]
         if not all(path.exists() for path in outputs):
             return False

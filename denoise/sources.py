@@ -92,7 +92,7 @@ def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> So
             quantities[quantity] = Source(COLOUR, best, tuple(layer.name or "R,G,B" for layer in others))
     if COLOUR not in quantities:
         raise BadInput(
-            f"{image.path} has no layer known to be radiance; it has {list_layers(channels)}: "
+            f"{image.path} has no layer with a name of radiance; it has {list_layers(channels)}: "
             "name it by --layers colour=LAYER"
         )
     layer = quantities[COLOUR].layer

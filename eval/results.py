@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.clip import Clip
-from datasets.clip_kind import ClipKind
+from datasets.clip import Clip, ClipKind
 from datasets.frame import Signal
 from errors import BadInput
 from eval.metrics import METRICS, Values

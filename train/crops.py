@@ -16,7 +16,7 @@ from datasets.frame import Frame, read_frame, to_tensor
 from models.history.running_scale import RunningMean, RunningScale
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
 from train.protocols import A, FilteringNetwork
-from train.sequences import check_fits, random_window
+from train.sequences import Batch, check_fits, random_window
 
 
 class Crops:
@@ -44,6 +44,9 @@ class Crops:
         irradiance = torch.cat([crop.irradiance for crop in crops])
         log_scale = torch.cat([crop.log_scale for crop in crops])
         return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, log_scale)
+
+
+AnyBatch = Batch | Crops
 
 
 class AccumulatedCrops(TorchDataset[Crops]):

@@ -12,13 +12,12 @@ from tqdm import tqdm
 from errors import BadInput
 from extras import can_draw
 from files import locked
-from train.checkpoint import load_checkpoint
 from train.log import Log, LogRow
 from train.made_by import differences
 from train.pictures import loss_curve, sample_picture
 from train.precision import fabric_here
 from train.task import WEIGHTS_FILE, Task
-from train.training import BEST_FILE, Training
+from train.training import BEST_FILE, Training, load_checkpoint
 
 SAVE_SECONDS = 60.0  # between checkpoints: what a kill loses at most
 

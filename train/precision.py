@@ -9,9 +9,8 @@ from lightning_fabric import Fabric
 
 from models.fastest import MIN_SPEEDUP
 from timing import device_clock, take_turns, thread_count
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import NetworkLoss
-from train.sequences import Batch
 
 FLOAT32 = "float32"
 BFLOAT16 = "bfloat16"  # by autocast; the weights are float32 all the same
@@ -34,7 +33,7 @@ def fabric_here(precision: str = FLOAT32) -> Fabric:
     return fabric
 
 
-def forward_and_backward(loss: NetworkLoss, batch: Batch | Crops, device: str, precision: str) -> None:
+def forward_and_backward(loss: NetworkLoss, batch: AnyBatch, device: str, precision: str) -> None:
     """Compute the gradients of a batch, and drop them."""
     with torch.autocast(device, torch.bfloat16, enabled=precision == BFLOAT16):
         value, _ = loss(batch)
@@ -43,7 +42,7 @@ def forward_and_backward(loss: NetworkLoss, batch: Batch | Crops, device: str, p
     loss.zero_grad()
 
 
-def fastest_precision(loss: NetworkLoss, batch: Batch | Crops, device: str) -> str:
+def fastest_precision(loss: NetworkLoss, batch: AnyBatch, device: str) -> str:
     """bfloat16 where that makes a step at least MIN_SPEEDUP times faster, by the best of some turns; else float32.
 
     On processors one thread computes, and only its own time counts: on a busy machine the wall clock measures waiting.

@@ -35,25 +35,11 @@ WSKP_RECIPE = Recipe(
 )
 
 # The defaults of its authors' code, as we do not have the paper's text. That also rotates and mirrors crops.
-NBGD_RECIPE = Recipe(
-    loss=NBGDLoss(),
-    rate=1e-4,
-    batch=1,
-    crop=128,
-    length=1,
-    crops=(50, 50),
-    epochs=100,
-)
+NBGD_RECIPE = Recipe(loss=NBGDLoss(), rate=1e-4, batch=1, crop=128, length=1, crops=(50, 50), epochs=100)
 
 # Its authors trained one network on 4 to 64 samples per pixel; more is not known.
 LBF_RECIPE = Recipe(
-    loss=LBFLoss(),
-    rate=1e-2,
-    batch=4,
-    crop=128,
-    length=1,
-    epochs=100,
-    augmentation=Augmentation(samples=True),
+    loss=LBFLoss(), rate=1e-2, batch=4, crop=128, length=1, epochs=100, augmentation=Augmentation(samples=True)
 )
 
 NTD_RECIPE = Recipe(

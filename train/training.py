@@ -1,11 +1,13 @@
 """A training: a network, its optimiser and data, and its steps."""
 
+import io
 import math
 import time
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,21 +17,37 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from errors import BadInput
+from files import write_file
 from models.weights import save_weights
 from provenance import file_digest
-from train.checkpoint import Checkpoint, save_checkpoint
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
 from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
 from train.made_by import MadeBy, made_by_here
 from train.precision import fabric_here, fastest_precision
-from train.sequences import Batch
 from train.task import Task
 
 BEST_FILE = "best.safetensors"
+CHECKPOINT_FILE = "checkpoint.pt"
 VALIDATIONS = 10  # in a training
 MAX_SKIPPED_IN_A_ROW = 20
+
+Checkpoint = dict[str, Any]  # all that an interrupted training needs to resume
+
+
+def load_checkpoint(folder: Path) -> Checkpoint:
+    """The checkpoint of the training in `folder`; empty where there is none. Raises BadInput where it is damaged."""
+    path = folder / CHECKPOINT_FILE
+    if not path.exists():
+        return {}
+    try:
+        return dict(torch.load(path, weights_only=True, map_location="cpu"))
+    except OSError:
+        raise
+    except Exception as error:  # a damaged pickle may fail in any way
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise BadInput(f"{path} is damaged ({reason}): delete {folder}") from None
 
 
 def average_decay(updates: int, span: float) -> float:
@@ -145,7 +163,7 @@ class Training:
         self.position = Position(**{field.name: saved[field.name] for field in fields(Position)})
 
     def save(self) -> None:
-        """Write the checkpoint."""
+        """Write the checkpoint atomically: a full disk or a kill leaves the previous one."""
         content = {
             "facts": self.facts,
             "precision": self.precision,
@@ -155,7 +173,9 @@ class Training:
             "optimiser": self.optimiser.state_dict(),
             **asdict(self.position),
         }
-        save_checkpoint(self.task.folder, content)
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_file(self.task.folder / CHECKPOINT_FILE, buffer.getvalue())
 
     def steps(self) -> Iterator[LogRow]:
         """Update the weights step by step until the last epoch's end; yields the log row of each step."""
@@ -170,7 +190,7 @@ class Training:
                 self.position.done += 1
                 yield row
 
-    def step(self, batch: Iterable[Batch | Crops]) -> LogRow:
+    def step(self, batch: Iterable[AnyBatch]) -> LogRow:
         """Update the weights once, from the parts of a batch.
 
         Returns the learning rate, the loss and its parts, the norm of the gradients, and milliseconds.

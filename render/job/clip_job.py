@@ -7,8 +7,7 @@ from typing import Literal, NamedTuple
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS
-from datasets.clip import is_clip
-from datasets.clip_kind import ClipKind
+from datasets.clip import ClipKind, is_clip
 from datasets.writer import ClipWriter
 from files import locked
 from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
-from datasets.clip import SCHEMA, SPLITS
-from datasets.clip_kind import ClipKind
+from datasets.clip import SCHEMA, SPLITS, ClipKind
 from errors import BadInput
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options

@@ -19,7 +19,7 @@ def card_in(root: Path) -> dict:
     return json.loads((root / CARD_FILE).read_text())
 
 
-def test_it_says_what_the_files_say(tiny):
+def test_it_agrees_with_the_files(tiny):
     card = card_in(tiny)
     clips = {str(path.parent.relative_to(tiny)): path for path in sorted(tiny.glob("*/*/*/clip.json"))}
     assert card["clips"].keys() == clips.keys() and card["splits"]["train"] == card["splits"]["train"] | {
@@ -28,11 +28,11 @@ def test_it_says_what_the_files_say(tiny):
     }
     for name, path in clips.items():
         facts = json.loads(path.read_text())
-        said = card["clips"][name]
-        assert said["crc32"] == f"{zlib.crc32(path.read_bytes()):08x}"
-        assert said["bytes"] == sum(f.stat().st_size for f in path.parent.iterdir() if f.name != "timing.json")
-        assert said["floor_db"] == pytest.approx(-10 * math.log10(facts["floor_mse"]), abs=0.006)
-        assert (said["reference_spp"], said["realisations"]) == ((64, 2) if "train" in name else (128, 1))
+        row = card["clips"][name]
+        assert row["crc32"] == f"{zlib.crc32(path.read_bytes()):08x}"
+        assert row["bytes"] == sum(f.stat().st_size for f in path.parent.iterdir() if f.name != "timing.json")
+        assert row["floor_db"] == pytest.approx(-10 * math.log10(facts["floor_mse"]), abs=0.006)
+        assert (row["reference_spp"], row["realisations"]) == ((64, 2) if "train" in name else (128, 1))
     assert card["bytes"] == sum(clip["bytes"] for clip in card["clips"].values())
     assert card["splits"]["test"]["worst_floor_db"] == min(
         clip["floor_db"] for name, clip in card["clips"].items() if name.startswith("test/")
@@ -53,7 +53,7 @@ def test_the_page_names_what_the_card_has(tiny):
     assert all(clip["crc32"] in page and f"{clip['floor_db']}" in page for clip in card["clips"].values())
 
 
-def test_options_and_what_was_left_out_are_told(tiny_copy):
+def test_options_and_channels_left_out_are_listed(tiny_copy):
     path = tiny_copy / "dataset.json"
     facts = json.loads(path.read_text())
     facts["options"]["halton"] = True
@@ -63,7 +63,7 @@ def test_options_and_what_was_left_out_are_told(tiny_copy):
     assert card["command"].endswith(" --halton") and "left out gradient" in page_of(card)
 
 
-def test_a_scene_of_ones_own_keeps_its_licence_and_tells_what_was_not_honoured(tiny_copy):
+def test_a_scene_of_ones_own_keeps_its_licence_and_lists_ignored_features(tiny_copy):
     path = tiny_copy / "dataset.json"
     facts = json.loads(path.read_text())
     own = {"profile": "/home/me/attic.toml", "source": {"/home/me/attic.toml": "0badcafe"}, "notes": ["fog: left out"]}

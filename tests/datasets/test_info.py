@@ -1,4 +1,4 @@
-"""What `onespp info` says of a data set, and how hard it finds the clips."""
+"""The tables of `onespp info`, and measures of how difficult clips are."""
 
 import math
 import shutil
@@ -10,14 +10,13 @@ from matplotlib import pyplot as plt
 from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
-from datasets.histogram import BINS, difficulty_histograms
-from datasets.info import summarise
+from datasets.info import BINS, difficulty_histograms, summarise
 from datasets.writer import ClipWriter
 from errors import BadInput
 from plotting import DPI
 
 
-def test_info_tells_sizes_floors_and_what_is_missing(tiny_copy):
+def test_info_lists_sizes_noise_floors_and_missing_clips(tiny_copy):
     shutil.rmtree(tiny_copy / "val" / "cornell_box" / "000")
     lines = summarise(tiny_copy).splitlines()
     for head in ("clip", "frames", "size", "noisy", "reference spp", "floor dB", "P95/P5", "MB", "seconds"):

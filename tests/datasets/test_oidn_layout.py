@@ -25,13 +25,13 @@ def groups_of(folder: Path) -> dict[str, tuple[list[str], str]]:
         name = path.name.rsplit(".", 2)[0]
         match = SAMPLES.fullmatch(name)
         names[match[1] if match else name].add(name)
-    found = {}
+    groups = {}
     for group, images in names.items():
         *inputs, target = sorted(images)
         wanted = [(name, feature) for name in inputs for feature in FEATURES] + [(target, "hdr")]
         if inputs and all((folder / f"{name}.{feature}.exr").is_file() for name, feature in wanted):
-            found[group] = (inputs, target)
-    return found
+            groups[group] = (inputs, target)
+    return groups
 
 
 def read(folder: Path, name: str, feature: str) -> np.ndarray:

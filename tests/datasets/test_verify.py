@@ -1,4 +1,4 @@
-"""Damage of every kind is found and named."""
+"""Every kind of damage is detected and named."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Short sequences whose truth is known, shared by the tests here."""
+"""Short sequences with ground truth, shared by the tests here."""
 
 from dataclasses import replace
 from pathlib import Path

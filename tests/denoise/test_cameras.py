@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
 from scenes.camera import View, intrinsics, inverse_pose, look_at, pixel_centres, project, unproject
+from tests.helpers.foreign import world_to_ndc
 
 HEIGHT, WIDTH = 36, 64
 SURFACE = np.ones((HEIGHT, WIDTH), bool)
@@ -23,10 +24,10 @@ def points_of(view: View, seed: int = 0) -> np.ndarray:
     return unproject(pixel_centres(HEIGHT, WIDTH), depth, view).astype(np.float32)
 
 
-def assert_same(found: View | None, view: View, tolerance: float = 1e-3) -> None:
-    assert found is not None
-    np.testing.assert_allclose(found.camera_to_world, view.camera_to_world, atol=tolerance)
-    np.testing.assert_allclose(found.K, view.K, atol=tolerance * WIDTH)
+def assert_same(fitted_view: View | None, view: View, tolerance: float = 1e-3) -> None:
+    assert fitted_view is not None
+    np.testing.assert_allclose(fitted_view.camera_to_world, view.camera_to_world, atol=tolerance)
+    np.testing.assert_allclose(fitted_view.K, view.K, atol=tolerance * WIDTH)
 
 
 @given(st.integers(0, 10**6))
@@ -51,10 +52,10 @@ def test_positions_in_half_precision_determine_the_camera():
 def test_left_handed_worlds_project_alike():
     view = some_view(2)
     mirrored = points_of(view) * [1, 1, -1]
-    found = view_of_positions(mirrored, SURFACE)
-    assert found is not None
-    np.testing.assert_allclose(project(mirrored, SURFACE, found), pixel_centres(HEIGHT, WIDTH), atol=1e-2)
-    identity = found.camera_to_world @ inverse_pose(found.camera_to_world)
+    fitted_view = view_of_positions(mirrored, SURFACE)
+    assert fitted_view is not None
+    np.testing.assert_allclose(project(mirrored, SURFACE, fitted_view), pixel_centres(HEIGHT, WIDTH), atol=1e-2)
+    identity = fitted_view.camera_to_world @ inverse_pose(fitted_view.camera_to_world)
     np.testing.assert_allclose(identity, np.eye(4), atol=1e-9)
 
 
@@ -67,22 +68,14 @@ def test_positions_that_do_not_determine_a_camera():
     assert view_of_positions(points_of(view), ~SURFACE) is None
 
 
-def ndc(view: View, from_zero: bool) -> np.ndarray:
-    """`worldToNDC` for row vectors, of a view."""
-    pixels = view.K @ inverse_pose(view.camera_to_world)[:3]
-    to_unit = np.array([[1 / WIDTH, 0, 0], [0, -1 / HEIGHT, 1], [0, 0, 1]])  # [0, 1], y up
-    x, y, w = to_unit @ pixels
-    rows = [x, y, w, w] if from_zero else [2 * x - w, 2 * y - w, w, w]
-    return np.array(rows, np.float32).T
-
-
 @pytest.mark.parametrize("from_zero", [True, False])
 def test_cameras_of_headers(from_zero):
     view = some_view(4)
-    assert_same(view_of_header({"worldToNDC": ndc(view, from_zero)}, HEIGHT, WIDTH), view, 1e-4)
+    ndc = world_to_ndc(view, HEIGHT, WIDTH, from_zero)
+    assert_same(view_of_header({"worldToNDC": ndc}, HEIGHT, WIDTH), view, 1e-4)
     assert view_of_header({}, HEIGHT, WIDTH) is None
     assert view_of_header({"worldToNDC": np.zeros((4, 4))}, HEIGHT, WIDTH) is None
-    stretched = ndc(view, from_zero) * [[0.5, 1, 1, 1]]
+    stretched = ndc * [[0.5, 1, 1, 1]]
     assert view_of_header({"worldToNDC": stretched}, HEIGHT, WIDTH) is None  # oblong pixels
 
 
@@ -97,6 +90,6 @@ def test_positions_in_the_cameras_own_space(dtype):
         fitted = view_of_positions(rounded, SURFACE)
         assert fitted is not None
         assert is_own_space(fitted, header, rounded, SURFACE) == is_own_space(fitted, {}, rounded, SURFACE) == is_own
-        found = in_the_world(fitted, header) if is_own else fitted
-        assert_same(found, view, 1e-3 if dtype == np.float32 else 1e-2)
+        fitted_view = in_the_world(fitted, header) if is_own else fitted
+        assert_same(fitted_view, view, 1e-3 if dtype == np.float32 else 1e-2)
         assert in_the_world(fitted, {}) is None

@@ -26,12 +26,7 @@ def frames_of(folder: Path) -> list[Frame]:
 
 
 def header_of(frame: Frame) -> dict[str, np.ndarray]:
-    """`worldToNDC` as OpenEXR means it: [-1, 1], y up."""
-    view = foreign.view(frame)
-    height, width = frame.size
-    to_unit = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
-    x, y, w = to_unit @ view.K @ np.linalg.inv(view.camera_to_world)[:3]
-    return {"worldToNDC": np.ascontiguousarray(np.array([x, y, w, w]).T, np.float32)}
+    return {"worldToNDC": foreign.world_to_ndc(foreign.view(frame), *frame.size)}
 
 
 def share_alike(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -46,27 +41,27 @@ def test_depth_and_the_headers_camera_give_motion_and_normals(box, tmp_path, kin
         distance = np.linalg.norm(foreign.positions(frame) - eye, axis=-1, keepdims=True)
         layer = {"Z": foreign.image(frame, "depth")} if kind == "depth" else {"distance.Y": distance}
         foreign.write(tmp_path / f"{index}.exr", {"RGB": foreign.beauty(frame)} | layer, header_of(frame))
-    for found, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
-        torch.testing.assert_close(found.depth, frame.depth, rtol=1e-4, atol=0)
-        torch.testing.assert_close(found.motion, frame.motion, rtol=0, atol=0.02)
-        assert share_alike(found.normal, frame.normal) > 0.95  # all but edges
+    for built, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
+        torch.testing.assert_close(built.depth, frame.depth, rtol=1e-4, atol=0)
+        torch.testing.assert_close(built.motion, frame.motion, rtol=0, atol=0.02)
+        assert share_alike(built.normal, frame.normal) > 0.95  # all but edges
     first, second, *_ = frames_of(tmp_path)
     assert second.follows(first.moment) and not first.follows(second.moment)
 
 
 def test_positions_give_our_cameras(box, tmp_path):
     foreign.write_sequence(tmp_path, box, foreign.pbrt)
-    for found, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
-        torch.testing.assert_close(found.now.camera_to_world, frame.now.camera_to_world, rtol=0, atol=1e-4)
-        torch.testing.assert_close(found.motion, frame.motion, rtol=0, atol=0.02)
-        torch.testing.assert_close(found.view_normal(), frame.view_normal(), rtol=0, atol=1e-2)
+    for built, frame in zip(frames_of(tmp_path)[1:], box[1:], strict=True):
+        torch.testing.assert_close(built.now.camera_to_world, frame.now.camera_to_world, rtol=0, atol=1e-4)
+        torch.testing.assert_close(built.motion, frame.motion, rtol=0, atol=0.02)
+        torch.testing.assert_close(built.view_normal(), frame.view_normal(), rtol=0, atol=1e-2)
 
 
 def test_a_dolly_moves_the_parallel_camera(box, tmp_path):
     """Without cameras, the parallel view moves by the median change of depth."""
     foreign.write_sequence(tmp_path, box, foreign.blender)
-    found = frames_of(tmp_path)
-    for before, now in pairwise(found):
+    built = frames_of(tmp_path)
+    for before, now in pairwise(built):
         assert now.follows(before.moment)
         step = now.now.camera_to_world[0, :3, 3] - now.previous.camera_to_world[0, :3, 3]
         forward = now.now.camera_to_world[0, :3, 2]

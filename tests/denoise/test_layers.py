@@ -39,8 +39,8 @@ CASES = [
 @pytest.mark.parametrize(("quantity", "layer", "prefix"), CASES)
 def test_common_names_are_recognised(quantity, layer, prefix):
     names = channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer)
-    found = candidates(quantity, names)
-    assert len(found) == 1 and set(found[0].channels) <= set(channels(prefix + layer))
+    layers = candidates(quantity, names)
+    assert len(layers) == 1 and set(layers[0].channels) <= set(channels(prefix + layer))
     others = set(QUANTITIES) - {quantity}
     assert not any(candidates(other, channels(prefix + layer)) for other in others)
 

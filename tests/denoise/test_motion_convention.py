@@ -14,7 +14,6 @@ from eval.bench.synthetic_frames import synthetic_frame
 from tests.helpers.foreign import image
 
 HEIGHT, WIDTH = 90, 160
-FAST = 12  # of the sequence's frames between two of these: a step of several pixels
 
 
 def encoded_as(

@@ -16,7 +16,7 @@ from datasets.clip import Clip
 from datasets.frame import Frame, read_frame
 from eval.bench.sizes import parse_size
 from eval.bench.synthetic_frames import synthetic_frame
-from scenes.camera import View, pixel_centres, unproject
+from scenes.camera import View, inverse_pose, pixel_centres, unproject
 
 Image = NDArray[np.floating]
 Layers = dict[str, Image]  # (H, W, C) by layer name with the components' letters: "Albedo.RGB"
@@ -37,6 +37,14 @@ def view(frame: Frame) -> View:
     return View(*(getattr(frame.now, name)[0].numpy() for name in View._fields))
 
 
+def world_to_ndc(view: View, height: int, width: int, from_zero: bool = False) -> NDArray[np.float32]:
+    """`worldToNDC` for row vectors, of a view: in [-1, 1] as OpenEXR means it, or else in [0, 1]; y up."""
+    to_unit = np.array([[1 / width, 0, 0], [0, -1 / height, 1], [0, 0, 1]])
+    x, y, w = to_unit @ view.K @ inverse_pose(view.camera_to_world)[:3]
+    rows = [x, y, w, w] if from_zero else [2 * x - w, 2 * y - w, w, w]
+    return np.ascontiguousarray(np.array(rows).T, np.float32)
+
+
 def positions(frame: Frame) -> Image:
     """Points in the world, 0 for background."""
     depth = image(frame, "depth")
@@ -45,13 +53,13 @@ def positions(frame: Frame) -> Image:
 
 def planes(layers: Layers, dtype: type = np.float32) -> dict[str, NDArray[Any]]:
     """The channels of a file."""
-    found = {}
+    channels = {}
     for name, array in layers.items():
         layer, dot, letters = name.rpartition(".")
         for index, letter in enumerate(letters):
             with np.errstate(over="ignore"):  # distances to the sky are infinite in half precision
-                found[f"{layer}{dot}{letter}"] = np.ascontiguousarray(array[..., index], dtype)
-    return found
+                channels[f"{layer}{dot}{letter}"] = np.ascontiguousarray(array[..., index], dtype)
+    return channels
 
 
 def write(path: Path, layers: Layers, header: Mapping[str, Any] | None = None, dtype: type = np.float32) -> Path:
@@ -121,8 +129,8 @@ def main(source: str, out: Path) -> None:
             write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
     else:
         for which, folder in enumerate(("frames", "half")):
-            halves = (synthetic_frame(index, *parse_size(source)).buffer(which) for index in range(3))
-            write_sequence(out / folder, halves, blender)
+            buffer = (synthetic_frame(index, *parse_size(source)).buffer(which) for index in range(3))
+            write_sequence(out / folder, buffer, blender)
 
 
 if __name__ == "__main__":

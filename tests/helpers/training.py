@@ -19,6 +19,8 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from models.history.running_scale import RunningScale
+from models.registry import create
+from models.weights import save_weights
 from train.loop import train_network
 from train.precision import FLOAT32
 from train.registry import task_for
@@ -39,6 +41,13 @@ def short_task(
     """A training of a few steps, or with other changes to its recipe."""
     task = task_for(name, data, runs, "tiny")
     return replace(task, recipe=replace(task.recipe, **(recipe or SHORT[name])), seed=seed, precision=precision)
+
+
+def fresh_weights(name: str, path: Path, seed: int = 0) -> Path:
+    """Weights that were not trained."""
+    torch.manual_seed(seed)
+    save_weights(create(name), name, {}, path)
+    return path
 
 
 def folder_of(runs: Path, name: str) -> Path:

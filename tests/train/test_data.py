@@ -33,8 +33,8 @@ def test_processes_share_the_items_of_a_single_process(world, largest, first):
     parts = len(equal_parts(batch // world, largest))
     shares = [micro_batches(first, stop, batch, largest, rank, world) for rank in range(world)]
     for step, expected in enumerate(whole):
-        seen = [i for share in shares for part in share[step * parts : (step + 1) * parts] for i in part]
-        assert sorted(seen) == expected
+        items = [i for share in shares for part in share[step * parts : (step + 1) * parts] for i in part]
+        assert sorted(items) == expected
 
 
 class Trap:

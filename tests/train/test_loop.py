@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
@@ -23,12 +24,12 @@ from errors import BadInput
 from files import locked
 from tests.helpers.training import as_command, folder_of, metadata, same_weights, short_task, start_training, tensors
 from timing import thread_count
-from train.checkpoint import CHECKPOINT_FILE
-from train.log import METRICS_CSV, read_metrics
+from train.log import METRICS_CSV, Log, read_metrics
 from train.loop import alone_in, train_network
+from train.pictures import smooth
 from train.precision import FLOAT32
 from train.task import WEIGHTS_FILE
-from train.training import Training
+from train.training import CHECKPOINT_FILE, Training
 
 # --- Interrupted, killed and finished ---------------------------------------------------------------------------------
 
@@ -98,7 +99,7 @@ SLOW_KILLS = [
 ]
 
 
-@pytest.mark.parametrize("name, recipe, rows", [("one", {"epochs": 1}, (3,)), *SLOW_KILLS])
+@pytest.mark.parametrize("name, recipe, rows", [("rae", {"epochs": 3}, (3,)), *SLOW_KILLS])
 def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, recipe, rows):
     """Begun and killed in processes of their own, ended in this one, where the undisturbed one runs as well."""
     kills = [kill_once(name, tiny, tmp_path / "killed", row, recipe) for row in rows]
@@ -187,6 +188,26 @@ def test_training_shows_what_it_does(trained_runs):
     assert imread(folder / "sample.png").shape[:2] == (64, 4 * 64)
     assert imread(folder / "loss.png").ndim == 3
     assert not (folder / ".lock").exists()
+
+
+def test_a_log_averages_and_forgets_what_a_kill_left(tmp_path):
+    with closing(Log(tmp_path, done=0, total=6000)) as log:  # three steps a row
+        for step in range(1, 8):
+            log.step({"loss": float(step)})
+            log.write(step, {"val_loss": 9.0} if step == 7 else None)
+    assert [(r["step"], r["loss"]) for r in read_metrics(log.path)] == [(3, 2.0), (6, 5.0), (7, 7.0)]
+    assert read_metrics(log.path)[-1]["val_loss"] == 9.0
+    with log.path.open("a") as file:
+        file.write("9,8.0")  # cut off
+    with closing(Log(tmp_path, done=6, total=6000)) as resumed:
+        assert [r["step"] for r in read_metrics(resumed.path)] == [3, 6]
+
+
+def test_a_curve_is_smoothed_to_means_of_neighbours():
+    points = np.stack([np.arange(1001), np.arange(1001) % 5], axis=1).astype(float)
+    smoothed = smooth(points)
+    assert smoothed.shape == (200, 2)
+    assert smoothed[:2].tolist() == [[2, 2], [7, 2]]
 
 
 # --- In several processes ---------------------------------------------------------------------------------------------

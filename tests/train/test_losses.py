@@ -13,7 +13,7 @@ from torch import Tensor
 from torchmetrics.functional import symmetric_mean_absolute_percentage_error
 
 from datasets.clip import Dataset
-from datasets.frame import Frame, disoccluded
+from datasets.frame import Frame
 from models.networks.ntd import NTD
 from models.networks.rae import RAE
 from models.networks.wskp import WSKP
@@ -152,8 +152,8 @@ def test_losses_of_crops_compare_radiance_as_exposed(batch_of, monkeypatch, name
 
 
 def test_lbf_loss_by_hand(batch_of, monkeypatch):
-    """The relative MSE of exposed radiance, emission included, times half the samples a pixel."""
-    batch = batch_of("lbf", 2)
+    """The relative MSE of exposed radiance, emission included, times half the samples per pixel."""
+    batch = batch_of("lbf", 2, crop=16)
     denoiser = create("lbf")
     (frame,) = batch.frames
     frame = replace(frame, spp=torch.tensor([1.0, 4.0])[:, None, None, None])
@@ -164,8 +164,8 @@ def test_lbf_loss_by_hand(batch_of, monkeypatch):
     exposure = state.scale.exposure().numpy()
     albedo = np.maximum(frame.albedo.numpy(), 0.01)
     output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
-    halves = frame.direct_reference + frame.indirect_reference + frame.emission[:, None]
-    reference = exposure * halves.mean(dim=1).numpy()
+    buffers = frame.direct_reference + frame.indirect_reference + frame.emission[:, None]
+    reference = exposure * buffers.mean(dim=1).numpy()
     error = (output - reference) ** 2 / (reference**2 + 0.01)
     surface = np.broadcast_to(frame.depth.numpy() > 0, error.shape)
     items = [samples / 2 * error[item][surface[item]].mean() for item, samples in enumerate((1, 4))]
@@ -259,11 +259,12 @@ def test_the_background_is_not_learnt_from(batch_of, name):
 
 @pytest.mark.parametrize("name", TRAINABLE)
 def test_losses_and_gradients_are_finite_at_the_extremes(batch_of, name):
-    batch = batch_of(name)
+    batch = batch_of(name, crop=16)
     own = loss_of(name)
     relative = NetworkLoss(own.denoiser, RelativeLoss())
-    for level, loss in product((0.0, 1e-7, 65504.0), (own, relative)):
+    for (level, gain), loss in product(((0.0, 1.0), (1e-7, 0.0), (65504.0, 2.0)), (own, relative)):
         for frame in frames_of(batch):
+            frame.gain.fill_(gain)
             for light in LIGHT & frame.channels.keys():
                 frame.channels[light] = torch.full_like(frame.channels[light], level)
         if isinstance(batch, Crops):
@@ -285,35 +286,24 @@ def test_validation_works_in_bfloat16(batch_of, name):
         assert loss(batch)[0].item() == pytest.approx(exact, rel=0.05)
 
 
-@pytest.mark.parametrize("gain", [0.0, 2.0])
-def test_gradients_are_finite_at_extreme_gains(batch_of, gain):
-    batch = batch_of("rae")
-    for frame in batch.frames:
-        frame.gain.fill_(gain)
-    loss = loss_of("rae")
-    value, _ = loss(batch)
-    value.backward()
-    assert torch.isfinite(value) and all(torch.isfinite(p.grad).all() for p in loss.parameters())
-
-
 @pytest.mark.parametrize("name", ["rae", "wskp6", "ntd", "one"])
 def test_equal_images_have_no_loss_and_finite_gradients(batch_of, name, monkeypatch):
     batch = batch_of(name, crop=16)
     denoiser = create(name)
     leaves: list[Tensor] = []
 
-    def known(truth: Tensor) -> Tensor:
+    def leaf_of(truth: Tensor) -> Tensor:
         leaves.append(truth.clone().requires_grad_())
         return leaves[-1]
 
     if isinstance(denoiser, WSKP):
         signal = denoiser.signal
-        monkeypatch.setattr(denoiser, "filter", lambda f, *_: (known(f.reference_irradiance(signal)), None))
+        monkeypatch.setattr(denoiser, "filter", lambda f, *_: (leaf_of(f.reference_irradiance(signal)), None))
     else:
 
         def output(frame, state):
             truth = frame.reference_irradiance(denoiser.signal)
-            return known(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth)
+            return leaf_of(denoiser.compress(truth, state.scale, frame) if name == "rae" else truth)
 
         predict_as(monkeypatch, denoiser, output)
     value, _ = NetworkLoss(denoiser, recipe_for(name, "tiny").loss)(batch)
@@ -387,31 +377,6 @@ def test_sequences_of_a_batch_do_not_leak_into_one_another(batch_of, name):
         assert torch.equal(a[0], b[0]) and not torch.equal(a[1], b[1])
 
 
-def test_no_term_of_rae_is_next_to_nothing(batch_of):
-    """The share of each weighted term in the loss, after some steps; by a kernel of another norm HFEN had 1 %."""
-    loss = loss_of("rae")
-    optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
-    batch = batch_of("rae", 2)
-    for _ in range(15):
-        optimiser.zero_grad()
-        loss(batch)[0].backward()
-        optimiser.step()
-    value, parts = loss(batch)
-    shares = {name: getattr(loss.loss, name) * part.item() / value.item() for name, part in parts.items()}
-    assert sum(shares.values()) == pytest.approx(1)
-    assert shares["gradient"] > 0.04 and shares["temporal"] > 0.01
-
-
-@torch.no_grad()
-def test_occlusion_is_not_next_to_nothing(batch_of):
-    """On the rendered clips, of whose pixels a few percent are hidden in the frame before."""
-    batch = batch_of("ntd", 4, length=6, crop=64)
-    value, parts = loss_of("ntd").eval()(batch)
-    hidden = torch.cat([disoccluded(frame.motion, frame.dual_motion) for frame in batch.frames]).float().mean()
-    assert 0 < hidden < 0.05
-    assert parts["occlusion"] > 0.1 * value
-
-
 def test_tone_is_that_of_displays_and_a_logarithm_above_white():
     radiance = torch.tensor([0.0, 0.18, 0.5, 1.0, 2.0, 1000.0])
     expected = [1e-4 ** (1 / 2.2), *(np.array([0.1801, 0.5001, 1.0001]) ** (1 / 2.2))]
@@ -457,11 +422,6 @@ def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
     assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
 
 
-SAME_NETWORK = [  # as ntd's
-    pytest.param(name, 40, {"length": 4}, 0.8, marks=pytest.mark.slow) for name in ("ntd-a", "ntd-b")
-]
-
-
 @pytest.mark.parametrize(
     "name, steps, changes, left",
     [
@@ -475,7 +435,6 @@ SAME_NETWORK = [  # as ntd's
         ("lbf", 40, {}, 0.95),
         ("ntd", 40, {"length": 4}, 0.8),
         ("one", 40, {"length": 4}, 0.8),
-        *SAME_NETWORK,
     ],
 )
 def test_every_network_learns_one_batch(batch_of, name, steps, changes, left):

@@ -9,13 +9,12 @@ import torch
 from models.registry import create
 from provenance import sources
 from tests.helpers.training import folder_of, makers_of, short_task
-from train.checkpoint import CHECKPOINT_FILE, load_checkpoint
 from train.loop import train_network
 from train.losses.network_loss import NetworkLoss
 from train.made_by import MadeBy, differences, made_by_here
 from train.recipes import TRAINABLE, recipe_for
 from train.task import WEIGHTS_FILE
-from train.training import Training
+from train.training import CHECKPOINT_FILE, Training, load_checkpoint
 
 OTHER_CODE = "0" * 64
 

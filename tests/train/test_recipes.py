@@ -8,7 +8,6 @@ import pytest
 from errors import BadInput
 from models.registry import DENOISERS, create
 from train.augmentation import Augmentation
-from train.losses.displayed import DisplayedLoss
 from train.losses.ntd import NTDLoss
 from train.losses.rae import RAELoss
 from train.losses.wskp import NBGDLoss, SMAPELoss
@@ -55,15 +54,6 @@ def test_budgets_scale_the_effort_and_anneal():
         assert budget == "paper" or recipe.crop
         assert name == "one" or budget == "paper" or recipe.crop <= (paper.crop or recipe.crop)
         assert (recipe.anneal, recipe.average) == ((False, 0.0) if of_a_paper else (True, 0.05))
-
-
-@pytest.mark.parametrize("name", TRAINABLE)
-def test_release_recipes_are_for_noisy_references(name):
-    """Without the blocks of 16 where a network filters single frames by small windows."""
-    recipe = recipe_for(name, "release")
-    assert isinstance(recipe.loss, DisplayedLoss)
-    assert recipe.loss.scales == ((1, 4) if recipe.crops else (1, 4, 16))
-    assert recipe.clip == 1.0 and recipe.augmentation.rotate is (recipe.crops is None)
 
 
 @pytest.mark.parametrize("name", TRAINABLE)

@@ -12,12 +12,10 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from models import registry
 from models.spec import load
-from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.frames import run
-from tests.helpers.training import SHORT, folder_of, metadata, short_task, tensors
+from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
 from train.loop import train_network
 from train.registry import start_file, task_for
@@ -29,14 +27,7 @@ GREY = {"value": [0.5, 0.5, 0.5]}
 
 @pytest.fixture
 def general(tmp_path) -> Path:
-    """Weights of wskp3 that were not trained."""
-    return fresh_weights("wskp3", tmp_path / "general.safetensors")
-
-
-def fresh_weights(name: str, path: Path, seed: int = 5) -> Path:
-    torch.manual_seed(seed)
-    save_weights(registry.create(name), name, {}, path)
-    return path
+    return fresh_weights("wskp3", tmp_path / "general.safetensors", seed=5)
 
 
 @pytest.fixture
@@ -86,7 +77,7 @@ def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, gen
 
 
 def test_it_may_begin_with_what_is_shipped(capsys, tiny, tmp_path, shipped):
-    ours = fresh_weights("wskp3", shipped / "wskp3.safetensors")
+    ours = fresh_weights("wskp3", shipped / "wskp3.safetensors", seed=5)
     assert start_file("wskp3", "weights") == ours
     assert start_file("wskp3", "weights.safetensors") == Path("weights.safetensors") and start_file("rae", None) is None
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny", "--from", "weights"]
@@ -97,7 +88,7 @@ def test_it_may_begin_with_what_is_shipped(capsys, tiny, tmp_path, shipped):
     assert json.loads(metadata(weights)["recipe"])["from"] == file_digest(ours)
 
 
-def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):
+def test_what_does_not_vary_is_left_out(capsys, tiny, grey, tmp_path, general):
     """Before the first step nothing has changed, but near the border of the image."""
     task = short("wskp3", grey, tmp_path, start=general, specialised=True)
     training = Training(task)
@@ -118,10 +109,7 @@ def test_what_does_not_vary_is_left_out(capsys, grey, tmp_path, general):
         run(trained, [read_frame(Dataset(grey).clips("test")[0], 0, trained.reads)])
     with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
         train_network(replace(task, specialised=False))
-
-
-def test_specialised_weights_go_on_with_such_scenes_only(tiny, grey, tmp_path, general):
-    weights = train_network(short("wskp3", grey, tmp_path, start=general, specialised=True))
+    # These weights can be trained further with such scenes only.
     for specialised in (True, False):
         again = Training(short("wskp3", grey, tmp_path / "again", start=weights, specialised=specialised))
         assert again.judged.denoiser.constants == {"albedo": GREY["value"]}

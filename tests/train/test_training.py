@@ -1,18 +1,20 @@
-"""Training steps: gradients of parts add up, what is not finite is skipped, and a full disk is survived."""
+"""Training steps: gradients of parts add up, bad steps are skipped, weights are averaged, precision is measured."""
 
 import math
 import shutil
+import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from errors import BadInput
-from tests.helpers.training import full_disk, short_task
-from train.checkpoint import CHECKPOINT_FILE
+from tests.helpers.training import full_disk, short_task, tensors
 from train.loop import train_network
 from train.losses.network_loss import NetworkLoss
-from train.training import BEST_FILE, MAX_SKIPPED_IN_A_ROW, Training
+from train.precision import BFLOAT16, FLOAT32, fastest_precision
+from train.training import BEST_FILE, CHECKPOINT_FILE, MAX_SKIPPED_IN_A_ROW, Training, average_decay
 
 
 def test_gradients_of_parts_add_up_to_those_of_the_batch(tiny, tmp_path):
@@ -78,7 +80,7 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tiny, tmp_path, monke
 
 
 def test_long_gradients_are_cut_and_their_length_is_noted(tiny, tmp_path):
-    """With plain descent the step is the rate times the cut gradient: its length tells."""
+    """With plain descent the step is the rate times the cut gradient, by its length."""
     task = short_task("rae", tiny, tmp_path)
     moved = {}
     noted = {}
@@ -123,3 +125,67 @@ def test_full_disk_is_one_clear_line_and_keeps_the_earlier_checkpoint(tiny, tmp_
             training.keep_best(0.5)
     assert (folder / CHECKPOINT_FILE).read_bytes() == before
     assert [path.name for path in folder.iterdir()] == [CHECKPOINT_FILE] and not (folder / BEST_FILE).exists()
+
+
+def test_average_forgets_the_beginning_and_spans_what_it_should():
+    """The weights of update i in the average after n, from the decays alone."""
+    decays = [average_decay(n, 50) for n in range(1, 1001)]
+    assert decays[:2] == pytest.approx([2 / 11, 3 / 12]) and decays[-1] == pytest.approx(0.98)
+    weights = [(1 - decay) * np.prod(decays[n:]) for n, decay in enumerate(decays, start=1)]
+    ages = [len(weights) - n for n in range(1, len(weights) + 1)]
+    assert sum(weights) == pytest.approx(1, abs=1e-6)
+    assert sum(w * age for w, age in zip(weights, ages, strict=True)) == pytest.approx(49, rel=0.01)
+    assert average_decay(5, 0.5) == 0  # over less than an update: the weights themselves
+
+
+def test_the_average_is_what_is_validated_and_saved(tiny, tmp_path):
+    without = Training(short_task("wskp6", tiny, tmp_path, epochs=1, crops=(2, 1), average=0.0))
+    assert without.judged is without.loss.module
+    training = Training(short_task("wskp6", tiny, tmp_path, epochs=2, crops=(2, 1), average=0.5))
+    first = [p.clone() for p in training.judged.parameters()]
+    for index, _ in enumerate(training.steps(), start=1):
+        decay = min(1 - 1 / (0.5 * training.total), (1 + index) / (10 + index))
+        now = [p.detach() for p in training.loss.parameters()]
+        first = [decay * a + (1 - decay) * b for a, b in zip(first, now, strict=True)]
+    assert training.total == index > 4
+    for expected, kept, last in zip(first, training.judged.parameters(), now, strict=True):
+        torch.testing.assert_close(kept.detach(), expected)
+        assert not torch.allclose(kept, last, rtol=1e-5)
+    validation = training.validate()
+    training.task.folder.mkdir(parents=True)
+    training.keep_best(validation)
+    saved = tensors(training.task.folder / BEST_FILE)
+    assert all(torch.equal(saved[name], p) for name, p in training.judged.denoiser.state_dict().items())
+    training.judged = training.loss.module
+    assert training.validate() != validation
+
+
+class SlowIn(torch.nn.Module):
+    """A loss that computes for long in one precision, and waits for longer in the other, as on a busy machine."""
+
+    def __init__(self, precision: str):
+        super().__init__()
+        self.precision = precision
+        self.weight = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, batch):
+        if torch.is_autocast_enabled("cpu") == (self.precision == BFLOAT16):
+            end = time.process_time() + 0.02
+            while time.process_time() < end:
+                pass
+        else:
+            time.sleep(0.05)
+        return self.weight * 1, {}
+
+
+class Nothing:
+    def to(self, _):
+        return self
+
+
+@pytest.mark.parametrize("slow, fast", [(BFLOAT16, FLOAT32), (FLOAT32, BFLOAT16)])
+def test_the_faster_precision_wins_however_busy_the_machine(slow, fast):
+    loss = SlowIn(slow)
+    threads = torch.get_num_threads()
+    assert fastest_precision(loss, Nothing(), "cpu") == fast
+    assert loss.weight.grad is None and torch.get_num_threads() == threads

@@ -9,9 +9,8 @@ from torch.nn import functional as F
 
 from datasets.tonemap import DISPLAY_GAMMA
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
-from train.sequences import Batch
 
 TONE_OFFSET = 1e-4  # of exposed radiance: it bounds the slope of the curve at black
 
@@ -60,7 +59,7 @@ class DisplayedLoss(Loss):
             errors.append((torch.where(share > 0, error, 0), share))
         return errors
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Sequence[Tensor] = ()  # the last frame's errors

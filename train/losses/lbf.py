@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
-from train.sequences import Batch
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class LBFLoss(Loss):
 
     epsilon: float = 0.01  # of squared exposed radiance
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         losses = []
         for frame, output, exposure in exposed_outputs(network, batch):
             reference = exposure * frame.reference_buffers(network.signal).mean(dim=1)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from datasets.frame import Frame
 from models.denoiser import Denoiser
 from models.history.running_scale import RunningScale
-from train.crops import Crops
+from train.crops import AnyBatch, Crops
 from train.protocols import FilteringNetwork, RecurrentNetwork, Scaled
 from train.sequences import Batch
 
@@ -20,7 +20,7 @@ Parts = dict[str, Tensor]  # of a loss by name: scalars, to display
 class Loss:
     """A loss with its parameters, as a recipe states them."""
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         """The loss to back-propagate (a scalar), through time where there are sequences, and its parts.
 
         `progress` is the share of the training that is done, 0 to 1; it is 1 in validation.
@@ -37,7 +37,7 @@ class NetworkLoss(nn.Module):
         self.loss = loss
         self.progress = 0.0
 
-    def forward(self, batch: Batch | Crops) -> tuple[Tensor, Parts]:
+    def forward(self, batch: AnyBatch) -> tuple[Tensor, Parts]:
         loss, parts = self.loss.compute(self.denoiser, batch, self.progress if self.training else 1.0)
         return loss, {name: part.detach() for name, part in parts.items()}
 
@@ -53,9 +53,7 @@ def surface_mean(values: Tensor, depth: Tensor) -> Tensor:
     return (total / (values.shape[1] * surface.sum(dim=(1, 2, 3))).clamp(min=1)).mean()
 
 
-def predictions(
-    network: RecurrentNetwork[Scaled], batch: Batch | Crops
-) -> Iterator[tuple[Frame, Tensor, RunningScale]]:
+def predictions(network: RecurrentNetwork[Scaled], batch: AnyBatch) -> Iterator[tuple[Frame, Tensor, RunningScale]]:
     """Each frame of a batch of sequences with what the network predicts, and the running scale there."""
     assert isinstance(batch, Batch)
     state: Scaled | None = None
@@ -64,7 +62,7 @@ def predictions(
         yield frame, prediction, state.scale
 
 
-def exposed_outputs(network: Denoiser, batch: Batch | Crops) -> Iterator[tuple[Frame, Tensor, Tensor]]:
+def exposed_outputs(network: Denoiser, batch: AnyBatch) -> Iterator[tuple[Frame, Tensor, Tensor]]:
     """Each frame, the radiance (B, 3, H, W) that surfaces reflect by the network, exposed, and the exposure.
 
     The exposure (B, 1 or 3, 1, 1) includes the gain. Emission is left out. What the network returns may be below 0.

@@ -7,10 +7,9 @@ from torch import Tensor
 
 from datasets.frame import disoccluded
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, predictions, surface_mean
 from train.protocols import CompressingNetwork
-from train.sequences import Batch
 
 MIN_OCCLUDED = 1e-3  # share of a sequence's pixels: the mean over fewer would be noise, and is that share of them
 
@@ -48,7 +47,7 @@ class NTDLoss(Loss):
             [w * hidden[-1 - k if k < len(hidden) else -1].float() for k, w in enumerate(self.masks)]
         ).sum(dim=0)
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         assert isinstance(network, CompressingNetwork)
         hidden: list[Tensor] = []
         spatial: list[Tensor] = []

@@ -8,10 +8,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, predictions, surface_mean
 from train.protocols import CompressingNetwork
-from train.sequences import Batch
 
 
 def laplacian_of_gaussian(sigma: float = 1.5, size: int = 15) -> Tensor:
@@ -53,7 +52,7 @@ class RAELoss(Loss):
     temporal: float = 0.1  # w_t
     frames: tuple[float, ...] = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)  # of a sequence, a Gaussian
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         assert isinstance(network, CompressingNetwork)
         parts: Parts = {}
         before: Tensor | None = None  # the error of the frame before

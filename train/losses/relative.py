@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
-from train.sequences import Batch
 
 
 def weighted_mean(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
@@ -37,7 +36,7 @@ class RelativeLoss(Loss):
     temporal: float = 1.0  # weight of the temporal term, where there are sequences
     frames: tuple[float, ...] = ()  # weights of a sequence's frames; even if there are none
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Tensor | None = None  # the errors of the frame before

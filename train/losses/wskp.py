@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from models.denoiser import Denoiser
-from train.crops import Crops
+from train.crops import AnyBatch, Crops
 from train.losses.displayed import clipped_tone
 from train.losses.network_loss import Loss, Parts, surface_mean
 from train.protocols import FilteringNetwork
-from train.sequences import Batch
 
 
 def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
@@ -25,7 +24,7 @@ class CropLoss(Loss):
         """Of every pixel and channel (B, 3, H, W), of exposed radiance."""
         raise NotImplementedError
 
-    def compute(self, network: Denoiser, batch: Batch | Crops, progress: float) -> tuple[Tensor, Parts]:
+    def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         assert isinstance(network, FilteringNetwork) and isinstance(batch, Crops)
         frame = batch.frame
         filtered, _ = network.filter(frame, batch.irradiance, batch.scale)

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from datasets.channels import CHANNELS, HIT_CHANNELS, MOTION_CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
-from datasets.clip import Clip, Dataset
-from datasets.clip_kind import ClipKind
+from datasets.clip import Clip, ClipKind, Dataset
 from datasets.frame import read_frame
 from datasets.info import size_in_full, stored_size, summarise
 from errors import BadInput
