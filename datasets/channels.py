@@ -19,30 +19,19 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Channel:
-    """One row of the table.
-
-    Attributes:
-        axes: F frames, S noise realisations, H rows, W columns and M meshes; a number is the length of its own axis.
-        dtype: as stored; float32 instead, if it `widens`, where float16 would lose precision.
-        letters: of its components in EXR layers.
-        of: the channel that this is another form of, for buffers, references and mirrored channels.
-        essential: whether it is rendered whatever denoisers read.
-        step: the optional step of rendering that makes it.
-        renderer_only: whether no other renderer writes it, and nothing else can take its place.
-        is_camera_motion: whether it follows from depth and cameras in a scene in which nothing else moves.
-    """
+    """One row of the table."""
 
     kind: Kind
-    axes: tuple[str | int, ...]
-    dtype: str
+    axes: tuple[str | int, ...]  # F frames, S noise realisations, H rows, W columns, M meshes; a number: its own length
+    dtype: str  # as stored; float32 instead, if it `widens`, where float16 would lose precision
     unit: str
-    letters: str = ""
-    of: str | None = None
+    letters: str = ""  # of its components in EXR layers
+    of: str | None = None  # the channel that this is another form of, for buffers, references and mirrored channels
     widens: bool = False
-    essential: bool = False
-    step: str | None = None
-    renderer_only: bool = False
-    is_camera_motion: bool = False
+    essential: bool = False  # whether it is rendered whatever denoisers read
+    step: str | None = None  # the optional step of rendering that makes it
+    renderer_only: bool = False  # whether no other renderer writes it, and nothing else can take its place
+    is_camera_motion: bool = False  # whether it follows from depth and cameras in a scene in which nothing else moves
 
     @property
     def is_image(self) -> bool:

@@ -16,22 +16,14 @@ ERROR_FILE = "error.csv"
 
 @dataclass(frozen=True)
 class FrameError:
-    """One row.
-
-    Attributes:
-        spp: samples per pixel of the frame.
-        relative_error: root of the mean squared error relative to the mean light of each pixel's neighbourhood.
-        at_most: the same with two standard errors added.
-        until: the relative error to reach; None where none was given.
-        samples: per pixel, to reach it; `spp` where it is reached, infinite beyond a limit.
-    """
+    """One row."""
 
     frame: int
-    spp: float
-    relative_error: float
-    at_most: float
-    until: float | None
-    samples: float | None
+    spp: float  # samples per pixel of the frame
+    relative_error: float  # root of the mean squared error relative to the mean light of each pixel's neighbourhood
+    at_most: float  # the same with two standard errors added
+    until: float | None  # the relative error to reach; None where none was given
+    samples: float | None  # per pixel, to reach it; `spp` where it is reached, infinite beyond a limit
 
     @staticmethod
     def of(frame: int, estimate: ErrorEstimate, until: float | None) -> "FrameError":

@@ -22,23 +22,14 @@ MAY_BE_INFINITE = ("depth", "distance", "position")  # at the background
 
 @dataclass
 class ForeignFrame:
-    """One frame.
+    """One frame: arrays (H, W, C) in the renderer's conventions, finite, albedo in [0, 1]."""
 
-    Attributes:
-        arrays: (H, W, C) by quantity (layers.QUANTITIES), in the renderer's conventions; finite, albedo in [0, 1].
-        surface: where pixels show a surface, (H, W).
-        nonfinite: how many pixels were not finite and were set to 0.
-        source: its name in messages.
-        header: attributes of the file that holds the colour.
-        view: its camera, where that is given beside the pixels.
-    """
-
-    arrays: dict[str, Image]
-    surface: NDArray[np.bool_]
-    nonfinite: int
-    source: str
-    header: Mapping[str, Any] = field(default_factory=dict)
-    view: View | None = None
+    arrays: dict[str, Image]  # by quantity, see layers.QUANTITIES
+    surface: NDArray[np.bool_]  # where pixels show a surface, (H, W)
+    nonfinite: int  # how many pixels were not finite and were set to 0
+    source: str  # its name in messages
+    header: Mapping[str, Any] = field(default_factory=dict)  # of the file that holds the colour
+    view: View | None = None  # its camera, where that is given beside the pixels
 
     @property
     def size(self) -> tuple[int, int]:

@@ -30,19 +30,12 @@ TELEPHOTO = 1e8  # px: a focal length that makes all rays parallel
 
 @dataclass(frozen=True)
 class InputConventions:
-    """The conventions of all frames of a sequence.
+    """The conventions of all frames of a sequence."""
 
-    Attributes:
-        motion: of its motion vectors; None where there are none.
-        normals_are_encoded: in [0, 1] instead of [-1, 1].
-        cameras: where they come from, "positions", "header" or "arrays" beside the pixels; None where they are unknown.
-        in_camera_space: whether positions and normals are in the camera's own coordinates.
-    """
-
-    motion: MotionConvention | None = None
-    normals_are_encoded: bool = False
-    cameras: str | None = None
-    in_camera_space: bool = False
+    motion: MotionConvention | None = None  # None where there are no motion vectors
+    normals_are_encoded: bool = False  # in [0, 1] instead of [-1, 1]
+    cameras: str | None = None  # from "positions", "header" or "arrays" beside the pixels; None where unknown
+    in_camera_space: bool = False  # whether positions and normals are in the camera's own coordinates
 
     @property
     def has_history(self) -> bool:

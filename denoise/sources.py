@@ -38,19 +38,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Sources:
-    """Where everything is.
+    """The sources of all quantities of a frame."""
 
-    Attributes:
-        quantities: by names of layers.QUANTITIES.
-        alpha: the channel beside the colour that is 0 where a pixel shows nothing.
-        target: the channels of the colour's file that denoised radiance replaces.
-        is_ours: whether the files are those of `onespp exr`, with channels and cameras under our own names.
-    """
-
-    quantities: dict[str, Source]
-    alpha: str | None
-    target: tuple[str, ...]
-    is_ours: bool
+    quantities: dict[str, Source]  # by names of layers.QUANTITIES
+    alpha: str | None  # the channel beside the colour that is 0 where a pixel shows nothing
+    target: tuple[str, ...]  # the channels of the colour's file that denoised radiance replaces
+    is_ours: bool  # whether the files are those of `onespp exr`, with channels and cameras under our own names
 
     def has(self, *quantities: str) -> bool:
         """Whether there is any of the quantities."""

@@ -55,20 +55,13 @@ def number_of_samples(realisations: int, rng: np.random.Generator) -> int:
 
 @dataclass(frozen=True)
 class LightEdge:
-    """The edge of a shadow, or of more light: light is multiplied by `factor` on one side of a moving line.
-
-    Attributes:
-        angle: of the direction in which it moves, radians.
-        speed: pixels per frame.
-        passes: when it passes the middle of the image, in frames.
-        softness: pixels over which it fades.
-    """
+    """The edge of a shadow, or of more light: light is multiplied by `factor` on one side of a moving line."""
 
     factor: float
-    angle: float
-    speed: float
-    passes: float
-    softness: float
+    angle: float  # of the direction in which it moves, radians
+    speed: float  # pixels per frame
+    passes: float  # when it passes the middle of the image, in frames
+    softness: float  # pixels over which it fades
 
     @staticmethod
     def random(rng: np.random.Generator, length: int) -> "LightEdge":
@@ -91,20 +84,12 @@ class LightEdge:
 
 @dataclass(frozen=True)
 class Draw:
-    """What is random about the pixels of a sequence.
+    """What is random about the pixels of a sequence."""
 
-    Attributes:
-        deal: the realisations in the order in which frames take them: a stopped camera has new noise while any is left.
-        together: the number of realisations that a frame is the mean of.
-        turns: by 90 degrees.
-        gain: of colours (1, 3, 1, 1), if any.
-        edge: of light, if any.
-    """
-
-    deal: list[int]
-    together: int
-    turns: int
-    gain: Tensor | None
+    deal: list[int]  # realisations in the order of their use: a stopped camera has new noise while any is left
+    together: int  # the number of realisations that a frame is the mean of
+    turns: int  # by 90 degrees
+    gain: Tensor | None  # of colours (1, 3, 1, 1)
     edge: LightEdge | None
 
     def realisations(self, time: int) -> list[int]:

@@ -22,30 +22,20 @@ def run_folder(runs: Path, name: str, budget: str) -> Path:
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, on what, and where that is kept.
-
-    Attributes:
-        create: makes the network with fresh weights.
-        folder: of this training.
-        cache: of accumulated frames, which trainings share.
-        precision: by default the fastest here.
-        micro_batch: items in memory together; by default what fits a few gigabytes.
-        start: the weights to begin with instead of fresh ones.
-        specialised: whether the network does without what does not vary in the data.
-    """
+    """What is trained, on what, and where that is kept."""
 
     name: str
-    create: Callable[[], Denoiser]
+    create: Callable[[], Denoiser]  # with fresh weights
     recipe: Recipe
     budget: str
     data: Dataset
-    folder: Path
-    cache: Path
+    folder: Path  # of this training
+    cache: Path  # of accumulated frames, which trainings share
     seed: int = 0
-    precision: str | None = None
-    micro_batch: int | None = None
-    start: Path | None = None
-    specialised: bool = False
+    precision: str | None = None  # None: the fastest here
+    micro_batch: int | None = None  # items in memory together; None: what fits a few gigabytes
+    start: Path | None = None  # the weights to begin with instead of fresh ones
+    specialised: bool = False  # whether the network does without what does not vary in the data
 
     def check(self, processes: int) -> None:
         """Raises BadInput where this data set, or so many processes, cannot be trained with."""
