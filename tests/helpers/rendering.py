@@ -4,10 +4,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
+from render.gbuffer import render_gbuffer
 from render.stage import Stage
+from scenes.bsdf import Bsdf
+from scenes.camera import Array, View, motion_vectors, pixel_centres
 
 POSED_FRAME = 5  # where tests of radiance pose their stages
 BLOCK_SIZE = 4  # px
+
+
+def rgb(*value: float) -> Bsdf:
+    """A colour in a Mitsuba dictionary."""
+    return {"type": "rgb", "value": list(value)}
+
+
+def posed_surfaces(stage: Stage, frame: int) -> tuple[View, View, Array, NDArray[np.integer], Array]:
+    """Poses the stage: views of the frame and the one before, depth and mesh ids (H, W), motion vectors (H, W, 2)."""
+    stage.pose(frame)
+    now, previous = stage.view(frame), stage.view(frame - 1)
+    buffer = render_gbuffer(stage, now)
+    depth = buffer["depth"][..., 0].astype(np.float64)
+    mesh_id = buffer["mesh_id"][..., 0].astype(int)
+    centres = pixel_centres(stage.height, stage.width)
+    return now, previous, depth, mesh_id, motion_vectors(centres, depth, mesh_id, now, previous)
 
 
 def stock_radiance(stage: Stage, max_depth: int, spp: int, seed: int) -> NDArray[np.float32]:

@@ -41,12 +41,12 @@ def test_extreme_scene_becomes_a_clip(name, tmp_path):
 def test_units_do_not_matter(factor):
     """The same samples in other units: the same picture and motion, depth times the factor."""
     scene = build_scene("cornell_box_moving", 5, FRAMES)
-    one, other = (
+    plain, other = (
         list(render_clip(s, FRAMES, SIZE, SIZE, Sampling(1, 1, 64), 5))[2][0] for s in (scene, rescaled(scene, factor))
     )
-    same = one["mesh_id"] == other["mesh_id"]
+    same = plain["mesh_id"] == other["mesh_id"]
     assert same.mean() > 0.99
-    np.testing.assert_allclose(other["depth"][same], one["depth"][same] * factor, rtol=1e-4)
-    np.testing.assert_allclose(other["motion"][same[..., 0]], one["motion"][same[..., 0]], atol=2e-3)
+    np.testing.assert_allclose(other["depth"][same], plain["depth"][same] * factor, rtol=1e-4)
+    np.testing.assert_allclose(other["motion"][same[..., 0]], plain["motion"][same[..., 0]], atol=2e-3)
     for name in ("direct_reference", "indirect_reference"):
-        assert other[name].mean() == pytest.approx(one[name].mean(), rel=0.01)
+        assert other[name].mean() == pytest.approx(plain[name].mean(), rel=0.01)

@@ -1,4 +1,4 @@
-"""Distances that the noisy samples' rays meet: what plates before a wall say, and the same samples as in the noise."""
+"""Hit distances of noisy samples: plates in front of a wall in closed form, by the same samples as the noise."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def of_frame(frame, realisation=0):
 
 
 @pytest.mark.parametrize("blocker_height", [0.5, 1.5])
-def test_blockers_stand_where_similar_triangles_say(blocker_height):
+def test_blockers_follow_similar_triangles(blocker_height):
     """Along every shadow ray, as high in proportion as over the wall; and light comes by the same rays."""
     blocker = plate("b blocker", 1.2, (1.6, 0, blocker_height))
     (frame,) = frames_of(WALL, blocker, LAMP, frames=1)
@@ -68,10 +68,10 @@ def test_the_sky_is_infinitely_far_away_and_wide():
 def test_means_count_the_samples_that_met_something():
     stage = Stage(build_scene("cornell_box", 3, 24), 16, 16)
     tracer = PathTracer(stage)
-    one, other = (hit_channels(tracer, stage.view(0), [SampleRange(7, 1, first)]) for first in (0, 1))
+    first, second = (hit_channels(tracer, stage.view(0), [SampleRange(7, 1, first)]) for first in (0, 1))
     both = hit_channels(tracer, stage.view(0), [SampleRange(7, 2)])
     for name, means in both.items():
-        pair = np.stack([one[name], other[name]])
+        pair = np.stack([first[name], second[name]])
         expected = np.ma.masked_equal(pair, 0).mean(axis=0).filled(0)
         np.testing.assert_allclose(means, expected, rtol=1e-6)
 
@@ -82,9 +82,9 @@ def test_realisations_have_their_own_and_no_other_channel_is_changed():
     names = ("direct", "indirect", "shadow_motion", "mesh_id")
     plain = list(render_clip(scene, 2, 16, 16, sampling, 1, names))
     whole = list(render_clip(scene, 2, 16, 16, sampling, 1, (*names, "light_angle")))
-    for (one, seconds), (other, more_seconds) in zip(plain, whole, strict=True):
-        assert set(one) == set(names) == set(other) - {"light_angle"} and all(
-            np.array_equal(one[name], other[name]) for name in names
+    for (first, seconds), (second, more_seconds) in zip(plain, whole, strict=True):
+        assert set(first) == set(names) == set(second) - {"light_angle"} and all(
+            np.array_equal(first[name], second[name]) for name in names
         )
         assert "hit_distance" not in seconds and "hit_distance" in more_seconds
     everything, _ = next(render_clip(scene, 1, 16, 16, sampling, 1))

@@ -1,4 +1,4 @@
-"""What the G-buffer says of materials, compared with Mitsuba's own sampling of the same BSDFs."""
+"""Albedo and roughness of materials, compared with Mitsuba's own sampling of the same BSDFs."""
 
 import numpy as np
 import pytest
@@ -10,10 +10,7 @@ from render.loading import to_mitsuba
 from render.materials import MaterialTable
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
-
-
-def rgb(*value: float) -> dict:
-    return {"type": "rgb", "value": list(value)}
+from tests.helpers.rendering import rgb
 
 
 def textured_square(bsdf: dict) -> Scene:

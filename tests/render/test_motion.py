@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from render.backend import mi
-from render.gbuffer import render_gbuffer
 from render.motion import dual_motion_vectors
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Track
 from scenes.camera import FAR_OUTSIDE, View, intrinsics, look_at, motion_vectors, pixel_centres, project
 from scenes.registry import build_scene
+from tests.helpers.rendering import posed_surfaces
 
 
 def homogeneous_projection(points: np.ndarray, view: View) -> np.ndarray:
@@ -19,12 +19,10 @@ def homogeneous_projection(points: np.ndarray, view: View) -> np.ndarray:
     return p[..., :2] / p[..., 2:]
 
 
-def primary_hits(stage: Stage, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """World positions (H, W, 3) that Mitsuba reports, and mesh ids (H, W)."""
+def primary_hits(stage: Stage, view: View) -> np.ndarray:
+    """World positions (H, W, 3) that Mitsuba reports."""
     si = stage.mitsuba_scene.ray_intersect(stage.rays(view))
-    shape = (stage.height, stage.width, -1)
-    mesh_id = np.array(stage.mesh_id(si)).reshape(shape)[..., 0]
-    return np.array(si.p, dtype=np.float64).T.reshape(shape), mesh_id
+    return np.array(si.p, dtype=np.float64).T.reshape(stage.height, stage.width, 3)
 
 
 def carry(points: np.ndarray, mesh_id: np.ndarray, source: View, target: View) -> np.ndarray:
@@ -65,15 +63,11 @@ def test_rays_are_those_of_mitsubas_perspective_camera():
 
 @pytest.mark.parametrize("frame", [1, 9, 17])
 def test_hits_project_to_their_pixel_and_to_where_motion_points(stage, frame):
-    now = stage.view(frame)
-    previous = stage.view(frame - 1)
-    stage.pose(frame)
-    points, mesh_id = primary_hits(stage, now)
-    depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
+    now, previous, _, mesh_id, motion = posed_surfaces(stage, frame)
+    points = primary_hits(stage, now)
     centres = pixel_centres(stage.height, stage.width)
     hit = mesh_id > 0
     assert np.abs(homogeneous_projection(points, now) - centres)[hit].max() < 0.01
-    motion = motion_vectors(centres, depth, mesh_id, now, previous)
     carried = carry(points, mesh_id, now, previous)
     expected = homogeneous_projection(carried, previous)
     in_front = (carried - previous.camera_to_world[:3, 3]) @ previous.camera_to_world[:3, 2] > 0
@@ -97,13 +91,9 @@ def seen_from(stage: Stage, view: View, points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("frame", range(1, 24, 4))
 def test_following_motion_meets_the_same_surface_point(stage, frame):
-    now = stage.view(frame)
-    previous = stage.view(frame - 1)
-    stage.pose(frame)
-    points, mesh_id = primary_hits(stage, now)
-    depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
-    centres = pixel_centres(stage.height, stage.width)
-    target = centres + motion_vectors(centres, depth, mesh_id, now, previous)
+    now, previous, depth, mesh_id, motion = posed_surfaces(stage, frame)
+    points = primary_hits(stage, now)
+    target = pixel_centres(stage.height, stage.width) + motion
 
     stage.pose(frame - 1)
     carried = carry(points, mesh_id, now, previous)
@@ -129,13 +119,7 @@ def test_dual_motion_finds_the_background_where_motion_finds_the_occluder():
     for seed in range(6):
         stage = Stage(build_scene("cornell_box_moving", seed, frames=24), size, size)
         for frame in range(1, 24, 2):
-            now = stage.view(frame)
-            previous = stage.view(frame - 1)
-            stage.pose(frame)
-            buffer = render_gbuffer(stage, now)
-            depth = buffer["depth"][..., 0].astype(np.float64)
-            mesh_id = buffer["mesh_id"][..., 0]
-            motion = motion_vectors(centres, depth, mesh_id, now, previous)
+            now, previous, depth, mesh_id, motion = posed_surfaces(stage, frame)
             stage.pose(frame - 1)
             dual = dual_motion_vectors(stage, depth, mesh_id, motion, now, previous)
             mask = np.abs(dual - motion).max(axis=-1) > 1 / 64
@@ -153,16 +137,11 @@ def test_dual_motion_finds_the_background_where_motion_finds_the_occluder():
 
 def test_dual_motion_equals_motion_exactly_where_visible(stage):
     frame = 9
-    now = stage.view(frame)
-    previous = stage.view(frame - 1)
-    stage.pose(frame)
-    points, mesh_id = primary_hits(stage, now)
-    depth = render_gbuffer(stage, now)["depth"][..., 0].astype(np.float64)
-    centres = pixel_centres(stage.height, stage.width)
-    motion = motion_vectors(centres, depth, mesh_id, now, previous)
+    now, previous, depth, mesh_id, motion = posed_surfaces(stage, frame)
+    points = primary_hits(stage, now)
     stage.pose(frame - 1)
     dual = dual_motion_vectors(stage, depth, mesh_id, motion, now, previous)
-    target = centres + motion
+    target = pixel_centres(stage.height, stage.width) + motion
     inside = ((target > 0) & (target < (stage.width, stage.height))).all(axis=-1)
     visible = inside & (mesh_id > 0) & seen_from(stage, previous, carry(points, mesh_id, now, previous))
     assert np.array_equal(dual[visible], motion[visible])

@@ -1,4 +1,4 @@
-"""One sphere of every kind of material that Mitsuba has, beside what sampling its BSDF says of it."""
+"""A sphere of every kind of material in Mitsuba, compared with samples of its BSDF."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,9 @@ from render.gbuffer import render_gbuffer
 from render.loading import StockLoader
 from render.stage import Stage
 from scenes.animation import Camera, Scene, StockShape, Track
+from tests.helpers.rendering import rgb
 
 SAMPLES = 1 << 16
-
-
-def rgb(*value: float) -> dict:
-    return {"type": "rgb", "value": list(value)}
 
 
 TAN = rgb(0.6, 0.4, 0.2)
@@ -23,7 +20,7 @@ FLAT = {"type": "uniform", "value": 0.5}
 UP = {"type": "bitmap", "raw": True, "data": np.broadcast_to(np.float32([0.5, 0.5, 1.0]), (2, 2, 3)).copy()}
 PRINCIPLED = {"type": "principled", "base_color": TAN, "roughness": 0.5, "specular": 0.5}
 
-# What samples say at normal incidence of all light that comes back or goes on.
+# Compared at normal incidence, with all light that is reflected or transmitted.
 BSDFS = {
     "diffuse": DIFFUSE,
     "plastic": {"type": "plastic", "diffuse_reflectance": TAN},
@@ -58,7 +55,7 @@ BSDFS = {name: {key: value for key, value in bsdf.items() if value is not None} 
 
 
 def spheres() -> Stage:
-    """A row of spheres of radius 1 along x, seen from far away; the middle of a pixel sees each head-on."""
+    """A row of spheres of radius 1 along x, far away; the centre of a pixel hits each at normal incidence."""
     shapes = [
         StockShape(name, {"type": "sphere", "center": [3.0 * i, 0.0, 0.0], "radius": 1.0}, bsdf)
         for i, (name, bsdf) in enumerate(BSDFS.items())

@@ -9,14 +9,10 @@ from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Scene, StockLight, StockShape, Track
-from scenes.camera import motion_vectors, move, pixel_centres, unproject
-from tests.helpers.rendering import assert_same_mean, stock_radiance
+from scenes.camera import move, pixel_centres, unproject
+from tests.helpers.rendering import assert_same_mean, posed_surfaces, rgb, stock_radiance
 
 SIZE = 24
-
-
-def rgb(*value: float) -> dict:
-    return {"type": "rgb", "value": list(value)}
 
 
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}
@@ -74,18 +70,14 @@ def test_moving_shapes_are_where_their_motion_vectors_say():
     shift = KeyframedTrack(np.array([[0.0, 0, 0], [0.1, -0.05, 0.2]]), times=np.array([0.0, 1.0]))
     stage = Stage(kinds(FreeMotion(np.array([0.2, 0.1, 0.0]), shift, turn)), 96, 96)
     before = render_gbuffer(stage, stage.view(0))
-    stage.pose(1)
-    now = render_gbuffer(stage, stage.view(1))
+    now, previous, depth, mesh_id, motion = posed_surfaces(stage, 1)
     centres = pixel_centres(96, 96)
-    depth = now["depth"][..., 0].astype(np.float64)
-    mesh_id = now["mesh_id"][..., 0].astype(int)
-    motion = motion_vectors(centres, depth, mesh_id, stage.view(1), stage.view(0))
     assert np.abs(motion[mesh_id > 0]).max() > 1
     target = np.clip(np.floor(centres + motion).astype(int), 0, 95)
     found = before["mesh_id"][target[..., 1], target[..., 0], 0]
     assert (found == mesh_id)[mesh_id > 0].mean() > 0.93  # else it was hidden, or lies on an edge
-    points = move(unproject(centres, depth, stage.view(1)), mesh_id, stage.view(1), stage.view(0))
-    expected = (points - stage.view(0).camera_to_world[:3, 3]) @ stage.view(0).camera_to_world[:3, 2]
+    points = move(unproject(centres, depth, now), mesh_id, now, previous)
+    expected = (points - previous.camera_to_world[:3, 3]) @ previous.camera_to_world[:3, 2]
     same = (found == mesh_id) & (mesh_id > 0)
     apart = np.abs(before["depth"][target[..., 1], target[..., 0], 0] - expected)[same]
     assert np.median(apart) < 0.01 and np.median(np.abs(expected - depth)[same]) > 0.1

@@ -19,7 +19,7 @@ def tracked(frame, name, mesh):
 
 @pytest.mark.parametrize("lamp_slides", [0.0, STEP])
 @pytest.mark.parametrize("eye_slides", [0.0, 0.05])
-def test_a_shadow_moves_as_similar_triangles_say(lamp_slides, eye_slides):
+def test_a_shadow_follows_similar_triangles(lamp_slides, eye_slides):
     """The lamp is twice as far from the wall as the blocker; both may slide, and the eye."""
     wall = plate("a wall", 20, (0, 0, 0))
     blocker = plate("b blocker", 0.6, (1.5, 0, 1), slides=STEP)
@@ -68,5 +68,5 @@ def test_first_frames_do_not_move_and_no_other_channel_is_changed():
     plain = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1, names)]
     whole = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1)]
     assert not any(whole[0][name].any() for name in ("shadow_motion", "reflection_motion"))
-    for one, other in zip(plain, whole, strict=True):
-        assert set(one) == set(names) and all(np.array_equal(one[name], other[name]) for name in names)
+    for first, second in zip(plain, whole, strict=True):
+        assert set(first) == set(names) and all(np.array_equal(first[name], second[name]) for name in names)

@@ -1,4 +1,4 @@
-"""Things stand where they say, are closed unless they are sheets, and leave the space above their supports free."""
+"""Things stand as described, are closed unless they are sheets, and keep the space above their supports free."""
 
 import numpy as np
 import pytest

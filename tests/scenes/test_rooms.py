@@ -11,12 +11,16 @@ from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Scene, Shape
-from scenes.camera import motion_vectors, pixel_centres
+from scenes.camera import directions, pixel_centres, project
 from scenes.registry import build_scene
+from scenes.rooms import MAX_ZOOM, MIN_ZOOM, OFF_CENTRE
+from tests.helpers.rendering import posed_surfaces
 from tests.helpers.scenes import FRAMES
 
 FEW = range(8)
 MANY = range(1000, 1100)
+CLOSEUP_FRAMES = 5
+CLOSEUP_SIZE = 64
 
 
 @cache
@@ -151,11 +155,35 @@ def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
     size = 64
     stage = Stage(build_room(number), size, size)
     for frame in (1, FRAMES // 2, FRAMES - 1):
-        stage.pose(frame)
-        now = stage.view(frame)
-        before = stage.view(frame - 1)
-        buffer = render_gbuffer(stage, now)
-        depth = buffer["depth"][..., 0].astype(float)
-        mesh_id = buffer["mesh_id"][..., 0]
-        motion = motion_vectors(pixel_centres(size, size), depth, mesh_id, now, before)
+        *_, motion = posed_surfaces(stage, frame)
         assert np.percentile(np.abs(motion).max(axis=-1), 95) < 1.5 * 20 / 256 * size
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_a_closeup_is_a_part_of_its_room_s_picture(number):
+    whole = build_scene(f"room-{number}", 0, CLOSEUP_FRAMES)
+    part = build_scene(f"closeup-{number}", 0, CLOSEUP_FRAMES)
+    assert [shape.name for shape in whole.shapes] == [shape.name for shape in part.shapes]
+    times = []
+    for frame in range(CLOSEUP_FRAMES):
+        a, b = (scene.view(frame, CLOSEUP_SIZE, CLOSEUP_SIZE) for scene in (whole, part))
+        assert np.array_equal(a.camera_to_world[:3, 3], b.camera_to_world[:3, 3])
+        assert np.array_equal(a.object_to_world, b.object_to_world)
+        towards = directions(pixel_centres(CLOSEUP_SIZE, CLOSEUP_SIZE), b)
+        seen = project(towards, np.zeros((CLOSEUP_SIZE, CLOSEUP_SIZE), bool), a)
+        # Its middle stays at one position of the room's image, but for the distortion of an off-centre lens.
+        half = CLOSEUP_SIZE // 2
+        middle = seen[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) / half - 1
+        assert np.abs(middle).max() < OFF_CENTRE + 0.05
+        times.append((b.K[0, 0] / a.K[0, 0], *middle))
+    assert MIN_ZOOM <= times[0][0] <= MAX_ZOOM
+    np.testing.assert_allclose(times, np.broadcast_to(times[0], (CLOSEUP_FRAMES, 3)), atol=0.02)
+
+
+def test_numbers_draw_different_parts():
+    zooms = {
+        build_scene(f"closeup-{n}", 0, 2).view(0, 8, 8).K[0, 0] / build_scene(f"room-{n}", 0, 2).view(0, 8, 8).K[0, 0]
+        for n in range(2)
+    }
+    assert len(zooms) == 2
+    assert build_scene("closeup-1", 5, 1).view(0, 8, 8).K[0, 0] == build_scene("closeup-1", 6, 1).view(0, 8, 8).K[0, 0]

@@ -26,7 +26,7 @@ from tests.helpers.datasets import clip_in_progress, dataset_command, digest, ge
 
 
 def remove_clips(root: Path, *clips: str) -> list[Path]:
-    """Delete clips, SPLIT/SCENE/CLIP, from a data set. Returns their folders."""
+    """Delete clips, SPLIT/SCENE/CLIP, from a dataset. Returns their folders."""
     folders = [root / clip for clip in clips]
     for folder in folders:
         shutil.rmtree(folder)
@@ -51,7 +51,7 @@ def all_are_whole(root: Path) -> bool:
 
 
 def resume(root: Path) -> str:
-    """Let another process finish the data set. Returns what it prints."""
+    """Let another process finish the dataset. Returns what it prints."""
     return subprocess.run(dataset_command(root), check=True, capture_output=True, text=True).stdout
 
 

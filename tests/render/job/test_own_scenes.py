@@ -1,4 +1,4 @@
-"""`onespp dataset --scene`: a user's own scene as a data set like any other."""
+"""`onespp dataset --scene`: a user's own scene as a dataset like any other."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ CONTENT = old_xml('<shape type="cube" id="lost"><bsdf type="phong"/></shape>', '
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A data set of an old Mitsuba file. Read only."""
+    """A dataset of an old Mitsuba file. Read only."""
     root = tmp_path_factory.mktemp("own")
     own_scene.cache_clear()
     toml = write(root, CONTENT, SPLITS)

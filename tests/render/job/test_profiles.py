@@ -52,7 +52,7 @@ def test_other_seeds_have_other_rooms():
     ("name", "kind"),
     [("000", (0, False, 1)), ("012", (12, False, 1)), ("still", (0, True, 1)), ("000-64spp", (0, False, 64))],
 )
-def test_clip_names_say_what_they_are(name, kind):
+def test_clip_names_are_parsed(name, kind):
     assert ClipKind.of(name) == kind
 
 
@@ -89,46 +89,48 @@ def test_in_a_still_clip_only_the_noise_changes(moving_boxes):
 
 
 def test_more_samples_as_input_have_less_noise_and_the_same_reference(moving_boxes):
-    one = moving_boxes["000"]
+    single = moving_boxes["000"]
     many = moving_boxes["000-16spp"]
     assert many.facts["noisy_spp"] == 16
     for name in ("direct_reference", "indirect_reference", "albedo", "motion", "dual_motion"):
-        assert all(np.array_equal(one.read(name, frame), many.read(name, frame)) for frame in range(one.frames))
+        assert all(np.array_equal(single.read(name, frame), many.read(name, frame)) for frame in range(single.frames))
 
     def variance(clip: Clip) -> float:
         noisy = [[clip.read("indirect", f, realisation=s).astype(float) for s in range(4)] for f in range(clip.frames)]
         return float(np.var(noisy, axis=1, ddof=1).mean())
 
-    assert variance(many) < variance(one) / 12  # stratified samples gain at least as much as independent ones, a 16th
+    assert (
+        variance(many) < variance(single) / 12
+    )  # stratified samples gain at least as much as independent ones, a 16th
 
 
-def test_halves_tell_the_noise_of_their_mean(moving_boxes):
+def test_buffers_predict_the_noise_of_their_mean(moving_boxes):
     """(A - B)² / 4 is the variance of the mean: the same that its realisations show."""
     assert "direct_halves" not in moving_boxes["000"].channels  # of one sample
     many = moving_boxes["000-16spp"]
-    for name, halves in SAMPLE_BUFFERS.items():
-        drawn = np.array([[many.read(halves, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
+    for name, buffers in SAMPLE_BUFFERS.items():
+        drawn = np.array([[many.read(buffers, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
         noisy = np.array([[many.read(name, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
         np.testing.assert_allclose(noisy, drawn.mean(axis=2), rtol=2e-3, atol=1e-5)  # of float16
-        told = ((drawn[:, :, 0] - drawn[:, :, 1]) ** 2).mean() / 4
-        assert told == pytest.approx(np.var(noisy, axis=1, ddof=1).mean(), rel=0.3)
+        predicted = ((drawn[:, :, 0] - drawn[:, :, 1]) ** 2).mean() / 4
+        assert predicted == pytest.approx(np.var(noisy, axis=1, ddof=1).mean(), rel=0.3)
 
 
-def test_halves_are_stored_together_and_where_asked_for():
+def test_buffers_are_stored_together_on_request():
     """A clip for denoisers of indirect light alone may be shown to others too."""
     asked = plan("release", 0, channels_read(["ntd+js"]))["channels"]["test"]
     assert set(SAMPLE_BUFFERS.values()) < set(asked)
     assert set(plan("release", 0, channels_read(["ntd"]))["channels"]["test"]) == set(USUAL_CHANNELS)
 
 
-def test_a_frame_gives_its_halves_as_frames(moving_boxes):
+def test_a_frame_returns_its_buffers_as_frames(moving_boxes):
     frame = read_frame(moving_boxes["000-16spp"], 2, ("direct", "albedo", *SAMPLE_BUFFERS.values()))
     a, b = frame.buffer(0), frame.buffer(1)
     assert frame.has_buffers and not a.has_buffers
     assert a.channels.keys() == {"direct", "albedo"} and float(a.samples) == float(b.samples) == 8
     torch.testing.assert_close((a.direct + b.direct) / 2, frame.direct, rtol=2e-3, atol=1e-5)
-    one = read_frame(moving_boxes["000"], 2, ("direct", "albedo", *SAMPLE_BUFFERS.values()))
-    assert not one.has_buffers and one.channels.keys() == {"direct", "albedo"}
+    single = read_frame(moving_boxes["000"], 2, ("direct", "albedo", *SAMPLE_BUFFERS.values()))
+    assert not single.has_buffers and single.channels.keys() == {"direct", "albedo"}
 
 
 @pytest.mark.parametrize("floor", [34.0, 40.0])
@@ -164,15 +166,15 @@ def test_references_stop_at_the_most(tmp_path):
     assert Clip(path).facts["reference_spp"] == 64
 
 
-def test_rooms_that_would_need_too_many_samples_are_passed_over():
+def test_rooms_that_would_need_too_many_samples_are_skipped():
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 3}, quality={"test": bounded})
     needed = choose_rooms(profile, 0, NO_OPTIONS, {})
     chosen = [f"test/{room}" for room in rooms_of(profile, "test", 0, needed)]
     assert len(chosen) == 3
     assert all(needed[room] <= 128 for room in chosen)
-    passed_over = set(needed) - set(chosen)
-    assert passed_over and all(needed[room] > 128 for room in passed_over)
+    skipped = set(needed) - set(chosen)
+    assert skipped and all(needed[room] > 128 for room in skipped)
     assert choose_rooms(profile, 0, NO_OPTIONS, needed) == needed  # nothing is rendered again
 
 
@@ -185,7 +187,7 @@ def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["rooms-0x16", "rooms-4x1", "rooms-4x0"])
-def test_rooms_need_a_room_and_two_halves(name):
+def test_rooms_need_a_room_and_two_buffers(name):
     with pytest.raises(BadInput, match="2 spp or more"):
         profile_of(name)
 
@@ -195,7 +197,7 @@ READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot b
 
 @pytest.fixture(scope="module")
 def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every other clip of the tiny data set, the box of each split, for denoisers that do not read all channels."""
+    """Every other clip of the tiny dataset, the box of each split, for denoisers that do not read all channels."""
     root = tmp_path_factory.mktemp("lean")
     assert generate(root, "tiny", seed=0, reads=READS, share=Share(1, 2)) == 3
     return root

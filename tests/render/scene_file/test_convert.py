@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from errors import BadInput
 from render.loading import StockLoader
 from render.scene_file.convert import convert
+from render.scene_file.stand_ins import RESERVED_NAMES, Names
 from tests.helpers.scene_files import own, write, xml
 
 
@@ -80,3 +83,17 @@ def test_more_lights_than_shapes(tmp_path):
     found = converted(tmp_path, xml(points))
     assert len(found.lights) == 31 and len(found.shapes) == 1
     np.testing.assert_allclose(found.lights[7].emitter["intensity"]["value"], [1, 2, 3])
+
+
+@given(st.lists(st.sampled_from(["a", "a-2", "a-3", "a.b", "a_b", "", "type", "sky", "sky-2"])))
+def test_names_are_given_once(wanted):
+    names = Names()
+    given = [names.unique(name) for name in wanted]
+    assert len(set(given)) == len(given) and not set(given) & set(RESERVED_NAMES)
+    assert not any("." in name or not name for name in given)
+
+
+def test_the_first_keeps_its_name():
+    names = Names()
+    assert [names.unique("ball") for _ in range(3)] == ["ball", "ball-2", "ball-3"]
+    assert names.unique("größe 1") == "größe 1" and names.unique("sky") == "sky-2"

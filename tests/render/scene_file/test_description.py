@@ -1,4 +1,4 @@
-"""The TOML of a user's own scene: what it may say, what is refused, and the curves that its keyframes mean."""
+"""The TOML of a user's own scene: its content, refusals, and the curves of its keyframes."""
 
 import re
 
@@ -50,24 +50,26 @@ def described(folder, text):
     return read_description(path)
 
 
-def test_all_that_it_may_say(tmp_path):
-    said = described(tmp_path, EVERYTHING)
-    assert said.resolution == (8, 4) and said.frames == 5 and said.bounces == 2
-    assert said.camera[1].fov == 50 and said.camera[0].up is None
-    assert said.motion[0].keyframes[1].rotation == (0, 90, 0) and said.light[0].keyframes[1].gain == 0.5
-    assert said.splits["test"].most_spp == 128
+def test_all_keys(tmp_path):
+    parsed = described(tmp_path, EVERYTHING)
+    assert parsed.resolution == (8, 4) and parsed.frames == 5 and parsed.bounces == 2
+    assert parsed.camera[1].fov == 50 and parsed.camera[0].up is None
+    assert parsed.motion[0].keyframes[1].rotation == (0, 90, 0) and parsed.light[0].keyframes[1].gain == 0.5
+    assert parsed.splits["test"].most_spp == 128
 
 
 def test_the_example_of_the_docs(tmp_path):
-    """It says what it means, and every default that it writes out is one."""
+    """It is valid, and the values that it gives as defaults are the defaults."""
     (example,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL)
-    said = described(tmp_path, example)
+    parsed = described(tmp_path, example)
     assert (
-        [key.time for key in said.camera] == [0, 1] and said.motion[0].shape == "ball" and said.light[0].light == "lamp"
+        [key.time for key in parsed.camera] == [0, 1]
+        and parsed.motion[0].shape == "ball"
+        and parsed.light[0].light == "lamp"
     )
     plain = described(tmp_path, "file = 'a.xml'")
-    assert (said.resolution, said.frames) == (plain.resolution, plain.frames)
-    for split, wanted in said.splits.items():
+    assert (parsed.resolution, parsed.frames) == (plain.resolution, plain.frames)
+    for split, wanted in parsed.splits.items():
         quality = OWN_QUALITY[split]._asdict() | {"clips": OWN_CLIPS[split]}
         for key, default in quality.items():
             assert getattr(wanted, key, None) in (None, default)
@@ -98,7 +100,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_what_it_may_not_say(tmp_path, text):
+def test_refused_content(tmp_path, text):
     with pytest.raises(BadInput, match=REFUSED[text]) as refusal:
         described(tmp_path, text)
     assert "my.toml" in str(refusal.value) and "\n" not in str(refusal.value)

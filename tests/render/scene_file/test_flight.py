@@ -75,13 +75,13 @@ def test_flights_keep_their_distance_and_are_smooth(stages, place):
             assert inside.all() == (box == ROOM)
         eyes = np.array([camera.eye.at(frame) for frame in range(FRAMES)])
         targets = np.array([camera.target.at(frame) for frame in range(FRAMES)])
-        looks = targets - eyes
-        looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+        directions = targets - eyes
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
         moves += steps.max() > 0.01
         assert steps.max() < 0.2
         assert np.linalg.norm(np.diff(eyes, 2, axis=0), axis=1).max() <= 0.5 * steps.max()
-        assert np.linalg.norm(np.diff(looks, 2, axis=0), axis=1).max() < 0.01
+        assert np.linalg.norm(np.diff(directions, 2, axis=0), axis=1).max() < 0.01
     assert moves > len(SEEDS) / 2
 
 
@@ -110,10 +110,10 @@ def test_units_do_not_matter(stages, scale):
     camera = moved(CAMERA, scale=scale)
     stage = stage_of(scene([ROOM, *BOXES], camera, scale=scale))
     for seed in SEEDS:
-        one = fly(stages["in a room"], CAMERA, FRAMES, seed, from_here=False)
+        plain = fly(stages["in a room"], CAMERA, FRAMES, seed, from_here=False)
         other = fly(stage, camera, FRAMES, seed, from_here=False)
-        np.testing.assert_allclose(fine(other) / scale, fine(one), atol=1e-4)
-        np.testing.assert_allclose(other.target.at(5) / scale, one.target.at(5), atol=1e-3)
+        np.testing.assert_allclose(fine(other) / scale, fine(plain), atol=1e-4)
+        np.testing.assert_allclose(other.target.at(5) / scale, plain.target.at(5), atol=1e-3)
 
 
 def test_z_may_be_up():
@@ -124,8 +124,8 @@ def test_z_may_be_up():
         np.testing.assert_array_equal(flown.up.at(0), [0, 0, 1])
         points = fine(flown) @ TO_Z_UP[:3, :3]  # its inverse is its transpose
         assert all(distance_to_box(points, *box).min() > 0.02 for box in [ROOM, *BOXES])
-        looks = flown.target.at(0) - flown.eye.at(0)
-        assert abs(looks[2]) < 0.9 * np.linalg.norm(looks)
+        directions = flown.target.at(0) - flown.eye.at(0)
+        assert abs(directions[2]) < 0.9 * np.linalg.norm(directions)
 
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 0.0), (0.0, 0.5, 0.5), (1e3, 1e3, 1e3)])
@@ -151,5 +151,5 @@ def test_a_rolled_camera_stays_rolled():
     rolled = replace(CAMERA, up=Track.constant([0.5, 1.0, 0.0]))
     assert upright(rolled) is rolled
     tilted = replace(CAMERA, target=Track.constant([0.0, -1.0, 2.0]), up=Track.constant([0.0, 0.55, -0.83]))
-    one, other = (scene([], each).view(0, 4, 4).camera_to_world for each in (tilted, upright(tilted)))
-    np.testing.assert_allclose(one, other, atol=1e-12)
+    plain, other = (scene([], each).view(0, 4, 4).camera_to_world for each in (tilted, upright(tilted)))
+    np.testing.assert_allclose(plain, other, atol=1e-12)

@@ -9,7 +9,8 @@ from render.gbuffer import render_gbuffer
 from render.posed_frame import PosedFrame
 from render.scene_file.load import OwnScene
 from render.stage import Stage
-from scenes.camera import motion_vectors, pixel_centres
+from scenes.camera import pixel_centres
+from tests.helpers.rendering import posed_surfaces
 from tests.helpers.scene_files import own, painted, xml
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
@@ -67,7 +68,7 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("words", UNUSABLE)
-def test_what_mitsuba_refuses_is_said_in_a_line(tmp_path, words):
+def test_refusals_of_mitsuba_are_one_line(tmp_path, words):
     assert words in refusal(tmp_path, xml(shape=UNUSABLE[words]))
 
 
@@ -94,7 +95,7 @@ def test_names_that_are_not_there(tmp_path):
 
 @pytest.mark.parametrize("key", ["target = [1, 0, 5]", "target = [1, 9, 5]"])
 def test_a_camera_that_cannot_see(tmp_path, key):
-    """It is where it looks, or looks straight up."""
+    """Its position is its target, or its up is its viewing axis."""
     scene = own(tmp_path, xml(), f"[[camera]]\ntime = 0\nposition = [1, 0, 5]\n{key}\n")
     with pytest.raises(BadInput, match=r"my\.toml: in frame 0 the camera"), np.errstate(invalid="ignore"):
         scene.clip(2, 0, by_keyframes=True, from_here=True)
@@ -145,13 +146,9 @@ def test_meshes_of_gltf_move_as_their_vectors_say(tmp_path):
     clip = scene.clip(2, 0, by_keyframes=False, from_here=True)
     stage = Stage(clip, 48, 64)
     before = render_gbuffer(stage, stage.view(0))["mesh_id"][..., 0]
-    stage.pose(1)
-    now = render_gbuffer(stage, stage.view(1))
-    mesh_id = now["mesh_id"][..., 0].astype(int)
-    centres = pixel_centres(48, 64)
-    vectors = motion_vectors(centres, now["depth"][..., 0].astype(float), mesh_id, stage.view(1), stage.view(0))
+    *_, mesh_id, vectors = posed_surfaces(stage, 1)
     box_id = 1 + [shape.name for shape in clip.meshes].index("box")
-    there = np.floor(centres + vectors).astype(int)
+    there = np.floor(pixel_centres(48, 64) + vectors).astype(int)
     inside = (there >= 0).all(axis=-1) & (there < [64, 48]).all(axis=-1) & (mesh_id == box_id)
     assert inside.sum() > 100 and np.abs(vectors[inside]).max() > 1
     assert (before[there[inside][:, 1], there[inside][:, 0]] == box_id).mean() > 0.9  # else hidden, or on an edge

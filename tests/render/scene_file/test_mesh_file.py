@@ -45,9 +45,9 @@ def gltf(folder, change, **material):
     for name, content in world(**material).export(file_type="gltf").items():
         (folder / name).write_bytes(content)
     path = folder / "model.gltf"
-    said = json.loads(path.read_text())
-    change(said)
-    path.write_text(json.dumps(said))
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
     return path
 
 
@@ -100,11 +100,11 @@ def test_srgb_pictures_become_linear():
 
 @pytest.mark.parametrize("aspect", [0.5, 1.5])
 def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
-    def add(said):
+    def add(content):
         lens = {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.0}}
-        said["cameras"] = [lens]
-        said["nodes"].append({"camera": 0, "translation": [0, 0, 4], "name": "eye"})
-        said["nodes"][0].setdefault("children", []).append(len(said["nodes"]) - 1)
+        content["cameras"] = [lens]
+        content["nodes"].append({"camera": 0, "translation": [0, 0, 4], "name": "eye"})
+        content["nodes"][0].setdefault("children", []).append(len(content["nodes"]) - 1)
 
     camera = load_mesh_file(gltf(tmp_path, add), aspect).camera
     np.testing.assert_allclose(camera.eye.at(0), [0, 0, 4])
@@ -114,9 +114,9 @@ def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
 
 
 def test_what_gltf_says_beyond_meshes(tmp_path):
-    def add(said):
-        said["animations"] = [{"channels": [], "samplers": []}]
-        said["extensionsUsed"] = ["KHR_lights_punctual"]
+    def add(content):
+        content["animations"] = [{"channels": [], "samplers": []}]
+        content["extensionsUsed"] = ["KHR_lights_punctual"]
 
     notes = load_mesh_file(gltf(tmp_path, add), 1.0).notes
     assert any("animations" in note for note in notes) and any("KHR_lights_punctual" in note for note in notes)
@@ -161,12 +161,12 @@ def test_missing_files_are_said(tmp_path):
     (tmp_path / "m.mtl").write_text("newmtl red\nmap_Kd gone.png\n")
     assert "gone.png is missing" in load_mesh_file(tmp_path / "scene.obj", 1.0).notes[0]
 
-    def lose(said):
-        said["images"] = [{"uri": "gone.png"}]
+    def lose(content):
+        content["images"] = [{"uri": "gone.png"}]
 
     assert "gone.png is missing" in load_mesh_file(gltf(tmp_path, lose, baseColorTexture=picture()), 1.0).notes[0]
     with pytest.raises(BadInput, match=r"gone\.bin is missing"):
-        load_mesh_file(gltf(tmp_path, lambda said: said["buffers"][0].update(uri="gone.bin")), 1.0)
+        load_mesh_file(gltf(tmp_path, lambda content: content["buffers"][0].update(uri="gone.bin")), 1.0)
 
 
 def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
@@ -183,11 +183,11 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
     with pytest.raises(BadInput, match="leaves the scene's folder"):
         load_mesh_file(folder / "scene.obj", 1.0)
     for uri in ("../model.bin", "/etc/hostname", "..%2Fmodel.bin", "file:///etc/hostname"):
-        path = gltf(folder, lambda said, uri=uri: said["buffers"][0].update(uri=uri))
+        path = gltf(folder, lambda content, uri=uri: content["buffers"][0].update(uri=uri))
         with pytest.raises(BadInput):
             load_mesh_file(path, 1.0)
     with pytest.raises(BadInput, match="leaves the scene's folder"):
-        path = gltf(folder, lambda said: said.update(images=[{"uri": "../tex.png"}]), baseColorTexture=picture())
+        path = gltf(folder, lambda content: content.update(images=[{"uri": "../tex.png"}]), baseColorTexture=picture())
         load_mesh_file(path, 1.0)
     ply = (
         "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\nproperty float x\nproperty float y\n"
