@@ -33,15 +33,11 @@ METRICS_CHANNELS = ("motion", "dual_motion")
 
 @dataclass
 class NamedDenoiser:
-    """A denoiser to evaluate on any number of clips, under the name that results give it.
-
-    Attributes:
-        saves_error: whether to store error maps, where it is a NAME+js and frames have two sample buffers.
-    """
+    """A denoiser to evaluate on any number of clips, under the name that results give it."""
 
     spec: "DenoiserSpec"
     name: str
-    saves_error: bool = False
+    saves_error: bool = False  # whether to store error maps, where it is a NAME+js and frames have two sample buffers
 
     @property
     def signal(self) -> Signal:

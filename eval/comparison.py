@@ -20,23 +20,15 @@ class Luminances(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """A denoised frame, its reference and the previous frame. Images are float64.
+    """A denoised frame, its reference and the previous frame. Images are float64."""
 
-    Attributes:
-        denoised: radiance (1, 3, H, W). A pixel that is not finite counts as 0.
-        reference_buffers: two independent sample buffers A and B (2, 3, H, W) of the reference radiance.
-        exposure: the clip's.
-        disoccluded: the pixels (1, 1, H, W) that were hidden in the previous frame; None where unknown.
-        before: luminances of the previous frame; None on the first one.
-        still: whether nothing moves in the clip.
-    """
-
-    denoised: Tensor
-    reference_buffers: Tensor
-    exposure: float
+    denoised: Tensor  # radiance (1, 3, H, W). A pixel that is not finite counts as 0.
+    reference_buffers: Tensor  # two independent sample buffers A and B (2, 3, H, W) of the reference radiance
+    exposure: float  # the clip's
+    # the pixels (1, 1, H, W) that were hidden in the previous frame; None where unknown
     disoccluded: Tensor | None = None
-    before: Luminances | None = None
-    still: bool = False
+    before: Luminances | None = None  # luminances of the previous frame; None on the first one
+    still: bool = False  # whether nothing moves in the clip
 
     @cached_property
     def output(self) -> Tensor:

@@ -35,25 +35,18 @@ def root_two_times(floor: float) -> float:
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric.
+    """One metric."""
 
-    Attributes:
-        title: its heading in tables.
-        form: the format of its values.
-        of: its value for a frame; None where it is undefined.
-        floor: the noise floor of a frame; None where noise of the reference has no effect.
-        edge: from the floor, the value at which noise of the reference is as large as the image's own error.
-        floor_is_error: the floor is a standard error around 0, because noise does not bias the metric.
-    """
-
-    title: str
-    form: str
+    title: str  # its heading in tables
+    form: str  # the format of its values
     more_is_better: bool = False
     _: KW_ONLY
-    of: Callable[[Comparison], float | None]
+    of: Callable[[Comparison], float | None]  # its value for a frame; None where it is undefined
+    # the noise floor of a frame; None where noise of the reference has no effect
     floor: Callable[[Comparison], float | None] | None
+    # from the floor, the value at which noise of the reference is as large as the image's own error
     edge: Callable[[float], float] = root_two_times
-    floor_is_error: bool = False
+    floor_is_error: bool = False  # the floor is a standard error around 0, because noise does not bias the metric
 
 
 def flip_map(x: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float32]:

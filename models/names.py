@@ -10,17 +10,11 @@ SYNTAX = re.compile(r"([^@+]+)(?:@([^@+]+))?((?:\+[^@+]+)*)")
 
 @dataclass(frozen=True)
 class DenoiserName:
-    """A name in its parts; `str` returns the name.
+    """A name in its parts; `str` returns the name."""
 
-    Attributes:
-        base: a key of registry.DENOISERS, which is also what its weights are called.
-        budget: the training budget of its weights, kept in RUNS; None for the weights that are shipped.
-        wrappers: keys of registry.WRAPPERS, innermost first.
-    """
-
-    base: str
-    budget: str | None = None
-    wrappers: tuple[str, ...] = ()
+    base: str  # a key of registry.DENOISERS, which is also what its weights are called
+    budget: str | None = None  # the training budget of its weights, kept in RUNS; None for the weights that are shipped
+    wrappers: tuple[str, ...] = ()  # keys of registry.WRAPPERS, innermost first
 
     @classmethod
     def parse(cls, text: str) -> "DenoiserName":

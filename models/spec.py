@@ -46,23 +46,14 @@ def check_device(device: str) -> None:
 
 @dataclass(frozen=True)
 class DenoiserSpec:
-    """One way to run a denoiser.
+    """One way to run a denoiser."""
 
-    Attributes:
-        denoiser: its name, in its parts.
-        signal: what it returns; None for what it usually does.
-        precision: of its network, a key of PRECISIONS.
-        weights: the file of a network's weights; without one they are fresh, and always the same.
-        compiled: by compiled kernels where there are any, or all in PyTorch.
-        device: "cpu" or "cuda".
-    """
-
-    denoiser: DenoiserName
-    signal: Signal | None = None
-    precision: str = "float32"
-    weights: Path | None = None
-    compiled: bool = True
-    device: str = "cpu"
+    denoiser: DenoiserName  # its name, in its parts
+    signal: Signal | None = None  # what it returns; None for what it usually does
+    precision: str = "float32"  # of its network, a key of PRECISIONS
+    weights: Path | None = None  # the file of a network's weights; without one they are fresh, and always the same
+    compiled: bool = True  # by compiled kernels where there are any, or all in PyTorch
+    device: str = "cpu"  # "cpu" or "cuda"
 
     @classmethod
     def named(cls, name: str, **fields: Any) -> "DenoiserSpec":

@@ -33,15 +33,10 @@ COUNTING_SIZE = 128  # px; a side that no network needs to pad
 
 @dataclass(frozen=True)
 class DenoiserCost(Timing):
-    """A row of results.json: times, memory in MB, and the size of the network; None where undefined or not measured.
+    """A row of results.json: times, memory in MB, and the size of the network; None where undefined or not measured."""
 
-    Attributes:
-        peak_mb: growth of memory during two frames: the state and all intermediate tensors.
-        parameters: of the network in its form for inference.
-    """
-
-    peak_mb: float | None
-    parameters: int | None
+    peak_mb: float | None  # growth of memory during two frames: the state and all intermediate tensors
+    parameters: int | None  # of the network in its form for inference
     macs_per_pixel: float | None
 
     @property

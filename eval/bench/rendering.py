@@ -32,25 +32,16 @@ ONESPP = "onespp"
 
 @dataclass(frozen=True)
 class TimeToFloor:
-    """The speed of a renderer on a frame.
-
-    Attributes:
-        spp: the fewest samples per pixel, doubling, that reach the target, or MAX_SPP.
-        samples_per_second: camera paths.
-        floor: PSNR in dB of the displayed mean of two independent sample buffers.
-        seconds: to the target, by the law that noise falls as 1 / spp.
-        extrapolated: whether `spp` was not enough.
-        ratio: to the seconds of stock Mitsuba.
-    """
+    """The speed of a renderer on a frame."""
 
     scene: str
     renderer: str
-    spp: int
-    samples_per_second: float
-    floor: float
-    seconds: float
-    extrapolated: bool
-    ratio: float
+    spp: int  # the fewest samples per pixel, doubling, that reach the target, or MAX_SPP
+    samples_per_second: float  # camera paths
+    floor: float  # PSNR in dB of the displayed mean of two independent sample buffers
+    seconds: float  # to the target, by the law that noise falls as 1 / spp
+    extrapolated: bool  # whether `spp` was not enough
+    ratio: float  # to the seconds of stock Mitsuba
 
 
 def noise_mse(render: Render, exposure: float, spp: int) -> float:

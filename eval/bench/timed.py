@@ -40,16 +40,12 @@ class Timing:
 
 @dataclass
 class TimedDenoiser:
-    """A denoiser, its state, and the times that were measured.
-
-    Attributes:
-        seconds: of each frame after warm-up.
-    """
+    """A denoiser, its state, and the times that were measured."""
 
     spec: DenoiserSpec
     denoiser: Denoiser
     state: State | None = None
-    seconds: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)  # of each frame after warm-up
 
     @staticmethod
     def of(spec: DenoiserSpec) -> "TimedDenoiser":

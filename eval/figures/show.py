@@ -39,19 +39,14 @@ def reference_of(frame: Frame, signal: Signal) -> Tensor:
 
 @dataclass
 class DenoiserView:
-    """One denoiser, its state, and its panels.
-
-    Attributes:
-        images: its output for each shown frame.
-        differences: from the reference; empty where the clip has none.
-        pictures: of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W).
-    """
+    """One denoiser, its state, and its panels."""
 
     name: str
     denoiser: Denoiser
     state: State | None = None
-    images: Column = field(default_factory=list)
-    differences: Column = field(default_factory=list)
+    images: Column = field(default_factory=list)  # its output for each shown frame
+    differences: Column = field(default_factory=list)  # from the reference; empty where the clip has none
+    # of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W)
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
     def step(self, frame: Frame) -> Tensor:

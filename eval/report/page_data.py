@@ -23,28 +23,19 @@ MOST_CROPS = 3  # a clip
 
 @dataclass(frozen=True)
 class PageClip:
-    """A clip on the page.
-
-    Attributes:
-        count: number of its frames.
-        frames: those with pictures.
-        images: data URIs of the pictures of each denoiser and of the reference.
-        flips: data URIs of each denoiser's FLIP maps.
-        errors: data URIs of the maps of estimated errors, of denoisers that have them.
-        curves: each metric in all frames, of each denoiser, and as the reference's its noise floor.
-        crops: the windows with most disocclusions.
-    """
+    """A clip on the page."""
 
     name: str
-    count: int
-    frames: list[int]
+    count: int  # number of its frames
+    frames: list[int]  # those with pictures
     height: int
     width: int
-    images: dict[str, list[str]]
-    flips: dict[str, list[str]]
-    errors: dict[str, list[str]]
+    images: dict[str, list[str]]  # data URIs of the pictures of each denoiser and of the reference
+    flips: dict[str, list[str]]  # data URIs of each denoiser's FLIP maps
+    errors: dict[str, list[str]]  # data URIs of the maps of estimated errors, of denoisers that have them
+    # each metric in all frames, of each denoiser, and as the reference's its noise floor
     curves: dict[str, dict[str, list[float | None]]]
-    crops: list[dict[str, int]]
+    crops: list[dict[str, int]]  # the windows with most disocclusions
 
 
 def data_uri(content: bytes, kind: str) -> str:

@@ -13,11 +13,7 @@ MEAN = "mean of clips of 1 spp"  # instead of a clip's name
 
 @dataclass(frozen=True)
 class TableRow:
-    """A denoiser on a clip, or the noise floor.
-
-    Attributes:
-        best: the metrics in which it is the best of its clip and signal.
-    """
+    """A denoiser on a clip, or the noise floor."""
 
     clip: str
     denoiser: str
@@ -25,7 +21,7 @@ class TableRow:
     values: Values
     floors: Values
     nonfinite: int = 0
-    best: frozenset[str] = frozenset()
+    best: frozenset[str] = frozenset()  # the metrics in which it is the best of its clip and signal
 
     @property
     def is_floor(self) -> bool:

@@ -34,31 +34,22 @@ class StressCase:
     """A sequence of frames, how they or the denoiser are changed, and the expected output.
 
     The sequence shows a moving scene under light of irradiance 1, free of noise at first, then noisy.
-
-    Attributes:
-        surfaces: change of the surfaces before they are lit.
-        change: change of the lit frames, of all or `only` of that index.
-        frame_count: of the sequence; the first `even_frames` of them are free of noise.
-        still: neither the camera nor anything else moves.
-        compare_with: "truth", in frames free of noise; "own", the denoiser's output without `change`, times `gain`;
-            "float32", its output in that precision; "past", its output for the same noise half a long sequence
-            earlier.
-        logits: the value to which the largest output of a kernel predictor's last layers is scaled.
-        precision: the denoiser's, a key of PRECISIONS.
     """
 
     name: str
-    surfaces: FrameChange = unchanged
-    change: FrameChange = unchanged
+    surfaces: FrameChange = unchanged  # change of the surfaces before they are lit
+    change: FrameChange = unchanged  # change of the lit frames, of all or `only` of that index
     only: int | None = None
     size: Size = CASE_SIZE
-    frame_count: int = CASE_FRAMES
+    frame_count: int = CASE_FRAMES  # of the sequence; the first `even_frames` of them are free of noise
     even_frames: int = EVEN_FRAMES
-    still: bool = False
+    still: bool = False  # neither the camera nor anything else moves
+    # "truth", in frames free of noise; "own", the denoiser's output without `change`, times `gain`; "float32", its
+    # output in that precision; "past", its output for the same noise half a long sequence earlier
     compare_with: Literal["truth", "own", "float32", "past"] = "truth"
     gain: float = 1
-    logits: float | None = None
-    precision: str = "float32"
+    logits: float | None = None  # the value to which the largest output of a kernel predictor's last layers is scaled
+    precision: str = "float32"  # the denoiser's, a key of PRECISIONS
 
     def frames(self, change: FrameChange | None = None) -> Iterator[Frame]:
         """The sequence, changed by `change`, by default the case's own."""

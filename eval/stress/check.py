@@ -65,28 +65,19 @@ def max_residue(precision: str) -> float:
 
 @dataclass(frozen=True)
 class StressRow:
-    """A denoiser in a stress case: a row of results.json.
-
-    Attributes:
-        weights: their file, FRESH, or None for a denoiser without.
-        extreme: the name of the case.
-        error: the largest, relative to the brightest expected pixel, absolute if that is black; None where no pixel is
-            finite.
-        nonfinite: output pixels that are not finite, in all frames.
-        violation: largest distance from the range, relative to its end (convex filters), or below 0 (others).
-        recovery: frames until the effect of a bad pixel ends, 0 if it has none; None if it does not end, and in cases
-            without a bad pixel.
-        broken: the requirements that are not kept, keys of REQUIREMENTS.
-    """
+    """A denoiser in a stress case: a row of results.json."""
 
     denoiser: str
-    weights: str | None
-    extreme: str
+    weights: str | None  # their file, FRESH, or None for a denoiser without
+    extreme: str  # the name of the case
+    # the largest, relative to the brightest expected pixel, absolute if that is black; None where no pixel is finite
     error: float | None
-    nonfinite: int
-    violation: float
+    nonfinite: int  # output pixels that are not finite, in all frames
+    violation: float  # largest distance from the range, relative to its end (convex filters), or below 0 (others)
+    # frames until the effect of a bad pixel ends, 0 if it has none; None if it does not end, and in cases without a bad
+    # pixel
     recovery: int | None
-    broken: tuple[str, ...]
+    broken: tuple[str, ...]  # the requirements that are not kept, keys of REQUIREMENTS
 
 
 class StressCheck:

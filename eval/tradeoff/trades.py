@@ -20,32 +20,21 @@ TRADED = ("psnr", "ssim", "rmse")
 
 @dataclass(frozen=True)
 class Trade:
-    """A denoiser in one precision with `spp` samples per pixel, compared with all others of the same signal.
+    """A denoiser in one precision with `spp` samples per pixel, compared with all others of the same signal."""
 
-    Attributes:
-        name: unique among those with which it is compared.
-        label: of the denoiser, its precision and signal.
-        dtype: the precision, a key of PRECISIONS.
-        render_ms: of the samples; 0 where denoisers alone are compared.
-        filter_ms: of the denoiser; None, like their sum `ms`, where not measured.
-        metrics: means over the clips.
-        floors: noise floors of means that are within them.
-        compared: the values of TRADED by which it is ranked.
-        dominated_by: the name that dominates it in each of TRADED; None on the front, and without a time or value.
-    """
-
-    name: str
-    label: str
+    name: str  # unique among those with which it is compared
+    label: str  # of the denoiser, its precision and signal
     denoiser: str
-    dtype: str
+    dtype: str  # the precision, a key of PRECISIONS
     signal: Signal
     spp: int
-    render_ms: float
-    filter_ms: float | None
+    render_ms: float  # of the samples; 0 where denoisers alone are compared
+    filter_ms: float | None  # of the denoiser; None, like their sum `ms`, where not measured
     ms: float | None
-    metrics: Values
-    floors: Values
-    compared: Values
+    metrics: Values  # means over the clips
+    floors: Values  # noise floors of means that are within them
+    compared: Values  # the values of TRADED by which it is ranked
+    # the name that dominates it in each of TRADED; None on the front, and without a time or value
     dominated_by: dict[str, str | None]
 
     def point(self, metric: str) -> Point | None:

@@ -29,15 +29,10 @@ CHUNK_PIXELS = 256  # of all maps, they fit into the fastest cache
 
 
 class Strip(NamedTuple):
-    """A window's part of a strip of rows from `start` on.
+    """A window's part of a strip of rows from `start` on."""
 
-    Attributes:
-        logits: (rows, W), from row `low` on, cover the windows of the strip.
-        shares: (strip, W), the window's weight in each pixel.
-    """
-
-    logits: Plane
-    shares: Plane
+    logits: Plane  # (rows, W), from row `low` on, cover the windows of the strip
+    shares: Plane  # (strip, W), the window's weight in each pixel
     radius: Index
     start: Index
     low: Index

@@ -37,18 +37,14 @@ MIN_LENGTH = 1e-3  # samples of a history, to divide by
 
 
 class NetworkInput(NamedTuple):
-    """A row of ONE_INPUTS.
-
-    Attributes:
-        transform: "log exposed": log(1 + exposure · irradiance); "per pixel": models.networks.one.per_pixel_inputs;
-            "surface": of the G-buffer.
-        without_history: the input whose irradiance stands in where there is no history.
-    """
+    """A row of ONE_INPUTS."""
 
     name: str
     channels: int
+    # "log exposed": log(1 + exposure · irradiance); "per pixel": models.networks.one.per_pixel_inputs; "surface": of
+    # the G-buffer
     transform: Literal["log exposed", "per pixel", "surface"]
-    without_history: str | None = None
+    without_history: str | None = None  # the input whose irradiance stands in where there is no history
 
 
 # The inputs of the network, in order. PyTorch, kernel and export all take their order from here.

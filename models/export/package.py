@@ -37,18 +37,13 @@ PACKAGES = ("onespp", "torch", "onnx", "onnxscript", "onnxruntime")
 
 @dataclass(frozen=True)
 class Export:
-    """What to export: a denoiser with the weights of a file, in a format.
-
-    Attributes:
-        precision: of its network, "float32" or "float16"; images and state are float32.
-        warp: whether the step reprojects its history itself.
-    """
+    """What to export: a denoiser with the weights of a file, in a format."""
 
     name: str
     weights: Path
     to: Format
-    precision: Literal["float32", "float16"]
-    warp: Warp
+    precision: Literal["float32", "float16"]  # of its network, "float32" or "float16"; images and state are float32
+    warp: Warp  # whether the step reprojects its history itself
 
     @property
     def file(self) -> str:

@@ -24,19 +24,13 @@ MESHES = "meshes_and_1"
 
 @dataclass(frozen=True)
 class Port:
-    """A tensor that goes into a step or comes out of it.
-
-    Attributes:
-        shape: numbers, and names of sizes that may differ from call to call.
-        meaning: for users, with its unit.
-        of_frame: how a frame provides it, if it does.
-    """
+    """A tensor that goes into a step or comes out of it."""
 
     name: str
-    shape: tuple[int | str, ...]
-    meaning: str
+    shape: tuple[int | str, ...]  # numbers, and names of sizes that may differ from call to call
+    meaning: str  # for users, with its unit
     dtype: torch.dtype = torch.float32
-    of_frame: OfFrame | None = None
+    of_frame: OfFrame | None = None  # how a frame provides it, if it does
 
     def zeros(self, sizes: Mapping[str, int]) -> Tensor:
         """A tensor of this shape, for named `sizes`."""
@@ -50,16 +44,11 @@ def image(name: str, channels: int, of_frame: OfFrame | None, meaning: str, dtyp
 
 @dataclass(frozen=True)
 class StatePort:
-    """An input that comes from the previous frame: zeros before the first frame and after a cut.
-
-    Attributes:
-        source: the output, or the input, of the previous frame that it is.
-        warped: whether the caller must reproject it first, with 0 where the surface was not visible.
-    """
+    """An input that comes from the previous frame: zeros before the first frame and after a cut."""
 
     port: Port
-    source: str
-    warped: bool = False
+    source: str  # the output, or the input, of the previous frame that it is
+    warped: bool = False  # whether the caller must reproject it first, with 0 where the surface was not visible
 
 
 FRAME_PORTS = (

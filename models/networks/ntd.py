@@ -179,11 +179,9 @@ class NTD(Denoiser):
     Where the motion vector leaves the image or leads to background, this frame's noise replaces the previous output, as
     in the first frame (§5). Like the paper, it validates no surfaces: the network decides. It denoises indirect light
     unless it is created for "total".
-
-    Attributes:
-        vectors: the motion channel by which the previous output is reprojected.
     """
 
+    # the motion channel by which the previous output is reprojected
     vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
     # Traditional vectors are needed for the disocclusion mask of the loss.
     reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")

@@ -42,25 +42,15 @@ MAX_SAMPLES = 2.0**20  # per pixel; no larger number is recommended
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Of one frame: squares of irradiance relative to `unit`, (B, 3, H, W).
+    """Of one frame: squares of irradiance relative to `unit`, (B, 3, H, W)."""
 
-    Attributes:
-        filter_error: squared error of the filter's output; unbiased, so below 0 in places.
-        filter_variance: the part of it that this frame's noise causes, never below 0.
-        covariance: of the filter's error with the frame's.
-        variance: of the frame.
-        rho: the weight of the frame in the output.
-        unit: mean luminance of the irradiance near each pixel, (B, 1, H, W), not 0.
-        frame: the frame.
-    """
-
-    filter_error: Tensor
-    filter_variance: Tensor
-    covariance: Tensor
-    variance: Tensor
-    rho: Tensor
-    unit: Tensor
-    frame: Frame
+    filter_error: Tensor  # squared error of the filter's output; unbiased, so below 0 in places
+    filter_variance: Tensor  # the part of it that this frame's noise causes, never below 0
+    covariance: Tensor  # of the filter's error with the frame's
+    variance: Tensor  # of the frame
+    rho: Tensor  # the weight of the frame in the output
+    unit: Tensor  # mean luminance of the irradiance near each pixel, (B, 1, H, W), not 0
+    frame: Frame  # the frame
 
     def blended(self, filter_error: Tensor) -> Tensor:
         """The squared error of the output, without its covariance term, for a squared error of the filter."""
