@@ -51,22 +51,16 @@ class Frame:
     """One frame of one noise realisation: `channels` are tensors (B, C, H, W), float32.
 
     Units and ranges are those of the data set (docs/format.md). Channels of two sample buffers are (B, 2, 3, H, W).
-
-    Attributes:
-        previous: the cameras of the frame that motion vectors lead to.
-        source: names the clip in messages.
-        spp: samples per pixel of the noisy channels (B, 1, 1, 1); None if unknown.
-        colour_gain: training alone: what networks multiply their exposure by (RAE §4.3), (B, 3, 1, 1); None for 1.
-        whole: training alone: what models.history.running_scale measures in the frame that this is a crop of, (B, 2).
     """
 
     channels: dict[str, Tensor]
     now: Cameras
-    previous: Cameras
-    source: str = ""
-    spp: Tensor | None = None
-    colour_gain: Tensor | None = None
-    whole: Tensor | None = None
+    previous: Cameras  # of the frame that motion vectors lead to
+    source: str = ""  # names the clip in messages
+    spp: Tensor | None = None  # samples per pixel of the noisy channels, (B, 1, 1, 1); None if unknown
+    # In training alone:
+    colour_gain: Tensor | None = None  # what networks multiply their exposure by (RAE §4.3), (B, 3, 1, 1); None for 1
+    whole: Tensor | None = None  # what running_scale measures in the frame that this is a crop of, (B, 2)
 
     direct = ChannelTensor()
     indirect = ChannelTensor()

@@ -10,10 +10,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from datasets.writer import FLOAT16_MAX
 from errors import BadInput
 from files import replacing
-
-MAX_HALF = 65504.0
 
 
 @contextmanager
@@ -76,7 +75,7 @@ class ExrImage:
         """Put `image` (H, W, C) in place of the named channels, in their own precision or in `dtype`."""
         for index, name in enumerate(channels):
             target = np.dtype(dtype or self.channels[name].pixels.dtype)
-            limit = MAX_HALF if target == np.float16 else np.inf
+            limit = FLOAT16_MAX if target == np.float16 else np.inf
             self.channels[name].pixels = np.ascontiguousarray(image[..., index].clip(-limit, limit), target)
 
     def add(self, layer: str, image: NDArray[np.float32], beside: str) -> None:
@@ -87,7 +86,7 @@ class ExrImage:
         home = next(part for part in self.file.parts if self.channels[beside] in part.channels.values())
         for index, component in enumerate("RGB"):
             name = f"{layer}.{component}"
-            plane = np.ascontiguousarray(image[..., index].clip(0, MAX_HALF), np.float16)
+            plane = np.ascontiguousarray(image[..., index].clip(0, FLOAT16_MAX), np.float16)
             if name in self.channels:
                 self.channels[name].pixels = plane
             else:

@@ -18,7 +18,7 @@ class Augmentation:
     """Which augmentations are on, those of RAE §4.3 first."""
 
     reverse: bool = False  # half of the sequences are played backward
-    stop: bool = False  # in a quarter the camera stops at a random frame, while the noise goes on
+    stop: bool = False  # in a quarter the camera stops at a random frame, while noise keeps changing
     rotate: bool = False  # every sequence is turned by a random multiple of 90 degrees
     gain: bool = False  # every sequence has a random factor in [0, 2] for each colour channel
     exposure: bool = False  # or one for all, of 2^-1.5 to 2^1.5

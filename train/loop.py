@@ -57,21 +57,16 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
             print(f"{task.name}: specialised to {task.data.path}, left out {left_out}")
         if fabric.is_global_zero:
             train_to_end(training, save_seconds)
-        else:
-            follow(training)
+        else:  # take part in every step and in every validation
+            for _ in training.steps():
+                if training.validates:
+                    training.validate()
         fabric.barrier()
     if not weights.exists():
         raise BadInput(f"{task.folder} has a finished training but no weights: delete it and train again")
     if fabric.is_global_zero:
         print(f"{task.name}: {outcome}")
     return weights
-
-
-def follow(training: Training) -> None:
-    """The work of all processes but the first: their share of every step and of every validation."""
-    for _ in training.steps():
-        if training.validates:
-            training.validate()
 
 
 def train_to_end(training: Training, save_seconds: float) -> None:

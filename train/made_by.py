@@ -24,12 +24,12 @@ def made_by_here(loss: NetworkLoss) -> MadeBy:
 
 def differences(recorded: Sequence[MadeBy], here: MadeBy) -> str:
     """How what a training ran with differs from here, "other code, torch 2.12.0 (now 2.13.0)"; empty if it does not."""
-    found: dict[str, None] = {}  # an ordered set
+    changes: dict[str, None] = {}  # an ordered set
     for made_by in recorded:
         if made_by["code"] != here["code"]:
-            found["other code"] = None
+            changes["other code"] = None
         for package in TRAINING_PACKAGES:
             then, now = (each["versions"].get(package, "none") for each in (made_by, here))
             if then != now:
-                found[f"{package} {then} (now {now})"] = None
-    return ", ".join(found)
+                changes[f"{package} {then} (now {now})"] = None
+    return ", ".join(changes)

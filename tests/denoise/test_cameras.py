@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
@@ -30,6 +30,7 @@ def assert_same(fitted_view: View | None, view: View, tolerance: float = 1e-3) -
     np.testing.assert_allclose(fitted_view.K, view.K, atol=tolerance * WIDTH)
 
 
+@settings(deadline=None)  # an example may take long on a busy machine
 @given(st.integers(0, 10**6))
 def test_positions_determine_the_camera(seed):
     view = some_view(seed)
