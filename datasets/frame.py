@@ -264,13 +264,7 @@ def read_frame(
         if not channel.is_image or (channel.kind == "buffers" and name not in clip.channels):
             continue
         if channel.is_temporal and previous != stored_previous:
-            # Only the renderer can compute what hid a surface and how light changes. But while time stands still
-            # nothing is hidden and nothing changes: dual motion equals motion, and both are 0 like the gradient.
-            if name != "motion" and previous != index:
-                raise BadInput(
-                    f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing"
-                )
-            array = clip.motion_to(index, previous, window)
+            array = temporal_channel(clip, name, index, previous, window)
         else:
             array = clip.read_visible(name, index, window, realisation)
         tensors[name] = to_tensor(array, has_buffers=channel.has_buffers)
@@ -281,6 +275,18 @@ def read_frame(
         source=str(clip.path),
         spp=torch.full((1, 1, 1, 1), float(clip.facts["noisy_spp"])),
     )
+
+
+def temporal_channel(clip: Clip, name: str, index: int, previous: int, window: ImageWindow) -> NDArray[np.float32]:
+    """A temporal channel (h, w, 2), to a frame that is not the one before in the clip.
+
+    Dual motion vectors depend on what hid a surface and gradients on how light changes: only the renderer can compute
+    them. But while time stands still nothing is hidden and nothing changes: dual motion equals motion, and both are 0
+    like the gradient.
+    """
+    if name != "motion" and previous != index:
+        raise BadInput(f"{clip.path}: the channel '{name}' exists for forward playback only; train without reversing")
+    return clip.motion_to(index, previous, window)
 
 
 def to_tensor(array: NDArray[np.generic], has_buffers: bool = False) -> Tensor:
