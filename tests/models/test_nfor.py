@@ -222,13 +222,3 @@ def test_features_stay_within_one():
     features = features_of(frame)
     assert features.shape == (1, 7, 2, 2) and features.abs().max() == 1
     torch.testing.assert_close(features[0, 6], torch.tensor([[0.4, 1], [1, 1]]))
-
-
-@settings(max_examples=20, deadline=None)
-@given(level=st.sampled_from([0.0, 1e-30, 1e-7, 6e4, 3e38]), firefly=st.sampled_from([0.0, 1e-7, 6e4, 3e38]))
-def test_extremes_stay_finite(level, firefly):
-    frame = flat_frame(7, 9, irradiance=torch.full((1, 3, 7, 9), level))
-    frame.direct[0, :, 3, 4] = firefly
-    frame.channels["albedo"] = torch.rand(1, 3, 7, 9)
-    (output,) = run(NFOR(), [frame])
-    assert torch.isfinite(output).all() and (output >= 0).all()

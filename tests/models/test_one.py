@@ -93,13 +93,6 @@ def test_where_nothing_was_found_history_has_no_weight(tiny, fresh):
     torch.testing.assert_close(after.accumulated[lost.expand_as(noisy)], noisy[lost.expand_as(noisy)])
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_brightness_is_but_a_factor(fresh, scale):
-    dim, lit = (run(fresh, frames(noise(4, each), (0.5, 0.25))) for each in (1.0, scale))
-    for a, b in zip(dim, lit, strict=True):
-        torch.testing.assert_close(scale * a, b, rtol=1e-3, atol=1e-3 * scale)
-
-
 @pytest.mark.parametrize("unit", [1e-2, 1e2])
 def test_units_of_length_do_not_matter(fresh, unit):
     sequences = [

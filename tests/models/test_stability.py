@@ -235,7 +235,9 @@ def test_preparing_twice_changes_nothing(name):
 # --- Scale ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["accumulated", *FILTERS, "rae", "noisy+taa", "accumulated+adaptive"])
+@pytest.mark.parametrize(
+    "name", ["accumulated", *FILTERS, "rae", "ntd", "lbf", "one", "noisy+taa", "accumulated+adaptive"]
+)
 def test_a_thousand_times_the_light_is_a_thousand_times_the_output(name):
     torch.manual_seed(0)
     denoiser = registry.create(name)
