@@ -308,7 +308,7 @@ def trade(
     threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
     spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = DEFAULT_SPP,
 ) -> None:
-    """Compare quality with milliseconds, by denoiser, precision and samples per pixel: tables, plots, trade.json.
+    """Compare quality with milliseconds, by denoiser, precision and samples per pixel: tables, a plot, trade.json.
 
     Evaluates denoisers on the test clips, by default all that can run. Run `onespp bench denoisers` first for times.
     """

@@ -1,13 +1,10 @@
-"""Plots of quality against milliseconds, and against samples per pixel."""
+"""Plots of quality against samples per pixel, and against milliseconds of rendering and filtering."""
 
 from collections.abc import Sequence
 
 from eval.metrics import METRICS
-from eval.tradeoff.pareto import Point
 from eval.tradeoff.trades import Trade
 from plotting import DPI, Axes, Figure, plt, ticker
-
-MARKERS = {"float32": "o", "bfloat16": "s", "float16": "^"}
 
 
 def plain_ticks(axis: Axes) -> None:
@@ -16,52 +13,6 @@ def plain_ticks(axis: Axes) -> None:
     axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
     axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-
-
-def draw_front(rows: Sequence[Trade], metric: str, title: str) -> Figure:
-    """A metric against milliseconds, one panel per signal: the front as a line, dominated points hollow."""
-    signals = list(dict.fromkeys(row.signal for row in rows))
-    size = (9, 5.5 * len(signals))
-    figure, axes = plt.subplots(len(signals), 1, figsize=size, dpi=DPI, layout="constrained", squeeze=False)
-    for axis, signal in zip(axes[:, 0], signals, strict=True):
-        drawn = [(row, point) for row in rows if row.signal == signal and (point := row.point(metric))]
-        draw_panel(axis, drawn, metric)
-        axis.set_title(f"{signal} light", fontsize=9)
-    figure.suptitle(title, fontsize=9)
-    return figure
-
-
-def draw_panel(axis: Axes, rows: Sequence[tuple[Trade, Point]], metric: str) -> None:
-    """The rows of one signal and their front."""
-    front = sorted((point for row, point in rows if row.dominated_by[metric] is None), key=lambda point: point.ms)
-    # The best quality within a number of milliseconds: steps at the points of the front.
-    axis.step([point.ms for point in front], [point.quality for point in front], where="post", lw=1, color="C0")
-    for row, point in rows:
-        on_front = row.dominated_by[metric] is None
-        axis.plot(
-            point.ms,
-            point.quality,
-            MARKERS[row.dtype],
-            ls="",
-            ms=6,
-            mfc="C0" if on_front else "none",
-            mec="C0" if on_front else "grey",
-        )
-        axis.annotate(
-            row.denoiser,
-            point,
-            xytext=(4, 4),
-            textcoords="offset points",
-            fontsize=8 if on_front else 6,
-            color="black" if on_front else "grey",
-        )
-    for dtype in dict.fromkeys(row.dtype for row, _ in rows):
-        axis.plot([], [], MARKERS[dtype], color="grey", mfc="none", label=dtype)
-    better = "more" if METRICS[metric].more_is_better else "less"
-    axis.set(xlabel="ms a frame", ylabel=f"{METRICS[metric].title} ({better} is better)")
-    plain_ticks(axis)
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=8)
 
 
 def draw_samples(rows: Sequence[Trade], title: str) -> Figure:

@@ -18,10 +18,10 @@ from eval.clip_run import NamedDenoiser
 from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.results import ClipResults, Result, by_clip
 from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
-from eval.tradeoff.plots import draw_front, draw_samples
+from eval.tradeoff.plots import draw_samples
 from eval.tradeoff.resampled_clips import scene_of, with_samples
 from eval.tradeoff.times import Times
-from eval.tradeoff.trades import TRADED, Trade, front_table, samples_table, trades
+from eval.tradeoff.trades import Trade, front_table, samples_table, trades
 from files import write_json
 from models.names import DenoiserName
 from models.registry import DENOISERS
@@ -45,7 +45,7 @@ def trade(
 ) -> str:
     """Evaluate all candidates on the test clips, with `levels` of samples per pixel.
 
-    Returns tables; writes RUNS/report/trade.json and figures. Times are those of RUNS/bench at `size` and `threads`.
+    Returns tables; writes RUNS/report/trade.json and a figure. Times are those of RUNS/bench at `size` and `threads`.
     Clips and results are stored in RUNS/trade and reused. Raises BadInput where there are no times or clips, for a bad
     size or numbers of samples, and as `candidates`.
     """
@@ -65,7 +65,9 @@ def trade(
     sample_rows = trades(fed, results, render_ms, times)
 
     title = f"{times.name}, {RENDERER}, {times.threads} threads; mean of {len(clips)} clips of {data}"
-    save_figures(runs / "report" / "figures", rows, sample_rows, title)
+    figures = runs / "report" / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    save_figure(figures / "trade-samples.png", draw_samples(sample_rows, title))
     content = {
         "schema": 1,
         "dataset": str(data),
@@ -134,14 +136,6 @@ def sample_costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[
         f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads, options)
         for clip in tqdm(clips, f"rendering {times.name}", unit="scene", leave=False)
     }
-
-
-def save_figures(folder: Path, rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str) -> None:
-    """Write trade-METRIC.png of denoisers alone, and trade-samples.png."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for metric in TRADED:
-        save_figure(folder / f"trade-{metric}.png", draw_front(rows, metric, title))
-    save_figure(folder / "trade-samples.png", draw_samples(sample_rows, title))
 
 
 def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, times: Times) -> str:

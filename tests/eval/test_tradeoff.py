@@ -16,7 +16,7 @@ from eval.means import compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
 from eval.results import NOISE_FLOOR, ClipResults, Result
 from eval.tradeoff.pareto import Point, dominated_by_name
-from eval.tradeoff.plots import draw_front, draw_samples
+from eval.tradeoff.plots import draw_samples
 from eval.tradeoff.resampled_clips import rendered, scene_of, with_samples
 from eval.tradeoff.run import candidates, check_levels, trade
 from eval.tradeoff.times import Times
@@ -275,9 +275,7 @@ def test_trade_has_every_precision(traded):
     )
     assert rows["noisy"]["dominated_by"]["psnr"] is None  # the fastest
     assert "dominated in PSNR by" in text
-    assert {path.name for path in (runs / "report" / "figures").iterdir()} == {
-        *("trade-psnr.png", "trade-ssim.png", "trade-rmse.png", "trade-samples.png"),
-    }
+    assert [path.name for path in (runs / "report" / "figures").iterdir()] == ["trade-samples.png"]
 
 
 def test_more_samples_cost_more_and_gain_quality(traded):
@@ -292,18 +290,6 @@ def test_more_samples_cost_more_and_gain_quality(traded):
     quality = {row["label"]: row["metrics"]["psnr"] for row in content["rows"]}
     assert rows["noisy", 1]["metrics"]["psnr"] == quality["noisy"]  # 1 spp is the clip itself
     assert all(math.isfinite(row["metrics"]["psnr"]) for row in content["samples"])
-
-
-def test_the_plot_draws_the_front(traded):
-    rows = [Trade(**row) for row in read_json(traded[0] / "report" / "trade.json")["rows"]]
-    (axis,) = draw_front(rows, "psnr", "title").axes
-    line, *points = axis.lines
-    on_front = sorted((row.ms, row.metrics["psnr"]) for row in rows if row.dominated_by["psnr"] is None)
-    assert [*zip(*line.get_data(), strict=True)] == on_front
-    places = {(row.ms, row.metrics["psnr"]) for row in rows}
-    filled = {tuple(point.get_xydata()[0]) for point in points if point.get_markerfacecolor() == "C0"}
-    hollow = {tuple(point.get_xydata()[0]) for point in points if len(point.get_xydata())} - filled
-    assert filled == {*on_front} and hollow == places - filled
 
 
 def test_the_plot_of_samples(traded):
