@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import trimesh
 
 from render.clip import Sampling, render_clip
@@ -94,6 +95,7 @@ for channels, _ in render_clip(scene, 10, 40, 40, Sampling(2, 1, 4), 0):
 """
 
 
+@pytest.mark.slow
 def test_no_kernel_is_recompiled_from_frame_to_frame(tmp_path):
     """In a new process with an empty kernel cache: all compilation happens before the first frame is out."""
     environment = os.environ | {"DRJIT_CACHE_DIR": str(tmp_path)}

@@ -24,7 +24,7 @@ def glossy() -> Stage:
     return stage
 
 
-@pytest.mark.parametrize("cycles", [10, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cycles", [5, pytest.param(50, marks=pytest.mark.slow)])
 def test_every_point_of_the_halton_cycle_is_unbiased(stage, cycles):
     stage.pose(POSED_FRAME)
     ray = stage.rays(stage.view(POSED_FRAME))

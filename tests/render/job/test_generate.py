@@ -1,4 +1,4 @@
-"""The generation job: equal bytes whatever interrupts it, whoever shares it, and clear words where it cannot go on."""
+"""The rendering job: equal bytes however it is interrupted or shared, and clear errors."""
 
 import json
 import os
@@ -111,6 +111,7 @@ def test_a_clip_that_another_job_renders_is_left_to_it(tiny_copy, tiny):
     assert digest(tiny_copy) == digest(tiny)
 
 
+@pytest.mark.slow
 def test_two_processes_on_one_folder_share_the_work(tiny, tiny_copy):
     remove_clips(tiny_copy, "train/cornell_box/000", "train/cornell_box_moving/000", "val/cornell_box/000")
     command = dataset_command(tiny_copy)
@@ -149,7 +150,7 @@ def test_a_share_has_the_bytes_of_the_whole(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "x", "1", "-1/2"])
-def test_what_is_no_share_is_refused(text):
+def test_invalid_shares_are_refused(text):
     with pytest.raises(BadInput, match="K/N"):
         Share.parse(text)
 
@@ -170,7 +171,7 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
     assert not list(failing.parent.glob("*"))
 
 
-def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(tiny_copy, monkeypatch):
+def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
     remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
     genuine = render.job.clip_job.render_clip
 
@@ -197,7 +198,7 @@ def test_samples_that_are_not_finite_are_counted_by_clip_and_shown(tiny_copy, mo
     assert bad.pop("val/cornell_box/000") == "7" and set(bad.values()) == {"0"}
 
 
-def test_what_a_kill_or_a_careless_hand_left_is_repaired(tiny, tmp_path):
+def test_incomplete_files_are_replaced(tiny, tmp_path):
     root = tmp_path / "data"
     root.mkdir()
     (root / ".dataset.json.tmp").write_text("{")  # killed before the first file was in place
@@ -219,7 +220,7 @@ def test_a_data_set_is_not_continued_with_other_versions(tiny_copy):
         generate_tiny(tiny_copy)
 
 
-def test_folder_of_something_else_is_left_alone(tmp_path):
+def test_other_folders_are_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(BadInput, match="something other"):
         generate_tiny(tmp_path)

@@ -1,4 +1,4 @@
-"""Which clips a profile has, what their names mean, how many samples references get, what is left out."""
+"""Clips of profiles and their names, samples of references, and channels that are left out."""
 
 from pathlib import Path
 
@@ -18,11 +18,7 @@ from render.job.clip_job import render_to_folder
 from render.job.generate import Share, generate
 from render.job.pilots import choose_rooms, noise_of_reference, samples_needed
 from render.job.plan import clips_of, plan, rooms_of
-from render.job.profiles import (
-    DataProfile,
-    SamplingQuality,
-    profile_of,
-)
+from render.job.profiles import DataProfile, SamplingQuality, profile_of
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -99,9 +95,7 @@ def test_more_samples_as_input_have_less_noise_and_the_same_reference(moving_box
         noisy = [[clip.read("indirect", f, realisation=s).astype(float) for s in range(4)] for f in range(clip.frames)]
         return float(np.var(noisy, axis=1, ddof=1).mean())
 
-    assert (
-        variance(many) < variance(single) / 12
-    )  # stratified samples gain at least as much as independent ones, a 16th
+    assert variance(many) < variance(single) / 12  # stratified samples gain about a 16th, as independent ones
 
 
 def test_buffers_predict_the_noise_of_their_mean(moving_boxes):
@@ -118,8 +112,8 @@ def test_buffers_predict_the_noise_of_their_mean(moving_boxes):
 
 def test_buffers_are_stored_together_on_request():
     """A clip for denoisers of indirect light alone may be shown to others too."""
-    asked = plan("release", 0, channels_read(["ntd+js"]))["channels"]["test"]
-    assert set(SAMPLE_BUFFERS.values()) < set(asked)
+    channels = plan("release", 0, channels_read(["ntd+js"]))["channels"]["test"]
+    assert set(SAMPLE_BUFFERS.values()) < set(channels)
     assert set(plan("release", 0, channels_read(["ntd"]))["channels"]["test"]) == set(USUAL_CHANNELS)
 
 
@@ -144,6 +138,7 @@ def test_references_get_down_to_their_floor(floor, tmp_path):
     assert spp > 16 and spp & (spp - 1) == 0
 
 
+@pytest.mark.slow
 def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
     scene = build_scene("room-3", 0, 2)  # in which few samples see little of the noise that many have
     quality = SamplingQuality(realisations=1, reference_spp=16, floor=26.0, most_spp=1024)
@@ -166,6 +161,7 @@ def test_references_stop_at_the_most(tmp_path):
     assert Clip(path).facts["reference_spp"] == 64
 
 
+@pytest.mark.slow
 def test_rooms_that_would_need_too_many_samples_are_skipped():
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 3}, quality={"test": bounded})
@@ -207,7 +203,7 @@ def static_box(root: Path, split: str) -> Clip:
     return Clip(root / split / "cornell_box" / "000")
 
 
-def test_what_nobody_reads_is_not_rendered(lean):
+def test_unread_channels_are_not_rendered(lean):
     clip = static_box(lean, "train")
     assert set(clip.channels) == set(plan("tiny", 0, READS)["channels"]["train"]) < set(CHANNELS)
     with pytest.raises(BadInput, match="'dual_motion': it was not rendered"):
@@ -215,7 +211,7 @@ def test_what_nobody_reads_is_not_rendered(lean):
     assert set(static_box(lean, "test").channels) == set(USUAL_CHANNELS)
 
 
-def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
+def test_channels_of_any_denoiser_are_rendered(tiny):
     assert "dual_motion" in create("ntd").reads
     for split in ("train", "val"):
         assert all("dual_motion" in clip.channels for clip in Dataset(tiny).clips(split))
@@ -223,17 +219,8 @@ def test_what_one_denoiser_reads_is_rendered_for_all(tiny):
 
 def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
     clip = static_box(lean, "train")
-    names = (
-        "emission",
-        "albedo",
-        "normal",
-        "depth",
-        "roughness",
-        "mesh_id",
-        *MOTION_CHANNELS,
-        "gradient",
-        *HIT_CHANNELS,
-    )
+    surface = ("emission", "albedo", "normal", "depth", "roughness", "mesh_id")
+    names = (*surface, *MOTION_CHANNELS, "gradient", *HIT_CHANNELS)
     stored = sum(stored_size(clip, name) for name in names)
     full = sum(size_in_full(clip, name) for name in names)
     assert 0.2 < stored / full <= 0.6
@@ -258,6 +245,6 @@ def test_info_shows_what_is_saved(lean):
     assert float(step[1]) > 0 and float(step[2]) > 0  # seconds spent on test clips, saved on the others
 
 
-def test_no_clip_of_another_scene_is_left_unrendered(tmp_path):
+def test_unknown_scenes_are_refused(tmp_path):
     with pytest.raises(BadInput, match="room-N"):
         render_to_folder(tmp_path / "test" / "castle" / "000", profile_of("tiny"), 0, ())
