@@ -1,4 +1,4 @@
-"""Which floating-point precision this machine convolves fastest in: measured, for its instructions do not tell."""
+"""The precision in which this machine convolves fastest: measured, since its instruction sets do not determine it."""
 
 import os
 import time

@@ -17,7 +17,7 @@ from models.specialise import specialise
 def save_weights(
     denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path, made_by: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Write atomically: a reader sees the old file or the whole new one.
+    """Write atomically: a reader gets the old file or the whole new one.
 
     `made_by` names the code and packages that trained them, see train/made_by.py.
     """

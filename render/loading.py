@@ -135,7 +135,7 @@ class StockLoader:
             if not unknown & description.keys():
                 raise BadInput(f"{what} is empty, damaged or cannot be used: {mitsuba_reason(error)}") from None
         names = ", ".join(f"'{name}'" for name in sorted(unknown))
-        self.notes.append(f"{what}: this Mitsuba does not know {names}: left out")
+        self.notes.append(f"{what}: this Mitsuba does not have {names}: left out")
         return self.made({key: value for key, value in description.items() if key not in unknown}, what)
 
     def load(self, description: Mapping[str, Any]) -> Any:

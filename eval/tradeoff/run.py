@@ -73,7 +73,7 @@ def trade(
         "dataset": str(data),
         "device": device_in_words(),
         "versions": versions(DENOISING),
-        "profile": budget,
+        "budget": budget,
         "clips": [f"{clip.scene}/{clip.name}" for clip in clips],
         "size": times.name,
         "threads": times.threads,

@@ -53,7 +53,7 @@ class StatePort:
 
 FRAME_PORTS = (
     image("noisy", 3, lambda f: f.direct + f.indirect, "noisy direct and indirect light; non-finite values count as 0"),
-    image("emission", 3, lambda f: f.emission, "light sources seen directly; added to the output unchanged"),
+    image("emission", 3, lambda f: f.emission, "directly visible light sources; added to the output unchanged"),
     image("albedo", 3, lambda f: f.albedo, "reflectance in [0, 1]; 1 for background"),
     image("normal", 3, lambda f: f.normal, "shading normal in world space, of unit length; 0 for background"),
     image("depth", 1, lambda f: f.depth, "distance along the viewing axis, in any unit; 0 for background"),

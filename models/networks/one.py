@@ -102,7 +102,7 @@ class OneState(State):
 
 
 class PixelInputs(NamedTuple):
-    """What is known of each pixel before the network runs; irradiance, all (B, ·, H, W)."""
+    """The irradiance inputs of each pixel, all (B, ·, H, W)."""
 
     noisy: Tensor
     mean_3x3: Tensor  # over pixels of the same mesh
@@ -222,7 +222,7 @@ class One(Denoiser):
         self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(head_channels(len(steps)).values()), self.widths)
 
     def pixel_inputs(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> PixelInputs:
-        """Means around each pixel, and reprojected history."""
+        """Local means and reprojected history."""
         has_history = torch.zeros_like(surface)
         history = has_history.expand(-1, sum(HISTORY), -1, -1)
         if before is not None:

@@ -1,4 +1,4 @@
-"""What LBF's network sees: statistics of the features around each pixel (Kalantari et al. 2015, §3.3).
+"""Inputs of LBF's network: statistics of the features in windows of each pixel (Kalantari et al. 2015, §3.3).
 
 All take features (B, sum(FEATURE_GROUPS), H, W) and `surface` (B, 1, H, W), 1 for pixels that count: background and
 what is outside the image is in none of them. Statistics are taken by channel, then averaged over those of a group.
@@ -15,7 +15,7 @@ from models.operators import pad_to_multiple
 BLOCK = 7  # px: what statistics are taken of
 SMALL_BLOCK = 3
 GAUSSIAN_MEDIAN = 0.6745  # of the absolute value of normal noise of deviation 1
-SPREAD = 0.01  # spreads that differ far below this look alike to the network
+SPREAD = 0.01  # the network cannot distinguish spreads far below this
 KINDS = 7  # of statistics, one for each group
 SECONDARY = KINDS * len(FEATURE_GROUPS) + 1
 

@@ -67,12 +67,12 @@ def needed_for(profile: DataProfile, room: str, seed: int, options: Options) -> 
     return samples_needed(scene, *profile.size, quality, clip_seed, options)
 
 
-def choose_rooms(profile: DataProfile, seed: int, options: Options, known: NeededSpp) -> dict[str, int]:
-    """`known`, and the samples that further rooms need, until enough rooms are within the bounds of the profile.
+def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: NeededSpp) -> dict[str, int]:
+    """`measured`, and the samples that further rooms need, until enough rooms are within the bounds of the profile.
 
     Raises BadInput if hardly any room is.
     """
-    needed = dict(known)
+    needed = dict(measured)
     for split, quality in profile.quality.items():
         wanted = profile.rooms[split]
         while quality.skips_noisy_rooms:

@@ -10,16 +10,10 @@ from errors import BadInput
 from eval import selection
 from eval.selection import choose, evaluated, untrained, weights_file, weights_of, with_indirect_baselines
 from models.names import DenoiserName
-from models.registry import DENOISERS, create, parse_name, prototype
-from models.spec import PRECISIONS, DenoiserSpec, fastest_precision, precisions_of
+from models.registry import DENOISERS, create, parse_name
+from models.spec import PRECISIONS, DenoiserSpec
 from models.weights import save_weights
 from train.task import WEIGHTS_FILE, run_folder
-
-NAMES = (
-    *(*DENOISERS, "svgf+taa", "wskp3+taa", "wskp3+adaptive", "eaw+adaptive+taa"),
-    *("wskp3@quick", "rae@tiny+taa", "wskp6@quick+adaptive"),
-)
-
 
 ONE, SVGF, RAE, KP, NFOR = map(parse_name, ("one", "svgf", "rae", "kp", "nfor"))
 
@@ -150,15 +144,6 @@ def test_baselines_of_indirect_light_are_added():
         ("ntd", "indirect"),
         ("noisy", "indirect"),
     ]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_prototype_describes_the_denoiser(name):
-    described, denoiser = prototype(name), create(name)
-    assert described.reads == denoiser.reads and described.signal == denoiser.signal
-    assert described.refuses == denoiser.refuses and described.is_network == (denoiser.parameter_count() > 0)
-    assert fastest_precision(name) in precisions_of(name)
-    assert create(name, "indirect").signal == "indirect"
 
 
 def test_names_of_the_ways_to_run():

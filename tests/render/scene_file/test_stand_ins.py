@@ -141,7 +141,7 @@ CASES = {
         xml(
             shape("cube", '<float name="wobble" value="3"/><bsdf type="diffuse"><float name="jolt" value="3"/></bsdf>')
         ),
-        "does not know 'wobble'",
+        "does not have 'wobble'",
         2,
         1,
     ),
