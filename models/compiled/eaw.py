@@ -9,8 +9,7 @@ from models.compiled.arrays import RGB, Image, Index, Row, Rows, Scalar, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
 from models.compiled.lines import add_square, divide_line, fill_line, triple, triple_of_lines, window_taps
-from models.compiled.svgf import SPLINE
-from models.filters.atrous import RADIUS
+from models.filters.atrous import RADIUS, SPLINE
 
 MAX_DECAY = 30  # e^-30 = 1e-13 counts as 0: denormal numbers are slow
 

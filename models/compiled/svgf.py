@@ -27,7 +27,7 @@ from models.compiled.jit import (
 )
 from models.compiled.lines import block_count, copy_line, luminance, rows_of_block, triple, triple_of_lines, window_taps
 from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
-from models.filters.atrous import B3_SPLINE, RADIUS
+from models.filters.atrous import RADIUS, SPLINE
 from models.history.geometry import GBuffer
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
@@ -44,7 +44,6 @@ NEGLIGIBLE_COSINE = np.float32(0.79)  # to the 128th it is 8e-14
 NEGLIGIBLE_WEIGHT = np.float32(1e-15)
 NEGLIGIBLE_EXPONENT = np.float32(40)  # e^-40 is below NEGLIGIBLE_WEIGHT
 MIN_GAUSSIAN_SHARE = np.float32(1 / 16)  # of one pixel in a Gaussian of 3 x 3
-SPLINE = np.array(B3_SPLINE, np.float32)
 VARIANCE_TAPS = 2 * RADIUS + 1  # of a row
 LEVEL_BLOCK = 256  # px; so many of a row are filtered together, and what they need stays in the first cache
 GEOMETRY = 7  # channels of pack_geometry: unit normal (3), depth, σ_z ∇z (2), tolerance

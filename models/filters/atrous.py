@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from types import EllipsisType
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from models.operators import STRIP_ROWS
 
 ATROUS_STEPS = (1, 2, 4, 8, 16)  # px from tap to tap, level by level
 B3_SPLINE = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)  # h, separable
+SPLINE = np.array(B3_SPLINE, np.float32)  # for kernels
 RADIUS = len(B3_SPLINE) // 2
 CENTRE = B3_SPLINE[RADIUS] ** 2
 

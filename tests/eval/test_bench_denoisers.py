@@ -83,6 +83,7 @@ def test_the_head_of_results_is_of_the_most_threads(tmp_path, capsys):
     assert [row["threads"] for row in results["rows"] if row["denoiser"] == "noisy"] == [1, 2]
 
 
+@pytest.mark.slow
 def test_an_interrupted_bench_resumes(tmp_path):
     unfinished = tmp_path / "unfinished.json"
 

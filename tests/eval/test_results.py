@@ -130,7 +130,7 @@ def test_damaged_results_are_evaluated_again(once, runs, tiny, played, damage):
     assert played == [("cornell_box", ["accumulated"])] and content(runs) == before
 
 
-@pytest.mark.parametrize("frame", [0, 5, 11])
+@pytest.mark.parametrize("frame", [5, *(pytest.param(frame, marks=pytest.mark.slow) for frame in (0, 11))])
 def test_an_interrupted_evaluation_resumes_to_equal_results(once, tiny, tmp_path, monkeypatch, frame):
     """`frame` of the 16 of both clips is the one in which it is killed."""
     frames = []

@@ -62,7 +62,7 @@ def play_noise(monkeypatch, frames: int, firefly: float, every: int) -> tuple[fl
     return float(alarms), float(torch.stack(outputs[10:]).mean() / torch.stack(inputs[6:-4]).mean() - 1)
 
 
-@pytest.mark.parametrize(("firefly", "every"), [(0.0, 1), (100.0, 1), (1e3, 1), (1e4, 50)])
+@pytest.mark.parametrize(("firefly", "every"), [(0.0, 1), (1e3, 1), (1e4, 50)])
 def test_noise_raises_few_false_alarms_and_loses_no_energy(monkeypatch, firefly, every):
     """A χ² of one degree of freedom exceeds 6 in 1.4 % of cases; fireflies must not add many."""
     alarms, bias = play_noise(monkeypatch, 150, firefly, every)

@@ -236,7 +236,7 @@ def test_only_the_network_is_in_float16(weights):
         assert b["radiance"].max() > 65504
 
 
-@pytest.fixture(scope="module", params=["wskp3", pytest.param("one", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["wskp3", "one"])
 def written(request, weights, tmp_path_factory):
     """A denoiser of each kind as ONNX, in a folder of its name."""
     name = request.param
@@ -246,6 +246,7 @@ def written(request, weights, tmp_path_factory):
 
 
 @onnx_only
+@pytest.mark.slow
 def test_onnx_equals_the_denoiser_at_two_sizes(weights, written):
     step, denoiser = pair(weights, written.name)
     for size in SIZES:
@@ -253,6 +254,7 @@ def test_onnx_equals_the_denoiser_at_two_sizes(weights, written):
 
 
 @onnx_only
+@pytest.mark.slow
 def test_the_manifest_describes_the_files(weights, written):
     import onnx
 
@@ -274,6 +276,7 @@ def test_the_manifest_describes_the_files(weights, written):
 
 
 @onnx_only
+@pytest.mark.slow
 def test_the_instructions_reproduce_the_golden_frames(written):
     check_page(written, np.ascontiguousarray, TOLERANCE)
 

@@ -34,6 +34,7 @@ def test_every_point_of_the_halton_cycle_is_unbiased(stage, cycles):
     assert_same_mean(emission + images, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
 
 
+@pytest.mark.slow
 def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
     stage.pose(POSED_FRAME)
     ray = stage.rays(stage.view(POSED_FRAME))

@@ -159,7 +159,7 @@ def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
         assert np.percentile(np.abs(motion).max(axis=-1), 95) < 1.5 * 20 / 256 * size
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.slow) for number in (1, 2))])
 def test_a_closeup_is_a_part_of_its_room_s_picture(number):
     whole = build_scene(f"room-{number}", 0, CLOSEUP_FRAMES)
     part = build_scene(f"closeup-{number}", 0, CLOSEUP_FRAMES)
@@ -180,6 +180,7 @@ def test_a_closeup_is_a_part_of_its_room_s_picture(number):
     np.testing.assert_allclose(times, np.broadcast_to(times[0], (CLOSEUP_FRAMES, 3)), atol=0.02)
 
 
+@pytest.mark.slow
 def test_numbers_draw_different_parts():
     zooms = {
         build_scene(f"closeup-{n}", 0, 2).view(0, 8, 8).K[0, 0] / build_scene(f"room-{n}", 0, 2).view(0, 8, 8).K[0, 0]

@@ -117,6 +117,7 @@ def test_what_does_not_vary_is_left_out(capsys, tiny, grey, tmp_path, general):
         Training(short("wskp3", tiny, tmp_path / "tiny", start=weights))
 
 
+@pytest.mark.slow
 def test_a_network_is_specialised_from_scratch_too(tiny, tmp_path):
     """All surfaces of the tiny data set are diffuse."""
     task = short("rae", tiny, tmp_path, specialised=True)

@@ -85,6 +85,7 @@ def test_killed_fifty_times(tiny, tmp_path):
     assert hits > 10
 
 
+@pytest.mark.slow
 def test_full_disk_is_one_clear_line_and_leaves_whole_clips_only(tmp_path):
     """A limit on file size stands in for a full disk: writing fails with an error of the operating system."""
 
