@@ -7,7 +7,6 @@ from matplotlib import pyplot as plt
 from errors import BadInput
 from eval.figures.contact_sheet import TITLE_INCHES, contact_sheet, displayed_frame
 from plotting import DPI
-from tests.helpers.references import reference_buffers
 
 
 def test_contact_sheet_shows_every_scene(tmp_path):
@@ -28,9 +27,3 @@ def test_contact_sheet_shows_every_scene(tmp_path):
     assert (places[3] == 1).all()
     with pytest.raises(BadInput, match="unknown scene 'castle'"):
         contact_sheet(tmp_path / "sheet.png", ["castle"])
-
-
-def test_references_are_two_independent_buffers_and_noise_falls():
-    few, many = reference_buffers("cornell_box", (8, 12), [4, 256])
-    assert few.shape == many.shape == (2, 8, 12, 3)
-    assert 0 < ((many[0] - many[1]) ** 2).mean() < ((few[0] - few[1]) ** 2).mean() / 16
