@@ -343,7 +343,7 @@ def weights(
         card: rewrite the measurements and facts of the card, or of all cards, from the weights and RUNS/eval.
     """
     from eval.shipped import card_file, measure_card, table
-    from models.shipped_weights import shipped_names
+    from models.registry import shipped_names
 
     if card:
         for each in [name] if name else shipped_names():

@@ -34,8 +34,7 @@ def load(
     is by default the fastest on the device. Raises errors.BadInput where the name is unknown, the file missing, damaged
     or of another network, for a network without weights, and where there is no such device.
     """
-    from models.registry import parse_name
-    from models.shipped_weights import shipped_weights
+    from models.registry import parse_name, shipped_weights
     from models.spec import load as load_denoiser
 
     file = Path(weights) if weights else shipped_weights(parse_name(name).base)

@@ -6,9 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from errors import BadInput
-from models.names import DenoiserName
-from models.registry import DENOISERS, parse_name, prototype
-from models.shipped_weights import shipped_weights
+from models.registry import DENOISERS, DenoiserName, parse_name, prototype, shipped_weights
 from models.spec import DenoiserSpec, fastest_precision
 from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder

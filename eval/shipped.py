@@ -15,7 +15,7 @@ from eval.results import FLOOR, RESULTS_FILE, ClipResults, of_one_spp, read_resu
 from eval.selection import baselines
 from eval.text_table import LEGEND, PRINTED, floor_cell, value_cell
 from files import read_json, write_file, write_json
-from models.shipped_weights import require_shipped, shipped_names
+from models.registry import require_shipped, shipped_names
 from models.weights import read_metadata
 from provenance import file_digest
 

@@ -1,7 +1,10 @@
-"""The denoisers and wrappers that have names."""
+"""The denoisers and wrappers that have names, such as wskp6@quick+adaptive+js: denoiser, training, wrappers."""
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import torch
 
@@ -18,7 +21,6 @@ from models.filters.oidn import OIDN, OIDNAccumulated, OIDNBalanced, OIDNFast
 from models.filters.sbf import SBF
 from models.filters.svgf import SVGF
 from models.filters.trmv import TRMV
-from models.names import DenoiserName
 from models.networks.lbf import LBF
 from models.networks.nbgd import NBGD
 from models.networks.ntd import NTD, NTDMean, NTDTraditional
@@ -60,6 +62,36 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "one": One,
 }
 WRAPPERS: dict[str, type[Wrapper]] = {"adaptive": Adaptive, "taa": TAA, "js": JamesStein}
+SHIPPED_FOLDER = Path(__file__).parent / "shipped"  # a file a network, beside its card
+SYNTAX = re.compile(r"([^@+]+)(?:@([^@+]+))?((?:\+[^@+]+)*)")
+
+
+@dataclass(frozen=True)
+class DenoiserName:
+    """A name in its parts; `str` returns the name."""
+
+    base: str  # a key of DENOISERS, which is also what its weights are called
+    budget: str | None = None  # the training budget of its weights, kept in RUNS; None for the weights that are shipped
+    wrappers: tuple[str, ...] = ()  # keys of WRAPPERS, innermost first
+
+    @classmethod
+    def parse(cls, text: str) -> "DenoiserName":
+        """The parts of a name. Raises BadInput where it is not BASE[@BUDGET][+WRAPPER...]."""
+        match = SYNTAX.fullmatch(text)
+        if not match:
+            raise BadInput(f"'{text}' is no name of a denoiser: write NAME, NAME@BUDGET or NAME+WRAPPER")
+        return cls(match[1], match[2], tuple(match[3].split("+")[1:]))
+
+    def __str__(self) -> str:
+        budget = f"@{self.budget}" if self.budget else ""
+        return self.base + budget + "".join(f"+{wrapper}" for wrapper in self.wrappers)
+
+    def with_budget(self, budget: str | None) -> "DenoiserName":
+        """The same denoiser with the weights of another budget, or with the shipped weights."""
+        return replace(self, budget=budget)
+
+    def wrapped(self, wrapper: str) -> "DenoiserName":
+        return replace(self, wrappers=(*self.wrappers, wrapper))
 
 
 def create(name: str | DenoiserName, signal: Signal | None = None) -> Denoiser:
@@ -101,3 +133,25 @@ def parse_name(name: str | DenoiserName) -> DenoiserName:
 def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
     """The channels that the named denoisers read, or all denoisers. Raises BadInput for an unknown name."""
     return tuple(sorted({channel for name in names or DENOISERS for channel in prototype(name).reads}))
+
+
+# --- Weights that come with onespp ------------------------------------------------------------------------------------
+
+
+def shipped_weights(name: str) -> Path | None:
+    """The shipped weights of a denoiser of the registry; None where there are none."""
+    path = SHIPPED_FOLDER / f"{name}.safetensors"
+    return path if path.exists() else None
+
+
+def require_shipped(name: str) -> Path:
+    """The same; raises BadInput where there are none."""
+    path = shipped_weights(name)
+    if path is None:
+        raise BadInput(f"no weights of '{name}' are shipped; those are {', '.join(shipped_names()) or 'none'}")
+    return path
+
+
+def shipped_names() -> list[str]:
+    """The networks whose weights are shipped, in the order of the registry."""
+    return [name for name in DENOISERS if shipped_weights(name)]

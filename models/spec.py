@@ -12,8 +12,7 @@ from errors import BadInput
 from models import compiled
 from models.denoiser import Denoiser
 from models.fastest import bfloat16_is_faster
-from models.names import DenoiserName
-from models.registry import create, parse_name, prototype
+from models.registry import DenoiserName, create, parse_name, prototype
 from models.weights import load_weights
 from models.wrappers.wrapper import layers_of, unwrapped
 

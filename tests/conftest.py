@@ -11,7 +11,7 @@ import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
 from eval.harness import compile_kernels
-from models import shipped_weights
+from models import registry
 from models.registry import DENOISERS, channels_read, prototype
 from models.spec import DenoiserSpec
 from render.job.generate import generate
@@ -59,7 +59,7 @@ def tiny_copy(tiny: Path, tmp_path: Path) -> Path:
 def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of shipped weights, empty here: no test that takes it depends on what is shipped."""
     folder = tmp_path_factory.mktemp("shipped")
-    monkeypatch.setattr(shipped_weights, "SHIPPED_FOLDER", folder)
+    monkeypatch.setattr(registry, "SHIPPED_FOLDER", folder)
     return folder
 
 

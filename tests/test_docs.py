@@ -8,7 +8,7 @@ import pytest
 from command_line import GROUPS
 from eval.pages import MARKED, PAGES, generated
 from eval.shipped import BEGIN, END, card_file, facts
-from models.shipped_weights import shipped_names
+from models.registry import shipped_names
 from provenance import ROOT
 
 MOST_WORDS = 16_000

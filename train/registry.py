@@ -4,8 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from datasets.clip import Dataset
-from models.registry import create
-from models.shipped_weights import require_shipped
+from models.registry import create, require_shipped
 from train.recipes import recipe_for
 from train.task import Task, run_folder
 

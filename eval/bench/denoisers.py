@@ -19,8 +19,7 @@ from eval.bench.timed import TIMED_FRAMES, TimedDenoiser, Timing, network_of, ti
 from eval.selection import cannot_run, choose, with_indirect_baselines
 from files import read_json, write_json
 from models.filters.oidn import OIDN
-from models.names import DenoiserName
-from models.registry import DENOISERS, parse_name
+from models.registry import DENOISERS, DenoiserName, parse_name
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory

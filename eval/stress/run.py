@@ -16,8 +16,7 @@ from eval.stress.logits import last_layers
 from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
-from models.names import DenoiserName
-from models.registry import DENOISERS, create
+from models.registry import DENOISERS, DenoiserName, create
 from models.spec import DenoiserSpec, precisions_of
 from plotting import save_figure
 from provenance import DENOISING, versions

@@ -23,9 +23,7 @@ from eval.tradeoff.resampled_clips import scene_of, with_samples
 from eval.tradeoff.times import Times
 from eval.tradeoff.trades import Trade, front_table, samples_table, trades
 from files import write_json
-from models.names import DenoiserName
-from models.registry import DENOISERS
-from models.shipped_weights import shipped_names
+from models.registry import DENOISERS, DenoiserName, shipped_names
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from plotting import save_figure
 from provenance import DENOISING, device_in_words, versions

@@ -1,7 +1,5 @@
 """models.history.accumulation for the CPU: history is validated, gathered and blended row by row, in one pass."""
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
 import torch
@@ -15,13 +13,6 @@ from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
 from models.history.geometry import GBuffer
 
 MIN_ALPHA = 0.2  # SVGF §4.1: weight of the newest frame in a long history
-
-
-class AccumulatedArrays(NamedTuple):
-    """One item of models.history.accumulation.Accumulation."""
-
-    irradiance: Image
-    length: Plane
 
 
 @jit_with_reciprocals
@@ -42,7 +33,9 @@ def blend(line: Row, past: Row, alpha: Row, noisy: Row) -> None:
 
 
 @jit_parallel
-def accumulate_image(out: AccumulatedArrays, noisy: Image, past: AccumulatedArrays, pair: FramePair) -> None:
+def accumulate_image(
+    irradiance: Image, length: Plane, noisy: Image, past_irradiance: Image, past_length: Plane, pair: FramePair
+) -> None:
     _, height, width = noisy.shape
     for block in numba.prange(block_count(height)):
         taps = new_taps(width)
@@ -50,11 +43,11 @@ def accumulate_image(out: AccumulatedArrays, noisy: Image, past: AccumulatedArra
         alpha = np.empty(width, np.float32)
         for y in rows_of_block(block, height):
             find_taps(taps, y, pair)
-            gather(gathered, past.length, y, taps)
-            weigh(alpha, out.length[y], gathered, taps.valid)
+            gather(gathered, past_length, y, taps)
+            weigh(alpha, length[y], gathered, taps.valid)
             for c in range(3):
-                gather(gathered, past.irradiance[c], y, taps)
-                blend(out.irradiance[c, y], gathered, alpha, noisy[c, y])
+                gather(gathered, past_irradiance[c], y, taps)
+                blend(irradiance[c, y], gathered, alpha, noisy[c, y])
 
 
 def accumulate_samples(
@@ -64,7 +57,7 @@ def accumulate_samples(
     irradiance = torch.empty_like(noisy, memory_format=torch.contiguous_format)
     length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
     for item in range(len(noisy)):
-        out = AccumulatedArrays(irradiance[item].numpy(), length[item, 0].numpy())
-        past = AccumulatedArrays(array(past_irradiance[item]), array(past_length[item, 0]))
-        accumulate_image(out, array(noisy[item]), past, FramePair.of(frame, gbuffer, item))
+        inputs = array(noisy[item]), array(past_irradiance[item]), array(past_length[item, 0])
+        pair = FramePair.of(frame, gbuffer, item)
+        accumulate_image(irradiance[item].numpy(), length[item, 0].numpy(), *inputs, pair)
     return irradiance, length

@@ -20,9 +20,7 @@ from models.compiled.jit import array, jit_in_any_order, jit_inlined, jit_parall
 from models.compiled.lines import add_line, add_product, add_weighted, normalise, scale_line, triple_of_lines
 
 MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
-AFFINITY_BLOCK_PIXELS = (
-    2048  # px; so many, in whole rows, are filtered together: what they need stays in the first caches
-)
+AFFINITY_BLOCK_PIXELS = 2048  # filtered together, in whole rows: what they need stays in the first caches
 STRIDE = 4  # features that are compared in one pass
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Rows, Scalar, Signals, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
-from models.compiled.lines import add_line, copy_line, fill_line, triple, triple_of_lines
+from models.compiled.lines import add_line, copy_line, exclude, fill_line, raise_line, triple, triple_of_lines
 from models.operators import MIN_DIVISOR
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # Fan et al. 2021, §5.3
@@ -54,13 +54,6 @@ def add_four(line: Row, a: Row, b: Row, c: Row, d: Row) -> None:
 
 
 @jit_in_any_order
-def exclude(logits: Row, surface: Row) -> None:
-    """No weight for pixels that show no surface."""
-    for x in range(logits.size):
-        logits[x] = logits[x] if surface[x] > 0 else f32(OUTSIDE_LOGIT)
-
-
-@jit_in_any_order
 def widen(low: Row, high: Row, logits: Row) -> None:
     """low and high come to include the logits that are not OUTSIDE_LOGIT."""
     for x in range(logits.size):
@@ -81,12 +74,6 @@ def weigh(weighted: RGB, weight: Row, logits: Row, shift: Scalar, colour: RGB) -
         r[x] = w * red[x]
         g[x] = w * green[x]
         b[x] = w * blue[x]
-
-
-@jit_in_any_order
-def raise_line(line: Row, other: Row) -> None:
-    for x in range(line.size):
-        line[x] = other[x] if other[x] > line[x] else line[x]
 
 
 # --- Rows and windows of them -----------------------------------------------------------------------------------------
@@ -289,7 +276,7 @@ def fuse_strips(
             split_row(my_logits, y - first, importance, y)
             if surface.size > 0 and surface[y].min() == 0:
                 for i in range(windows.size):
-                    exclude(my_logits[i, y - first], surface[y])
+                    exclude(my_logits[i, y - first], surface[y], f32(OUTSIDE_LOGIT))
         for i in range(windows.size):
             radius = windows[i] // 2
             low = max(start - radius, 0)

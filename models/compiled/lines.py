@@ -49,6 +49,19 @@ def add_product(line: Row, weight: Row, values: Row) -> None:
 
 
 @jit_in_any_order
+def raise_line(line: Row, other: Row) -> None:
+    for x in range(line.size):
+        line[x] = other[x] if other[x] > line[x] else line[x]
+
+
+@jit_in_any_order
+def exclude(logits: Row, surface: Row, logit: Scalar) -> None:
+    """A logit that has no weight for pixels that show no surface."""
+    for x in range(logits.size):
+        logits[x] = logits[x] if surface[x] > 0 else logit
+
+
+@jit_in_any_order
 def add_square(distance: Row, here: Row, there: Row) -> None:
     """distance += (here - there)²."""
     for x in range(distance.size):

@@ -3,6 +3,7 @@
 Networks take and give pixels with their channels side by side; all other loops here run along rows of one channel.
 """
 
+import itertools
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numba
@@ -22,14 +23,8 @@ if TYPE_CHECKING:
 
 LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
-TAP_SPACINGS = (
-    32,
-    16,
-    8,
-    4,
-    2,
-    1,
-)  # px between taps of each filter level: the last ones smooth the first ones' pattern
+# px between taps of each filter level: the last ones smooth the first ones' pattern
+TAP_SPACINGS = (32, 16, 8, 4, 2, 1)
 MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
 MAX_LOGIT = 10.0  # of the weights of taps
 SIDE_MULTIPLE = 8  # of the sides of the network's images
@@ -67,12 +62,6 @@ ONE_INPUTS = (
 INPUT_CHANNELS = {row.name: row.channels for row in ONE_INPUTS}
 
 
-def first_channels(channels: dict[str, int]) -> dict[str, int]:
-    """Where each of consecutive groups of channels begins."""
-    ends = np.cumsum([*channels.values()])
-    return {name: int(end) - count for end, (name, count) in zip(ends, channels.items(), strict=True)}
-
-
 def head_channels(levels: int) -> dict[str, int]:
     """The outputs of the network in order, and how many channels each has, for a filter of so many levels."""
     per_level = {"sharpness": levels, "centre": levels, "importance": levels}
@@ -84,22 +73,10 @@ def filter_levels(outputs: int) -> int:
     return (outputs - sum(head_channels(0).values())) // 3
 
 
-# Constants of the kernels, where Numba finds them.
-FIRST_CHANNEL = first_channels(INPUT_CHANNELS)
-NOISY, MEAN_3X3, MEAN_9X9 = FIRST_CHANNEL["noisy"], FIRST_CHANNEL["mean_3x3"], FIRST_CHANNEL["mean_9x9"]
-OUTPUT, ACCUMULATED = FIRST_CHANNEL["output"], FIRST_CHANNEL["accumulated"]
-DEVIATION, NEWEST, OLDEST = (
-    FIRST_CHANNEL["deviation"],
-    FIRST_CHANNEL["1/samples"],
-    FIRST_CHANNEL["1/(length + samples)"],
-)
-HAS_HISTORY, LATENT_INPUT = FIRST_CHANNEL["has_history"], FIRST_CHANNEL["latent"]
-ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = (
-    FIRST_CHANNEL["albedo"],
-    FIRST_CHANNEL["view_normal"],
-    FIRST_CHANNEL["depth"],
-    FIRST_CHANNEL["roughness"],
-)
+# The first channel of each input, in the order of ONE_INPUTS: constants, as Numba needs them.
+FIRST_CHANNELS = itertools.accumulate([row.channels for row in ONE_INPUTS[:-1]], initial=0)
+NOISY, MEAN_3X3, MEAN_9X9, OUTPUT, ACCUMULATED, DEVIATION, NEWEST, OLDEST, HAS_HISTORY, *OTHERS = FIRST_CHANNELS
+LATENT_INPUT, ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = OTHERS
 ONE = np.float32(1)
 ZERO = np.float32(0)
 TWO = np.float32(2)
@@ -342,9 +319,8 @@ def tanh(line: Row, head: Row) -> None:
 def sigmoid(line: Row, head: Row, has_history: Row) -> None:
     """1 / (1 + exp(-head)), or 1 without history."""
     for x in range(line.size):
-        line[x] = (
-            ONE / (ONE + exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))) if has_history[x] > ZERO else ONE
-        )
+        against = exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))
+        line[x] = ONE / (ONE + against) if has_history[x] > ZERO else ONE
 
 
 @jit_in_any_order

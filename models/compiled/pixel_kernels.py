@@ -11,7 +11,7 @@ from torch import Tensor
 from models.compiled.arrays import Image, Index, Plane, Row, Rows, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory, plane_or_empty
-from models.compiled.lines import add_product, window_taps
+from models.compiled.lines import add_product, exclude, raise_line, window_taps
 
 MIN_RELATIVE_LOGIT = np.float32(-87)  # to the largest: exp of less is denormal in float32, which is slow
 PADDING = 16  # numbers; keeps the rows of a buffer from falling on the same set of the cache
@@ -28,19 +28,6 @@ def to_float32(row: Rows, logits: NDArray[np.float32 | np.int16], bfloat: bool) 
         for x in range(logits.shape[1]):
             for tap in range(logits.shape[0]):
                 row[tap, x] = logits[tap, x]
-
-
-@jit_in_order
-def exclude(logits: Row, surface: Row) -> None:
-    """No weight for taps that show no surface."""
-    for x in range(surface.size):
-        logits[x] = logits[x] if surface[x] > 0 else f32(-np.inf)
-
-
-@jit_in_order
-def raise_top(top: Row, logits: Row) -> None:
-    for x in range(top.size):
-        top[x] = max(top[x], logits[x])
 
 
 @jit_in_order
@@ -66,8 +53,8 @@ def apply_to_row(output: Image, image: Image, surface: Plane, row: Rows, y: Inde
     for dx, dy, low, high in window_taps(y, radius, 1, height, width):
         logits = row[(dy + radius) * size + dx + radius, low:high]
         if surface.size > 0:
-            exclude(logits, surface[y + dy, low + dx : high + dx])
-        raise_top(top[low:high], logits)
+            exclude(logits, surface[y + dy, low + dx : high + dx], f32(-np.inf))
+        raise_line(top[low:high], logits)
     for dx, dy, low, high in window_taps(y, radius, 1, height, width):
         logits = row[(dy + radius) * size + dx + radius, low:high]
         to_weights(logits, top[low:high], total[low:high])

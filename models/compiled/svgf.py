@@ -6,7 +6,7 @@ vectorises a loop only where few comparisons show that no output overlaps an inp
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -28,8 +28,10 @@ from models.compiled.jit import (
 from models.compiled.lines import block_count, copy_line, luminance, rows_of_block, triple, triple_of_lines, window_taps
 from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
 from models.filters.atrous import RADIUS, SPLINE
-from models.history.geometry import GBuffer
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
+
+if TYPE_CHECKING:
+    from models.filters.svgf import Integrated
 
 ALPHA = 0.2  # §4.1: weight of the newest sample
 SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
@@ -114,23 +116,16 @@ def integrate_image(
 
 
 def integrate_samples(
-    frame: Frame,
-    noisy: Tensor,
-    past_colour: Tensor,
-    past_moments: Tensor,
-    past_length: Tensor,
-    gbuffer: GBuffer,
-    change: Tensor | None,
+    frame: Frame, noisy: Tensor, previous: "Integrated", change: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See models.filters.svgf.integrate_samples."""
-    colour = torch.empty_like(noisy, memory_format=torch.contiguous_format)
-    moments = torch.empty_like(past_moments, memory_format=torch.contiguous_format)
-    length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
+    images = noisy, previous.moments, previous.length
+    colour, moments, length = (torch.empty_like(image, memory_format=torch.contiguous_format) for image in images)
     for item in range(len(noisy)):
         out = IntegratedArrays(colour[item].numpy(), moments[item].numpy(), length[item, 0].numpy())
-        past = IntegratedArrays(array(past_colour[item]), array(past_moments[item]), array(past_length[item, 0]))
-        pair = FramePair.of(frame, gbuffer, item)
-        integrate_image(out, array(noisy[item]), past, plane_or_empty(change, item), pair)
+        past = (array(image) for image in (previous.colour[item], previous.moments[item], previous.length[item, 0]))
+        pair = FramePair.of(frame, previous.gbuffer, item)
+        integrate_image(out, array(noisy[item]), IntegratedArrays(*past), plane_or_empty(change, item), pair)
     return colour, moments, length
 
 
@@ -367,12 +362,10 @@ def add_surfaces(total: Row, weight: Row, h: Scalar, variance: Row, depth: Row) 
 def finish_edge(y: Row, scale: Row, colour: RGB, columns: Row, inside: Row) -> None:
     """Luminance y, and 1 / (σ_l √(g(Var) + ε)) of Eq. 5, from weighted sums of columns: of variances, of weights."""
     r, g, b = colour
-    quarter = f32(0.25)
-    half = f32(0.5)
     for x in range(scale.size):
         y[x] = luminance(r[x], g[x], b[x])
-        mean = quarter * columns[x] + half * columns[x + 1] + quarter * columns[x + 2]
-        share = quarter * inside[x] + half * inside[x + 1] + quarter * inside[x + 2]
+        mean = f32(0.25) * columns[x] + f32(0.5) * columns[x + 1] + f32(0.25) * columns[x + 2]
+        share = f32(0.25) * inside[x] + f32(0.5) * inside[x + 1] + f32(0.25) * inside[x + 2]
         scale[x] = f32(1) / (f32(SIGMA_L) * np.sqrt(mean / max(share, MIN_GAUSSIAN_SHARE) + f32(EPSILON_L)))
 
 

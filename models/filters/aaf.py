@@ -26,8 +26,6 @@ We know the papers by their abstracts, others' accounts and, of the second, the 
 - No filter reaches farther than 50 px, the authors' limit; wider ones are narrowed.
 """
 
-from collections.abc import Iterator, Sequence
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -37,7 +35,7 @@ from models import compiled
 from models.compiled import aaf as kernels
 from models.compiled.aaf import COSINE_OF_5_DEGREES, DIFFUSE_BAND, MAX_REACH, TRUNCATION
 from models.denoiser import CLASSICAL, Denoiser, State
-from models.filters.atrous import Tap, window_mean
+from models.filters.atrous import Tap, offset_taps, window_mean
 from models.filters.neighbours import mesh_min
 from models.filters.svgf import irradiances
 from models.history.geometry import frame_rays
@@ -94,18 +92,6 @@ def pack_geometry(frame: Frame) -> Tensor:
     return torch.cat([positions(frame), unit], dim=1)[:, None]
 
 
-def line_taps(size: Sequence[int], reach: int, down: bool) -> Iterator[Tap]:
-    """The taps up to `reach` px to either side of a pixel, without itself, in its row or `down` its column."""
-    height, width = size
-    for step in range(-reach, reach + 1):
-        dx, dy = (0, step) if down else (step, 0)
-        rows = slice(max(0, -dy), min(height, height - dy))
-        columns = slice(max(0, -dx), min(width, width - dx))
-        if step and rows.start < rows.stop and columns.start < columns.stop:
-            q = (..., slice(rows.start + dy, rows.stop + dy), slice(columns.start + dx, columns.stop + dx))
-            yield Tap(dx, dy, (..., rows, columns), q)
-
-
 def gaussian_weight(width: Tensor, p: Tensor, q: Tensor) -> Tensor:
     """Weights (..., 1, h, w) of taps by Gaussians of `width`, from the geometry (..., 6, h, w) at p and q."""
     difference = q[..., :3, :, :] - p[..., :3, :, :]
@@ -129,7 +115,9 @@ def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tens
         narrower = torch.minimum(width[tap.p], max_width[tap.q])
         return gaussian_weight(narrower, geometry[tap.p], geometry[tap.q])
 
-    return window_mean(image, 1, line_taps(image.shape[-2:], MAX_REACH, down), weight)
+    along = range(-MAX_REACH, MAX_REACH + 1)
+    taps = offset_taps(image.shape[-2:], *((along, [0]) if down else ([0], along)))
+    return window_mean(image, 1, taps, weight)
 
 
 class AAF(Denoiser):

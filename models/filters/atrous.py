@@ -35,10 +35,15 @@ class Tap:
 
 def strip_taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]:
     """The taps of windows of (2 radius + 1)² pixels, `step` apart, without the centre, by strips of (H, W)."""
-    height, width = size
     offsets = range(-radius * step, radius * step + 1, step)
+    return offset_taps(size, offsets, offsets)
+
+
+def offset_taps(size: Sequence[int], down: Iterable[int], across: Iterable[int]) -> Iterator[Tap]:
+    """The taps of windows of the product of offsets `down` and `across`, without the centre, by strips of (H, W)."""
+    height, width = size
     for start in range(0, height, STRIP_ROWS):
-        for dy, dx in itertools.product(offsets, offsets):
+        for dy, dx in itertools.product(down, across):
             top = max(start, -dy)
             bottom = min(start + STRIP_ROWS, height, height - dy)
             left = max(0, -dx)

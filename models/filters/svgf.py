@@ -13,7 +13,8 @@ Where the paper is silent, we choose:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,8 +33,7 @@ from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 MIN_TEMPORAL_LENGTH = 4  # §4.2: frames of history from which on the temporal variance is used
 
 
-@dataclass(frozen=True)
-class Integrated:
+class Integrated(NamedTuple):
     """Temporally integrated samples of S signals, the history of the next frame (§4.1, §4.2)."""
 
     colour: Tensor  # (B, S, 3, H, W), irradiance
@@ -50,23 +50,17 @@ def luminance_moments(colour: Tensor) -> Tensor:
 
 @compiled.by(kernels.integrate_samples)
 def integrate_samples(
-    frame: Frame,
-    noisy: Tensor,
-    past_colour: Tensor,
-    past_moments: Tensor,
-    past_length: Tensor,
-    gbuffer: GBuffer,
-    change: Tensor | None,
+    frame: Frame, noisy: Tensor, previous: Integrated, change: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`integrate` where there is a previous frame, with `gbuffer`: colour, moments and length of Integrated."""
-    past = [past_colour.flatten(1, 2), past_moments.flatten(1, 2), past_length]
-    history, has_history = reproject(frame, torch.cat(past, dim=1), gbuffer)
-    change = torch.zeros_like(past_length) if change is None else change
+    """`integrate` where there is a previous frame: colour, moments and length of Integrated."""
+    past = [previous.colour.flatten(1, 2), previous.moments.flatten(1, 2), previous.length]
+    history, has_history = reproject(frame, torch.cat(past, dim=1), previous.gbuffer)
+    change = torch.zeros_like(previous.length) if change is None else change
     alpha = torch.where(has_history, (1 - change) * ALPHA + change, 1)
     colour, moments, length = history.split([image.shape[1] for image in past], dim=1)
     return (
         torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
-        torch.lerp(moments.view_as(past_moments), luminance_moments(noisy), alpha[:, None]),
+        torch.lerp(moments.view_as(previous.moments), luminance_moments(noisy), alpha[:, None]),
         torch.where(has_history, length * (1 - change) + 1, 1),
     )
 
@@ -78,8 +72,7 @@ def integrate(frame: Frame, colour: Tensor, previous: Integrated | None, change:
     """
     if previous is None:
         return Integrated(colour, luminance_moments(colour), torch.ones_like(frame.depth), GBuffer.of(frame))
-    past = previous.colour, previous.moments, previous.length, previous.gbuffer
-    return Integrated(*integrate_samples(frame, colour, *past, change), GBuffer.of(frame))
+    return Integrated(*integrate_samples(frame, colour, previous, change), GBuffer.of(frame))
 
 
 def slope(depth: Tensor, mesh_id: Tensor, dim: int) -> Tensor:
@@ -228,5 +221,5 @@ class SVGF(Denoiser):
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         variance = estimate_variance(integrated, geometry)
         first, colour, _ = svgf_levels(integrated.colour, variance, geometry, ATROUS_STEPS)
-        history = replace(integrated, colour=first)  # §4.3: the first level's output
+        history = integrated._replace(colour=first)  # §4.3: the first level's output
         return frame.remodulate(colour.sum(dim=1), self.signal), SVGFState(frame.moment, history, variance)

@@ -82,5 +82,5 @@ class TRMV(SVGF):
         variance = torch.cat([estimate_variance(part, geometry) for part in integrated], dim=1)
         colour = torch.cat([part.colour for part in integrated], dim=1)
         first, colour, _ = svgf_levels(colour, variance, geometry, ATROUS_STEPS)
-        kept = [replace(part, colour=level) for part, level in zip(integrated, first.split(1, dim=1), strict=True)]
+        kept = [part._replace(colour=level) for part, level in zip(integrated, first.split(1, dim=1), strict=True)]
         return frame.remodulate(colour.sum(dim=1), self.signal), TRMVState(frame.moment, kept)

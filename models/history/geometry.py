@@ -23,10 +23,6 @@ class GBuffer:
     def of(frame: Frame) -> "GBuffer":
         return GBuffer(frame.depth, frame.normal, frame.mesh_id)
 
-    def packed(self) -> Tensor:
-        """All channels in one tensor, (B, 5, H, W)."""
-        return torch.cat([self.depth, self.normal, self.mesh_id], dim=1)
-
 
 def pixel_centres(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """x and y of the centres of all pixels, (H, W) each, of the type and on the device of `like`."""

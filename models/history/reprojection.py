@@ -22,7 +22,8 @@ class Reprojection:
     def __init__(self, frame: Frame, image: Tensor, gbuffer: GBuffer, item: int):
         self.height, self.width = frame.size
         self.image = image[item].flatten(1)  # (C, H W)
-        self.gbuffer = gbuffer.packed()[item].flatten(1)  # (5, H W)
+        channels = [gbuffer.depth[item], gbuffer.normal[item], gbuffer.mesh_id[item]]
+        self.gbuffer = torch.cat(channels).flatten(1)  # (5, H W)
         self.previous_K = frame.previous.K[item]
         self.mesh = frame.mesh_id[item, 0].long().flatten()  # (H W,)
         motion = frame.motion[item]

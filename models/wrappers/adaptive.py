@@ -23,13 +23,13 @@ from datasets.frame import Frame
 from errors import BadInput
 from models.compiled.accumulation import MIN_ALPHA
 from models.denoiser import Denoiser, State
+from models.filters.asvgf import repeat_strata, strata_centres, strata_sums
 from models.filters.atrous import Tap, WindowSum, strip_taps
 from models.filters.baselines import Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from models.history.strata import repeat_strata, strata_centres, strata_sums
 from models.operators import MAX_IRRADIANCE, MAX_LUMINANCE, MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
 

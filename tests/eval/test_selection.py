@@ -9,8 +9,7 @@ import torch
 from errors import BadInput
 from eval import selection
 from eval.selection import choose, evaluated, untrained, weights_file, weights_of, with_indirect_baselines
-from models.names import DenoiserName
-from models.registry import DENOISERS, create, parse_name
+from models.registry import DENOISERS, DenoiserName, create, parse_name
 from models.spec import PRECISIONS, DenoiserSpec
 from models.weights import save_weights
 from train.task import WEIGHTS_FILE, run_folder

@@ -12,8 +12,7 @@ from eval.harness import evaluate
 from eval.results import read_results
 from eval.shipped import BEGIN, END, card_file, facts, measure_card, table
 from files import read_json, write_json
-from models.registry import create
-from models.shipped_weights import shipped_names
+from models.registry import create, shipped_names
 from models.weights import save_weights
 from provenance import file_digest
 from tests.test_cli import fails

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from models.filters.asvgf import ASVGF, change_of_light
+from models.filters.asvgf import ASVGF, STRATUM, change_of_light, repeat_strata, strata_centres, strata_sums
 from models.filters.svgf import ALPHA, SVGF, SVGFState
-from models.history.strata import STRATUM, repeat_strata, strata_centres, strata_sums
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 24

@@ -12,7 +12,7 @@ import torch
 
 from errors import BadInput
 from models import registry
-from models.shipped_weights import SHIPPED_FOLDER, require_shipped, shipped_names, shipped_weights
+from models.registry import SHIPPED_FOLDER, require_shipped, shipped_names, shipped_weights
 from models.spec import load
 from provenance import ROOT
 from tests.helpers.frames import flat_frame, run

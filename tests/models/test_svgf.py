@@ -155,7 +155,7 @@ def test_disoccluded_pixels_begin_with_their_sample():
     mesh = torch.ones(1, 1, 4, 6)
     mesh[..., 3:] = 2
     before = wall(5.0, 5.0, mesh_id=mesh)
-    history = replace(svgf.integrate(before, svgf.irradiances(before, "total"), None), length=torch.full_like(mesh, 7))
+    history = svgf.integrate(before, svgf.irradiances(before, "total"), None)._replace(length=torch.full_like(mesh, 7))
     frame = wall(2.0, 1.0)
     now = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
     # Column 3 has mesh 1 beside it, within the 3 x 3 box of the second try.
