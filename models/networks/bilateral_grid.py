@@ -60,13 +60,13 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     """
     counted = torch.ones_like(guide) if surface is None else surface
     values = torch.cat([image * counted, counted], dim=1).permute(0, 2, 3, 1).reshape(-1, 4)
-    around = cells_of_pixels(guide, spacing)
+    corners = cells_of_pixels(guide, spacing)
     cells = values.new_zeros(math.prod(grid_shape(guide, spacing)), 4)
-    for cell, weight in around:
+    for cell, weight in corners:
         cells.index_add_(0, cell, values * weight)
     # A pixel that counts is in all the cells that it reads: none of them is empty.
     means = cells[:, :3] / cells[:, 3:].clamp(min=MIN_DIVISOR)
-    total = torch.stack([weight * means[cell] for cell, weight in around]).sum(dim=0)
-    share = torch.stack([weight for _, weight in around]).sum(dim=0)
+    total = torch.stack([weight * means[cell] for cell, weight in corners]).sum(dim=0)
+    share = torch.stack([weight for _, weight in corners]).sum(dim=0)
     filtered = (total / share).reshape(len(image), *image.shape[-2:], 3).permute(0, 3, 1, 2)
     return filtered * counted

@@ -71,9 +71,9 @@ def noise(features: Tensor, surface: Tensor) -> Tensor:
     signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).to(features)[:, None]
     details = (signs * values).sum(dim=(3, 5)) / 2
     details = details.abs() * shown.amin(dim=(3, 5))
-    around = F.pad(details, (2, 1, 2, 1), mode="replicate").unfold(2, 4, 1).unfold(3, 4, 1).flatten(4)
+    blocks = F.pad(details, (2, 1, 2, 1), mode="replicate").unfold(2, 4, 1).unfold(3, 4, 1).flatten(4)
     median = torch.stack(
-        [channel.sort(dim=-1).values[..., 7:9].mean(dim=-1) for channel in around.unbind(dim=1)], dim=1
+        [channel.sort(dim=-1).values[..., 7:9].mean(dim=-1) for channel in blocks.unbind(dim=1)], dim=1
     )
     pixels = F.interpolate(median / GAUSSIAN_MEDIAN, scale_factor=2.0)[..., :height, :width]
     return F.max_pool2d(pixels, 3, stride=1, padding=1)

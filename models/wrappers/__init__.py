@@ -1,1 +1,1 @@
-"""What may be put around a denoiser: +adaptive, +taa, +js."""
+"""Wrappers of denoisers: +adaptive, +taa, +js."""

@@ -273,8 +273,8 @@ def test_ntd_fetches_surfaces_alone():
     frame = replace(frame, channels=frame.channels | {"direct": torch.zeros_like(light), "indirect": light})
     frames = chain([with_background(frame, surface)] * 2)
     _, state = play(ntd, frames)
-    seen = state.warped.masked_select(surface)
-    torch.testing.assert_close(seen, torch.full_like(seen, 5.0), rtol=1e-5, atol=0)
+    visible = state.warped.masked_select(surface)
+    torch.testing.assert_close(visible, torch.full_like(visible, 5.0), rtol=1e-5, atol=0)
 
 
 @given(surface=MASKS, seed=st.integers(0, 999))

@@ -168,10 +168,10 @@ def test_rae_inputs_are_the_seven_of_the_paper(tiny, denoisers, monkeypatch):
     rae = denoisers["rae"]
     clip = Dataset(tiny).clips("test")[1]
     frame = read_frame(clip, 2, rae.reads)
-    seen = []
-    monkeypatch.setattr(rae.network, "forward", lambda x, h: (seen.append(x), (x[:, :3], (x,) * 6))[1])
+    captured = []
+    monkeypatch.setattr(rae.network, "forward", lambda x, h: (captured.append(x), (x[:, :3], (x,) * 6))[1])
     _, state = rae(frame, None)
-    (x,) = seen
+    (x,) = captured
     irradiance = (frame.direct + frame.indirect) / frame.albedo.clamp(min=0.01)
     torch.testing.assert_close(x[:, :3], (irradiance * state.scale.exposure()) ** 0.2)
     # View-space normals from Mitsuba's frame: x to the right is minus its x.

@@ -67,7 +67,7 @@ def test_the_filter_is_the_paper_s(way, size, seed):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_windows_are_55_pixels_wide(way):
-    """A pixel of light is seen from 27 pixels away."""
+    """A pixel of light reaches 27 pixels."""
     pixels, sharpness = random_pixels(0, 1, 70)
     image = torch.zeros(1, 3, 1, 70)
     image[..., 35] = 1.0
@@ -180,10 +180,10 @@ def test_the_network_sees_the_statistics_of_the_paper(size, seed):
     pixels, _ = random_pixels(seed, *size)
     variance = torch.rand(1, len(FEATURE_GROUPS), *size, generator=torch.Generator().manual_seed(seed))
     features = pixels.features * pixels.surface
-    seen = secondary_features(features, variance, pixels.surface, torch.full((1, 1, 1, 1), 4.0))[0].numpy()
+    statistics = secondary_features(features, variance, pixels.surface, torch.full((1, 1, 1, 1), 4.0))[0].numpy()
     shown = pixels.surface[0, 0].numpy() > 0
     f = features[0].double().numpy()
-    assert len(seen) == 36
+    assert len(statistics) == 36
     for p in zip(*np.nonzero(shown), strict=True):
         by_channel = np.array([naive_statistics(channel, shown, p) for channel in f])
         by_group = np.array([part.mean(axis=0) for part in np.split(by_channel, np.cumsum(FEATURE_GROUPS)[:-1])])
@@ -191,7 +191,7 @@ def test_the_network_sees_the_statistics_of_the_paper(size, seed):
         noise, apart, gradient, deviation, mean = by_group.T
         spreads = [noise, apart, gradient, np.sqrt(variance[0, :, *p].numpy()), deviation]
         expected = np.concatenate([np.log1p(np.concatenate(spreads) / 0.01), own, mean, [0.25]])
-        np.testing.assert_allclose(seen[:, *p], expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(statistics[:, *p], expected, rtol=1e-4, atol=1e-4)
 
 
 def test_visibility_is_where_direct_light_arrives():

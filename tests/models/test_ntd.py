@@ -133,10 +133,10 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     height, width = size
     noisy = torch.rand(1, 3, height, width)
     ones = torch.ones(1, 3, height, width)
-    seen: list[Tensor] = []
-    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, *_: seen.append(image) or image)
+    captured: list[Tensor] = []
+    monkeypatch.setattr(ntd_module, "apply_kernels", lambda image, *_: captured.append(image) or image)
     reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
-    for image, block in zip(seen, (4, 2, 1), strict=False):
+    for image, block in zip(captured, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))
         for y in range(height // block):
             for x in range(width // block):
@@ -207,13 +207,13 @@ def test_averaging_keeps_the_light_and_maxima_darken(kind, kept):
 
 
 def test_the_network_is_the_one_described(ntd, frames, monkeypatch):
-    seen: list[Tensor] = []
+    captured: list[Tensor] = []
     genuine = ntd.network.forward
-    monkeypatch.setattr(ntd.network, "forward", lambda x: seen.append(x) or genuine(x))
+    monkeypatch.setattr(ntd.network, "forward", lambda x: captured.append(x) or genuine(x))
     _, state = play(ntd, frames[:2])
     assert isinstance(state, NTDState)
-    assert [tuple(p.shape[1:]) for p in genuine(seen[1])] == [(26, 16, 16), (26, 32, 32), (51, 64, 64)]
-    x = seen[1]
+    assert [tuple(p.shape[1:]) for p in genuine(captured[1])] == [(26, 16, 16), (26, 32, 32), (51, 64, 64)]
+    x = captured[1]
     frame = frames[1]
     exposure = state.scale.exposure()
     assert x.shape == (1, 13, 64, 64)

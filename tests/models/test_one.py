@@ -130,7 +130,7 @@ def test_kernels_are_pytorch_at_any_size(fresh, size):
 
 
 def test_a_still_wall_stays_what_it_is(fresh):
-    """300 frames of even light, seen by a camera that does not move: no drift."""
+    """300 frames of even light, with a static camera: no drift."""
     image = 0.5 * torch.ones(1, 3, *SIZE)
     outputs = run(fresh, frames([image] * 300))
     for output in (outputs[0], outputs[10], outputs[-1]):

@@ -125,17 +125,17 @@ def test_every_network_can_do_without_what_does_not_vary(name, tmp_path):
             torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("seen", [("colour", "normal", "depth"), ("colour", "albedo", "depth"), ("colour", "depth")])
-def test_what_is_seen_is_part_of_all_features(seen):
+@pytest.mark.parametrize("varying", [("colour", "normal", "depth"), ("colour", "albedo", "depth"), ("colour", "depth")])
+def test_varying_features_are_part_of_all(varying):
     [frame] = frames(9, 13, 1)
     irradiance = frame.irradiance("total")
     scale = running_scale(irradiance * frame.divisor, frame.depth, None)
     places = {"colour": [0, 1, 2], "albedo": [3, 4, 5], "normal": [6, 7, 8], "depth": [9]}
     with compiled.disabled():
         everything = network_features(frame, irradiance, scale)
-        slow = network_features(frame, irradiance, scale, seen)
-    assert torch.equal(slow, everything[:, [i for name in seen for i in places[name]]])
-    torch.testing.assert_close(network_features(frame, irradiance, scale, seen), slow, rtol=1e-5, atol=1e-6)
+        slow = network_features(frame, irradiance, scale, varying)
+    assert torch.equal(slow, everything[:, [i for name in varying for i in places[name]]])
+    torch.testing.assert_close(network_features(frame, irradiance, scale, varying), slow, rtol=1e-5, atol=1e-6)
 
 
 def with_channel(frame: Frame, name: str, change: Tensor) -> Frame:

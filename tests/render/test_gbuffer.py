@@ -61,8 +61,10 @@ def test_colours_lie_on_their_walls(stage):
     stage.pose(0)
     buffer = render_gbuffer(stage, stage.view(0))
     for index, shape in enumerate(stage.scene.shapes):
-        seen = buffer["albedo"][buffer["mesh_id"][..., 0] == index + 1]
-        np.testing.assert_allclose(seen, np.broadcast_to(shape.bsdf["reflectance"]["value"], seen.shape), rtol=1e-5)
+        visible = buffer["albedo"][buffer["mesh_id"][..., 0] == index + 1]
+        np.testing.assert_allclose(
+            visible, np.broadcast_to(shape.bsdf["reflectance"]["value"], visible.shape), rtol=1e-5
+        )
 
 
 def test_other_materials_are_measured(square):

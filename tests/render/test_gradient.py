@@ -77,7 +77,7 @@ def test_gradients_average_to_the_change_of_noise_free_light():
     stage = Stage(replace(scene, shapes=(*rest, replace(lamp, radiance=dims, motion=slides))), SIZE, SIZE)
     references = [sample_luminance(PosedFrame(stage, frame).reflected(9, 1024).reshape(-1, 3)) for frame in (0, 1)]
     lamp_id = len(scene.shapes)
-    seen = [render_gbuffer(stage, stage.view(frame))["mesh_id"].ravel() for frame in (0, 1)]
+    visible = [render_gbuffer(stage, stage.view(frame))["mesh_id"].ravel() for frame in (0, 1)]
 
     tracer = PathTracer(stage)
     stage.pose(0)
@@ -87,7 +87,7 @@ def test_gradients_average_to_the_change_of_noise_free_light():
     pixel = np.concatenate([samples.pixel for samples in pairs])
     found = np.concatenate([image[samples.pixel, 0] for image, samples in zip(images, pairs, strict=True)])
     expected = (references[1] - references[0])[pixel]
-    wall = (seen[0] != lamp_id)[pixel] & (seen[1] != lamp_id)[pixel]
+    wall = (visible[0] != lamp_id)[pixel] & (visible[1] != lamp_id)[pixel]
     block = (pixel // SIZE // 8 * 4 + pixel % SIZE // 8)[wall]
     error = (found - expected)[wall]
     z = np.array(

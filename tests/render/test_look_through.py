@@ -41,14 +41,14 @@ def rendered(scene: Scene) -> list[dict]:
 
 
 @pytest.fixture(scope="module")
-def seen() -> list[tuple[dict, dict]]:
+def visible() -> list[tuple[dict, dict]]:
     """Each frame of the room with the mirror, and of that which is built twice."""
     return list(zip(rendered(room(SILVER)), rendered(room_twice()), strict=True))
 
 
-def test_a_mirror_shows_what_a_window_would(seen):
+def test_a_mirror_shows_what_a_window_would(visible):
     """Surfaces and motion, but for single pixels at edges."""
-    for frame, twice in seen:
+    for frame, twice in visible:
         picture = frame["mesh_id"][..., 0] == 1
         same = picture & (frame["mirrored_mesh_id"] + 3 == twice["mesh_id"])[..., 0]
         assert picture.mean() > 0.4 and same.sum() >= picture.sum() - 3
@@ -56,11 +56,11 @@ def test_a_mirror_shows_what_a_window_would(seen):
         for name in (*SURFACE, "motion"):
             shown = frame[f"mirrored_{name}"][same]
             np.testing.assert_allclose(shown, twice[name][same], rtol=1e-4, atol=1e-3, err_msg=name)
-    assert np.abs(seen[-1][0]["mirrored_motion"]).max() > 1
+    assert np.abs(visible[-1][0]["mirrored_motion"]).max() > 1
 
 
-def test_elsewhere_all_is_as_it_is(seen):
-    for frame, _ in seen:
+def test_elsewhere_all_is_as_it_is(visible):
+    for frame, _ in visible:
         elsewhere = frame["mesh_id"][..., 0] != 1
         assert elsewhere.any()
         for name in (*SURFACE, "mesh_id", "motion"):

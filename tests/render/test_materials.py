@@ -14,7 +14,7 @@ from tests.helpers.rendering import rgb
 
 
 def textured_square(bsdf: dict) -> Scene:
-    """A unit square seen head-on, with texture coordinates from 0 to 1, v up."""
+    """A unit square visible head-on, with texture coordinates from 0 to 1, v up."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     mesh = trimesh.Trimesh(np.c_[corners - 0.5, np.zeros(4)], [[0, 1, 2], [0, 2, 3]], process=False)
     mesh.visual = trimesh.visual.TextureVisuals(uv=corners)

@@ -75,7 +75,7 @@ def test_hits_project_to_their_pixel_and_to_where_motion_points(stage, frame):
 
 
 def trace_pixels(stage: Stage, view: View, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh id (...) and world position (..., 3) of what is seen through pixel positions (..., 2), as posed."""
+    """Mesh id (...) and world position (..., 3) of what is visible through pixel positions (..., 2), as posed."""
     si = stage.mitsuba_scene.ray_intersect(stage.rays(view, pixels.reshape(-1, 2)))
     shape = pixels.shape[:-1]
     return np.array(stage.mesh_id(si)).reshape(shape), np.array(si.p, dtype=np.float64).T.reshape(*shape, 3)
@@ -105,7 +105,7 @@ def test_following_motion_meets_the_same_surface_point(stage, frame):
     assert (then_mesh == mesh_id)[visible].all()
     back = carry(then_points, then_mesh, previous, now)
     footprint = depth / -now.K[0, 0]
-    # A pixel covers more of a surface that is seen at a grazing angle; compare across the line of sight.
+    # A pixel covers more of a surface that is visible at a grazing angle; compare across the line of sight.
     sight = points - now.camera_to_world[:3, 3]
     across = np.linalg.norm(np.cross(back - points, sight / np.linalg.norm(sight, axis=-1, keepdims=True)), axis=-1)
     assert (across < footprint)[visible].all()

@@ -85,7 +85,7 @@ def test_a_scene_without_shapes_is_rendered_beside_another(moving):
     assert moving.shapes  # Dr.Jit refuses to freeze calls of materials that only other scenes have
     stage = Stage(build_scene("extremes-sky", 5, 1), 8, 8)
     direct, indirect = PathTracer(stage).radiance(stage.rays(stage.view(0)), 1, 2)
-    assert not direct.any() and not indirect.any()  # all that is seen of the sky is emission
+    assert not direct.any() and not indirect.any()  # all that is visible of the sky is emission
 
 
 def test_equal_seeds_equal_bytes_and_different_seeds_uncorrelated_noise(stage):

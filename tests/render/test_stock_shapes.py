@@ -1,4 +1,4 @@
-"""Shapes, maps and lights as scene files describe them: what is seen of them, and how they move and change."""
+"""Shapes, maps and lights as scene files describe them: what is visible of them, and how they move and change."""
 
 import numpy as np
 import pytest
@@ -59,8 +59,8 @@ def test_every_kind_of_shape_is_seen_by_its_own_id():
         box = stage.shapes[index].bbox()
         middle = (np.array(box.min) + np.array(box.max)).ravel() / 2
         view = stage.view(0)
-        seen = view.K @ (np.linalg.inv(view.camera_to_world) @ [*middle, 1])[:3]
-        column, row = (seen[:2] / seen[2]).astype(int)
+        visible = view.K @ (np.linalg.inv(view.camera_to_world) @ [*middle, 1])[:3]
+        column, row = (visible[:2] / visible[2]).astype(int)
         assert mesh_id[row, column, 0] == index + 1, name
 
 

@@ -45,9 +45,9 @@ def test_a_reflection_moves_as_what_stands_behind_the_mirror(eye_slides):
     thing = plate("b thing", 1.0, (1.5, 0, 1), slides=STEP)
     lamp = plate("c lamp", 0.5, (0, 3, 6), radiance=1)
     for frame in frames_of(mirror, thing, lamp, eye_slides=eye_slides)[1:]:
-        seen = tracked(frame, "reflection_motion", 1)
+        visible = tracked(frame, "reflection_motion", 1)
         back = (eye_slides - STEP) * FOCAL / (DISTANCE + 1)
-        of_thing = seen[np.abs(seen[:, 0] - back) < 5e-3]
+        of_thing = visible[np.abs(visible[:, 0] - back) < 5e-3]
         assert len(of_thing) > 10 and np.abs(of_thing[:, 1]).max() < 5e-3
 
 

@@ -110,7 +110,7 @@ def test_rooms_differ():
 
 
 def share_of_kinds(numbers: range) -> dict[str, float]:
-    """Shares of rooms in which two things move, lights change, the camera stops, the sky is seen or glass is."""
+    """Shares of rooms in which two things move, lights change, the camera stops, the sky is visible or glass is."""
     rooms = [build_room(number) for number in numbers]
     facts = {
         "two things move": [sum(parts[0].motion.varies() for parts in things(s).values()) >= 2 for s in rooms],
@@ -151,7 +151,7 @@ def test_frames_are_neither_night_nor_glare(number):
 
 @pytest.mark.parametrize("number", FEW[:4])
 def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
-    """Motion of what is seen, with a margin for what comes nearer than the centres of things, which were aimed at."""
+    """Motion of visible surfaces, with a margin for those nearer than the centres of things, which were aimed at."""
     size = 64
     stage = Stage(build_room(number), size, size)
     for frame in (1, FRAMES // 2, FRAMES - 1):
@@ -170,10 +170,10 @@ def test_a_closeup_is_a_part_of_its_room_s_picture(number):
         assert np.array_equal(a.camera_to_world[:3, 3], b.camera_to_world[:3, 3])
         assert np.array_equal(a.object_to_world, b.object_to_world)
         towards = directions(pixel_centres(CLOSEUP_SIZE, CLOSEUP_SIZE), b)
-        seen = project(towards, np.zeros((CLOSEUP_SIZE, CLOSEUP_SIZE), bool), a)
+        visible = project(towards, np.zeros((CLOSEUP_SIZE, CLOSEUP_SIZE), bool), a)
         # Its middle stays at one position of the room's image, but for the distortion of an off-centre lens.
         half = CLOSEUP_SIZE // 2
-        middle = seen[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) / half - 1
+        middle = visible[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) / half - 1
         assert np.abs(middle).max() < OFF_CENTRE + 0.05
         times.append((b.K[0, 0] / a.K[0, 0], *middle))
     assert MIN_ZOOM <= times[0][0] <= MAX_ZOOM

@@ -52,9 +52,9 @@ def test_a_scene_without_camera_is_seen_whole(aspect):
     camera = camera_framing(low, high)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     view = Scene((), camera).view(0, 100, int(100 / aspect))
-    seen = project(corners, np.ones(8, bool), view)
+    visible = project(corners, np.ones(8, bool), view)
     assert camera.x_fov.at(0) == FOV_WITHOUT_CAMERA
-    assert (seen > 0).all() and (seen < [100 / aspect, 100]).all()
+    assert (visible > 0).all() and (visible < [100 / aspect, 100]).all()
 
 
 @pytest.mark.parametrize("camera", ["orthographic", "irradiancemeter", "spherical", "batch"])

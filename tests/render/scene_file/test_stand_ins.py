@@ -11,7 +11,7 @@ from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
 
 
 def rendered(scene) -> np.ndarray:
-    """A frame's light (H, W, 3), with what is seen directly."""
+    """A frame's light (H, W, 3), with what is visible directly."""
     posed = PosedFrame(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
     return np.add(*posed.tracer.radiance(posed.ray, 0, 2)) + posed.emission
 
@@ -260,8 +260,8 @@ def test_old_skies_have_their_zenith_at_y():
     sky = mi.load_dict({"type": "scene", "sky": made}).emitters()[0]
     si = mi.SurfaceInteraction3f()
 
-    def seen(*direction: float) -> float:
+    def visible(*direction: float) -> float:
         si.wi = -mi.Vector3f(*direction)
         return float(np.array(sky.eval(si)).max())
 
-    assert seen(0, 0.9, 0.3) > 0 and seen(0.9, 0.1, 0) > 0 and seen(0, -0.9, 0.1) == 0
+    assert visible(0, 0.9, 0.3) > 0 and visible(0.9, 0.1, 0) > 0 and visible(0, -0.9, 0.1) == 0
