@@ -61,14 +61,10 @@ def penumbra(frame: Frame) -> Tensor:
     return frame.light_angle * blocked / (1 - share).clamp(min=MIN_LIGHT_GAP)
 
 
-def pixel_size(frame: Frame) -> Tensor:
-    """The distance of pixel centres on a surface that faces the camera, (B, 1, H, W), in world units."""
-    return frame.depth / frame.now.K[:, 0, 0].abs().to(frame.depth)[:, None, None, None]
-
-
 def widths(frame: Frame) -> Tensor:
     """Standard deviations (B, 2, 1, H, W) of the Gaussians for direct and for indirect light, in world units."""
-    size = pixel_size(frame)
+    focal_length = frame.now.K[:, 0, 0].abs().to(frame.depth)[:, None, None, None]
+    size = frame.depth / focal_length  # of a pixel, on a surface that faces the camera
     blocked = frame.hit_distance[:, 1:] > 0
     penumbras = torch.where(blocked, penumbra(frame), torch.inf)
     shadow = torch.maximum(mesh_min(penumbras, frame.mesh_id), size) / SHADOW_SHARPNESS

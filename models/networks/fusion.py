@@ -152,11 +152,7 @@ def fuse_whole(
 
 @compiled.by(kernels.fuse, gpu=kernels.fuse_on_gpu if find_spec("triton") else None)
 def fuse(
-    image: Tensor,
-    importance: Tensor,
-    mixture: Tensor,
-    windows: Sequence[int] = WINDOWS,
-    surface: Tensor | None = None,
+    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
 ) -> Tensor:
     """Filter an image with shared kernels of several window sizes and mix the results (Eq. 5).
 

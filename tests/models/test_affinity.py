@@ -41,12 +41,11 @@ def by_definition(inputs: list[Tensor], item: int, y: int, x: int, step: int) ->
     return total / weights if surface[0, y, x] > 0 else torch.zeros(3, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kernels", [True, False])
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("step", [1, 3])
-def test_a_level_is_its_formula(kernels: bool, step: int) -> None:
+def test_a_level_is_its_formula(step: int) -> None:
     inputs = random_inputs(0, 5, 7)
-    with compiled.disabled() if not kernels else torch.no_grad():
-        filtered = affinity_level(*inputs, step)
+    filtered = affinity_level(*inputs, step)
     for item, y, x in ((0, 0, 0), (0, 2, 3), (1, 4, 6), (1, 1, 5), (0, 3, 0)):
         torch.testing.assert_close(
             filtered[item, :, y, x].double(), by_definition(inputs, item, y, x, step), rtol=1e-5, atol=1e-6

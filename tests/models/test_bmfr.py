@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from datasets.cameras import Cameras
 from eval.bench.synthetic_frames import synthetic_frame
 from models.filters import bmfr
-from models.filters.baselines import Accumulated
 from models.filters.bmfr import BMFR, Blocks
 from tests.helpers.frames import chain, flat_frame, play, run
 
@@ -250,15 +249,3 @@ def test_the_same_frames_give_the_same_bits_and_far_from_the_origin_the_same_pic
     assert all(torch.equal(a, b) for a, b in zip(near, again, strict=True))
     for a, b in zip(near, there, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
-
-
-def test_noise_on_a_wall_is_gone():
-    """A thousand pixels for each of ten coefficients: nearly all of its variance goes."""
-    generator = torch.Generator().manual_seed(0)
-    frames = []
-    for _ in range(8):
-        light = (torch.rand(1, 1, 64, 64, generator=generator) < 0.25).float().repeat(1, 3, 1, 1) * 4
-        frames.append(flat_frame(64, 64, irradiance=light))
-    fitted, accumulated = (run(denoiser, frames)[-1] for denoiser in (BMFR(), Accumulated()))
-    errors = [(image - 1).square().mean() for image in (fitted, accumulated)]
-    assert errors[0] < 0.02 * errors[1]

@@ -1,7 +1,5 @@
 """LBF: its filter and that one's gradient, what its network sees, and its spikes, against slow versions in float64."""
 
-import contextlib
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from models import compiled, registry
+from models import registry
 from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.history.running_scale import running_scale
 from models.networks.cross_bilateral import Pixels, cross_bilateral
@@ -17,7 +15,7 @@ from models.networks.lbf import features_of, remove_spikes
 from models.networks.secondary_features import secondary_features
 from tests.helpers.frames import flat_frame, run
 
-WAYS = {"compiled": contextlib.nullcontext, "plain": compiled.disabled}
+both_implementations = pytest.mark.usefixtures("implementation")
 SIZES = st.tuples(st.integers(1, 7), st.integers(1, 7))
 CHANNELS = sum(FEATURE_GROUPS)
 
@@ -55,25 +53,23 @@ def naive_filter(pixels: Pixels, sharpness: Tensor) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("way", WAYS)
+@both_implementations
 @settings(max_examples=15, deadline=None)
 @given(size=SIZES, seed=st.integers(0, 999))
-def test_the_filter_is_the_paper_s(way, size, seed):
+def test_the_filter_is_the_paper_s(size, seed):
     pixels, sharpness = random_pixels(seed, *size)
-    with WAYS[way]():
-        filtered = cross_bilateral(pixels, sharpness)
+    filtered = cross_bilateral(pixels, sharpness)
     np.testing.assert_allclose(filtered[0], naive_filter(pixels, sharpness), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_windows_are_55_pixels_wide(way):
+@both_implementations
+def test_windows_are_55_pixels_wide():
     """A pixel of light reaches 27 pixels."""
     pixels, sharpness = random_pixels(0, 1, 70)
     image = torch.zeros(1, 3, 1, 70)
     image[..., 35] = 1.0
     pixels = Pixels(image, torch.ones_like(image), torch.zeros(1, CHANNELS, 1, 70), torch.ones(1, 1, 1, 70))
-    with WAYS[way]():
-        filtered = cross_bilateral(pixels, torch.zeros_like(sharpness))
+    filtered = cross_bilateral(pixels, torch.zeros_like(sharpness))
     lit = torch.arange(70).sub(35).abs() <= 27
     assert torch.equal(filtered[0, 0, 0] > 0, lit)
 
@@ -98,13 +94,12 @@ def all_at_once(pixels: Pixels, sharpness: Tensor) -> Tensor:
     return filtered.unflatten(1, (height, width))
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_the_gradient_is_autograd_s(way):
+@both_implementations
+def test_the_gradient_is_autograd_s():
     pixels, sharpness = random_pixels(2, 9, 11, batch=2)
     sharpness = (sharpness / 10).requires_grad_()
     weights = torch.rand(pixels.image.shape, generator=torch.Generator().manual_seed(0))
-    with WAYS[way]():
-        (weights * cross_bilateral(pixels, sharpness)).sum().backward()
+    (weights * cross_bilateral(pixels, sharpness)).sum().backward()
     found = sharpness.grad
     sharpness.grad = None
     for item in range(2):
@@ -114,8 +109,8 @@ def test_the_gradient_is_autograd_s(way):
     torch.testing.assert_close(found, sharpness.grad, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_gradients_stay_finite_at_the_extremes(way):
+@both_implementations
+def test_gradients_stay_finite_at_the_extremes():
     """Colours without noise, features far apart, and no surface at all."""
     pixels, sharpness = random_pixels(3, 6, 7)
     extremes = [
@@ -125,9 +120,8 @@ def test_gradients_stay_finite_at_the_extremes(way):
     ]
     for extreme in extremes:
         sharpness = (1e4 * sharpness).detach().requires_grad_()
-        with WAYS[way]():
-            filtered = cross_bilateral(extreme, sharpness)
-            (filtered / 1e16).sum().backward()
+        filtered = cross_bilateral(extreme, sharpness)
+        (filtered / 1e16).sum().backward()
         assert torch.isfinite(filtered).all() and torch.isfinite(sharpness.grad).all()
         assert filtered.min() >= 0 and (filtered.amax((2, 3)) <= extreme.image.amax((2, 3)) * (1 + 1e-5)).all()
 

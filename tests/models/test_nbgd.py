@@ -7,11 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled, registry
 from models.networks.bilateral_grid import grid_mean, grid_shape
 from models.networks.nbgd import SPACINGS
-from tests.helpers.frames import flat_frame, run
 
 
 def random_inputs(seed: int, height: int, width: int, share: float = 0.7) -> tuple[Tensor, Tensor, Tensor]:
@@ -161,23 +159,3 @@ def test_the_third_picture_has_what_weights_leave(shares):
     expected = sum(weight * picture for weight, picture in zip(weights, pictures, strict=True))
     assert mixture is None and output.min() >= 0
     torch.testing.assert_close(output, expected.clamp(min=0), rtol=1e-4, atol=1e-4)
-
-
-def test_a_constant_image_stays_constant():
-    frames = [flat_frame(21, 18, irradiance=torch.full((1, 3, 21, 18), 7.0)) for _ in range(2)]
-    for output in run(registry.create("nbgd"), frames):
-        torch.testing.assert_close(output, torch.full_like(output, 7.0), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("height", [70, 137])
-def test_large_frames_are_filtered_in_strips(height, monkeypatch):
-    torch.manual_seed(0)
-    frame = synthetic_frame(0, height, 90)
-    denoiser = registry.create("nbgd")
-    denoiser.prepare()
-    with torch.inference_mode():
-        whole, _ = denoiser(frame, None)
-        monkeypatch.setattr("models.networks.wskp.MAX_WHOLE_PIXELS", 1)
-        monkeypatch.setattr("models.networks.wskp.STRIP_PIXELS", 32 * 90)
-        strips, _ = denoiser(frame, None)
-    assert torch.equal(strips, whole)

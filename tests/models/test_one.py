@@ -1,6 +1,5 @@
 """`one`: what it accumulates, when it forgets, what it does not depend on; the kernels against PyTorch."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -155,12 +154,11 @@ def test_levels_of_the_filter_can_be_chosen():
     torch.testing.assert_close(outputs[0], square)
 
 
-@pytest.mark.parametrize("compiled_kernels", [True, False])
-def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh, compiled_kernels):
+@pytest.mark.usefixtures("implementation")
+def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh):
     """Logits at their bounds, and light whose sum float32 could not hold."""
     fresh.network.leave.bias.data[FEATURES:] = 50.0
     images = [torch.full((1, 3, *SIZE), 3e38) for _ in range(3)]
-    with nullcontext() if compiled_kernels else compiled.disabled():
-        outputs, state = play(fresh, frames(images))
+    outputs, state = play(fresh, frames(images))
     assert all(torch.isfinite(output).all() for output in outputs)
     assert torch.isfinite(state.output).all() and torch.isfinite(state.accumulated).all()

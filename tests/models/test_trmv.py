@@ -1,5 +1,6 @@
 """TRMV: history follows the cause of light, and is SVGF's where only the camera moves."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -28,23 +29,18 @@ def error(name: str, frames: list[Frame]) -> float:
     return (output - stripes(len(frames) - 1))[..., 4:-4, 14:-4].abs().mean().item()
 
 
-def test_moving_shadows_do_not_lag():
+@pytest.mark.parametrize("cause", ["shadow", "reflection"])
+def test_moving_shadows_and_reflections_do_not_lag(cause):
     """A quarter of the samples report that shadows move."""
     generator = torch.Generator().manual_seed(0)
     frames = []
     for index in range(6):
         shaded = torch.rand(1, 1, SIZE, SIZE, generator=generator) < 0.25
-        frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
-        frames.append(frame.with_channels({"shadow_motion": torch.where(shaded, vectors(-2), 0)}))
-    assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
-
-
-def test_reflections_do_not_lag():
-    frames = []
-    for index in range(6):
-        frame = flat_frame(SIZE, SIZE, irradiance=stripes(index))
-        smooth = torch.full_like(frame.roughness, 0.1)
-        frames.append(frame.with_channels({"roughness": smooth, "reflection_motion": vectors(-2)}))
+        causes = {
+            "shadow": {"shadow_motion": torch.where(shaded, vectors(-2), 0)},
+            "reflection": {"roughness": torch.full((1, 1, SIZE, SIZE), 0.1), "reflection_motion": vectors(-2)},
+        }
+        frames.append(flat_frame(SIZE, SIZE, irradiance=stripes(index)).with_channels(causes[cause]))
     assert error("trmv", chain(frames)) < 0.2 * error("svgf", chain(frames))
 
 
@@ -84,8 +80,5 @@ def test_each_kind_of_light_has_its_vectors():
     few[..., ::4, ::4] = 2.0
     assert vectors_for() == [2, 1]
     assert vectors_for(roughness=smooth) == [3, 3]
-    assert vectors_for(roughness=smooth, reflection_motion=few) == [
-        2,
-        1,
-    ]  # plastic
+    assert vectors_for(roughness=smooth, reflection_motion=few) == [2, 1]  # plastic
     assert vectors_for(shadow_motion=few) == [1, 1]

@@ -114,7 +114,7 @@ def test_mr_kp_is_kernels_of_5_by_5_at_three_resolutions():
     torch.testing.assert_close(output[..., *inner], expected.clamp(min=0)[..., *inner], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"])
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd"])
 def test_a_constant_image_stays_constant(name):
     frames = [flat_frame(21, 18, irradiance=torch.full((1, 3, 21, 18), 7.0)) for _ in range(2)]
     for output in run(registry.create(name), frames):
@@ -161,7 +161,7 @@ def test_pairs_of_pixels_are_convolved_as_pixels_are(dtype, size):
         torch.testing.assert_close(layer(image), F.conv2d(x, layer.weight, layer.bias, padding=2))
 
 
-@pytest.mark.parametrize("name", ["wskp3", "wskp6", "kp"])
+@pytest.mark.parametrize("name", ["wskp3", "wskp6", "kp", "nbgd"])
 @pytest.mark.parametrize("height", [70, 137])
 def test_large_frames_are_filtered_in_strips_bit_for_bit(name, height, monkeypatch):
     torch.manual_seed(0)
