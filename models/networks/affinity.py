@@ -29,18 +29,10 @@ class AffinityLevel(torch.autograd.Function):
     """Both directions by kernels for the processor."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        image: Tensor,
-        features: Tensor,
-        sharpness: Tensor,
-        own: Tensor,
-        importance: Tensor,
-        surface: Tensor,
-        step: int,
-    ) -> Tensor:
-        given = (image, features, sharpness, own, importance)
-        out, total = kernels.filter_level(*given, surface, step)
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        """The arguments are those of affinity_level."""
+        *given, surface, step = arguments
+        out, total = kernels.filter_level(*arguments)
         ctx.step = step
         ctx.save_for_backward(*given, surface, out, total)
         return out

@@ -41,12 +41,6 @@ def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
         x = x.narrow(dim, 0, reach) + x.narrow(dim, size // 2, reach)
 
 
-def windowed_max(x: Tensor, window: int, dim: int) -> Tensor:
-    """Maxima of `window` consecutive entries along `dim`, which gets shorter by window - 1."""
-    size = (1, window) if dim == -1 else (window, 1)
-    return F.max_pool2d(x, size, stride=1)
-
-
 def along(dim: int, margin: int) -> tuple[int, ...]:
     """F.pad's argument for `margin` entries on both sides of the last or the last but one dimension."""
     return (margin, margin) if dim == -1 else (0, 0, margin, margin)
@@ -61,7 +55,7 @@ def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, 
         size = top.shape[dim]
         entries = F.pad(top, along(dim, margin), value=OUTSIDE_LOGIT)
         parts = F.pad(total, along(dim, margin))
-        top = windowed_max(entries, window, dim)
+        top = F.max_pool2d(entries, (1, window) if dim == -1 else (window, 1), stride=1)
         total = torch.zeros_like(total)
         for tap in range(window):
             entry = entries.narrow(dim, tap, size)
@@ -89,10 +83,6 @@ def windowed_sums(logits: Tensor, values: Tensor, window: int, counted: Tensor |
     return shift.view(1, 1, 1, 1), box_sum(box_sum(weighted, window, -2), window, -1)
 
 
-def with_ones(image: Tensor) -> Tensor:
-    return torch.cat([image, torch.ones_like(image[:, :1])], dim=1)
-
-
 class SharedKernel(torch.autograd.Function):
     """R(p) = sum exp(I(q)) r(q) / sum exp(I(q)) over the window of p (Eq. 3 and 4).
 
@@ -103,7 +93,8 @@ class SharedKernel(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, logits: Tensor, window: int, surface: Tensor | None = None) -> Tensor:
         counted = None if surface is None else surface > 0
-        top, total = windowed_sums(logits, with_ones(image), window, counted)
+        values = torch.cat([image, torch.ones_like(image[:, :1])], dim=1)
+        top, total = windowed_sums(logits, values, window, counted)
         weight = total[:, -1:]
         filtered = total[:, :-1] / weight.clamp(min=MIN_DIVISOR)
         ctx.window = window
