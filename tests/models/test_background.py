@@ -1,7 +1,5 @@
 """Background reflects nothing: it is black in the output, and no surface gathers from it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -34,20 +32,10 @@ MASKS = st.builds(
 
 def with_background(frame: Frame, surface: torch.Tensor) -> Frame:
     """The frame with sky, lit by an emission of 3, where `surface` (1, 1, H, W) is false."""
-    cut = {
-        name: torch.where(surface, frame.channels[name], value)
-        for name, value in {
-            "direct": 0.0,
-            "indirect": 0.0,
-            "emission": 3.0,
-            "albedo": 1.0,
-            "normal": 0.0,
-            "depth": 0.0,
-            "roughness": 1.0,
-            "mesh_id": 0.0,
-        }.items()
-    }
-    return replace(frame, channels=frame.channels | cut)
+    sky = dict.fromkeys(("direct", "indirect", "normal", "depth", "mesh_id"), 0.0)
+    sky |= {"emission": 3.0, "albedo": 1.0, "roughness": 1.0}
+    cut = {name: torch.where(surface, frame.channels[name], value) for name, value in sky.items()}
+    return frame.with_channels(cut)
 
 
 def noisy_frames(surface: torch.Tensor, count: int = 3) -> list[Frame]:
@@ -269,8 +257,7 @@ def test_ntd_fetches_surfaces_alone():
     surface = torch.ones(1, 1, 16, 32, dtype=torch.bool)
     surface[..., 20:] = False
     light = torch.full((1, 3, 16, 32), 5.0)
-    frame = flat_frame(16, 32, (0.5, 0.0))
-    frame = replace(frame, channels=frame.channels | {"direct": torch.zeros_like(light), "indirect": light})
+    frame = flat_frame(16, 32, (0.5, 0.0)).with_channels({"direct": torch.zeros_like(light), "indirect": light})
     frames = chain([with_background(frame, surface)] * 2)
     _, state = play(ntd, frames)
     visible = state.warped.masked_select(surface)

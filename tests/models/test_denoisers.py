@@ -14,6 +14,7 @@ from models.weights import load_weights, save_weights
 from tests.helpers.frames import flat_frame, run
 
 NAMES = list(registry.DENOISERS)
+WRAPPED = "noisy+taa svgf+taa wskp6+taa ntd+taa eaw+adaptive wskp6+adaptive+taa svgf+js ntd+taa+js".split()
 
 
 @pytest.fixture(scope="module")
@@ -22,20 +23,7 @@ def denoisers():
     return {name: registry.create(name).eval() for name in NAMES}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *NAMES,
-        "noisy+taa",
-        "svgf+taa",
-        "wskp6+taa",
-        "ntd+taa",
-        "eaw+adaptive",
-        "wskp6+adaptive+taa",
-        "svgf+js",
-        "ntd+taa+js",
-    ],
-)
+@pytest.mark.parametrize("name", NAMES + WRAPPED)
 def test_a_prototype_has_the_attributes_of_the_denoiser(name):
     prototype = registry.prototype(name)
     denoiser = registry.create(name)

@@ -157,10 +157,8 @@ def test_non_finite_radiance_counts_as_zero(weights, name):
 
 
 def test_sample_counts_that_change_from_frame_to_frame(weights):
-    frames = [
-        replace(frame, spp=torch.full((1, 1, 1, 1), samples))
-        for frame, samples in zip(sequence((13, 17), frames=3), (4.0, 1.0, 16.0), strict=True)
-    ]
+    counted = zip(sequence((13, 17), frames=3), (4.0, 1.0, 16.0), strict=True)
+    frames = [replace(frame, spp=torch.full((1, 1, 1, 1), samples)) for frame, samples in counted]
     check_equal(*pair(weights, "one"), frames)
 
 

@@ -1,12 +1,10 @@
 """Specialised networks: the general ones' output where a channel does not vary, and a clear word where it does."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame
@@ -17,21 +15,13 @@ from models.history.running_scale import running_scale
 from models.networks.features import network_features
 from models.spec import load
 from models.specialise import drop_inputs, specialise
-from models.weights import save_weights
+from models.weights import read_metadata, save_weights
 from tests.helpers.frames import chain, flat_frame, run
 
 GREY = [0.25, 0.5, 0.75]
 CONSTANTS = {"albedo": GREY, "normal": [0.0, 0.0, -1.0], "roughness": [1.0], "depth": [2.0]}
-LEFT_OUT = {
-    "wskp3": {"albedo", "normal"},
-    "wskp6": {"albedo", "normal"},
-    "wskp-mr": {"albedo", "normal"},
-    "kp": {"albedo", "normal"},
-    "mr-kp": {"albedo", "normal"},
-    "nbgd": {"albedo", "normal"},
-    "rae": {"roughness"},
-    "ntd": {"albedo", "normal"},
-}
+LEFT_OUT = dict.fromkeys(("wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "ntd"), {"albedo", "normal"})
+LEFT_OUT |= {"rae": {"roughness"}}
 FEWER = {"wskp3": 6 * 24 * (1 + 9 + 25), "wskp-mr": 6 * 32 * 9, "rae": 32 * 9, "ntd": 6 * 32 * 9}  # weights
 
 
@@ -138,10 +128,6 @@ def test_varying_features_are_part_of_all(varying):
     torch.testing.assert_close(network_features(frame, irradiance, scale, varying), slow, rtol=1e-5, atol=1e-6)
 
 
-def with_channel(frame: Frame, name: str, change: Tensor) -> Frame:
-    return replace(frame, channels=frame.channels | {name: frame.channels[name] + change})
-
-
 @pytest.mark.parametrize("name, channel", [("rae", "roughness"), ("wskp3", "albedo"), ("wskp3+taa", "normal")])
 def test_a_frame_in_which_such_a_channel_varies_is_refused(name, channel, tmp_path):
     plain = registry.parse_name(name).base
@@ -150,22 +136,21 @@ def test_a_frame_in_which_such_a_channel_varies_is_refused(name, channel, tmp_pa
     save_weights(special, plain, {}, path)
     denoiser = load(name, path, torch.float32)
     [frame] = frames(8, 8, 1)
-    odd = torch.zeros(1, 1, 8, 8)
-    odd[..., 3, 4] = 1
-    run(denoiser, [frame, with_channel(frame, channel, odd * 2e-4)])  # as float16 rounds
-    run(denoiser, [with_channel(frame, channel, odd * torch.nan)])  # as any pixel that is not finite
+
+    def varied(change: float) -> Frame:
+        values = frame.channels[channel].clone()
+        values[..., 3, 4] += change
+        return frame.with_channels({channel: values})
+
+    run(denoiser, [frame, varied(2e-4)])  # as float16 rounds
+    run(denoiser, [varied(torch.nan)])  # as any pixel that is not finite
     with pytest.raises(BadInput, match=f"test: {channel} is not .* specialised: use general weights"):
-        run(denoiser, [with_channel(frame, channel, odd * 0.01)])
-
-
-def constants_in(path: Path) -> str | None:
-    with safe_open(path, "pt") as file:
-        return file.metadata().get("constants")
+        run(denoiser, [varied(0.01)])
 
 
 def test_weights_say_what_they_do_without(tmp_path):
     general, special = pair("rae")
     save_weights(general, "rae", {}, tmp_path / "general")
     save_weights(special, "rae", {}, tmp_path / "special")
-    assert constants_in(tmp_path / "general") is None
-    assert constants_in(tmp_path / "special") == '{"roughness": [1.0]}'
+    assert "constants" not in read_metadata(tmp_path / "general")
+    assert read_metadata(tmp_path / "special")["constants"] == {"roughness": [1.0]}
