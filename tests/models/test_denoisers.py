@@ -14,7 +14,10 @@ from models.weights import load_weights, save_weights
 from tests.helpers.frames import flat_frame, run
 
 NAMES = list(registry.DENOISERS)
-WRAPPED = "noisy+taa svgf+taa wskp6+taa ntd+taa eaw+adaptive wskp6+adaptive+taa svgf+js ntd+taa+js".split()
+WRAPPED = [
+    *("noisy+taa", "svgf+taa", "wskp6+taa", "ntd+taa"),
+    *("eaw+adaptive", "wskp6+adaptive+taa", "svgf+js", "ntd+taa+js"),
+]
 
 
 @pytest.fixture(scope="module")

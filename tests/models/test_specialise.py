@@ -20,7 +20,7 @@ from tests.helpers.frames import chain, flat_frame, run
 
 GREY = [0.25, 0.5, 0.75]
 CONSTANTS = {"albedo": GREY, "normal": [0.0, 0.0, -1.0], "roughness": [1.0], "depth": [2.0]}
-LEFT_OUT = dict.fromkeys(("wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "ntd"), {"albedo", "normal"})
+LEFT_OUT = {name: {"albedo", "normal"} for name in ("wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "ntd")}
 LEFT_OUT |= {"rae": {"roughness"}}
 FEWER = {"wskp3": 6 * 24 * (1 + 9 + 25), "wskp-mr": 6 * 32 * 9, "rae": 32 * 9, "ntd": 6 * 32 * 9}  # weights
 
