@@ -99,7 +99,7 @@ SLOW_KILLS = [
 ]
 
 
-@pytest.mark.parametrize("name, recipe, rows", [("rae", {"epochs": 3}, (3,)), *SLOW_KILLS])
+@pytest.mark.parametrize("name, recipe, rows", [("wskp6", {"epochs": 1}, (3,)), *SLOW_KILLS])
 def test_killed_training_ends_with_the_weights_of_an_undisturbed_one(tiny, tmp_path, name, recipe, rows):
     """Begun and killed in processes of their own, ended in this one, where the undisturbed one runs as well."""
     kills = [kill_once(name, tiny, tmp_path / "killed", row, recipe) for row in rows]
