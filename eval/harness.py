@@ -139,7 +139,8 @@ def strip(runs: Path, results: ClipResults) -> "Figure":
     index = len(results.reference.frames) * 3 // 4
     columns = []
     for result in (*results.results, results.reference):
-        errors = (f"{key.upper()} {value:.3f}" for key in ("rmse", "ssim") if (value := result.frames[index].get(key)))
+        values = ((key, result.frames[index].get(key)) for key in ("rmse", "ssim"))
+        errors = (f"{key.upper()} {value:.3f}" for key, value in values if value is not None)
         caption = f"{result.denoiser}\n{'' if result.floor else '  '.join(errors)}"
         picture = load_picture(folder_of(runs, result.scene, result.clip, result.denoiser, result.signal), index)
         columns.append([Panel(picture / 255, caption)])

@@ -37,13 +37,11 @@ class Trade:
     # the name that dominates it in each of TRADED; None on the front, and without a time or value
     dominated_by: dict[str, str | None]
 
-    def point(self, metric: str) -> Point | None:
-        """Its position in plots."""
-        return Point.of(self.ms, self.metrics[metric])
-
     def standing(self, metric: str) -> str:
         """The name that dominates it, "front", or "-" without a time or value."""
-        return (self.dominated_by[metric] or "front") if self.point(metric) else "-"
+        if self.ms is None or self.metrics[metric] is None:
+            return "-"
+        return self.dominated_by[metric] or "front"
 
     def cell(self, metric: str) -> str:
         return value_cell(metric, self.metrics[metric], self.floors.get(metric))

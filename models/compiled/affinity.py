@@ -34,7 +34,7 @@ class Level(NamedTuple):
     importance: Rows
 
 
-class PixelTaps(NamedTuple):
+class TapLayout(NamedTuple):
     """Which taps a pixel has."""
 
     width: int
@@ -100,7 +100,7 @@ def weigh_own(weight: Row, own: Row, surface: Row) -> None:
 
 @jit_in_any_order
 def weigh_taps(
-    weight: Row, distance: Row, level: Level, layout: PixelTaps, item: Index, taps: Taps, first: Index
+    weight: Row, distance: Row, level: Level, layout: TapLayout, item: Index, taps: Taps, first: Index
 ) -> None:
     """weight (n) of taps; `first` is the first pixel of the block."""
     offset, low, high, column = taps
@@ -115,7 +115,7 @@ def weigh_taps(
 
 
 @jit_in_any_order
-def taps_of_block(layout: PixelTaps, first: Index, last: Index) -> Iterator[Taps]:
+def taps_of_block(layout: TapLayout, first: Index, last: Index) -> Iterator[Taps]:
     """The nine taps of the pixels `first` to `last` - 1, without those in rows above and below the image."""
     pixels = layout.surface.shape[1]
     for tap in range(9):
@@ -128,7 +128,7 @@ def taps_of_block(layout: PixelTaps, first: Index, last: Index) -> Iterator[Taps
 
 @jit_with_memory
 def filter_block(
-    out: Rows, total: Row, level: Level, layout: PixelTaps, item: Index, first: Index, last: Index
+    out: Rows, total: Row, level: Level, layout: TapLayout, item: Index, first: Index, last: Index
 ) -> None:
     """Pixels `first` to `last` - 1 of out (3, N) and total (N)."""
     weights = np.empty(last - first, np.float32)
@@ -151,7 +151,7 @@ def block_size(width: int) -> int:
 
 
 @jit_parallel
-def filter_item(out: Image, total: Rows, level: Level, layout: PixelTaps, item: int) -> None:
+def filter_item(out: Image, total: Rows, level: Level, layout: TapLayout, item: int) -> None:
     pixels = total.shape[1]
     block = block_size(layout.width)
     for number in numba.prange((pixels + block - 1) // block):
@@ -170,11 +170,11 @@ def level_of(inputs: Sequence[Tensor]) -> Level:
     return Level(flat(image), flat(features), sharpness, own, importance)
 
 
-def layout_of(surface: Tensor, step: int) -> PixelTaps:
+def layout_of(surface: Tensor, step: int) -> TapLayout:
     width = surface.shape[-1]
     column = np.arange(block_size(width)) % width
     inside = np.stack([column >= step, column >= 0, column < width - step])
-    return PixelTaps(width, step, flat(surface)[:, 0], inside.astype(np.float32))
+    return TapLayout(width, step, flat(surface)[:, 0], inside.astype(np.float32))
 
 
 def filter_level(
@@ -231,7 +231,7 @@ def pull_feature(to_here: Row, to_there: Row, pull: Row, here: Row, there: Row) 
 
 @jit_with_memory
 def pull_block(
-    to: Level, level: Level, layout: PixelTaps, filtered: Filtered, item: Index, first: Index, last: Index
+    to: Level, level: Level, layout: TapLayout, filtered: Filtered, item: Index, first: Index, last: Index
 ) -> None:
     """Add to the gradients `to` those by the outputs of pixels `first` to `last` - 1."""
     n = last - first
@@ -263,7 +263,7 @@ def pull_block(
 
 
 @jit_parallel
-def pull_items(to: Level, level: Level, layout: PixelTaps, filtered: Filtered) -> None:
+def pull_items(to: Level, level: Level, layout: TapLayout, filtered: Filtered) -> None:
     """The gradients of a level, added to `to`; items in parallel, for the blocks of one share pixels."""
     pixels = filtered.total.shape[1]
     block = block_size(layout.width)

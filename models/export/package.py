@@ -42,7 +42,7 @@ class Export:
     name: str
     weights: Path
     to: Format
-    precision: Literal["float32", "float16"]  # of its network, "float32" or "float16"; images and state are float32
+    precision: Literal["float32", "float16"]  # of its network; images and state are float32
     warp: Warp  # whether the step reprojects its history itself
 
     @property

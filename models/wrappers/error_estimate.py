@@ -50,7 +50,7 @@ class ErrorEstimate:
     variance: Tensor  # of the frame
     rho: Tensor  # the weight of the frame in the output
     unit: Tensor  # mean luminance of the irradiance near each pixel, (B, 1, H, W), not 0
-    frame: Frame  # the frame
+    frame: Frame
 
     def blended(self, filter_error: Tensor) -> Tensor:
         """The squared error of the output, without its covariance term, for a squared error of the filter."""

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from errors import BadInput
 from tests.helpers.training import full_disk, short_task, tensors
 from train.loop import train_network
 from train.losses.network_loss import NetworkLoss
 from train.precision import BFLOAT16, FLOAT32, fastest_precision
-from train.training import BEST_FILE, CHECKPOINT_FILE, MAX_SKIPPED_IN_A_ROW, Training, average_decay
+from train.training import BEST_FILE, CHECKPOINT_FILE, MAX_SKIPPED_IN_A_ROW, Training, average_decay, update_average
 
 
 def test_gradients_of_parts_add_up_to_those_of_the_batch(tiny, tmp_path):
@@ -125,6 +126,15 @@ def test_full_disk_is_one_clear_line_and_keeps_the_earlier_checkpoint(tiny, tmp_
             training.keep_best(0.5)
     assert (folder / CHECKPOINT_FILE).read_bytes() == before
     assert [path.name for path in folder.iterdir()] == [CHECKPOINT_FILE] and not (folder / BEST_FILE).exists()
+
+
+def test_average_by_hand():
+    average = nn.Linear(1, 1, bias=False)
+    network = nn.Linear(1, 1, bias=False)
+    average.weight.data.fill_(2.0)
+    network.weight.data.fill_(10.0)
+    update_average(average, network, 0.75)
+    assert average.weight.item() == 4.0 and network.weight.item() == 10.0
 
 
 def test_average_forgets_the_beginning_and_spans_what_it_should():
