@@ -79,7 +79,7 @@ def weights_of(name: DenoiserName, runs: Path) -> Path | None:
 def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
     """All denoisers, then those with wrappers; networks with shipped weights and with those trained in `budget`."""
     plain = [DenoiserName(base) for base in DENOISERS]
-    wrapped = [name.wrapped(wrapper) for name in plain for wrapper in prototype(name).evaluated_with]
+    wrapped = [replace(name, wrappers=(wrapper,)) for name in plain for wrapper in prototype(name).evaluated_with]
     for name in (*plain, *wrapped):
         yield name
         trained = name.with_budget(budget)

@@ -31,11 +31,6 @@ CONSTANT_TOLERANCE = 1e-3  # of a channel that counts as constant: more than flo
 S = TypeVar("S", bound=State)
 
 
-def as_it_is(value: Tensor) -> Tensor:
-    """The network input of a channel that is used unchanged."""
-    return value
-
-
 def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None:
     """The state if it is of `kind` and the frame follows it, else None."""
     return state if isinstance(state, kind) and frame.follows(state.moment) else None

@@ -36,9 +36,19 @@ def halve(image: Tensor, surface: Tensor | None = None) -> Tensor:
     return mean(image * surface) / mean(surface).clamp(min=1 / 4)
 
 
-def halve_surface(surface: Tensor | None) -> Tensor | None:
+def halve_surface(surface: Tensor) -> Tensor:
     """The surface (B, 1, H, W) of an image after `halve`: where any of the 2 x 2 pixels shows one."""
-    return None if surface is None else F.max_pool2d(surface, 2, ceil_mode=True)
+    return F.max_pool2d(surface, 2, ceil_mode=True)
+
+
+def pyramid(image: Tensor, surface: Tensor | None, levels: int) -> list[tuple[Tensor, Tensor | None]]:
+    """An image halved level by level, each with its surface, coarse to fine."""
+    pairs = [(image, surface)]
+    for _ in range(levels - 1):
+        image = halve(image, surface)
+        surface = None if surface is None else halve_surface(surface)
+        pairs.append((image, surface))
+    return pairs[::-1]
 
 
 def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:

@@ -90,9 +90,6 @@ class DenoiserName:
         """The same denoiser with the weights of another budget, or with the shipped weights."""
         return replace(self, budget=budget)
 
-    def wrapped(self, wrapper: str) -> "DenoiserName":
-        return replace(self, wrappers=(*self.wrappers, wrapper))
-
 
 def create(name: str | DenoiserName, signal: Signal | None = None) -> Denoiser:
     """A denoiser by its name, with fresh weights if it is a network; `signal` is by default that of its class.

@@ -1,4 +1,4 @@
-"""models.networks.features for the CPU: in one pass, and in the order of memory that convolutions are fastest in."""
+"""network_features of models.networks.wskp for the CPU: in one pass, in the order of memory that convolutions want."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -67,7 +67,7 @@ def feature_image(out: Image, arrays: FeatureArrays, with_albedo: bool, with_nor
 def network_features(
     frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
 ) -> Tensor:
-    """See models.networks.features.network_features; channels come last in memory."""
+    """See models.networks.wskp.network_features; channels come last in memory."""
     exposure = array((scale.exposure() * frame.gain).flatten(1))
     depth_scale = array(scale.log_depth.value.exp())
     out = torch.empty(len(irradiance), *frame.size, sum(FEATURE_CHANNELS[name] for name in names))

@@ -12,12 +12,11 @@ from torch.nn import functional as F
 from models.compiled.accumulation import MIN_ALPHA
 from models.compiled.exponential import MIN_EXPONENT
 from models.compiled.features import GAMMA
-from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE
+from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE, WINDOWS
 from models.export.history import Scale, updated_scale
 from models.export.step import Step, Warp, demodulation, image
-from models.networks.features import scaled_normal
 from models.networks.repvgg import RepVGGBlock
-from models.networks.wskp import WSKP
+from models.networks.wskp import WSKP, scaled_normal
 from models.operators import MIN_DIVISOR
 
 SUMMED = 4  # channels of each window's sums: weighted red, green and blue, and the weights
@@ -113,10 +112,10 @@ class WSKPStep(Step):
         super().__init__(denoiser, warp)
         self.features = tuple(denoiser.inputs)
         self.network = plain_convolutions(denoiser.network)
-        self.fusion = BoxWindows(denoiser.windows)
+        self.fusion = BoxWindows(WINDOWS)
 
     def network_features(self, x: dict[str, Tensor], radiance: Tensor, scale: Scale) -> Tensor:
-        """models.networks.features.network_features of accumulated `radiance`."""
+        """models.networks.wskp.network_features of accumulated `radiance`."""
         features = {
             "colour": (radiance * scale.exposure).clamp(0, 1) ** (1 / GAMMA),
             "albedo": x["albedo"],

@@ -77,9 +77,8 @@ def widths(frame: Frame) -> Tensor:
 
 def positions(frame: Frame) -> Tensor:
     """Positions of surfaces relative to the camera, in world axes, (B, 3, H, W)."""
-    directions = frame_rays(frame)
-    rotation = frame.now.camera_to_world[:, :3, :3].to(directions)
-    return torch.einsum("bij,bhwj->bihw", rotation, directions) * frame.depth
+    rotation = frame.now.camera_to_world[:, :3, :3].to(frame.depth)
+    return torch.einsum("bij,bhwj->bihw", rotation, frame_rays(frame)) * frame.depth
 
 
 def pack_geometry(frame: Frame) -> Tensor:

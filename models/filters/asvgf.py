@@ -16,7 +16,7 @@ from datasets.channels import STRATUM
 from datasets.frame import Frame
 from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, Tap, b3_spline, strip_taps, window_mean
 from models.filters.svgf import SVGF, geometry_weight, pack_geometry
-from models.operators import MIN_DIVISOR
+from models.operators import MIN_DIVISOR, pad_to_multiple
 
 
 def strata_sums(image: Tensor) -> Tensor:
@@ -26,10 +26,8 @@ def strata_sums(image: Tensor) -> Tensor:
 
 def strata_centres(image: Tensor) -> Tensor:
     """The centre pixel of each stratum, (B, C, h, w), of an image (B, C, H, W); the last pixel of smaller ones."""
-    right = -image.shape[-1] % STRATUM
-    bottom = -image.shape[-2] % STRATUM
-    padded = F.pad(image, (0, right, 0, bottom), mode="replicate")
-    return padded[..., STRATUM // 2 :: STRATUM, STRATUM // 2 :: STRATUM].contiguous()
+    centres = slice(STRATUM // 2, None, STRATUM)
+    return pad_to_multiple(image, STRATUM)[..., centres, centres].contiguous()
 
 
 def repeat_strata(strata: Tensor, size: tuple[int, int]) -> Tensor:

@@ -4,13 +4,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-FUSED = "_convolution_pointwise"  # an undocumented operator of PyTorch's compiler
-
 
 class ConvReLU(nn.Conv2d):
     """relu(convolution(x) + other) with kernels of `size` x `size`, an odd one or the stride.
 
-    Zero padding; the stride divides the size. Inference on CPUs uses oneDNN's fused operator.
+    Zero padding; the stride divides the size. Inference on CPUs uses oneDNN's fused operator, which is undocumented.
     """
 
     def __init__(self, inputs: int, outputs: int, size: int = 3, stride: int = 1):
@@ -34,6 +32,6 @@ def fusable(x: Tensor) -> bool:
     if torch.compiler.is_compiling():
         return False
     plain = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
-    if not plain or not torch.backends.mkldnn.is_available() or not hasattr(torch.ops.mkldnn, FUSED):
+    if not plain or not torch.backends.mkldnn.is_available() or not hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
         return False
     return x.dtype == torch.float32 or (x.dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())

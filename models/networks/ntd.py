@@ -9,18 +9,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
-from models.denoiser import Denoiser, State, as_it_is, matching_state
+from models.denoiser import Denoiser, State, matching_state
+from models.history.geometry import pixel_centres
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import ConvReLU
 from models.networks.pixel_kernels import apply_kernels
-from models.operators import halve, halve_surface, pad_to_multiple
+from models.operators import halve, halve_surface, pad_to_multiple, pyramid
 
 NTD_INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper does not print its own
 KERNEL_TAPS = 25  # of a 5 x 5 kernel
 Pool = Callable[[Tensor, Tensor | None], Tensor]  # to half the size, rounded up, over surface pixels
 MIN_SURFACE_SHARE = 1e-6  # of bilinear taps that show a surface; with less the result is invalid
-NTD_SIDE_MULTIPLE = 2 ** (len(WIDTHS) - 1)  # of the sides of the network's images
 
 
 class Decode(nn.Module):
@@ -66,11 +66,11 @@ class KernelNet(nn.Module):
         for level, encode in enumerate(self.encode):
             x = encode(F.max_pool2d(x, 2) if level else x)
             skips.append(x)
-        predictions = []
+        decoded = []
         for decode, skip in zip(self.decode, skips[-2::-1], strict=True):
             x = decode(x, skip)
-            predictions.append(x)
-        return [head(x) for head, x in zip(self.heads, predictions[-3:], strict=True)]
+            decoded.append(x)
+        return [head(x) for head, x in zip(self.heads, decoded[-3:], strict=True)]
 
 
 def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,9 +79,8 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     Outside, the border is repeated. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
     """
     height, width = image.shape[-2:]
-    x = torch.arange(width, device=motion.device) + 0.5
-    y = torch.arange(height, device=motion.device) + 0.5
-    grid = torch.stack([(x + motion[:, 0]) * (2 / width), (y[:, None] + motion[:, 1]) * (2 / height)], dim=-1) - 1
+    x, y = pixel_centres(height, width, motion)
+    grid = torch.stack([(x + motion[:, 0]) * (2 / width), (y + motion[:, 1]) * (2 / height)], dim=-1) - 1
     inside = (grid.abs() <= 1).all(dim=-1)[:, None]
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
@@ -108,7 +107,7 @@ def combine_levels(
     change = alpha * (coarse - pool(fine, surface))
     if surface is None:
         return fine + enlarge(change)
-    valid = F.max_pool2d(surface, 2, ceil_mode=True)
+    valid = halve_surface(surface)
     return fine + enlarge(change * valid) / enlarge(valid).clamp(min=MIN_SURFACE_SHARE)
 
 
@@ -121,28 +120,20 @@ def reconstruct_image(
 ) -> tuple[Tensor, Tensor]:
     """The denoised image (B, 3, H, W) and alpha_t (B, 1, H, W), the weight of the current frame in it (§4.3, Fig. 6).
 
-    Args:
-        noisy, warped: linear irradiance (B, 3, H, W) of this frame and of the previous output.
-        predictions: of the network, coarse to fine, at least as large as the images.
-        surface: the pixels that may be gathered, see Frame.surface.
-        pool: D of Eq. 4.
+    From linear irradiance (B, 3, H, W) of this frame and of the previous output, and the network's predictions, coarse
+    to fine, at least as large as the images. `pool` is D of Eq. 4; pixels of the `surface` are gathered.
     """
-    pyramid = [noisy]
-    surfaces = [surface]
-    for _ in predictions[1:]:  # averages: maxima of noise would be biased
-        pyramid.append(halve(pyramid[-1], surfaces[-1]))
-        surfaces.append(halve_surface(surfaces[-1]))
-    output = pyramid[-1]
+    output = noisy
     alpha: Tensor | None = None
-    for image, valid, prediction in zip(pyramid[::-1], surfaces[::-1], predictions, strict=True):
+    # Levels are averages: maxima of noise would be biased.
+    for (image, valid), prediction in zip(pyramid(noisy, surface, len(predictions)), predictions, strict=True):
         prediction = prediction[..., : image.shape[-2], : image.shape[-1]]
         filtered = apply_kernels(image, prediction[:, :KERNEL_TAPS], valid)
         output = filtered if alpha is None else combine_levels(filtered, output, alpha, valid, pool)
         alpha = torch.sigmoid(prediction[:, -1:].to(image.dtype))
     assert alpha is not None
-    return torch.lerp(
-        apply_kernels(warped, prediction[:, KERNEL_TAPS : 2 * KERNEL_TAPS], surface), output, alpha
-    ), alpha
+    past = apply_kernels(warped, prediction[:, KERNEL_TAPS : 2 * KERNEL_TAPS], surface)
+    return torch.lerp(past, output, alpha), alpha
 
 
 @dataclass(frozen=True)
@@ -185,10 +176,11 @@ class NTD(Denoiser):
     vectors: ClassVar[Literal["motion", "dual_motion"]] = "dual_motion"
     # Traditional vectors are needed for the disocclusion mask of the loss.
     reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
+    pool: Pool = staticmethod(maximum_pool)  # D of Eq. 4
     signal: Signal = "indirect"
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
-    dispensable: ClassVar = {"albedo": as_it_is, "normal": as_it_is}
+    dispensable: ClassVar = {"albedo": nn.Identity(), "normal": nn.Identity()}
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -199,10 +191,6 @@ class NTD(Denoiser):
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
         return [self.network.encode[0][0]]
-
-    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
-        """D of Eq. 4: `image` (B, 3, H, W) in half the size, rounded up."""
-        return maximum_pool(image, surface)
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""
@@ -227,7 +215,7 @@ class NTD(Denoiser):
         }
         x = torch.cat([parts[name] for name in self.inputs], dim=1)
         x = x.to(self.precision, memory_format=torch.channels_last)
-        predictions = self.network(pad_to_multiple(x, NTD_SIDE_MULTIPLE))
+        predictions = self.network(pad_to_multiple(x, 2 ** (len(WIDTHS) - 1)))
         surface = frame.surface
         irradiance, alpha = reconstruct_image(noisy, warped, predictions, surface, self.pool)
         if surface is not None:
@@ -254,5 +242,4 @@ class NTDMean(NTD):
     Eq. 7 of WSKP (Fan et al. 2021) has the same form with averages.
     """
 
-    def pool(self, image: Tensor, surface: Tensor | None = None) -> Tensor:
-        return halve(image, surface)
+    pool = staticmethod(halve)

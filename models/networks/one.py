@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -56,18 +56,11 @@ class Trunk(nn.Module):
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
 
     @property
-    def hidden(self) -> nn.Linear:
-        """The first layer of `detail`."""
-        layer = self.detail[0]
-        assert isinstance(layer, nn.Linear)
-        return layer
-
-    @property
-    def last(self) -> nn.Linear:
-        """The second layer of `detail`."""
-        layer = self.detail[2]
-        assert isinstance(layer, nn.Linear)
-        return layer
+    def detail_layers(self) -> tuple[nn.Linear, nn.Linear]:
+        """The first and the last layer of `detail`."""
+        first, _, last = self.detail
+        assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        return first, last
 
     def forward(self, patches: Tensor) -> Tensor:
         """The U-Net's outputs (B, outputs, H, W) from patches_of (B, inputs, H, W)."""
@@ -76,8 +69,7 @@ class Trunk(nn.Module):
         c = self.down_c(b)
         b = self.join_b(self.up_b(c).add_(b))
         a = self.join_a(self.up_a(b).add_(a))
-        outputs: Tensor = self.leave(a)
-        return outputs
+        return cast(Tensor, self.leave(a))
 
 
 @dataclass(frozen=True)
@@ -233,11 +225,12 @@ class One(Denoiser):
 
     def run_network(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
         """The network's decoded outputs."""
-        patches, hidden = network_inputs(frame, scale, inputs, self.network.hidden)
+        first, last = self.network.detail_layers
+        patches, hidden = network_inputs(frame, scale, inputs, first)
         height, width = frame.size
         head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
         noisy = inputs.noisy
-        return Decoded(*decode_head(head.to(noisy), hidden, self.network.last, inputs, frame.samples.to(noisy)))
+        return Decoded(*decode_head(head.to(noisy), hidden, last, inputs, frame.samples.to(noisy)))
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
@@ -252,16 +245,8 @@ class One(Denoiser):
         for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):
             image = affinity_level(image, decoded.features, sharpness, centre, importance, surface, step)
         output = torch.lerp(inputs.history[:, :3], image, decoded.alpha[:, 1:]) * surface
-        return output, OneState(
-            frame.moment,
-            output,
-            decoded.accumulated,
-            decoded.length,
-            decoded.latent,
-            GBuffer.of(frame),
-            scale,
-            decoded.alpha.detach(),
-        )
+        carried = (output, decoded.accumulated, decoded.length, decoded.latent)
+        return output, OneState(frame.moment, *carried, GBuffer.of(frame), scale, decoded.alpha.detach())
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         irradiance, after = self.predict(frame, state)

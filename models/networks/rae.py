@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -9,14 +10,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.denoiser import Denoiser, State, as_it_is, matching_state
+from models.denoiser import Denoiser, State, matching_state
 from models.history.running_scale import RunningScale, running_scale
 from models.operators import pad_to_multiple
 
 POWER = 0.2  # §4.4: inputs and targets are raised to it before anything else
 SLOPE = 0.1  # §5.3: leaky ReLU
 MIN_SLOPE_AT = 0.01  # exposed irradiance, below which `raised` has no flatter slope
-ENCODER = (32, 32, 43, 57, 76, 101, 101)
+ENCODER = (32, 32, 43, 57, 76, 101, 101)  # widths; ours, like the decoder's: the paper does not print its own
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
 # The auxiliary inputs (§3.2): the number of channels of each, and how to compute it.
 AUXILIARY: dict[str, tuple[int, Callable[[Frame, RunningScale], Tensor]]] = {
@@ -55,9 +56,7 @@ class RecurrentBlock(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.input = conv(width, width)
-        self.merge = conv(2 * width, width)
-        self.output = conv(width, width)
+        self.input, self.merge, self.output = conv(width, width), conv(2 * width, width), conv(width, width)
 
     def forward(self, x: Tensor, hidden: Tensor | None) -> Tensor:
         x = activate(self.input(x))
@@ -69,21 +68,19 @@ class RecurrentAutoencoder(nn.Module):
     """The network of Fig. 2: images whose sides are multiples of 32 in, images of the same size out.
 
     36 convolutions: 7 in the encoder, 3 in each of 6 recurrent blocks, 10 in the decoder, one linear output layer.
-    The widths `encoder` and `decoder` are ours: the paper does not print its own.
     """
 
-    def __init__(self, inputs: int = 7, encoder: Sequence[int] = ENCODER, decoder: Sequence[tuple[int, int]] = DECODER):
+    def __init__(self, inputs: int):
         super().__init__()
-        widths = encoder[1:]  # after the second convolution of full resolution, one width a resolution
-        self.first = conv(inputs, encoder[0])
-        self.encoder = nn.ModuleList(conv(a, b) for a, b in zip(encoder, widths, strict=False))
+        widths = ENCODER[1:]  # after the second convolution of full resolution, one width a resolution
+        self.first = conv(inputs, ENCODER[0])
+        self.encoder = nn.ModuleList(conv(a, b) for a, b in pairwise(ENCODER))
         self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
         below = widths[-1]
         stages = []
-        for skip, (middle, out) in zip(widths[-2::-1], decoder, strict=True):
-            stages.append(
-                nn.Sequential(conv(below + skip, middle), nn.LeakyReLU(SLOPE, inplace=True), conv(middle, out))
-            )
+        for skip, (middle, out) in zip(widths[-2::-1], DECODER, strict=True):
+            activation = nn.LeakyReLU(SLOPE, inplace=True)
+            stages.append(nn.Sequential(conv(below + skip, middle), activation, conv(middle, out)))
             below = out
         self.decoder = nn.ModuleList(stages)
         self.output = conv(below, 3)
@@ -111,22 +108,16 @@ class RAEState(State):
 
 
 class RAE(Denoiser):
-    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2).
-
-    Args:
-        auxiliary: inputs beside irradiance, names of AUXILIARY; fewer for the paper's ablation (§5.1).
-    """
+    """Denoises irradiance from 7 channels: irradiance, view-space normal x and y, depth, roughness (§3.2)."""
 
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness")
     is_network = True
     has_kernels = False
-    dispensable: ClassVar = {"roughness": as_it_is}
+    dispensable: ClassVar = {"roughness": nn.Identity()}
 
-    def __init__(self, auxiliary: Sequence[str] = tuple(AUXILIARY), *, signal: Signal | None = None):
+    def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = {"colour": 3} | {name: AUXILIARY[name][0] for name in auxiliary}
-        needed = {*auxiliary, "depth"}  # the running scale always reads depth
-        self.reads = tuple(name for name in RAE.reads if name not in AUXILIARY or name in needed)
+        self.inputs = {"colour": 3} | {name: channels for name, (channels, _) in AUXILIARY.items()}
         network = RecurrentAutoencoder(sum(self.inputs.values()))
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -50,31 +51,26 @@ class RepVGGBlock(nn.Module):
     """Parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, and identity where widths match, summed; then ReLU or nothing.
 
     The sum of the branches is one convolution with the sum of their kernels, also in training: gradients reach every
-    branch through the sum. `merge` makes it permanent. A single size without identity is a plain convolution.
+    branch through the sum. `merge` makes it permanent.
     """
 
-    def __init__(self, inputs: int, outputs: int, relu: bool, sizes: Sequence[int] = BRANCH_SIZES):
+    def __init__(self, inputs: int, outputs: int, relu: bool):
         super().__init__()
         self.relu = relu
-        self.has_identity = inputs == outputs and len(sizes) > 1
+        self.has_identity = inputs == outputs
         self.branches: Sequence[nn.Conv2d] = nn.ModuleList(  # type: ignore[assignment]
-            nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in sizes
+            nn.Conv2d(inputs, outputs, size, padding=size // 2) for size in BRANCH_SIZES
         )
         self.merged: nn.Conv2d | None = None
 
     def kernel(self) -> tuple[Tensor, Tensor]:
         """Weight (outputs, inputs, k, k), k the largest size, and bias (outputs,) of the branches' sum."""
-        size = max(branch.kernel_size[0] for branch in self.branches)
-        weights = []
-        biases = []
-        for branch in self.branches:
-            margin = (size - branch.kernel_size[0]) // 2
-            weights.append(F.pad(branch.weight, (margin,) * 4))
-            assert branch.bias is not None
-            biases.append(branch.bias)
+        reach = max(BRANCH_SIZES) // 2
+        weights = [F.pad(branch.weight, (reach - branch.kernel_size[0] // 2,) * 4) for branch in self.branches]
+        biases = [cast(Tensor, branch.bias) for branch in self.branches]
         if self.has_identity:
             eye = torch.eye(len(biases[0]), dtype=biases[0].dtype, device=biases[0].device)
-            weights.append(F.pad(eye[:, :, None, None], (size // 2,) * 4))
+            weights.append(F.pad(eye[:, :, None, None], (reach,) * 4))
         return torch.stack(weights).sum(dim=0), torch.stack(biases).sum(dim=0)
 
     def merge(self) -> None:
@@ -101,10 +97,10 @@ class RepVGGBlock(nn.Module):
         return F.relu(y, inplace=True) if self.relu else y
 
 
-def repvgg(widths: Sequence[int], sizes: Sequence[int] = BRANCH_SIZES) -> nn.Sequential:
+def repvgg(widths: Sequence[int]) -> nn.Sequential:
     """Blocks from widths[0] channels to widths[-1], the last one linear."""
     pairs = list(pairwise(widths))
-    return nn.Sequential(*(RepVGGBlock(a, b, i + 1 < len(pairs), sizes) for i, (a, b) in enumerate(pairs)))
+    return nn.Sequential(*(RepVGGBlock(a, b, relu=i + 1 < len(pairs)) for i, (a, b) in enumerate(pairs)))
 
 
 @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -9,20 +10,45 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
-from models.compiled.features import FEATURE_CHANNELS
+from models import compiled
+from models.compiled import features as kernels
+from models.compiled.features import FEATURE_CHANNELS, GAMMA
 from models.compiled.fusion import THREAD_ROWS, WINDOWS
-from models.denoiser import State, as_it_is, matching_state
+from models.denoiser import State, matching_state
 from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.history.running_scale import RunningScale, running_scale
-from models.networks.features import network_features, scaled_normal
 from models.networks.fusion import fuse
 from models.networks.pixel_kernels import apply_kernels
 from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
-from models.operators import halve, halve_surface, pad_to_multiple
+from models.operators import halve, pad_to_multiple, pyramid
 
 WSKP_WIDTH = 24  # ours: the paper does not print its widths
 MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips
 STRIP_PIXELS = 1 << 20
+
+
+def scaled_normal(normal: Tensor) -> Tensor:
+    """A normal's components, from [-1, 1] to [0, 1]."""
+    return normal / 2 + 0.5
+
+
+@compiled.by(kernels.network_features)
+def network_features(
+    frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
+) -> Tensor:
+    """The network's input (B, 10, H, W) in [0, 1] (§5.1), or fewer channels for some `names` of FEATURE_CHANNELS only.
+
+    Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
+    world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.
+    """
+    exposure = scale.exposure() * frame.gain
+    parts = {
+        "colour": (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA),
+        "albedo": frame.albedo,
+        "normal": scaled_normal(frame.normal),
+        "depth": scale.normalised_depth(frame.depth),
+    }
+    return torch.cat([parts[name] for name in names], dim=1)
 
 
 @dataclass(frozen=True)
@@ -33,12 +59,11 @@ class WSKPState(AccumulatedState):
     mixture: Tensor | None  # logits (B, M, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
-        shown = super().pictures()
-        if self.mixture is not None:
-            windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
-            shares = torch.softmax(self.mixture, dim=1)
-            shown["mean window (px)"] = (shares * windows[:, None, None]).sum(dim=1, keepdim=True)
-        return shown
+        if self.mixture is None:
+            return super().pictures()
+        windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
+        mean = (torch.softmax(self.mixture, dim=1) * windows[:, None, None]).sum(dim=1, keepdim=True)
+        return super().pictures() | {"mean window (px)": mean}
 
 
 class KernelPredictor(Accumulating):
@@ -46,7 +71,7 @@ class KernelPredictor(Accumulating):
 
     reads = Accumulated.reads
     is_network = True
-    dispensable: ClassVar = {"albedo": as_it_is, "normal": scaled_normal}
+    dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
     filter_reads = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
     network: nn.Module
     reach: int | None = None  # rows above and below that a pixel depends on; None for all
@@ -79,7 +104,7 @@ class KernelPredictor(Accumulating):
         history = self.accumulated(frame, before)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
-        return WSKPState(frame.moment, history, scale, None)
+        return WSKPState(frame.moment, history, scale, mixture=None)
 
     def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
         """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any.
@@ -90,27 +115,23 @@ class KernelPredictor(Accumulating):
         if self.reach is None or height * width <= MAX_WHOLE_PIXELS:
             return self.filter_whole(frame, irradiance, scale)
         rows = max(1, STRIP_PIXELS // width // THREAD_ROWS) * THREAD_ROWS
-        strips = [self.filter_rows(frame, irradiance, scale, top, top + rows) for top in range(0, height, rows)]
-        filtered, mixtures = zip(*strips, strict=True)
-        return torch.cat(filtered, dim=-2), None if mixtures[0] is None else torch.cat(mixtures, dim=-2)
-
-    def filter_rows(
-        self, frame: Frame, irradiance: Tensor, scale: RunningScale, top: int, bottom: int
-    ) -> tuple[Tensor, Tensor | None]:
-        """Rows `top` to `bottom` of what `filter_whole` returns."""
-        assert self.reach is not None
-        first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # keep the kernel's strips: they decide rounding
-        needed = slice(first, bottom + self.reach)
-        inner = slice(top - first, bottom - first)
-        part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in self.filter_reads})
-        filtered, mixture = self.filter_whole(part, irradiance[..., needed, :], scale)
-        return filtered[..., inner, :], None if mixture is None else mixture[..., inner, :]
+        strips = []
+        mixtures = []
+        for top in range(0, height, rows):
+            first = max(0, top - self.reach) // THREAD_ROWS * THREAD_ROWS  # the kernel's strips decide rounding
+            needed = slice(first, top + rows + self.reach)
+            inner = slice(top - first, top + rows - first)
+            part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in self.filter_reads})
+            filtered, mixture = self.filter_whole(part, irradiance[..., needed, :], scale)
+            strips.append(filtered[..., inner, :])
+            if mixture is not None:
+                mixtures.append(mixture[..., inner, :])
+        return torch.cat(strips, dim=-2), torch.cat(mixtures, dim=-2) if mixtures else None
 
     def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
         """`filter`, in one piece."""
-        x = self.features(frame, irradiance, scale)
-        predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
-        return self.reconstruct(irradiance, predicted, frame.surface)
+        x = self.features(frame, irradiance, scale).to(self.precision, memory_format=torch.channels_last)
+        return self.reconstruct(irradiance, self.network(x), frame.surface)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         after = self.accumulate(frame, state)
@@ -123,31 +144,30 @@ class KernelPredictor(Accumulating):
         super().prepare(precision)
 
 
-def trunk(layers: int, outputs: int, sizes: Sequence[int]) -> nn.Sequential:
-    """`layers` RepVGG blocks from the inputs to `outputs` channels."""
-    return repvgg([sum(FEATURE_CHANNELS.values()), *[WSKP_WIDTH] * (layers - 1), outputs], sizes)
-
-
-class WSKP(KernelPredictor):
-    """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
+class TrunkPredictor(KernelPredictor):
+    """A trunk of RepVGG blocks that predicts windows or kernels of up to 13 x 13 pixels."""
 
     convex = True
-    evaluated_with: tuple[str, ...] = ("adaptive",)
     layers: ClassVar[int] = 6
+    outputs: ClassVar[int]
 
-    def __init__(
-        self, windows: Sequence[int] = WINDOWS, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None
-    ):
+    def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.windows = tuple(windows)
-        self.network = trunk(self.layers, 2 * len(windows), sizes)
-        self.reach = self.layers * (max(sizes) // 2) + max(windows) // 2
+        self.network = repvgg([sum(FEATURE_CHANNELS.values()), *[WSKP_WIDTH] * (self.layers - 1), self.outputs])
+        self.reach = self.layers * (max(BRANCH_SIZES) // 2) + max(WINDOWS) // 2
+
+
+class WSKP(TrunkPredictor):
+    """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
+
+    evaluated_with: tuple[str, ...] = ("adaptive",)
+    outputs = 2 * len(WINDOWS)
 
     def reconstruct(
         self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
     ) -> tuple[Tensor, Tensor | None]:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
-        return fuse(irradiance, importance, mixture, self.windows, surface), mixture
+        return fuse(irradiance, importance, mixture, WINDOWS, surface), mixture
 
 
 class WSKP3(WSKP):
@@ -157,16 +177,10 @@ class WSKP3(WSKP):
     layers = 3
 
 
-class KP(KernelPredictor):
+class KP(TrunkPredictor):
     """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel per pixel."""
 
-    convex = True
-    window = 13
-
-    def __init__(self, sizes: Sequence[int] = BRANCH_SIZES, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.network = trunk(WSKP.layers, self.window**2, sizes)
-        self.reach = WSKP.layers * (max(sizes) // 2) + self.window // 2
+    outputs = max(WINDOWS) ** 2
 
     def reconstruct(
         self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
@@ -187,9 +201,7 @@ class MultiResolutionNet(nn.Module):
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
         fine, middle, coarse = self.widths
-        self.down = nn.ModuleList(
-            [convolutions(inputs, fine), convolutions(fine, middle), convolutions(middle, coarse)]
-        )
+        self.down = nn.ModuleList(convolutions(a, b) for a, b in pairwise((inputs, fine, middle, coarse)))
         self.up = nn.ModuleList([convolutions(coarse + middle, middle), convolutions(middle + fine, fine)])
         self.heads = nn.ModuleList(nn.Conv2d(width, outputs, 1) for width in self.widths[::-1])
 
@@ -232,43 +244,35 @@ class MultiResolution(KernelPredictor):
     def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
         return pad_to_multiple(super().features(frame, irradiance, scale), 4)
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
-        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w)."""
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w), and logits, if any."""
         raise NotImplementedError
-
-    def mixture(self, maps: Tensor) -> Tensor | None:
-        """The logits between windows among the `maps` of the finest resolution, if any."""
-        return None
 
     def reconstruct(  # type: ignore[override]
         self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
     ) -> tuple[Tensor, Tensor | None]:
         height, width = irradiance.shape[-2:]
-        images = [pad_to_multiple(irradiance, 4)]
-        surfaces = [None if surface is None else pad_to_multiple(surface, 4)]
-        for _ in predicted[1:]:
-            images.append(halve(images[-1], surfaces[-1]))
-            surfaces.append(halve_surface(surfaces[-1]))
-        output = images[-1]
-        for level, (image, valid, predictions) in enumerate(zip(images[::-1], surfaces[::-1], predicted, strict=True)):
+        surface = None if surface is None else pad_to_multiple(surface, 4)
+        levels = pyramid(pad_to_multiple(irradiance, 4), surface, len(predicted))
+        output: Tensor | None = None
+        for (image, valid), predictions in zip(levels, predicted, strict=True):
             maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
-            filtered = self.filter_level(image, maps, valid)
-            output = combine_resolutions(filtered, output, torch.sigmoid(alpha), valid) if level else filtered
-        mixture = self.mixture(maps[..., :height, :width])
+            fine, mixture = self.filter_level(image, maps, valid)
+            output = fine if output is None else combine_resolutions(fine, output, torch.sigmoid(alpha), valid)
+        assert output is not None
+        if mixture is not None:
+            mixture = mixture[..., :height, :width]
         return output[..., :height, :width].clamp(min=0), mixture
 
 
 class WSKPMR(MultiResolution):
     """Windows 3 and 5 at three resolutions (§5.3)."""
 
-    windows = (3, 5)
     maps = 4
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
-        return fuse(image, maps[:, :2], maps[:, 2:], self.windows, surface)
-
-    def mixture(self, maps: Tensor) -> Tensor | None:
-        return maps[:, 2:]
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        importance, mixture = maps.chunk(2, dim=1)
+        return fuse(image, importance, mixture, (3, 5), surface), mixture
 
 
 class MRKP(MultiResolution):
@@ -276,5 +280,5 @@ class MRKP(MultiResolution):
 
     maps = 25
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Tensor:
-        return apply_kernels(image, maps, surface)
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        return apply_kernels(image, maps, surface), None

@@ -37,7 +37,6 @@ SCARCE_SAMPLES = 16.0  # per pixel
 RARE_PIXELS = 2.0
 MAX_RATIO = 1e6  # of noise to denoised irradiance; the square of a square must stay finite
 MIN_RELATIVE_LUMINANCE = 0.01  # of the mean luminance: added to what irradiance is divided by
-COMPARED_CHANNELS = ("albedo", "depth", "mesh_id")
 
 
 class WindowMeans(NamedTuple):
@@ -122,9 +121,10 @@ def blend(frame: Frame, denoised: Tensor, rho: Tensor, signal: Signal) -> Tensor
 class JamesStein(Wrapper):
     """Shrinkage of noise to a denoiser's output, where frames have sample buffers. Its state is the inner one's."""
 
+    needs = ("albedo", "depth", "mesh_id")
+
     def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
-        buffers = (SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)
-        return tuple(dict.fromkeys((*reads, *buffers, *COMPARED_CHANNELS)))
+        return super().reads_with((*reads, *(SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.forward(frame, state)

@@ -1,6 +1,5 @@
 """NAME+taa: temporal antialiasing after a denoiser (Karis 2014)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,8 +93,7 @@ class TAA(Wrapper):
     finds none: disoccluded, or off-screen. Tone mapping takes the causal exposure of the outputs so far.
     """
 
-    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
-        return tuple(dict.fromkeys((*reads, "normal", "depth", "mesh_id", "motion")))
+    needs = ("normal", "depth", "mesh_id", "motion")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         previous = matching_state(state, TAAState, frame)

@@ -1,6 +1,7 @@
 """The base class of wrappers: denoisers that change the input or output of another one."""
 
 from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import torch
 
@@ -9,6 +10,8 @@ from models.denoiser import Denoiser
 
 class Wrapper(Denoiser):
     """A denoiser that wraps another one and takes over its attributes, apart from those of its output's light."""
+
+    needs: ClassVar[tuple[str, ...]] = ()  # channels, beside those of the inner denoiser
 
     def __init__(self, inner: Denoiser):
         super().__init__(signal=inner.signal)
@@ -21,7 +24,7 @@ class Wrapper(Denoiser):
 
     def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
         """The channels that the inner denoiser `reads`, and those that the wrapper needs."""
-        return tuple(reads)
+        return tuple(dict.fromkeys((*reads, *self.needs)))
 
     def unavailable(self) -> str | None:
         return self.inner.unavailable()

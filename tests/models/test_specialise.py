@@ -12,7 +12,7 @@ from errors import BadInput
 from models import compiled, registry
 from models.denoiser import Denoiser
 from models.history.running_scale import running_scale
-from models.networks.features import network_features
+from models.networks.wskp import network_features
 from models.spec import load
 from models.specialise import drop_inputs, specialise
 from models.weights import read_metadata, save_weights
