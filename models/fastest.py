@@ -3,7 +3,7 @@
 import os
 import time
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch.nn import functional as F
@@ -41,19 +41,12 @@ def bfloat16_is_faster() -> bool:
 
 
 def bfloat16_speedup() -> float:
-    """How many times faster this processor convolves in bfloat16, by the time that one thread computes.
-
-    So it makes no difference what else the machine is doing.
-    """
-    image = torch.ones(1, 32, 96, 96).contiguous(memory_format=torch.channels_last)
-    weight = torch.ones(32, 32, 3, 3).contiguous(memory_format=torch.channels_last)
-    inputs = {dtype: (image.to(dtype), weight.to(dtype)) for dtype in (torch.float32, torch.bfloat16)}
-
-    @torch.no_grad()
-    def convolve(dtype: torch.dtype) -> None:
-        F.conv2d(*inputs[dtype], padding=1)
-
-    work = {str(dtype): lambda dtype=dtype: convolve(dtype) for dtype in inputs}
-    with thread_count(1):
+    """How many times faster this processor convolves in bfloat16, by the time that one thread computes, busy or not."""
+    work = {}
+    for dtype in (torch.float32, torch.bfloat16):
+        image, weight = (torch.ones(shape, dtype=dtype) for shape in ((1, 32, 96, 96), (32, 32, 3, 3)))
+        image, weight = (each.contiguous(memory_format=torch.channels_last) for each in (image, weight))
+        work[str(dtype)] = partial(F.conv2d, image, weight, padding=1)
+    with thread_count(1), torch.no_grad():
         seconds = take_turns(work, TURNS, clock=time.thread_time, label=None)
     return min(seconds[str(torch.float32)]) / min(seconds[str(torch.bfloat16)])

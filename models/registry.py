@@ -74,17 +74,8 @@ class DenoiserName:
     budget: str | None = None  # the training budget of its weights, kept in RUNS; None for the weights that are shipped
     wrappers: tuple[str, ...] = ()  # keys of WRAPPERS, innermost first
 
-    @classmethod
-    def parse(cls, text: str) -> "DenoiserName":
-        """The parts of a name. Raises BadInput where it is not BASE[@BUDGET][+WRAPPER...]."""
-        match = SYNTAX.fullmatch(text)
-        if not match:
-            raise BadInput(f"'{text}' is no name of a denoiser: write NAME, NAME@BUDGET or NAME+WRAPPER")
-        return cls(match[1], match[2], tuple(match[3].split("+")[1:]))
-
     def __str__(self) -> str:
-        budget = f"@{self.budget}" if self.budget else ""
-        return self.base + budget + "".join(f"+{wrapper}" for wrapper in self.wrappers)
+        return "+".join([f"{self.base}@{self.budget}" if self.budget else self.base, *self.wrappers])
 
     def with_budget(self, budget: str | None) -> "DenoiserName":
         """The same denoiser with the weights of another budget, or with the shipped weights."""
@@ -105,19 +96,20 @@ def create(name: str | DenoiserName, signal: Signal | None = None) -> Denoiser:
 
 @cache
 def prototype(name: str | DenoiserName) -> Denoiser:
-    """A denoiser without weights, to read its attributes from: what it reads, returns, refuses. It cannot run.
-
-    Raises BadInput as `create`.
-    """
+    """A denoiser without weights, to read its attributes from; it cannot run. Raises BadInput as `create`."""
     with torch.device("meta"):
         return create(name)
 
 
 def parse_name(name: str | DenoiserName) -> DenoiserName:
-    """A name in its parts. Raises BadInput for one of no denoiser."""
-    parsed = DenoiserName.parse(name) if isinstance(name, str) else name
-    unknown = [wrapper for wrapper in parsed.wrappers if wrapper not in WRAPPERS]
-    if parsed.base not in DENOISERS or unknown:
+    """A name BASE[@BUDGET][+WRAPPER...] in its parts. Raises BadInput for one of no denoiser."""
+    parsed = name
+    if isinstance(parsed, str):
+        match = SYNTAX.fullmatch(parsed)
+        if not match:
+            raise BadInput(f"'{name}' is no name of a denoiser: write NAME, NAME@BUDGET or NAME+WRAPPER")
+        parsed = DenoiserName(match[1], match[2], tuple(match[3].split("+")[1:]))
+    if parsed.base not in DENOISERS or not WRAPPERS.keys() >= {*parsed.wrappers}:
         raise BadInput(
             f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with +taa and +js, and "
             "those that begin with temporal accumulation with +adaptive"

@@ -21,8 +21,7 @@ PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": t
 
 def precisions_of(name: str | DenoiserName) -> list[str]:
     """The precisions that a denoiser computes in, keys of PRECISIONS. Raises BadInput for an unknown name."""
-    refused = prototype(name).refuses
-    return [precision for precision, dtype in PRECISIONS.items() if dtype not in refused]
+    return [precision for precision, dtype in PRECISIONS.items() if dtype not in prototype(name).refuses]
 
 
 def fastest_precision(name: str | DenoiserName, device: str = "cpu") -> str:

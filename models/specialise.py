@@ -17,9 +17,8 @@ def specialise(denoiser: Denoiser, constants: Mapping[str, Sequence[float]]) -> 
     for name in [name for name in denoiser.inputs if name in denoiser.dispensable and name in constants]:
         names = list(denoiser.inputs)
         first = sum(denoiser.inputs[other] for other in names[: names.index(name)])
-        values = denoiser.dispensable[name](torch.tensor(constants[name]))
         for layer in denoiser.first_layers():
-            drop_inputs(layer, first, values)
+            drop_inputs(layer, first, denoiser.dispensable[name](torch.tensor(constants[name])))
         del denoiser.inputs[name]
         denoiser.constants[name] = list(constants[name])
 

@@ -17,10 +17,7 @@ from models.specialise import specialise
 def save_weights(
     denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path, made_by: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Write atomically: a reader gets the old file or the whole new one.
-
-    `made_by` names the code and packages that trained them, see train/made_by.py.
-    """
+    """Write atomically. `made_by` names the code and packages that trained them, see train/made_by.py."""
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
     metadata = {"denoiser": name, "recipe": json.dumps(recipe), "made_by": json.dumps(list(made_by))}
     if denoiser.constants:
@@ -39,10 +36,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
-    """Load a file into `denoiser`, specialised as its metadata states.
-
-    Raises BadInput where it is missing, damaged or of another network.
-    """
+    """Load a file, specialised as its metadata states. Raises BadInput if missing, damaged or of another network."""
     if not path.exists():
         raise BadInput(f"there are no weights at {path}: train them with `onespp train {name}`")
     try:
@@ -54,7 +48,7 @@ def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
     if metadata.get("denoiser") != name:
         raise BadInput(f"{path} holds weights of '{metadata.get('denoiser')}', not of '{name}'")
     specialise(denoiser, json.loads(metadata.get("constants", "{}")))
-    wanted = {key: tensor.shape for key, tensor in denoiser.state_dict().items()}
-    if {key: tensor.shape for key, tensor in tensors.items()} != wanted:
-        raise BadInput(f"{path} holds a '{name}' of another shape: train it again with `onespp train {name}`")
-    denoiser.load_state_dict(tensors)
+    try:
+        denoiser.load_state_dict(tensors)
+    except RuntimeError:
+        raise BadInput(f"{path} holds a '{name}' of another shape: train it again with `onespp train {name}`") from None

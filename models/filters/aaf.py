@@ -65,14 +65,13 @@ def widths(frame: Frame) -> Tensor:
     """Standard deviations (B, 2, 1, H, W) of the Gaussians for direct and for indirect light, in world units."""
     focal_length = frame.now.K[:, 0, 0].abs().to(frame.depth)[:, None, None, None]
     size = frame.depth / focal_length  # of a pixel, on a surface that faces the camera
-    blocked = frame.hit_distance[:, 1:] > 0
-    penumbras = torch.where(blocked, penumbra(frame), torch.inf)
+    penumbras = torch.where(frame.hit_distance[:, 1:] > 0, penumbra(frame), torch.inf)
     shadow = torch.maximum(mesh_min(penumbras, frame.mesh_id), size) / SHADOW_SHARPNESS
     distance = torch.cat([frame.light_distance, frame.hit_distance[:, :1]], dim=1)
     nearest = mesh_min(torch.where(distance > 0, distance, torch.inf), frame.mesh_id)
     lamp, indirect = (nearest / (2 * band_limit(frame.roughness))).split(1, dim=1)
-    both = torch.stack([torch.minimum(shadow, lamp), indirect], dim=1)
-    return torch.minimum(both, (MAX_REACH / TRUNCATION * size)[:, None])
+    sigmas = torch.stack([torch.minimum(shadow, lamp), indirect], dim=1)
+    return torch.minimum(sigmas, (MAX_REACH / TRUNCATION * size)[:, None])
 
 
 def positions(frame: Frame) -> Tensor:
@@ -101,10 +100,7 @@ def gaussian_weight(width: Tensor, p: Tensor, q: Tensor) -> Tensor:
 
 @compiled.by(kernels.filter_lines)
 def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
-    """Images (B, S, 3, H, W), filtered along rows, or `down` columns, by Gaussians of `width` (B, S, 1, H, W).
-
-    No Gaussian is wider than `max_width` (B, S, 1, H, W) of the tap.
-    """
+    """Images (B, S, 3, H, W) filtered along rows, or `down` columns, by Gaussians of `width`, limited by the tap's."""
 
     def weight(tap: Tap) -> Tensor:
         narrower = torch.minimum(width[tap.p], max_width[tap.q])

@@ -20,8 +20,6 @@ SPLINE = np.array(B3_SPLINE, np.float32)  # for kernels
 RADIUS = len(B3_SPLINE) // 2
 CENTRE = B3_SPLINE[RADIUS] ** 2
 
-Region = tuple[EllipsisType, slice, slice]
-
 
 @dataclass(frozen=True)
 class Tap:
@@ -29,8 +27,8 @@ class Tap:
 
     dx: int
     dy: int
-    p: Region
-    q: Region
+    p: tuple[EllipsisType, slice, slice]
+    q: tuple[EllipsisType, slice, slice]
 
 
 def strip_taps(size: Sequence[int], radius: int, step: int = 1) -> Iterator[Tap]:

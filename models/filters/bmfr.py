@@ -51,8 +51,7 @@ def grid_offset(number: int) -> Offset:
 def feature_noise(number: int) -> Tensor:
     """Noise (1024, 10), float64, for the features of each block in frame `number`; always the same."""
     generator = torch.Generator().manual_seed(number)
-    uniform = torch.rand(BLOCK_SIDE**2, REGRESSORS, dtype=torch.float64, generator=generator)
-    noise = NOISE * (2 * uniform - 1)
+    noise = NOISE * (2 * torch.rand(BLOCK_SIDE**2, REGRESSORS, dtype=torch.float64, generator=generator) - 1)
     noise[:, 0] = 0  # of the constant
     return noise
 
@@ -82,10 +81,9 @@ class Blocks:
 
     def join(self, blocks: Tensor) -> Tensor:
         """The image (B, C, H, W) of blocks (B, blocks, 1024, C)."""
-        grid = blocks.unflatten(1, self.counts).unflatten(3, (BLOCK_SIDE, BLOCK_SIDE))
-        image = grid.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
+        grid = blocks.unflatten(1, self.counts).unflatten(3, (BLOCK_SIDE, BLOCK_SIDE)).permute(0, 5, 1, 3, 2, 4)
         (height, width), (above, left) = self.size, self.offset
-        return image[:, :, above : above + height, left : left + width]
+        return grid.flatten(4, 5).flatten(2, 3)[:, :, above : above + height, left : left + width]
 
 
 def features(normal: Tensor, position: Tensor, surface: Tensor) -> Tensor:

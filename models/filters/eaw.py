@@ -34,10 +34,9 @@ def guides(frame: Frame, scale: RunningScale) -> Tensor:
 
 @compiled.by(kernels.eaw_level)
 def eaw_level(colour: Tensor, features: Tensor, step: int) -> Tensor:
-    """One level of the à-trous transform of colour (B, 3, H, W): w = exp(-|f(p) - f(q)|²) with features f (B, 9, H, W).
+    """One level of the à-trous transform of colour (B, 3, H, W), with taps `step` pixels apart.
 
-    The product of Gaussians of colour, normal and position is a single Gaussian of all features. Taps are `step` pixels
-    apart.
+    w = exp(-|f(p) - f(q)|²) of features f (B, 9, H, W) is the product of Gaussians of colour, normal and position.
     """
 
     def weight(tap: Tap) -> Tensor:

@@ -12,9 +12,7 @@ from models.operators import MAX_LUMINANCE, image_luminance
 
 def taps_3x3(x: Tensor, step: int) -> Tensor:
     """The 3 x 3 taps, `step` pixels apart, of every pixel of (B, C, H, W): (B, C, 9, H, W), 0 outside the image."""
-    batch, channels, height, width = x.shape
-    taps = F.unfold(x, 3, dilation=step, padding=step)
-    return taps.view(batch, channels, 9, height, width)
+    return F.unfold(x, 3, dilation=step, padding=step).unflatten(2, x.shape[-2:]).unflatten(1, (-1, 9))
 
 
 def taps_on_mesh(mesh_id: Tensor, step: int) -> Tensor:
@@ -63,7 +61,6 @@ def mesh_min(image: Tensor, mesh_id: Tensor) -> Tensor:
 
 def mesh_variance(image: Tensor, mesh_id: Tensor) -> Tensor:
     """Variance (B, C, H, W) of each channel of the image over 9 x 9 pixels of the same mesh; 0 for a single pixel."""
-    moments = torch.cat([image, image.square(), torch.ones_like(image[:, :1])], dim=1)
-    sums = mesh_sums_9x9(moments, mesh_id)
+    sums = mesh_sums_9x9(torch.cat([image, image.square(), torch.ones_like(image[:, :1])], dim=1), mesh_id)
     mean, square = (sums[:, :-1] / sums[:, -1:]).chunk(2, dim=1)
     return (square - mean.square()).clamp(min=0)

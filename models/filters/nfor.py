@@ -88,14 +88,11 @@ def nl_means(image: Tensor, distances: Tensor, bandwidth: float) -> Tensor:
 
 
 def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float) -> Tensor:
-    """Collaborative regression of the image (B, 3, H, W), linear in features (B, F, H, W) and position; 0 off surfaces.
-
-    Weights are exp(-distance / bandwidth²).
-    """
+    """Collaborative regression of the image (B, 3, H, W) on features (B, F, H, W) and position, weighted so."""
     height, width = image.shape[-2:]
     count = features.shape[1]
     steps = torch.linspace(-1, 1, WINDOW_SIDE).to(image)
-    position = torch.cartesian_prod(steps, steps).T
+    positions = torch.cartesian_prod(steps, steps).T
     padded = F.pad(torch.cat([features, image], dim=1), (REACH,) * 4)
     sums = torch.zeros_like(padded[:, :4])
     for rows in torch.arange(height).split(max(1, FITTED_PIXELS // width)):
@@ -103,13 +100,12 @@ def regress(image: Tensor, features: Tensor, distances: Tensor, bandwidth: float
         wide = slice(strip.start, strip.stop + 2 * REACH)
         taps = F.unfold(padded[:, :, wide], WINDOW_SIDE).mT.unflatten(2, (-1, WINDOW_SIDE**2))  # (B, N, F + 3, taps)
         apart = taps[:, :, :count] - features[:, :, strip].flatten(2).mT[..., None]
-        coordinates = position.expand(*apart.shape[:2], -1, -1)
-        x = torch.cat([torch.ones_like(apart[:, :, :1]), coordinates, apart], dim=2).double()
+        position = positions.expand(*apart.shape[:2], -1, -1)
+        x = torch.cat([torch.ones_like(apart[:, :, :1]), position, apart], dim=2).double()
         weight = torch.exp(-distances[:, :, strip].flatten(2) / bandwidth**2).mT[:, :, None].double()
         weighted = weight * x
         moments = weighted @ x.mT
-        total = moments[..., :1, 0].clamp_(min=1)
-        moments.diagonal(dim1=-2, dim2=-1)[..., 1:] += RIDGE * total
+        moments.diagonal(dim1=-2, dim2=-1)[..., 1:] += RIDGE * moments[..., :1, 0].clamp_(min=1)
         fit = torch.cholesky_solve(weighted @ taps[:, :, count:].double().mT, torch.linalg.cholesky(moments))
         predicted = torch.cat([weight * (fit.mT @ x), weight], dim=2).flatten(2).mT
         sums[:, :, wide] += F.fold(predicted.to(image), (wide.stop - wide.start, sums.shape[-1]), WINDOW_SIDE)
@@ -163,9 +159,8 @@ def nfor(buffers: Tensor, variance: Tensor, features: Tensor, surface: Tensor) -
 def features_of(frame: Frame) -> Tensor:
     """Normal, albedo and relative depth, which fits are linear in: (B, 7, H, W) in [-1, 1]."""
     max_depth = frame.depth.amax((2, 3), keepdim=True).clamp(min=MIN_DIVISOR)
-    return torch.cat(
-        [frame.normal.clamp(-1, 1), frame.albedo.clamp(0, 1), (frame.depth / max_depth).clamp(0, 1)], dim=1
-    )
+    depth = (frame.depth / max_depth).clamp(0, 1)
+    return torch.cat([frame.normal.clamp(-1, 1), frame.albedo.clamp(0, 1), depth], dim=1)
 
 
 class NFOR(Denoiser):
@@ -179,6 +174,5 @@ class NFOR(Denoiser):
         colour = frame.irradiance(self.signal).clamp(-MAX_FITTED, MAX_FITTED)
         buffers = checkerboard_buffers(colour, frame.mesh_id)
         _, variance, _ = mesh_means(variance_of_mean(buffers), frame.mesh_id)
-        surface = (frame.depth > 0).to(colour)
-        denoised = nfor(buffers, variance, features_of(frame), surface).clamp(min=0)
-        return frame.remodulate(denoised, self.signal), State(frame.moment)
+        denoised = nfor(buffers, variance, features_of(frame), (frame.depth > 0).to(colour))
+        return frame.remodulate(denoised.clamp(min=0), self.signal), State(frame.moment)

@@ -34,11 +34,6 @@ def open_device(threads: int) -> Any:
     return device
 
 
-def release_native(device: Any, filter_: Any) -> None:
-    filter_.release()
-    device.release()
-
-
 class RayTracingFilter:
     """OIDN's filter "RT" for images of one size. OIDN reads and writes the tensors of `images` in place.
 
@@ -52,7 +47,8 @@ class RayTracingFilter:
 
         self.device = device
         self.filter = pyoidn.Filter(device)
-        self.close = weakref.finalize(self, release_native, self.device, self.filter)  # at the latest at exit
+        weakref.finalize(self, device.release)  # at the latest at exit, where the last one is called first
+        weakref.finalize(self, self.filter.release)
         with torch.inference_mode(False):  # else they could not be written outside of it
             self.images = {name: torch.zeros(height, width, 3) for name in OIDN_IMAGES}
         for name, image in self.images.items():
@@ -91,10 +87,7 @@ class OIDN(Denoiser):
     baseline_for: tuple[Signal, ...] = ("total",)
 
     quality: OIDNQuality = "high"
-
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.key: tuple[int, int, int] | None = None  # (H, W, threads) of the filter
+    key: tuple[int, int, int] | None = None  # (H, W, threads) of the filter
 
     def unavailable(self) -> str | None:
         try:
@@ -117,9 +110,8 @@ class OIDN(Denoiser):
 
     def denoise(self, frame: Frame, radiance: Tensor) -> Tensor:
         """The denoised image of reflected `radiance` (B, 3, H, W), with emission for "total"."""
-        denoise = self.filter_for(*frame.size)
         inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
-        denoised = torch.stack([denoise(*item) for item in zip(*inputs, strict=True)])
+        denoised = torch.stack([*map(self.filter_for(*frame.size), *inputs)])
         return frame.complete(denoised, self.signal)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

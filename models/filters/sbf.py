@@ -86,12 +86,9 @@ def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
 def filter_with_risk(
     colour: Tensor, variance: Tensor, guides: Tensor, sigmas: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
-    """Colour (B, 3, H, W) by each filter, and its risk: both (B, S, 3, H, W).
-
-    `variance` (B, 3, H, W) is that of the noise, `sigmas` are the filters' σ_s.
-    """
-    ones = torch.ones_like(colour[:, :1])
-    sums = window_sums(torch.cat([colour, ones], dim=1), guides, gaussians(sigmas).to(colour))
+    """Colour (B, 3, H, W) by filters of σ_s `sigmas`, and their risks, (B, S, 3, H, W), for noise of this variance."""
+    image = torch.cat([colour, torch.ones_like(colour[:, :1])], dim=1)
+    sums = window_sums(image, guides, gaussians(sigmas).to(colour))
     filtered = sums[:, :, :3] / sums[:, :, 3:]
     derivative = 1 / sums[:, :, 3:]  # a pixel's own weight is 1
     return filtered, (filtered - colour[:, None]).square() + (2 * derivative - 1) * variance[:, None]
@@ -101,8 +98,7 @@ def best_filtered(colour: Tensor, variance: Tensor, guides: Tensor) -> Tensor:
     """Colour (B, 3, H, W), at each pixel by the filter of BANK with the smallest smoothed risk."""
     filtered, risk = filter_with_risk(colour, variance, guides, BANK)
     smoothed = window_sums(risk.mean(dim=2), guides, gaussians([RISK_SIGMA]).to(colour))  # up to a factor
-    best = smoothed.argmin(dim=2, keepdim=True)
-    return filtered.take_along_dim(best, dim=1)[:, 0]
+    return filtered.take_along_dim(smoothed.argmin(dim=2, keepdim=True), dim=1)[:, 0]
 
 
 class SBF(Denoiser):

@@ -151,10 +151,7 @@ def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
 
 
 def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
-    """One level of the à-trous transform (§4.3): colour (B, S, 3, H, W) and variance (B, S, 1, H, W), filtered.
-
-    Taps are `step` pixels apart.
-    """
+    """Colour (B, S, 3, H, W) and variance (B, S, 1, H, W) after a level (§4.3) with taps `step` pixels apart."""
     y = image_luminance(colour.flatten(0, 1)).view_as(variance)
     scale = edge_scale(variance, geometry[:, :, 3:4] > 0)
     total = WindowSum(torch.ones_like(variance), CENTRE)

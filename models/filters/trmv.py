@@ -16,7 +16,7 @@ We do not have the paper's text; the three kinds of vectors follow its abstract 
 - Elsewhere, motion vectors are dual.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -76,8 +76,7 @@ class TRMV(SVGF):
         histories = previous.histories if previous else [None] * len(signals)
         integrated = []
         for vectors, signal, history in zip(reliable_vectors(frame)[-len(signals) :], signals, histories, strict=True):
-            moved = replace(frame, channels=frame.channels | {"motion": vectors})
-            integrated.append(integrate(moved, signal, history))
+            integrated.append(integrate(frame.with_channels({"motion": vectors}), signal, history))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         variance = torch.cat([estimate_variance(part, geometry) for part in integrated], dim=1)
         colour = torch.cat([part.colour for part in integrated], dim=1)

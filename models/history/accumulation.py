@@ -29,9 +29,8 @@ def accumulate_samples(
     """`accumulate` where there is a previous frame, with `gbuffer`: irradiance (B, 3, H, W), length (B, 1, H, W)."""
     history, has_history = reproject(frame, torch.cat([past_irradiance, past_length], dim=1), gbuffer)
     length = history[:, 3:] + 1
-    alpha = (1 / length).clamp(min=MIN_ALPHA)
-    irradiance = torch.lerp(history[:, :3], noisy, torch.where(has_history, alpha, 1))
-    return irradiance, torch.where(has_history, length, 1)
+    alpha = torch.where(has_history, (1 / length).clamp(min=MIN_ALPHA), 1)
+    return torch.lerp(history[:, :3], noisy, alpha), torch.where(has_history, length, 1)
 
 
 def accumulate(frame: Frame, irradiance: Tensor, previous: Accumulation | None) -> Accumulation:

@@ -68,8 +68,6 @@ def to_previous_camera(now: Cameras, previous: Cameras, item: int) -> Tensor:
 
     Products are taken in float64 and camera to camera, so that scenes far from the origin keep their precision.
     """
-    to_world = now.camera_to_world[item]
-    from_world = inverse_pose(previous.camera_to_world[item])
     moved = previous.object_to_world[item] @ inverse_pose(now.object_to_world[item])
-    still = torch.eye(4, dtype=moved.dtype, device=moved.device)[None]
-    return from_world @ torch.cat([still, moved]) @ to_world
+    still = torch.eye(4).to(moved)[None]
+    return inverse_pose(previous.camera_to_world[item]) @ torch.cat([still, moved]) @ now.camera_to_world[item]

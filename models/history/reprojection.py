@@ -1,6 +1,6 @@
 """Reprojection: where each pixel's surface was in the previous frame, and what an image held there (SVGF §4.1)."""
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -22,8 +22,7 @@ class Reprojection:
     def __init__(self, frame: Frame, image: Tensor, gbuffer: GBuffer, item: int):
         self.height, self.width = frame.size
         self.image = image[item].flatten(1)  # (C, H W)
-        channels = [gbuffer.depth[item], gbuffer.normal[item], gbuffer.mesh_id[item]]
-        self.gbuffer = torch.cat(channels).flatten(1)  # (5, H W)
+        self.gbuffer = torch.cat([gbuffer.depth[item], gbuffer.normal[item], gbuffer.mesh_id[item]]).flatten(1)
         self.previous_K = frame.previous.K[item]
         self.mesh = frame.mesh_id[item, 0].long().flatten()  # (H W,)
         motion = frame.motion[item]
@@ -31,44 +30,44 @@ class Reprojection:
         self.position = torch.stack([x + motion[0], y + motion[1]]).flatten(1)  # (2, H W), in the previous frame
 
         # The expected position of each surface point and its normal, in the previous camera's frame.
-        depth = frame.depth[item, 0].flatten()
-        normal = frame.normal[item].flatten(1)
         matrix = to_previous_camera(frame.now, frame.previous, item).to(motion)[self.mesh]
-        ray = rays(frame.now.K[item], x.flatten(), y.flatten())
-        world_to_camera = frame.now.camera_to_world[item, :3, :3].T.to(motion)
-        self.point = torch.einsum("nij,nj->ni", matrix[:, :3, :3], depth[:, None] * ray) + matrix[:, :3, 3]  # (H W, 3)
-        self.normal = torch.einsum("nij,jk,kn->ni", matrix[:, :3, :3], world_to_camera, normal)  # (H W, 3)
+        point = frame.depth[item].flatten()[:, None] * rays(frame.now.K[item], x.flatten(), y.flatten())
+        to_camera = frame.now.camera_to_world[item, :3, :3].T.to(motion)
+        self.point = torch.einsum("nij,nj->ni", matrix[:, :3, :3], point) + matrix[:, :3, 3]  # (H W, 3)
+        self.normal = torch.einsum("nij,jk,kn->ni", matrix[:, :3, :3], to_camera, frame.normal[item].flatten(1))
         self.world_to_previous = frame.previous.camera_to_world[item, :3, :3].T.to(motion)
 
-    def taps(self, pixels: Tensor, column: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-        """The image (C, K, n) at taps (K, n) for the n `pixels` (indices), and whether each tap is valid (K, n)."""
+    def taps(self, pixels: Tensor, corner: Tensor, offsets: range) -> tuple[Tensor, Tensor]:
+        """The image (C, K, n) at K taps for the n `pixels` (indices), and whether each tap is valid (K, n).
+
+        The taps lie at `offsets` from the pixel `corner` (2, n) along both axes, row by row.
+        """
+        offset = torch.tensor(offsets, device=corner.device)
+        dy, dx = torch.cartesian_prod(offset, offset).T
+        column = corner[0] + dx[:, None]
+        row = corner[1] + dy[:, None]
         inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
         index = row.clamp(0, self.height - 1) * self.width + column.clamp(0, self.width - 1)
         depth = self.gbuffer[0, index]
         normal = torch.einsum("ij,jkn->kni", self.world_to_previous, self.gbuffer[1:4, index])
-        mesh = self.gbuffer[4, index]
+        same_mesh = self.gbuffer[4, index] == self.mesh[pixels]
         position = depth[..., None] * rays(self.previous_K, column + 0.5, row + 0.5)
         off_plane = ((self.point[pixels] - position) * normal).sum(dim=-1).abs()
         same_plane = off_plane <= HISTORY_PLANE_TOLERANCE * depth
         same_normal = (normal * self.normal[pixels]).sum(dim=-1) >= NORMAL_TOLERANCE
         background = self.mesh[pixels] == BACKGROUND_ID
-        return self.image[:, index], inside & (mesh == self.mesh[pixels]) & (background | same_plane & same_normal)
+        return self.image[:, index], inside & same_mesh & (background | same_plane & same_normal)
 
     def bilinear(self) -> tuple[Tensor, Tensor]:
         """History (C, H W) and where there is one (H W,)."""
         # Far outside the image an index would overflow; any place outside is as good.
         x = (self.position[0] - 0.5).clamp(-2, self.width + 1)
         y = (self.position[1] - 0.5).clamp(-2, self.height + 1)
-        left = x.floor()
-        top = y.floor()
-        fx = x - left
-        fy = y - top
-        shift = torch.tensor([[0, 1, 0, 1], [0, 0, 1, 1]], device=x.device)
+        corner = torch.stack([x, y]).floor()
+        fx = x - corner[0]
+        fy = y - corner[1]
         weight = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
-        all_pixels = torch.arange(x.numel(), device=x.device)
-        column = left.long() + shift[0][:, None]
-        row = top.long() + shift[1][:, None]
-        image, valid = self.taps(all_pixels, column, row)
+        image, valid = self.taps(torch.arange(x.numel(), device=x.device), corner.long(), range(2))
         count = valid.sum(dim=0)
         failed = (weight * ~valid).sum(dim=0)
         weight = torch.where(valid, weight + failed / count.clamp(min=1), 0)
@@ -77,11 +76,7 @@ class Reprojection:
     def box(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """History (C, n) of the n `pixels` from 3 x 3 taps, and where there is one (n,)."""
         centre = self.position[:, pixels].clamp(-2, max(self.height, self.width) + 1).floor().long()
-        offset = torch.arange(-1, 2, device=pixels.device)
-        dy, dx = torch.meshgrid(offset, offset, indexing="ij")
-        column = centre[0] + dx.flatten()[:, None]
-        row = centre[1] + dy.flatten()[:, None]
-        image, valid = self.taps(pixels, column, row)
+        image, valid = self.taps(pixels, centre, range(-1, 2))
         count = valid.sum(dim=0)
         return (image * valid).sum(dim=1) / count.clamp(min=1), count > 0
 
@@ -117,7 +112,6 @@ def reproject(frame: Frame, image: Tensor, gbuffer: GBuffer) -> tuple[Tensor, Te
     `image` (B, C, H, W) and `gbuffer` are the previous frame's. The frame needs depth, normal, mesh_id and motion.
     """
     if compiled.with_gradients(image):
-        result: tuple[Tensor, Tensor] = CompiledReprojection.apply(image, frame, gbuffer)
-        return result
+        return cast(tuple[Tensor, Tensor], CompiledReprojection.apply(image, frame, gbuffer))
     fetched = [Reprojection(frame, image, gbuffer, item).fetch() for item in range(len(image))]
     return torch.stack([history for history, _ in fetched]), torch.stack([valid for _, valid in fetched])

@@ -90,8 +90,8 @@ def running_scale(
     Of a training crop, `whole` (B, 2) are the logarithms of the frame that it was cut from.
     """
     previous = previous or RunningScale.neutral(radiance)
-    new = (log_luminance_and_depth(radiance, depth) if whole is None else whole).to(radiance)
-    log_luminance, log_depth = new.unbind(dim=1)
+    new = log_luminance_and_depth(radiance, depth) if whole is None else whole
+    log_luminance, log_depth = new.to(radiance).unbind(dim=1)
     return RunningScale(
         previous.log_luminance.update(log_luminance, ~log_luminance.isnan()),
         previous.log_depth.update(log_depth, ~log_depth.isnan()),

@@ -1,6 +1,6 @@
 """A filter whose weights compare learned features of pixels: one level of an à-trous transform (Isik et al. 2021)."""
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -50,10 +50,8 @@ def affinity_level(
 
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p). Only
     pixels that show a surface count; the others become 0.
-
     image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """
     level = AffinityLevel.apply if compiled.with_gradients(image) else plain_level
-    filtered: Tensor = level(image, features, sharpness, own, importance, surface, step)
-    return filtered
+    return cast(Tensor, level(image, features, sharpness, own, importance, surface, step))

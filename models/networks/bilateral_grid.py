@@ -36,9 +36,8 @@ def cells_of_pixels(guide: Tensor, spacing: int) -> list[tuple[Tensor, Tensor]]:
     z = ((GUIDES - 1) * guide[:, 0] + 0.5) / spacing - 0.5
     item = torch.arange(batch, device=guide.device)[:, None, None]
     weighted = []
-    for (row, by_row), (column, by_column), (level, by_level) in product(
-        cells_around(y[:, None], down), cells_around(x, across), cells_around(z, along)
-    ):
+    axes = (cells_around(y[:, None], down), cells_around(x, across), cells_around(z, along))
+    for (row, by_row), (column, by_column), (level, by_level) in product(*axes):
         cell = ((item * down + row) * across + column) * along + level
         weighted.append((cell.flatten(), (by_row * by_column * by_level).reshape(-1, 1)))
     return weighted
@@ -52,11 +51,8 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     of the pixels around it, whose weights fall linearly along every axis, to 0 at a distance of a cell. A pixel is
     interpolated linearly between the cells around it; there are no cells outside the image.
 
-    Args:
-        image: float32, finite.
-        guide: (B, 1, H, W), in [0, 1].
-        spacing: px, a power of two.
-        surface: (B, 1, H, W), 1 for pixels that count; the others, with 0, become 0. By default all count.
+    The image is finite, the guide (B, 1, H, W) in [0, 1], the spacing a power of two, in px. Pixels off the `surface`
+    (B, 1, H, W) do not count and become 0; by default all count.
     """
     counted = torch.ones_like(guide) if surface is None else surface
     values = torch.cat([image * counted, counted], dim=1).permute(0, 2, 3, 1).reshape(-1, 4)

@@ -8,7 +8,7 @@ d(p, q) = sum (image(p) - image(q))² / (var(p) + var(q)), summed over colours.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -93,5 +93,4 @@ def cross_bilateral(pixels: Pixels, sharpness: Tensor) -> Tensor:
     Differentiable in the sharpness (B, 1 + groups, H, W) >= 0: that of the distance in the image, then of each group
     of features. Colours lie within ±MAX_LUMINANCE.
     """
-    filtered: Tensor = CrossBilateral.apply(sharpness, *pixels)
-    return filtered
+    return cast(Tensor, CrossBilateral.apply(sharpness, *pixels))

@@ -4,7 +4,7 @@ A window's weights are exp(I(q)) / sum exp(I(q')): a weight depends on the neigh
 the ratio of two box sums. No kernel is materialised, and the cost hardly grows with the window.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -20,30 +20,21 @@ from models.operators import MIN_DIVISOR, STRIP_ROWS
 
 
 def box_sum(x: Tensor, window: int, dim: int) -> Tensor:
-    """Sums of `window` consecutive entries along `dim`, which gets shorter by window - 1.
+    """Sums of `window` consecutive entries, an odd number, along `dim`, which gets shorter by window - 1.
 
     Sums of powers of two of entries are combined; running sums would suffer from cancellation.
     """
     length = x.shape[dim] - window + 1
-    total: Tensor | None = None
-    start = 0
-    size = 1
-    while True:
-        if window & size:
-            part = x.narrow(dim, start, length)
-            total = part if total is None else total + part
-            start += size
+    total = x.narrow(dim, 0, length)
+    start = size = 1
+    while 2 * size <= window:
+        reach = x.shape[dim] - size
+        x = x.narrow(dim, 0, reach) + x.narrow(dim, size, reach)
         size *= 2
-        if size > window:
-            assert total is not None
-            return total
-        reach = x.shape[dim] - size // 2
-        x = x.narrow(dim, 0, reach) + x.narrow(dim, size // 2, reach)
-
-
-def along(dim: int, margin: int) -> tuple[int, ...]:
-    """F.pad's argument for `margin` entries on both sides of the last or the last but one dimension."""
-    return (margin, margin) if dim == -1 else (0, 0, margin, margin)
+        if window & size:
+            total = total + x.narrow(dim, start, length)
+            start += size
+    return total
 
 
 def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, Tensor]:
@@ -51,11 +42,11 @@ def sums_in_steps(logits: Tensor, values: Tensor, window: int) -> tuple[Tensor, 
     margin = window // 2
     top = logits
     total = values
-    for dim in (-2, -1):
+    for dim, padding, shape in ((-2, (0, 0, margin, margin), (window, 1)), (-1, (margin, margin), (1, window))):
         size = top.shape[dim]
-        entries = F.pad(top, along(dim, margin), value=OUTSIDE_LOGIT)
-        parts = F.pad(total, along(dim, margin))
-        top = F.max_pool2d(entries, (1, window) if dim == -1 else (window, 1), stride=1)
+        entries = F.pad(top, padding, value=OUTSIDE_LOGIT)
+        parts = F.pad(total, padding)
+        top = F.max_pool2d(entries, shape, stride=1)
         total = torch.zeros_like(total)
         for tap in range(window):
             entry = entries.narrow(dim, tap, size)
@@ -84,7 +75,9 @@ def windowed_sums(logits: Tensor, values: Tensor, window: int, counted: Tensor |
 
 
 class SharedKernel(torch.autograd.Function):
-    """R(p) = sum exp(I(q)) r(q) / sum exp(I(q)) over the window of p (Eq. 3 and 4).
+    """R(p) = sum exp(I(q)) r(q) / sum exp(I(q)) over the pixels of a surface in the window of p (Eq. 3 and 4).
+
+    The image r is (B, C, H, W), the logits I are (B, 1, H, W), as is the surface.
 
     With D(p) the denominator and g the gradient of R: dr(q) = exp(I(q)) sum_p g(p) / D(p), over the windows that q lies
     in, and dI(q) = exp(I(q)) sum_p g(p) (r(q) - R(p)) / D(p). That is the same box sum, of logits -ln D.
@@ -115,51 +108,32 @@ class SharedKernel(torch.autograd.Function):
         return to_image, (to_image * image).sum(dim=1, keepdim=True) - total[:, -1:], None, None
 
 
-def shared_kernel(image: Tensor, logits: Tensor, window: int, surface: Tensor | None = None) -> Tensor:
-    """Filter `image` (B, C, H, W) with the kernels that `logits` (B, 1, H, W) encode (Eq. 3, 4). `window` is odd.
-
-    Only pixels of a `surface` (B, 1, H, W) count.
-    """
-    filtered: Tensor = SharedKernel.apply(image, logits, window, surface)
-    return filtered
-
-
-def strips(height: int, margin: int) -> Iterator[tuple[slice, slice, slice]]:
-    """Rows to compute, rows that they depend on, and the former within the latter."""
-    for start in range(0, height, STRIP_ROWS):
-        stop = min(start + STRIP_ROWS, height)
-        low = max(start - margin, 0)
-        high = min(stop + margin, height)
-        yield slice(start, stop), slice(low, high), slice(start - low, stop - low)
-
-
 def fuse_whole(
     image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int], surface: Tensor | None
 ) -> Tensor:
-    shares = torch.softmax(mixture, dim=1)
-    parts = [shares[:, [i]] * shared_kernel(image, importance[:, [i]], k, surface) for i, k in enumerate(windows)]
-    return torch.stack(parts).sum(dim=0)
+    filtered = (SharedKernel.apply(image, importance[:, [i]], k, surface) for i, k in enumerate(windows))
+    shares = torch.softmax(mixture, dim=1).split(1, dim=1)
+    return torch.stack([share * part for share, part in zip(shares, filtered, strict=True)]).sum(dim=0)
 
 
 @compiled.by(kernels.fuse, gpu=kernels.fuse_on_gpu if find_spec("triton") else None)
 def fuse(
     image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
 ) -> Tensor:
-    """Filter an image with shared kernels of several window sizes and mix the results (Eq. 5).
+    """Filter a finite image (B, 3, H, W) with shared kernels of M odd window sizes and mix the results (Eq. 5).
 
-    Args:
-        image: (B, 3, H, W), finite. importance: I, (B, M, H, W), one map a window; any finite numbers.
-        mixture: logits (B, M, H, W) whose softmax over M are the shares alpha. windows: M odd sizes.
-        surface: (B, 1, H, W), 1 for pixels that count, 0 for those that are left out; by default all count.
-    Returns (B, 3, H, W): a convex combination of pixels within the largest window; a window without any pixel that
-    counts adds 0. Differentiable in the first three.
+    Importance I and mixture are (B, M, H, W), any finite numbers; the shares alpha are the mixture's softmax over M.
+    Pixels off the `surface` (B, 1, H, W) are left out, by default none. The result is a convex combination of pixels
+    within the largest window; a window without any pixel that counts adds 0. Differentiable in the first three.
     """
     training = torch.is_grad_enabled() and any(t.requires_grad for t in (image, importance, mixture))
     if training or image.device.type != "cpu":
         return fuse_whole(image, importance, mixture, windows, surface)
-    fused = torch.empty_like(image)
-    for rows, needed, within in strips(image.shape[-2], max(windows) // 2):
-        valid = None if surface is None else surface[..., needed, :]
-        part = fuse_whole(image[..., needed, :], importance[..., needed, :], mixture[..., needed, :], windows, valid)
-        fused[..., rows, :] = part[..., within, :]
-    return fused
+    strips = []
+    for top in range(0, image.shape[-2], STRIP_ROWS):
+        first = max(top - max(windows) // 2, 0)
+        rows = slice(first, top + STRIP_ROWS + max(windows) // 2)
+        valid = None if surface is None else surface[..., rows, :]
+        part = fuse_whole(image[..., rows, :], importance[..., rows, :], mixture[..., rows, :], windows, valid)
+        strips.append(part[..., top - first : top - first + STRIP_ROWS, :])
+    return torch.cat(strips, dim=-2)

@@ -109,8 +109,8 @@ class LBF(Denoiser):
 
     def sharpness(self, features: Tensor, variance: Tensor, surface: Tensor, samples: Tensor) -> Tensor:
         """The factors of squared distances, (B, 1 + groups, H, W); see features_of (Eq. 12)."""
-        statistics = secondary_features(features, variance, surface, samples)
-        factors = self.network(statistics.movedim(1, -1)).movedim(-1, 1).to(features)
+        statistics = secondary_features(features, variance, surface, samples).movedim(1, -1)
+        factors = self.network(statistics).movedim(-1, 1).to(features)
         return factors / torch.cat([torch.ones_like(surface), variance.clamp(min=MIN_FEATURE_VARIANCE)], dim=1)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, LBFState]:

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from datasets.frame import Signal
 from models.compiled.features import FEATURE_CHANNELS
 from models.networks.bilateral_grid import grid_mean
-from models.networks.wskp import KernelPredictor
+from models.networks.wskp import Filtered, KernelPredictor
 
 NBGD_WIDTH = 20  # channels between the two layers
 KERNEL = 5  # px
@@ -36,7 +36,7 @@ class NBGD(KernelPredictor):
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        outputs = len(SPACINGS) + len(SPACINGS) - 1
+        outputs = 2 * len(SPACINGS) - 1
         self.network = nn.Sequential(
             nn.Conv2d(sum(FEATURE_CHANNELS.values()), NBGD_WIDTH, KERNEL, padding=KERNEL // 2),
             nn.LeakyReLU(LEAK, inplace=True),
@@ -48,13 +48,9 @@ class NBGD(KernelPredictor):
     def first_layers(self) -> Sequence[nn.Conv2d]:
         return [self.network[0]]  # type: ignore[index]
 
-    def reconstruct(
-        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         guides, shares = predicted.to(irradiance.dtype).sigmoid().split([len(SPACINGS), len(SPACINGS) - 1], dim=1)
         shares = torch.cat([shares, 1 - shares.sum(dim=1, keepdim=True)], dim=1)
-        parts = [
-            shares[:, [i]] * grid_mean(irradiance, guides[:, [i]], spacing, surface)
-            for i, spacing in enumerate(SPACINGS)
-        ]
+        means = (grid_mean(irradiance, guides[:, [i]], spacing, surface) for i, spacing in enumerate(SPACINGS))
+        parts = [share * mean for share, mean in zip(shares.split(1, dim=1), means, strict=True)]
         return torch.stack(parts).sum(dim=0).clamp(min=0), None

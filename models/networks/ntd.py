@@ -237,9 +237,6 @@ class NTDTraditional(NTD):
 
 
 class NTDMean(NTD):
-    """NTD with averages in place of the maxima of Eq. 4, which darken; ours.
-
-    Eq. 7 of WSKP (Fan et al. 2021) has the same form with averages.
-    """
+    """NTD with averages, as in Eq. 7 of WSKP (Fan et al. 2021), in place of the maxima of Eq. 4, which darken; ours."""
 
     pool = staticmethod(halve)

@@ -223,15 +223,6 @@ class One(Denoiser):
             has_history = valid.to(noisy) * surface
         return PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
 
-    def run_network(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
-        """The network's decoded outputs."""
-        first, last = self.network.detail_layers
-        patches, hidden = network_inputs(frame, scale, inputs, first)
-        height, width = frame.size
-        head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
-        noisy = inputs.noisy
-        return Decoded(*decode_head(head.to(noisy), hidden, last, inputs, frame.samples.to(noisy)))
-
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
@@ -239,7 +230,11 @@ class One(Denoiser):
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         inputs = self.pixel_inputs(frame, noisy, surface, before)
-        decoded = self.run_network(frame, scale, inputs)
+        first, last = self.network.detail_layers
+        patches, hidden = network_inputs(frame, scale, inputs, first)
+        height, width = frame.size
+        head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
+        decoded = Decoded(*decode_head(head.to(noisy), hidden, last, inputs, frame.samples.to(noisy)))
         image = decoded.accumulated
         planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
         for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):

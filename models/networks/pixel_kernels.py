@@ -7,7 +7,7 @@ Work goes tap by tap over shifted views of the image, so that no temporary is la
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -80,14 +80,10 @@ class ApplyKernels(torch.autograd.Function):
 
 @compiled.by(kernels.apply_kernels)
 def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
-    """Filter `image` (B, C, H, W) with one k x k kernel a pixel; returns (B, C, H, W). Differentiable in both.
+    """Filter a finite `image` (B, C, H, W) with one k x k kernel a pixel. Differentiable in both.
 
-    Args:
-        image: float32, finite, linear. Taps outside it are left out.
-        logits: (B, k², H, W), k odd, the taps row by row from the top left; any finite numbers, also in half precision.
-        surface: (B, 1, H, W), 1 for pixels that count and 0 for those that are left out like taps outside; by default
-            all count. Where none of a window does, the output is 0.
+    The logits (B, k², H, W), k odd, are taps row by row from the top left, any finite numbers, also in half precision.
+    Taps outside the image or off the `surface` (B, 1, H, W) are left out; where none is left, the output is 0.
     """
     # Taps that lie apart in memory would be gathered one by one, several times each.
-    filtered: Tensor = ApplyKernels.apply(image, logits.contiguous(), surface)
-    return filtered
+    return cast(Tensor, ApplyKernels.apply(image, logits.contiguous(), surface))

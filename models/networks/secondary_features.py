@@ -65,16 +65,12 @@ def noise(features: Tensor, surface: Tensor) -> Tensor:
     results, the largest of 3 x 3 pixels. Details that are not all of surfaces count as 0.
     """
     height, width = surface.shape[-2:]
-    values, shown = (
-        pad_to_multiple(image, 2).unflatten(3, (-1, 2)).unflatten(2, (-1, 2)) for image in (features, surface)
-    )
+    values, shown = (pad_to_multiple(x, 2).unflatten(3, (-1, 2)).unflatten(2, (-1, 2)) for x in (features, surface))
     signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).to(features)[:, None]
-    details = (signs * values).sum(dim=(3, 5)) / 2
-    details = details.abs() * shown.amin(dim=(3, 5))
+    details = ((signs * values).sum(dim=(3, 5)) / 2).abs() * shown.amin(dim=(3, 5))
     blocks = F.pad(details, (2, 1, 2, 1), mode="replicate").unfold(2, 4, 1).unfold(3, 4, 1).flatten(4)
-    median = torch.stack(
-        [channel.sort(dim=-1).values[..., 7:9].mean(dim=-1) for channel in blocks.unbind(dim=1)], dim=1
-    )
+    medians = [channel.sort(dim=-1).values[..., 7:9].mean(dim=-1) for channel in blocks.unbind(dim=1)]
+    median = torch.stack(medians, dim=1)
     pixels = F.interpolate(median / GAUSSIAN_MEDIAN, scale_factor=2.0)[..., :height, :width]
     return F.max_pool2d(pixels, 3, stride=1, padding=1)
 

@@ -23,7 +23,7 @@ from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
 from models.operators import halve, pad_to_multiple, pyramid
 
 WSKP_WIDTH = 24  # ours: the paper does not print its widths
-MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips
+MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips, with the same result
 STRIP_PIXELS = 1 << 20
 
 
@@ -51,6 +51,9 @@ def network_features(
     return torch.cat([parts[name] for name in names], dim=1)
 
 
+Filtered = tuple[Tensor, Tensor | None]  # irradiance (B, 3, H, W), and the logits between windows, if any
+
+
 @dataclass(frozen=True)
 class WSKPState(AccumulatedState):
     """Accumulated frames, running exposure and depth scale; for debugging, the mixture of windows."""
@@ -74,6 +77,7 @@ class KernelPredictor(Accumulating):
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
     filter_reads = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
     network: nn.Module
+    side_multiple = 1  # of the network's images; they are padded
     reach: int | None = None  # rows above and below that a pixel depends on; None for all
 
     def __init__(self, *, signal: Signal | None = None):
@@ -85,17 +89,8 @@ class KernelPredictor(Accumulating):
         assert isinstance(first, RepVGGBlock)
         return first.branches
 
-    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
-        """The network's input, see network_features."""
-        return network_features(frame, irradiance, scale, tuple(self.inputs))
-
-    def reconstruct(
-        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
-        """Filtered irradiance (B, 3, H, W) from the network's output, and the logits between windows, if any.
-
-        Background has no weight: see Frame.surface.
-        """
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
+        """Irradiance (B, 3, H, W) of surfaces, filtered with the network's output."""
         raise NotImplementedError
 
     def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
@@ -106,11 +101,8 @@ class KernelPredictor(Accumulating):
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
         return WSKPState(frame.moment, history, scale, mixture=None)
 
-    def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
-        """Filtered irradiance (B, 3, H, W) of accumulated `irradiance`, and the logits between windows, if any.
-
-        Large images are filtered in strips of rows, with the same result.
-        """
+    def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Filtered:
+        """Accumulated `irradiance` (B, 3, H, W) filtered, of large images in strips of rows."""
         height, width = frame.size
         if self.reach is None or height * width <= MAX_WHOLE_PIXELS:
             return self.filter_whole(frame, irradiance, scale)
@@ -128,10 +120,11 @@ class KernelPredictor(Accumulating):
                 mixtures.append(mixture[..., inner, :])
         return torch.cat(strips, dim=-2), torch.cat(mixtures, dim=-2) if mixtures else None
 
-    def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor | None]:
+    def filter_whole(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Filtered:
         """`filter`, in one piece."""
-        x = self.features(frame, irradiance, scale).to(self.precision, memory_format=torch.channels_last)
-        return self.reconstruct(irradiance, self.network(x), frame.surface)
+        x = pad_to_multiple(network_features(frame, irradiance, scale, tuple(self.inputs)), self.side_multiple)
+        predicted = self.network(x.to(self.precision, memory_format=torch.channels_last))
+        return self.reconstruct(irradiance, predicted, frame.surface)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         after = self.accumulate(frame, state)
@@ -163,9 +156,7 @@ class WSKP(TrunkPredictor):
     evaluated_with: tuple[str, ...] = ("adaptive",)
     outputs = 2 * len(WINDOWS)
 
-    def reconstruct(
-        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
         return fuse(irradiance, importance, mixture, WINDOWS, surface), mixture
 
@@ -182,9 +173,7 @@ class KP(TrunkPredictor):
 
     outputs = max(WINDOWS) ** 2
 
-    def reconstruct(
-        self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
+    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         return apply_kernels(irradiance, predicted, surface), None
 
 
@@ -219,20 +208,15 @@ class MultiResolutionNet(nn.Module):
 
 
 def combine_resolutions(fine: Tensor, coarse: Tensor, alpha: Tensor, surface: Tensor | None = None) -> Tensor:
-    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D averages 2 x 2 pixels, U repeats them; alpha (B, 1, H, W).
-
-    D averages surface pixels only, as `halve` does.
-    """
+    """i_f - alpha [U D i_f] + alpha [U i_c] (Eq. 7): D is `halve`, U repeats pixels; alpha (B, 1, H, W)."""
     return fine + alpha * F.interpolate(coarse - halve(fine, surface), scale_factor=2.0)
 
 
 class MultiResolution(KernelPredictor):
-    """A filter at each of three resolutions, combined from coarse to fine by Eq. 7 (§5.2).
-
-    Eq. 7 is no convex combination: negative results are clamped to 0.
-    """
+    """A filter at each of three resolutions, combined by Eq. 7 (§5.2): not convex, so it is clamped at 0."""
 
     maps: ClassVar[int]  # channels of filter parameters at each resolution
+    side_multiple = 4
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -241,19 +225,16 @@ class MultiResolution(KernelPredictor):
     def first_layers(self) -> Sequence[nn.Conv2d]:
         return [self.network.down[0][0]]  # type: ignore[index, list-item]
 
-    def features(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Tensor:
-        return pad_to_multiple(super().features(frame, irradiance, scale), 4)
-
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w), and logits, if any."""
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
+        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w)."""
         raise NotImplementedError
 
     def reconstruct(  # type: ignore[override]
         self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> Filtered:
         height, width = irradiance.shape[-2:]
-        surface = None if surface is None else pad_to_multiple(surface, 4)
-        levels = pyramid(pad_to_multiple(irradiance, 4), surface, len(predicted))
+        surface = None if surface is None else pad_to_multiple(surface, self.side_multiple)
+        levels = pyramid(pad_to_multiple(irradiance, self.side_multiple), surface, len(predicted))
         output: Tensor | None = None
         for (image, valid), predictions in zip(levels, predicted, strict=True):
             maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
@@ -270,7 +251,7 @@ class WSKPMR(MultiResolution):
 
     maps = 4
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
         importance, mixture = maps.chunk(2, dim=1)
         return fuse(image, importance, mixture, (3, 5), surface), mixture
 
@@ -280,5 +261,5 @@ class MRKP(MultiResolution):
 
     maps = 25
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
         return apply_kernels(image, maps, surface), None

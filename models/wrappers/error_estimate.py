@@ -18,6 +18,7 @@ The estimate of a single pixel is pure noise, so a map averages it over windows.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -64,22 +65,18 @@ class ErrorEstimate:
     def smoothed(self, squares: Tensor, minimum: Tensor, weight: Tensor) -> Tensor:
         """Means of `squares`, which have `weight` times the noise, over 81 x 81 pixels of the same mesh.
 
-        Over 27 x 27 and 9 x 9 where these differ by more than chance; at least the 9 x 9 means of `minimum`. All
-        (B, 3, H, W).
+        Over 27 x 27 and 9 x 9 where these differ by more than chance; at least the 9 x 9 means of `minimum`.
         """
         mesh = self.frame.mesh_id
         chance = 2 * (weight * self.variance).square()
         sums = mesh_sums(torch.cat([squares, chance, minimum, torch.ones_like(mesh)], dim=1), mesh, 1)
-        windows = []
-        for step in (3, 9, 27):
-            sums = mesh_sums(sums, mesh, step)
-            windows.append(sums)
-        smooth = windows[-1][:, :3] / windows[-1][:, 9:]
-        for sums in reversed(windows[:-1]):
+        _, small, middle, wide = accumulate((3, 9, 27), lambda sums, step: mesh_sums(sums, mesh, step), initial=sums)
+        smooth = wide[:, :3] / wide[:, 9:]
+        for sums in (middle, small):
             pixels = sums[:, 9:]
             correction = sums[:, :3] / pixels - smooth
             smooth = smooth + significant_part(correction, sums[:, 3:6].sqrt() / pixels) * correction
-        return torch.maximum(smooth, windows[0][:, 6:9] / windows[0][:, 9:])
+        return torch.maximum(smooth, small[:, 6:9] / small[:, 9:])
 
     @property
     def radiance_scale(self) -> Tensor:
@@ -143,10 +140,7 @@ class ErrorEstimate:
 
 
 def denoise_with_error(denoiser: JamesStein, frame: Frame, state: State | None) -> tuple[Tensor, State, ErrorEstimate]:
-    """The output of NAME+js for a frame, its state, and an estimate of its error.
-
-    Raises BadInput where the frame has no sample buffers.
-    """
+    """The output of NAME+js for a frame, its state, and its error. Raises BadInput without sample buffers."""
     if not frame.has_buffers:
         raise BadInput(f"{frame.source} has no two sample buffers: its error cannot be estimated")
     frame = frame.finite()

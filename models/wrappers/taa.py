@@ -40,17 +40,13 @@ def inverse_tone_map(tone_mapped: Tensor) -> Tensor:
 
 
 def fetch_bicubic(image: Tensor, motion: Tensor) -> Tensor:
-    """The previous `image` (B, 3, H, W) at p + motion(p), bicubic, clamped at 0; its border pixels are repeated.
-
-    `motion` (B, 2, H, W) is in pixels.
-    """
+    """The `image` (B, 3, H, W) at p + motion(p), in pixels, bicubic, clamped at 0; its border pixels are repeated."""
     height, width = image.shape[-2:]
     x, y = pixel_centres(height, width, motion)
     # Far outside the image an index would overflow; any place outside is as good.
     x = (x + motion[:, 0]).clamp(-1, width + 1) * (2 / width) - 1
     y = (y + motion[:, 1]).clamp(-1, height + 1) * (2 / height) - 1
-    grid = torch.stack([x, y], dim=-1)
-    return F.grid_sample(image, grid, "bicubic", "border", align_corners=False).clamp(min=0)
+    return F.grid_sample(image, torch.stack([x, y], dim=-1), "bicubic", "border", align_corners=False).clamp(min=0)
 
 
 def max_3x3(image: Tensor) -> Tensor:
@@ -64,13 +60,9 @@ def max_3x3(image: Tensor) -> Tensor:
 
 
 def resolve(current: Tensor, history: Tensor, has_history: Tensor) -> Tensor:
-    """Blend tone-mapped images (B, 4, H, W), the history clamped to the range of the current 3 x 3 pixels.
-
-    Without history, where `has_history` (B, 1, H, W) is False, the current image is returned.
-    """
-    low = -max_3x3(-current)
-    high = max_3x3(current)
-    return torch.lerp(torch.clamp(history, low, high), current, torch.where(has_history, TAA_ALPHA, 1))
+    """Blend tone-mapped images (B, 4, H, W), the history, if any, clamped to the range of the current 3 x 3 pixels."""
+    clamped = torch.clamp(history, -max_3x3(-current), max_3x3(current))
+    return torch.lerp(clamped, current, torch.where(has_history, TAA_ALPHA, 1))
 
 
 @dataclass(frozen=True)

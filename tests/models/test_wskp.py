@@ -16,7 +16,7 @@ from models.compiled.exponential import exp, log
 from models.history.accumulation import accumulate
 from models.history.running_scale import running_scale
 from models.networks.repvgg import PairedConv2d, RepVGGBlock, merge, repvgg
-from models.networks.wskp import combine_resolutions
+from models.networks.wskp import combine_resolutions, network_features
 from tests.helpers.frames import flat_frame, run
 from tests.helpers.unfold import unfold_fuse
 
@@ -137,9 +137,9 @@ def test_compiled_features_equal_pytorch_s(tiny):
     frame = replace(frame, colour_gain=torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 0.0]])[..., None, None])
     irradiance = frame.irradiance("total")
     scale = running_scale(irradiance, frame.depth, None)
-    fast = wskp.features(frame, irradiance, scale)
+    fast = network_features(frame, irradiance, scale)
     with compiled.disabled():
-        torch.testing.assert_close(fast, wskp.features(frame, irradiance, scale), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(fast, network_features(frame, irradiance, scale), rtol=1e-5, atol=1e-6)
 
 
 def test_compiled_functions_are_the_mathematical_ones():
