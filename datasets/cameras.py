@@ -26,11 +26,9 @@ class Cameras:
         return Cameras(*(torch.from_numpy(matrix)[None] for matrix in view._replace(K=K)))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Cameras":
-        """The cameras with `function` applied to every matrix."""
         return Cameras(*map(function, vars(self).values()))
 
     def almost_equal(self, other: "Cameras") -> bool:
-        """Whether they are the same up to rounding."""
         return all(
             a.shape == b.shape and torch.allclose(a, b, rtol=1e-9, atol=1e-12)
             for a, b in zip(vars(self).values(), vars(other).values(), strict=True)

@@ -13,8 +13,6 @@ from files import write_file
 
 CARD_FILE = "card.json"
 PAGE_FILE = "README.md"
-LICENCE = "CC0-1.0"  # of built-in scenes
-OTHER_LICENCE = "that of its scene file"
 
 PAGE = """# {profile}, seed {seed}
 
@@ -68,14 +66,16 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
     facts = dataset.facts
     clips = {str(path.relative_to(dataset.path)): clip_facts(Clip(path)) for path in dataset.planned()}
     used = [split for split, names in facts["splits"].items() if names]
+    what = f"--scene {Path(facts['profile']).name}" if facts["source"] else f"--profile {facts['profile']}"
+    options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
     return {
         "profile": Path(facts["profile"]).name,
         "seed": facts["seed"],
-        "command": command_of(facts),
+        "command": f"onespp dataset {what} --seed {facts['seed']}{options}",
         "generator": facts["generator"],
         "versions": facts["versions"],
         "options": facts["options"],
-        "licence": OTHER_LICENCE if facts["source"] else LICENCE,
+        "licence": "that of its scene file" if facts["source"] else "CC0-1.0",
         "source": {Path(path).name: crc32 for path, crc32 in facts["source"].items()},
         "notes": facts["notes"],
         "scenes": facts["scenes"],
@@ -92,13 +92,6 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
         },
         "clips": clips,
     }
-
-
-def command_of(facts: dict[str, Any]) -> str:
-    """The command that renders such a data set, from the facts in dataset.json."""
-    options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
-    what = f"--scene {Path(facts['profile']).name}" if facts["source"] else f"--profile {facts['profile']}"
-    return f"onespp dataset {what} --seed {facts['seed']}{options}"
 
 
 def clip_facts(clip: Clip) -> dict[str, Any]:
@@ -118,7 +111,6 @@ def clip_facts(clip: Clip) -> dict[str, Any]:
 
 
 def split_facts(clips: list[dict[str, Any]]) -> dict[str, Any]:
-    """A split on the card, from its clips."""
     floors = [clip["floor_db"] for clip in clips]
     return {
         "clips": len(clips),
@@ -129,7 +121,6 @@ def split_facts(clips: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def page_of(card: dict[str, Any]) -> str:
-    """The card as Markdown."""
     options = [name for name, on in card["options"].items() if on]
     left_out = [name for name, channel in card["channels"].items() if channel["splits"] != list(card["splits"])]
     splits = [{"split": split, **facts} for split, facts in card["splits"].items()]

@@ -19,8 +19,6 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Channel:
-    """One row of the table."""
-
     kind: Kind
     axes: tuple[str | int, ...]  # F frames, S noise realisations, H rows, W columns, M meshes; a number: its own length
     dtype: str  # as stored; float32 instead, if it `widens`, where float16 would lose precision
@@ -51,10 +49,6 @@ class Channel:
     def is_temporal(self) -> bool:
         """Whether it relates a frame to the one before."""
         return self.kind in ("motion", "gradient")
-
-    def shape(self, **sizes: int) -> list[int]:
-        """The stored shape, for the lengths of the axes given by name: F, S, H, W and M."""
-        return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
 
 
 RADIANCE = "W sr^-1 m^-2"

@@ -114,9 +114,8 @@ class Clip:
         if channel not in self._maps:
             entry = self.entry(channel)
             path = self.path / entry["file"]
-            empty = 0 in entry["shape"]  # an empty file cannot be mapped
             try:
-                array = np.load(path, mmap_mode=None if empty else "r")
+                array = np.load(path, mmap_mode=None if 0 in entry["shape"] else "r")  # an empty file cannot be mapped
             except FileNotFoundError:
                 raise BadInput(f"{path} is missing: delete {self.path} and rerun `onespp dataset`") from None
             except (ValueError, EOFError, SyntaxError, TokenError) as error:  # np.load reads the header as Python
@@ -141,7 +140,7 @@ class Clip:
             value = np.array(entry["value"], "<f4" if spec.widens else spec.dtype)
             return np.broadcast_to(value, (*buffers, *area, len(spec.letters)))
         if "derived" in entry:
-            return self._motion(self.read, frame, max(frame - 1, 0), window)
+            return self.motion_to(frame, max(frame - 1, 0), window, self.read)
         array = self.map(channel)
         images = array[frame, realisation] if "S" in spec.axes else array[frame]
         return images[..., rows, columns, :]
@@ -156,20 +155,22 @@ class Clip:
         """The camera and the poses of all meshes in one frame."""
         return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
-    def motion_to(self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE) -> NDArray[np.float32]:
-        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip, of visible surfaces.
-
-        They are computed from depth, the cameras and the poses of the meshes.
-        """
-        return self._motion(self.read_visible, frame, other, window)
-
-    def _motion(
-        self, surface: Callable[..., NDArray[Any]], frame: int, other: int, window: ImageWindow
+    def motion_to(
+        self,
+        frame: int,
+        other: int,
+        window: ImageWindow = WHOLE_IMAGE,
+        read: Callable[..., NDArray[Any]] | None = None,
     ) -> NDArray[np.float32]:
-        """Motion vectors of the surfaces that are read by `surface`: `read` or `read_visible`."""
+        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip.
+
+        They are computed from depth, the cameras and the poses of the meshes. They are those of visible surfaces, or of
+        the surfaces that `read` returns.
+        """
+        read = read or self.read_visible
         pixels = pixel_centres(self.height, self.width)[window]
-        depth = surface("depth", frame, window)[..., 0].astype(np.float64)
-        mesh_id = surface("mesh_id", frame, window)[..., 0]
+        depth = read("depth", frame, window)[..., 0].astype(np.float64)
+        mesh_id = read("mesh_id", frame, window)[..., 0]
         return motion_vectors(pixels, depth, mesh_id, self.view(frame), self.view(other)).astype(np.float32)
 
     def noisy(self, frame: int, realisation: int = 0) -> NDArray[np.float32]:

@@ -22,8 +22,6 @@ class Difficulty(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """How one measure of difficulty is shown."""
-
     head: str  # of its column in tables
     title: str  # of its histogram
     minimum: float  # of the histogram's axis; smaller values are shown there
@@ -49,7 +47,6 @@ def difficulty_of_clip(clip: Clip) -> Difficulty:
 
 
 def difficulty_of_frame(clip: Clip, frame: int) -> Difficulty:
-    """The measures of one frame. They are NaN where it shows no surface."""
     albedo = np.maximum(clip.read("albedo", frame).astype(np.float64), ALBEDO_FLOOR)
     surface = clip.read("mesh_id", frame)[..., 0] > 0
     if not surface.any():

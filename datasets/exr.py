@@ -14,7 +14,7 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip
 from errors import BadInput
 from files import replacing
-from scenes.camera import View, inverse_pose
+from scenes.camera import inverse_pose
 
 BUFFER_SUFFIXES = ("_a", "_b")  # of the two layers of a channel that has two sample buffers
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
@@ -90,11 +90,6 @@ def channels_in(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
             array = images[0] if len(images) == 1 else np.stack(images)
             channels[name] = array.astype(np.uint16) if channel.dtype == "<u2" else array
     return channels
-
-
-def view_of_facts(facts: Mapping[str, Any]) -> View:
-    """The exact view in the header's facts."""
-    return View._make(np.array(facts[key]) for key in View._fields)
 
 
 def export_clip(path: Path, out: Path) -> int:

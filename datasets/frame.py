@@ -90,7 +90,6 @@ class Frame:
         return self.channels[name]
 
     def with_channels(self, channels: Mapping[str, Tensor]) -> "Frame":
-        """The frame with some channels replaced or added."""
         return replace(self, channels=self.channels | dict(channels))
 
     @property
@@ -110,7 +109,6 @@ class Frame:
 
     @property
     def moment(self) -> Moment:
-        """What identifies this frame in its sequence."""
         return Moment(self.shape, self.now)
 
     def follows(self, moment: Moment) -> bool:
@@ -169,7 +167,6 @@ class Frame:
         return replace(self, channels=others | noisy, spp=self.samples / 2)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
-        """The frame with `function` applied to every channel."""
         return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})
 
     def radiance(self, signal: Signal) -> Tensor:

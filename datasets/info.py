@@ -45,22 +45,17 @@ def summarise(root: Path, plot: Path | None = None) -> str:
         timings.append(read_json(path / "timing.json"))
         rows.append({"clip": label, **clip_row(clips[-1], difficulties[-1], sum(timings[-1].values()))})
     if plot:
-        plot_difficulties(root, difficulties, plot)
+        if not difficulties:
+            raise BadInput(f"{root} has no clips yet: render some with `onespp dataset`")
+        from plotting import save_figure  # takes matplotlib, which tables do not need
+
+        save_figure(plot, difficulty_histograms(difficulties))
     facts = dataset.facts
     title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {megabytes(size_of(root))} MB"
     parts = [title, tabulate(rows, "keys")]
     if clips:
         parts += [channel_table(clips), step_table(clips, timings)]
     return "\n\n".join(parts)
-
-
-def plot_difficulties(root: Path, difficulties: list[Difficulty], path: Path) -> None:
-    """Write the histograms to a PNG. Raises BadInput where there are no clips."""
-    if not difficulties:
-        raise BadInput(f"{root} has no clips yet: render some with `onespp dataset`")
-    from plotting import save_figure  # takes matplotlib, which tables do not need
-
-    save_figure(path, difficulty_histograms(difficulties))
 
 
 def difficulty_histograms(clips: Sequence[Difficulty]) -> "Figure":
@@ -72,8 +67,8 @@ def difficulty_histograms(clips: Sequence[Difficulty]) -> "Figure":
         values = np.array([getattr(clip, field) for clip in clips])
         finite = np.maximum(values[np.isfinite(values)], measure.minimum)
         maximum = max(finite.max(initial=measure.minimum), 2 * measure.minimum)
-        edges = np.geomspace(measure.minimum, maximum * 1.0001, BINS + 1)
-        axis.hist(finite, edges, color="#4477aa", edgecolor="white")
+        bins = np.geomspace(measure.minimum, maximum * 1.0001, BINS + 1)
+        axis.hist(finite, bins, color="#4477aa", edgecolor="white")
         axis.set(xscale="log", xlabel=measure.title)
         if len(finite):
             low, middle, high = np.percentile(finite, [5, 50, 95])
@@ -83,7 +78,6 @@ def difficulty_histograms(clips: Sequence[Difficulty]) -> "Figure":
 
 
 def clip_row(clip: Clip, difficulty: Difficulty, seconds: float) -> dict[str, object]:
-    """The row of a clip, by column."""
     return {
         "frames": clip.frames,
         "size": f"{clip.height}x{clip.width}",
@@ -107,8 +101,7 @@ def channel_table(clips: list[Clip]) -> str:
         if name not in USUAL_CHANNELS and not any(name in clip.channels for clip in clips):
             continue
         sizes = np.sum([[stored_size(clip, name), size_in_full(clip, name)] for clip in clips], axis=0)
-        kinds = sorted({stored_as(clip, name) for clip in clips})
-        rows.append([name, ", ".join(kinds), *map(megabytes, sizes)])
+        rows.append([name, ", ".join(sorted({stored_as(clip, name) for clip in clips})), *map(megabytes, sizes)])
         everything += sizes
         if name in USUAL_CHANNELS and channel.kind not in ("noisy", "reference", "camera"):
             auxiliary += sizes
@@ -150,17 +143,15 @@ def stored_size(clip: Clip, channel: str) -> int:
 
 def size_in_full(clip: Clip, channel: str) -> int:
     """Bytes that a channel would take with all its numbers written out."""
-    meshes = len(clip.facts["meshes"])
-    shape = CHANNELS[channel].shape(F=clip.frames, S=clip.realisations, H=clip.height, W=clip.width, M=meshes)
-    entry = clip.channels.get(channel, {})
-    return math.prod(shape) * np.dtype(entry.get("dtype", CHANNELS[channel].dtype)).itemsize
+    sizes = {"F": clip.frames, "S": clip.realisations, "H": clip.height, "W": clip.width}
+    sizes["M"] = len(clip.facts["meshes"])
+    count = math.prod(axis if isinstance(axis, int) else sizes[axis] for axis in CHANNELS[channel].axes)
+    return count * np.dtype(clip.channels.get(channel, {}).get("dtype", CHANNELS[channel].dtype)).itemsize
 
 
 def size_of(path: Path) -> int:
-    """Bytes of all files below a folder."""
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def megabytes(count: int) -> str:
-    """A number of bytes in MB, with one decimal."""
     return f"{count / 1e6:.1f}"

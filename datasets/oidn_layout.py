@@ -19,7 +19,6 @@ from errors import BadInput
 from files import read_json, write_json
 
 SPLIT_FOLDERS = {"train": "train", "val": "valid", "test": "test"}  # as its options are called by default
-TARGET = "reference"  # comes after all numbers
 
 
 def export_dataset(root: Path, out: Path) -> int:
@@ -66,7 +65,7 @@ def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
         f"{noisy}.hdr": lambda: clip.noisy(frame, realisation),
         f"{noisy}.alb": lambda: clip.read_visible("albedo", frame),
         f"{noisy}.nrm": lambda: clip.read_visible("normal", frame),
-        f"{group}_{TARGET}.hdr": lambda: clip.reference(frame).mean(axis=0),
+        f"{group}_reference.hdr": lambda: clip.reference(frame).mean(axis=0),  # as text it comes after all numbers
     }
     for name, read in images.items():
         path = folder / f"{name}.exr"

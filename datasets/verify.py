@@ -19,7 +19,6 @@ def find_problems(root: Path) -> list[str]:
 
 
 def problems_of_clip(path: Path) -> Iterator[str]:
-    """Everything wrong with one clip, one line each, naming the file."""
     if not path.exists():
         yield f"{path} has not been rendered"
         return

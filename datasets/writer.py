@@ -58,7 +58,6 @@ class RawChannel:
         return array
 
     def read(self, frame: int) -> NDArray[Any]:
-        """An appended frame, in working precision."""
         count = int(np.prod(self.frame_shape))
         offset = frame * count * self.working_dtype.itemsize
         return np.fromfile(self.path, self.working_dtype, count, offset=offset).reshape(self.frame_shape)
@@ -83,7 +82,6 @@ class RawChannel:
         """Write all frames to a file. Returns the entry of clip.json."""
         shape = (self.frames, *self.frame_shape)
         path = self.path.with_suffix(".npy")
-        checksum = 0
         with path.open("w+b") as file:
             np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
             file.seek(0)

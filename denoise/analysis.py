@@ -56,7 +56,6 @@ def analyse(
 def derived_and_missing(
     first: ForeignFrame, sources: Sources, conventions: InputConventions, reads: Sequence[str]
 ) -> Report:
-    """The lines for what is derived and what is missing of the channels that are read."""
     report = []
     if conventions.normals_are_encoded:
         report.append(("normal", "scaled from [0, 1] to [-1, 1]"))

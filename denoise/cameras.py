@@ -52,8 +52,7 @@ def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]
     pixels = pixel_centres(*surface.shape)[rows, columns]
     if len(points) < DRAW_SIZE:
         return None
-    middle = points.mean(axis=0)
-    thickness = np.linalg.svd(points - middle, compute_uv=False)
+    thickness = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if thickness[2] < MIN_THICKNESS * thickness[0]:
         return None
 
@@ -79,8 +78,7 @@ def linear_fit(points: Array, pixels: Array) -> Array:
     equations = np.concatenate([np.hstack([p, zero, -x[:, None] * p]), np.hstack([zero, p, -y[:, None] * p])])
     unit = np.linalg.svd(np.linalg.qr(equations, mode="r"))[2][-1].reshape(3, 4)
     projection: Array = np.linalg.inv(to_unit_2) @ unit @ to_unit_3
-    weight = homogeneous(points) @ projection[2]
-    return projection * np.sign(np.median(weight))
+    return projection * np.sign(np.median(homogeneous(points) @ projection[2]))
 
 
 def homogeneous(points: Array) -> Array:

@@ -18,7 +18,6 @@ from eval.metrics import METRICS
 from files import write_csv
 
 COMPARED_METRICS = ("rmse", "psnr", "ssim")
-METRICS_FILE = "metrics.csv"
 
 
 def compare(
@@ -36,7 +35,7 @@ def compare(
             raise BadInput(f"{reference} is of another size than {out / files.name}")
         comparison = Comparison(denoised, reference_pair, exposure)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in COMPARED_METRICS)])
-    write_csv(out / METRICS_FILE, ["frame", *COMPARED_METRICS], rows)
+    write_csv(out / "metrics.csv", ["frame", *COMPARED_METRICS], rows)
     columns = zip(*(row[1:] for row in rows), strict=True)
     means = [None if None in column else float(np.mean(column)) for column in columns]
     cells = [

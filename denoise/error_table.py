@@ -16,8 +16,6 @@ ERROR_FILE = "error.csv"
 
 @dataclass(frozen=True)
 class FrameError:
-    """One row."""
-
     frame: int
     spp: float  # samples per pixel of the frame
     relative_error: float  # root of the mean squared error relative to the mean light of each pixel's neighbourhood
@@ -64,7 +62,6 @@ class ErrorTable:
         write_csv(self.path, [field.name for field in fields(FrameError)], rows)
 
     def has(self, frame: int, until: float | None) -> bool:
-        """Whether there is a row of the frame for this relative error."""
         return frame in self.rows and self.rows[frame].until == until
 
     def summary(self, frames: Iterable[int]) -> str:

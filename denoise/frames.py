@@ -13,7 +13,7 @@ from tqdm import tqdm
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
 from datasets.clip import visible_channel
-from datasets.exr import FACTS_ATTRIBUTE, channels_in, view_of_facts
+from datasets.exr import FACTS_ATTRIBUTE, channels_in
 from datasets.frame import Frame, to_tensor
 from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
 from denoise.exr_image import ExrImage
@@ -107,7 +107,6 @@ class FrameBuilder:
         self.had_camera = False
 
     def build(self, foreign: ForeignFrame) -> Frame:
-        """The next Frame."""
         views = views_of(foreign, self.conventions)
         if (views is not None) != self.had_camera:  # motion between a known and an unknown camera is unknown
             self.view = None
@@ -175,8 +174,7 @@ class FrameBuilder:
             if self.conventions.in_camera_space and views and views.positions:
                 normal = normal @ (view.camera_to_world[:3, :3] @ views.positions.camera_to_world[:3, :3].T).T
         elif views:
-            points = unproject(pixel_centres(*foreign.size), depth.astype(np.float64), view)
-            normal = facet_normals(points, view)
+            normal = facet_normals(unproject(pixel_centres(*foreign.size), depth.astype(np.float64), view), view)
         else:
             normal = np.broadcast_to(toward_viewer, (*foreign.size, 3))
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -251,7 +249,7 @@ class OwnFrameBuilder:
     def build(self, image: ExrImage) -> Frame:
         """The next Frame. A channel that was not exported is missing in it."""
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
-        view = view_of_facts(facts)
+        view = View._make(np.array(facts[key]) for key in View._fields)
         arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
         visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
         before = self.view if self.view is not None else view

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Array, View, pixel_centres
+from scenes.camera import Array, View, look_at, pixel_centres
 
 Image = NDArray[np.float32]
 
@@ -19,15 +19,9 @@ def facing_pose(normal: Image | None, surface: NDArray[np.bool_]) -> Array:
 
     Depths are compared along this axis: no visible surface, but for grazing ones, must lie along it.
     """
-    mean = normal[surface].mean(axis=0, dtype=np.float64) if normal is not None and surface.any() else None
-    pose = np.eye(4)
-    if mean is not None and np.linalg.norm(mean) > 1e-3:
-        forward = -mean / np.linalg.norm(mean)
-        side = np.eye(3)[np.argmin(np.abs(forward))]
-        left = np.cross(side, forward)
-        left /= np.linalg.norm(left)
-        pose[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-    return pose
+    mean = normal[surface].mean(axis=0, dtype=np.float64) if normal is not None and surface.any() else np.zeros(3)
+    length = np.linalg.norm(mean)
+    return look_at(np.zeros(3), -mean, np.eye(3)[np.argmin(np.abs(mean / length))]) if length > 1e-3 else np.eye(4)
 
 
 def depth_change(depth: Image, before: Image, motion: Image) -> float:

@@ -112,8 +112,6 @@ def bilinear(image: Image, x: NDArray[np.floating], y: NDArray[np.floating]) -> 
 
 @dataclass(frozen=True)
 class Detection:
-    """The convention that warps best, whether it is certain, and a line for users that explains it."""
-
     convention: MotionConvention
     certain: bool
     reason: str

@@ -39,8 +39,6 @@ from models.wrappers.shrinkage import JamesStein
 from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, file_digest, versions
 
-ERROR_LAYER = "error"
-SETTINGS_FILE = "denoise.json"
 DTYPES: dict[str | None, type | None] = {None: None, "half": np.float16, "float": np.float32}
 
 FrameReader = Callable[[FrameFiles], tuple[ExrImage, Frame, int]]
@@ -121,7 +119,7 @@ def check_names(out: Path, frames: Sequence[FrameFiles]) -> None:
 def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
     """Make the folder and write the settings into it. Raises BadInput where it has frames with other settings."""
     out.mkdir(parents=True, exist_ok=True)
-    path = out / SETTINGS_FILE
+    path = out / "denoise.json"
     if not path.exists():
         write_json(path, dict(settings))
         return
@@ -138,8 +136,6 @@ def image_of(tensor: Tensor) -> NDArray[np.float32]:
 
 @dataclass
 class SequenceDenoiser:
-    """A job with its files and its denoiser."""
-
     job: Job
     spec: DenoiserSpec
     denoiser: Denoiser
@@ -164,7 +160,6 @@ class SequenceDenoiser:
         return clip_exposure(luminance(image.clip(0, None)))
 
     def introduction(self) -> str:
-        """The frames, and where each quantity comes from."""
         frames = [frame for shot in self.shots for frame in shot]
         head = f"{len(frames)} frames, {frames[0].passes[COLOUR]} to {frames[-1].passes[COLOUR].name}"
         if missing := gaps(frames):
@@ -244,7 +239,7 @@ class SequenceDenoiser:
         output, state, estimate = denoise_with_error(self.estimator, frame, state)
         self.errors.add(FrameError.of(files.number, estimate, self.job.until))
         if self.job.error:
-            image.add(ERROR_LAYER, image_of(estimate.radiance_error()), self.sources.target[0])
+            image.add("error", image_of(estimate.radiance_error()), self.sources.target[0])
         return output, state
 
     @cached_property
@@ -289,7 +284,6 @@ class SequenceDenoiser:
         return read_foreign
 
     def write(self, files: FrameFiles, image: ExrImage, radiance: NDArray[np.float32]) -> None:
-        """Write the frame's file with denoised radiance in it, and its preview."""
         image.replace(self.sources.target, radiance, DTYPES[self.job.stored_as])
         if self.job.png:
             from PIL import Image

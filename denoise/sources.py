@@ -25,8 +25,6 @@ PASS_LAYERS = ("", "rgb", "rgba", "beauty", "combined")  # usual names of the la
 
 @dataclass(frozen=True)
 class Source:
-    """A layer of one of a frame's files."""
-
     pass_name: str
     layer: ExrLayer
     others: tuple[str, ...] = ()  # further layers that have a name of the quantity
@@ -38,15 +36,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Sources:
-    """The sources of all quantities of a frame."""
-
     quantities: dict[str, Source]  # by names of layers.QUANTITIES
     alpha: str | None  # the channel beside the colour that is 0 where a pixel shows nothing
     target: tuple[str, ...]  # the channels of the colour's file that denoised radiance replaces
     is_ours: bool  # whether the files are those of `onespp exr`, with channels and cameras under our own names
 
     def has(self, *quantities: str) -> bool:
-        """Whether there is any of the quantities."""
         return any(quantity in self.quantities for quantity in quantities)
 
 

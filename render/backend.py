@@ -61,7 +61,6 @@ def choose_llvm() -> None:
 
 
 def has_cuda() -> bool:
-    """Whether there is a CUDA driver with a device."""
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:

@@ -94,7 +94,7 @@ def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTi
     view = stage.view(0)
     arrays = render_gbuffer(stage, view)
     arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
-    if stage.has_mirrors:
+    if stage.materials.has_mirrors:
         arrays[MIRRORED["motion"]] = arrays["motion"]
     frame = FrameInProgress(0, view, view, arrays)
     timer.lap("gbuffer")
@@ -105,7 +105,7 @@ def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTi
         timer.lap("gbuffer")
         surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
         arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
-        if stage.has_mirrors:
+        if stage.materials.has_mirrors:
             shown = arrays[MIRRORED["depth"]][..., 0].astype(np.float64), arrays[MIRRORED["mesh_id"]][..., 0]
             arrays[MIRRORED["motion"]] = motion_vectors(centres, *shown, view, frame.view)
         timer.lap("motion")
@@ -136,7 +136,6 @@ class SampledChannels:
         self.samples: GradientSamples | None = None  # of the previous frame
 
     def noisy(self, frame: FrameInProgress) -> Arrays:
-        """Noisy direct and indirect radiance, and their sample buffers."""
         self.ray: mi.Ray3f = self.stage.rays(frame.view)
         streams = (NOISY_STREAM, SECOND_BUFFER_STREAM) if self.in_buffers else (NOISY_STREAM,)
         spp = self.sampling.noisy_spp // len(streams)
@@ -159,12 +158,10 @@ class SampledChannels:
         return arrays | buffers if self.in_buffers else arrays
 
     def hit_distance(self, frame: FrameInProgress) -> Arrays:
-        """Distances to what the first rays of the noisy samples hit."""
         hits = [hit_channels(self.noisy_tracer, frame.view, draws) for draws in self.draws]
         return {name: np.stack([realisation[name] for realisation in hits]) for name in hits[0]}
 
     def shadow_motion(self, frame: FrameInProgress) -> Arrays:
-        """Motion of shadows and reflections."""
         draw = self.draws[0][0]
         hits = hits_of_samples(self.noisy_tracer, frame.view, draw.seed, draw.first)
         return tracked_motion(hits, frame.arrays, frame.view, frame.previous)

@@ -31,7 +31,6 @@ class MirroredHit:
 
     @staticmethod
     def without_mirrors(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> "MirroredHit":
-        """The hits of primary rays."""
         axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
         return MirroredHit(si, ray, mi.Float(0), mi.Color3f(1), axes)
 
@@ -77,8 +76,7 @@ def depth_along_axis(
     """
     length = si.t if beyond is None else si.t + beyond
     distance = np.array(dr.select(si.is_valid(), length, 0), dtype=np.float64) * stage.unit
-    cosine = columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2]
-    depth = distance * cosine
+    depth = distance * (columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2])
     if stage.has_cutouts:  # rays begin behind those that they have passed
         begins = columns(ray.o).astype(np.float64) * stage.unit - view.camera_to_world[:3, 3]
         depth += np.where(distance > 0, begins @ view.camera_to_world[:3, 2], 0)
@@ -86,8 +84,6 @@ def depth_along_axis(
 
 
 class VisibleSurface(NamedTuple):
-    """The surfaces visible at some positions of an image."""
-
     depth: Array  # (...,), along the viewing axis; 0 for background
     mesh_id: NDArray[np.uint32]  # (...,), 0 for background
     normal: Array  # (..., 3), geometric
@@ -138,7 +134,7 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
-    if stage.has_mirrors:
+    if stage.materials.has_mirrors:
         mirrored = trace_mirrors(stage, direct)
         shown = {MIRRORED[name]: value for name, value in surface_channels(stage, mirrored).items()}
         dr.eval(shown, mirrored.beyond)

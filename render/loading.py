@@ -139,7 +139,6 @@ class StockLoader:
         return self.made({key: value for key, value in description.items() if key not in unknown}, what)
 
     def load(self, description: Mapping[str, Any]) -> Any:
-        """The Mitsuba object of a dictionary with nested ones."""
         if id(description) not in self.loaded:
             what = str(description.get("filename", f"a {description['type']}"))
             loaded = self.made(self.resolved(description), what)

@@ -30,11 +30,6 @@ class Material(NamedTuple):
     squared: bool = False
     internal: float = 0.0
 
-    @property
-    def depth(self) -> int:
-        """Of mixtures within each other."""
-        return 0
-
 
 class Mixture(NamedTuple):
     """Two materials: the second where `weight` is 1, the first where it is 0; where `sided`, front and back."""
@@ -44,13 +39,13 @@ class Mixture(NamedTuple):
     weight: mi.Texture
     sided: bool = False
 
-    @property
-    def depth(self) -> int:
-        return 1 + max(self.first.depth, self.second.depth)
+
+def depth_of(tree: Material | Mixture) -> int:
+    """Of mixtures within each other."""
+    return 1 + max(depth_of(tree.first), depth_of(tree.second)) if isinstance(tree, Mixture) else 0
 
 
 def constant(value: float) -> mi.Texture:
-    """The same number everywhere."""
     return mi.load_dict({"type": "uniform", "value": value})
 
 
@@ -213,7 +208,6 @@ def registry_index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
 
 
 def registry_number(pointer: mi.BSDFPtr | mi.ShapePtr) -> int:
-    """The same as a Python integer."""
     return int(np.array(registry_index(pointer))[0])
 
 
@@ -253,7 +247,7 @@ class MaterialTable:
         self.mixtures: dict[int, tuple[mi.Texture, int, int, bool]] = {}  # by row: weight, rows of both, sided
         bsdfs = bsdfs_of(shapes)
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
-        self.depth = max((tree.depth for tree in trees), default=0)
+        self.depth = max(map(depth_of, trees), default=0)
         rows = [self.add(tree) for tree in trees]
         self.has_mirrors = any(map(may_be_mirror, bsdfs.values(), trees))
         if not rows:

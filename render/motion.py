@@ -54,8 +54,7 @@ def dual_motion_vectors(
         return np.asarray(((p >= 0) & (p < (width, height))).all(axis=-1))
 
     # z behind the camera is FAR_OUTSIDE, which takes x_previous out of the image too.
-    use_dual = ~was_visible & inside(y) & inside(x_previous)
-    return np.where(use_dual[..., None], x_previous - x, motion)
+    return np.where((~was_visible & inside(y) & inside(x_previous))[..., None], x_previous - x, motion)
 
 
 class MeshPoint(NamedTuple):
@@ -66,7 +65,6 @@ class MeshPoint(NamedTuple):
     mesh_id: NDArray[np.integer]  # (H, W), 0 for static points
 
     def in_previous(self, now: View, previous: View) -> Array:
-        """The points (H, W, 3) in the previous frame."""
         return move(self.point, self.mesh_id, now, previous)
 
     def moved(self, now: View, previous: View) -> NDArray[np.bool_]:

@@ -73,5 +73,4 @@ def palette() -> list[object]:
         "Shape": lambda: mesh(False, False, False),
         "Emitter": lambda: mi.load_dict({"type": "area", "radiance": HALF_GREY}),
     }
-    lasts = [[fillers[name]() for _ in range(most)][-1] for name, most in MAX_OBJECTS.items()]
-    return objects + lasts
+    return objects + [[fillers[name]() for _ in range(most)][-1] for name, most in MAX_OBJECTS.items()]

@@ -119,8 +119,6 @@ def sample_mean(
 
 
 class SampleRange(NamedTuple):
-    """A range of samples of every pixel."""
-
     seed: int  # in [0, 2^32): different ones are independent
     spp: int
     first: int = 0  # index of the first in a sequence

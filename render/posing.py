@@ -57,7 +57,6 @@ class StockParameters:
                 raise BadInput(f"the light of '{name}' cannot change: it is of the kind {kind}")
 
     def changes(self, frame: float) -> Changes:
-        """The parameters that change, in a frame."""
         values = {name: value * (self.factor * self.described.gain.at(frame)) for name, value in self.light.items()}
         if self.rest and isinstance(self.described, StockShape):
             matrix = self.described.motion.matrix(frame)
@@ -72,8 +71,7 @@ def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array
     for name in names:
         if name in parameters:
             value = parameters[name]
-            matrix = value.matrix if isinstance(value, mi.AffineTransform4f) else value
-            values[name] = np.array(matrix, np.float64)
+            values[name] = np.array(value.matrix if isinstance(value, mi.AffineTransform4f) else value, np.float64)
     return {name: value for name, value in values.items() if value.size}
 
 

@@ -20,7 +20,6 @@ Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dic
 
 
 def at_least(roughness: Roughness, least: float) -> Roughness:
-    """The roughness, clamped from below."""
     if not isinstance(roughness, dict):
         return max(roughness, least)
     if "data" in roughness:

@@ -98,7 +98,6 @@ class HaltonSampler:
         self.dimension = 0
 
     def next_1d(self) -> mi.Float:
-        """A number in [0, 1)."""
         base = mi.UInt32(PRIMES[0][self.dimension])
         for bounce in range(1, len(PRIMES)):
             base = dr.select(self.bounce == bounce, PRIMES[bounce][self.dimension], base)
@@ -117,5 +116,4 @@ class HaltonSampler:
         return dr.minimum(shifted - dr.floor(shifted), ONE_MINUS_EPSILON)
 
     def next_2d(self) -> mi.Point2f:
-        """A point in [0, 1)^2."""
         return mi.Point2f(self.next_1d(), self.next_1d())

@@ -80,7 +80,6 @@ class Stage:
         self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
         visible = [*self.shapes, *loader.grouped]
         self.materials = MaterialTable(visible)
-        self.has_mirrors = self.materials.has_mirrors
         self.normals = ShadingNormals(visible)
         # Masks have null transmission; so has thin glass.
         self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(visible).values())

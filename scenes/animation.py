@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from scenes.bsdf import Bsdf
-from scenes.camera import Y_UP, Array, View, intrinsics, look_at
+from scenes.camera import Y_UP, Array, View, axis_rotation, intrinsics, look_at
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,7 @@ class KeyframedTrack(Track):
 
     def at(self, frame: float) -> Array:
         """The value, (D,) or a scalar, in a `frame`, which may be fractional."""
-        keys = self.keys
-        times = self.times
+        keys, times = self.keys, self.times
         if len(keys) == 1 or frame <= times[0]:
             return keys[0]
         if frame >= times[-1]:
@@ -93,9 +92,8 @@ class RigidMotion:
 
     def matrix(self, frame: float) -> Array:
         """object_to_world (4, 4), rigid."""
-        cos = np.cos(self.angle.at(frame))
-        sin = np.sin(self.angle.at(frame))
-        matrix = np.array([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0], [0, 0, 0, 1.0]])
+        matrix = np.eye(4)
+        matrix[:3, :3] = axis_rotation(1, float(self.angle.at(frame)))
         matrix[:3, 3] = self.position.at(frame)
         return matrix
 
@@ -115,13 +113,7 @@ class FreeMotion:
         """object_to_world (4, 4), rigid."""
         turn = np.eye(3)
         for axis, angle in enumerate(self.rotation.at(frame)):
-            i = (axis + 1) % 3
-            j = (axis + 2) % 3
-            about = np.eye(3)
-            about[[i, j], [i, j]] = np.cos(angle)
-            about[j, i] = np.sin(angle)
-            about[i, j] = -np.sin(angle)
-            turn = about @ turn
+            turn = axis_rotation(axis, angle) @ turn
         matrix = np.eye(4)
         matrix[:3, :3] = turn
         matrix[:3, 3] = self.pivot + self.position.at(frame) - turn @ self.pivot

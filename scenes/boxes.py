@@ -39,5 +39,4 @@ def first_hit(origin: Array, targets: Array, boxes: Array) -> Array:
     near, far = np.sort((boxes[None] - origin) / rays, axis=2).transpose(2, 0, 1, 3)
     enter = near.max(axis=-1)
     leave = far.min(axis=-1)
-    hit = (enter < leave) & (leave > 0)
-    return np.asarray(np.where(hit, enter, np.inf).min(axis=1, initial=np.inf))
+    return np.asarray(np.where((enter < leave) & (leave > 0), enter, np.inf).min(axis=1, initial=np.inf))

@@ -41,6 +41,16 @@ def look_at(eye: Array, target: Array, up: Array = Y_UP) -> Array:
     return matrix
 
 
+def axis_rotation(axis: int, angle: float) -> Array:
+    """The rotation (3, 3) by `angle` radians about the x, y or z axis (`axis` 0, 1, 2)."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[[i, j], [i, j]] = np.cos(angle)
+    matrix[i, j] = -np.sin(angle)
+    matrix[j, i] = np.sin(angle)
+    return matrix
+
+
 def inverse_pose(matrix: Array) -> Array:
     """Inverses (..., 4, 4) of poses: rigid transforms (..., 4, 4)."""
     inverse = np.zeros_like(matrix)
@@ -82,8 +92,7 @@ def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
     in_camera = relative @ view.camera_to_world[:3, :3]
     depth = in_camera[..., 2]
     ahead = depth > 1e-9 * np.linalg.norm(in_camera, axis=-1)
-    homogeneous = in_camera @ view.K.T
-    pixel = homogeneous[..., :2] / np.where(ahead, depth, 1)[..., None]
+    pixel = (in_camera @ view.K.T)[..., :2] / np.where(ahead, depth, 1)[..., None]
     # A point nearly in the plane of the eye projects to a huge but finite position: the same bound holds for it.
     return np.where(ahead[..., None], np.clip(pixel, -FAR_OUTSIDE, FAR_OUTSIDE), FAR_OUTSIDE)
 
@@ -111,5 +120,4 @@ def motion_vectors(pixels: Array, depth: Array, mesh_id: NDArray[np.integer], no
     """
     if all(np.array_equal(a, b) for a, b in zip(now, other, strict=True)):
         return np.zeros_like(pixels)
-    points = move(unproject(pixels, depth, now), mesh_id, now, other)
-    return project(points, depth > 0, other) - pixels
+    return project(move(unproject(pixels, depth, now), mesh_id, now, other), depth > 0, other) - pixels

@@ -13,13 +13,11 @@ from scenes.sky import sky
 
 SceneBuilder = Callable[[Rng, int], Scene]  # of a clip's number of frames
 
-TINY_LIGHT = 0.005  # of the size of the Cornell box's
-
 
 def repaint(scene: Scene, paint: Callable[[Shape], Bsdf]) -> Scene:
     """The scene with new materials for all shapes that emit no light."""
-    shapes = tuple(s if s.radiance is not None else replace(s, bsdf=paint(s)) for s in scene.shapes)
-    return replace(scene, shapes=shapes)
+    painted = (shape if shape.radiance is not None else replace(shape, bsdf=paint(shape)) for shape in scene.shapes)
+    return replace(scene, shapes=tuple(painted))
 
 
 def sharp_highlights(rng: Rng, frames: int) -> Scene:
@@ -33,7 +31,7 @@ def tiny_light(rng: Rng, frames: int) -> Scene:
     scene = cornell_box_moving(rng, frames)
     light = scene.shapes[-1]
     mesh = light.mesh.copy()
-    mesh.apply_scale(TINY_LIGHT)
+    mesh.apply_scale(0.005)
     tiny = replace(light, mesh=mesh, radiance=Track.constant([1e5, 1e5, 1e5]))
     return replace(scene, shapes=(*scene.shapes[:-1], tiny))
 

@@ -27,7 +27,6 @@ class Group:
 
     @property
     def bounds(self) -> Array:
-        """Lowest and highest x, y, z (2, 3)."""
         return enclosing_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in self.members]))
 
     @staticmethod
@@ -111,7 +110,6 @@ class Layout:
         self.boxes = np.concatenate([self.boxes, np.stack(boxes)])
 
     def try_add(self, group: Group, motion: RigidMotion) -> bool:
-        """Add the group if it fits. Returns whether it does."""
         box = self.swept(group.bounds + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
         if not self.fits(box) or self.things + len(group.members) > MAX_THINGS:
             return False

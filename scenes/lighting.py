@@ -26,8 +26,6 @@ BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
 
 @dataclass(frozen=True)
 class Lamp:
-    """A mesh that emits light."""
-
     mesh: trimesh.Trimesh
     motion: RigidMotion = AT_REST
 
@@ -71,8 +69,7 @@ def ceiling_panel(layout: Layout) -> list[Lamp]:
 
 def luminous_panel(layout: Layout) -> list[Lamp]:
     """A panel of up to half of the ceiling, as in offices and shops."""
-    share = layout.rng.uniform(0.25, 0.7, 2)
-    return panel_below_ceiling(layout, *(share * layout.size[[0, 2]]).tolist())
+    return panel_below_ceiling(layout, *(layout.rng.uniform(0.25, 0.7, 2) * layout.size[[0, 2]]).tolist())
 
 
 def downlight(layout: Layout) -> list[Lamp]:
@@ -92,8 +89,7 @@ def downlight(layout: Layout) -> list[Lamp]:
 
 
 def bulb(thing: Thing, radius: float, motion: RigidMotion) -> Lamp:
-    shade = next(part.mesh for part in thing.parts if part.slot == "shade")
-    low, high = shade.bounds
+    low, high = next(part.mesh.bounds for part in thing.parts if part.slot == "shade")
     x, y, z = (low + high) / 2
     ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 1).mesh()
     ball.apply_transform(turn_then_shift(1, 0, x, y - radius, z))

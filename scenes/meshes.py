@@ -9,12 +9,11 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scenes.animation import Track
-from scenes.camera import Array
+from scenes.camera import Y_UP, Array, axis_rotation
 from scenes.draws import Rng
 
 Faces = NDArray[np.int64]
 
-UP = np.array([0.0, 1.0, 0.0])
 CREASE = np.cos(np.radians(40))  # profiles that bend more than this keep a sharp edge
 
 
@@ -29,21 +28,14 @@ class Surface:
     smooth: bool  # shade with the interpolated normals
 
     def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Surface":
-        """Translated."""
         return replace(self, points=self.points + np.array([x, y, z]))
 
     def turned(self, angle: float, axis: int = 1) -> "Surface":
         """Rotated by `angle` radians about the x, y or z axis (`axis` 0, 1, 2)."""
-        i = (axis + 1) % 3
-        j = (axis + 2) % 3
-        matrix = np.eye(3)
-        matrix[[i, j], [i, j]] = np.cos(angle)
-        matrix[i, j] = -np.sin(angle)
-        matrix[j, i] = np.sin(angle)
+        matrix = axis_rotation(axis, angle)
         return replace(self, points=self.points @ matrix.T, normals=self.normals @ matrix.T)
 
     def mesh(self) -> trimesh.Trimesh:
-        """As a mesh with these normals and texture coordinates."""
         visual = trimesh.visual.TextureVisuals(uv=self.uv)
         return trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
@@ -97,7 +89,6 @@ def box_mapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Sur
 
 
 def flat_shaded(points: Array, faces: Faces) -> Surface:
-    """Facets with vertices and normals of their own."""
     normals = np.repeat(unit(area_vectors(points, faces)), 3, axis=0)
     return box_mapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
 
@@ -125,7 +116,7 @@ def unit_sphere(subdivisions: int) -> tuple[Array, Faces]:
 def slab(width: float, height: float, depth: float) -> Surface:
     """A box along x, y, z, standing on the origin."""
     points, faces = unit_box(0)
-    return flat_shaded((points + UP) * (width / 2, height / 2, depth / 2), faces)
+    return flat_shaded((points + Y_UP) * (width / 2, height / 2, depth / 2), faces)
 
 
 def superellipsoid(width: float, height: float, depth: float, power: float, subdivisions: int = 2) -> Surface:
@@ -136,7 +127,7 @@ def superellipsoid(width: float, height: float, depth: float, power: float, subd
     points, faces = unit_box(subdivisions)
     points = np.sin(np.pi / 2 * points)  # more points near the edges
     points = points / np.linalg.norm(points, ord=power, axis=1, keepdims=True)
-    return smooth_shaded((points + UP) * (width / 2, height / 2, depth / 2), faces)
+    return smooth_shaded((points + Y_UP) * (width / 2, height / 2, depth / 2), faces)
 
 
 def blob(rng: Rng, radius: float, roughness: float, subdivisions: int) -> Surface:
@@ -274,10 +265,10 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
 
 def leaf(path: Array, width: float, fold: float) -> Surface:
     """A thin pointed leaf along `path` (N, 3) in a vertical plane, its middle `fold` * `width` lower than its edges."""
-    across = unit(np.cross(path[-1] - path[0], UP))
+    across = unit(np.cross(path[-1] - path[0], Y_UP))
     share = np.sin(np.pi * np.linspace(0.04, 0.98, len(path)) ** 0.8) * width / 2
     side = share[:, None] * across
-    edge = path + UP * (fold * share)[:, None]
+    edge = path + Y_UP * (fold * share)[:, None]
     points = np.stack([edge - side, path, edge + side], axis=1)
     along = np.broadcast_to(arc_lengths(path)[:, None], (len(path), 3))
     uv = np.stack([share[:, None] * (-1, 0, 1), along], axis=2)

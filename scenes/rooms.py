@@ -86,7 +86,6 @@ def partition(layout: Layout) -> None:
 
 
 def shell(layout: Layout) -> list[Shape]:
-    """Floor, ceiling and walls with their openings."""
     rng = layout.rng
     width, height, depth = layout.size
     below = horizontal_rectangle(width + 0.1, depth + 0.1)

@@ -43,7 +43,6 @@ def wall_pose(wall: int, size: Array) -> Array:
 
 
 def wall_width(wall: int, size: Array) -> float:
-    """The width of wall 0 to 3 of a room of `size` (3,)."""
     return float(size[0] if wall % 2 == 0 else size[2])
 
 
@@ -63,7 +62,7 @@ def wall_with_openings(width: float, height: float, openings: list[Opening]) -> 
 
 def reveal(opening: Opening, thickness: float) -> Surface:
     """The four sides of an opening through a wall of that thickness, behind the plane z = 0."""
-    x, _ = opening.middle
+    x = opening.middle[0]
     border = 0.02
     sides = [
         slab(opening.width + 2 * border, border, thickness).at(x, opening.low[1] - border, -thickness / 2),

@@ -181,8 +181,7 @@ def scratches(rng: Rng) -> Pattern:
     length = rng.uniform(0.05, 0.9, (count, 1))
     x = start[0] + length * np.cos(angle) * steps
     y = start[1] + length * np.sin(angle) * steps
-    row = (y * TEXTURE_SIZE).astype(int) % TEXTURE_SIZE
-    column = (x * TEXTURE_SIZE).astype(int) % TEXTURE_SIZE
+    row, column = ((t * TEXTURE_SIZE).astype(int) % TEXTURE_SIZE for t in (y, x))
     tone = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE))
     tone[row, column] = rng.uniform(0.3, PALETTE_SIZE - 1, (count, 1))
     return Pattern(tone, 1 + rng.uniform(0, 0.1) * periodic_noise(rng, 1))

@@ -29,8 +29,6 @@ class RenderJob(NamedTuple):
 
 
 class ClipOutcome(NamedTuple):
-    """How a clip's job ended, and why if it did not render the clip."""
-
     path: Path
     ending: Literal["rendered", "left", "failed"]
     reason: str = ""

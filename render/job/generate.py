@@ -39,7 +39,6 @@ class Share:
         raise BadInput(f"'{text}' is not a share: write K/N with K from 1 to N, such as 2/8")
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Every `count`-th item."""
         return items[self.index - 1 :: self.count]
 
 

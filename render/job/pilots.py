@@ -63,8 +63,7 @@ def samples_needed(
 def needed_for(profile: DataProfile, room: str, seed: int, options: Options) -> int:
     """Samples a pixel that the references of a room, SPLIT/SCENE/CLIP, need."""
     scene, clip_seed = scene_of_clip(Path(room), profile, seed)
-    quality = profile.quality[room.split("/")[0]]
-    return samples_needed(scene, *profile.size, quality, clip_seed, options)
+    return samples_needed(scene, *profile.size, profile.quality[room.split("/")[0]], clip_seed, options)
 
 
 def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: NeededSpp) -> dict[str, int]:
@@ -74,7 +73,7 @@ def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: Ne
     """
     needed = dict(measured)
     for split, quality in profile.quality.items():
-        wanted = profile.rooms[split]
+        wanted = profile.rooms.get(split, 0)
         while quality.skips_noisy_rooms:
             unknown = {f"{split}/{room}" for room in rooms_of(profile, split, seed, needed)} - set(needed)
             if not unknown:

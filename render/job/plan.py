@@ -33,20 +33,18 @@ def rooms_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp)
     names = (f"room-{number}/000" for number in count(ROOMS_OF_A_SEED * seed + FIRST_ROOM[split]))
     if quality.skips_noisy_rooms:
         names = (name for name in names if needed_spp.get(f"{split}/{name}", 0) <= quality.most_spp)
-    return list(islice(names, profile.rooms[split]))
+    return list(islice(names, profile.rooms.get(split, 0)))
 
 
 def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp = NO_PILOTS) -> list[str]:
     """All clips of a split, each as SCENE/CLIP, for the dataset with that seed. Close-ups are of other rooms."""
-    boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes[split])]
-    rooms = rooms_of(profile, split, seed, needed_spp)
-    first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms[split]
+    boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes.get(split, 0))]
+    first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms.get(split, 0)
     closeups = [f"closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
-    return boxes + rooms + closeups + profile.special.get(split, [])
+    return boxes + rooms_of(profile, split, seed, needed_spp) + closeups + profile.special.get(split, [])
 
 
 def check_seed(seed: int) -> None:
-    """Raise BadInput for a negative seed of a dataset."""
     if seed < 0:
         raise BadInput(f"the seed {seed} is negative: use 0 or more")
 
@@ -101,9 +99,9 @@ def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tupl
     kind = ClipKind.of(clip_name)
     seed = clip_seed(dataset_seed, scene_name, split, kind.number)
     if profile.own is None:
-        scene = build_scene(scene_name, seed, profile.frames)
+        scene = build_scene(scene_name, seed, profile.size[0])
     else:
-        scene = clip_of_own_scene(profile.own, split, kind.number, profile.frames, seed)
+        scene = clip_of_own_scene(profile.own, split, kind.number, profile.size[0], seed)
     return (scene.still() if kind.still else scene), seed
 
 

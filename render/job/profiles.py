@@ -12,8 +12,6 @@ from render.scene_file.description import SplitRequest, read_description
 
 
 class SamplingQuality(NamedTuple):
-    """The sampling of the clips of a split."""
-
     realisations: int  # independent ones of the noisy channels
     reference_spp: int  # samples a pixel of references, at least
     floor: float | None = None  # PSNR in dB: references get more samples until their noise is down to this,
@@ -25,31 +23,21 @@ class SamplingQuality(NamedTuple):
 class DataProfile:
     """The clips of a dataset, and their sampling, by split."""
 
-    height: int
-    width: int
-    frames: int
-    boxes: dict[str, int]  # clips of each Cornell box
-    rooms: dict[str, int]  # rooms, of one clip each
+    size: tuple[int, int, int]  # frames, height, width
     quality: dict[str, SamplingQuality]
+    boxes: dict[str, int] = field(default_factory=dict)  # clips of each Cornell box
+    rooms: dict[str, int] = field(default_factory=dict)  # rooms, of one clip each
     closeups: dict[str, int] = field(default_factory=dict)  # of further rooms, one clip each
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
     own: Path | None = None  # the TOML of a user's own scene, the only one
-
-    @property
-    def size(self) -> tuple[int, int, int]:
-        """(frames, height, width)."""
-        return self.frames, self.height, self.width
 
 
 TEST_OF_SMALL_ROOMS = SamplingQuality(1, reference_spp=64, floor=40, most_spp=256, skips_noisy_rooms=True)
 
 DATA_PROFILES = {
     "tiny": DataProfile(
-        height=64,
-        width=64,
-        frames=8,
-        boxes={"train": 1, "val": 1, "test": 1},
-        rooms={"train": 0, "val": 0, "test": 0},
+        size=(8, 64, 64),
+        boxes=dict.fromkeys(SPLITS, 1),
         quality={
             "train": SamplingQuality(realisations=2, reference_spp=64),
             "val": SamplingQuality(realisations=1, reference_spp=128),
@@ -57,10 +45,8 @@ DATA_PROFILES = {
         },
     ),
     "quick": DataProfile(
-        height=128,
-        width=128,
-        frames=16,
-        boxes={"train": 1, "val": 0, "test": 1},
+        size=(16, 128, 128),
+        boxes={"train": 1, "test": 1},
         rooms={"train": 24, "val": 2, "test": 2},
         quality={
             "train": SamplingQuality(realisations=4, reference_spp=32),
@@ -70,19 +56,14 @@ DATA_PROFILES = {
     ),
     # Rooms as those of release, small and short, to measure in minutes how hard they are.
     "sketch": DataProfile(
-        height=64,
-        width=64,
-        frames=4,
-        boxes={"train": 0, "val": 0, "test": 0},
-        rooms={"train": 64, "val": 8, "test": 0},
+        size=(4, 64, 64),
+        rooms={"train": 64, "val": 8},
         quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=64)),
     ),
     # Whole rooms, and parts of others with the resolution of large images.
     "release": DataProfile(
-        height=128,
-        width=128,
-        frames=12,
-        boxes={"train": 0, "val": 0, "test": 1},
+        size=(12, 128, 128),
+        boxes={"test": 1},
         rooms={"train": 128, "val": 8, "test": 6},
         closeups={"train": 128, "val": 4},
         quality={
@@ -105,10 +86,7 @@ DATA_PROFILES = {
 def rooms_profile(rooms: int, spp: int) -> DataProfile:
     """Small rooms to train on, with references of `spp` samples a pixel, and a few to validate and test."""
     return DataProfile(
-        height=96,
-        width=96,
-        frames=12,
-        boxes=dict.fromkeys(SPLITS, 0),
+        size=(12, 96, 96),
         rooms={"train": rooms, "val": 3, "test": 4},
         quality={
             "train": SamplingQuality(realisations=8, reference_spp=spp),
@@ -130,7 +108,6 @@ OWN_QUALITY = {
 def own_profile(path: Path) -> DataProfile:
     """The profile in the TOML of a user's own scene. Raises BadInput, naming the file, if it cannot be used."""
     described = read_description(path)
-    width, height = described.resolution
     name = re.sub(r"[^\w-]", "_", path.stem)
     clips: dict[str, list[str]] = {}
     quality: dict[str, SamplingQuality] = {}
@@ -143,8 +120,8 @@ def own_profile(path: Path) -> DataProfile:
         quality[split] = OWN_QUALITY[split]._replace(**given)
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
-    none = dict.fromkeys(SPLITS, 0)
-    return DataProfile(height, width, described.frames, none, none, quality, special=clips, own=path)
+    width, height = described.resolution
+    return DataProfile((described.frames, height, width), quality, special=clips, own=path)
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:

@@ -49,7 +49,10 @@ class SceneFile:
 
 
 class Converter:
-    """Converts the nodes of one file to dictionaries; a node with several references is one shared dictionary."""
+    """Converts a Mitsuba XML file to dictionaries; a node with several references is one shared dictionary.
+
+    Raises BadInput, naming the file, if it cannot be used.
+    """
 
     def __init__(self, path: Path):
         self.root = path.resolve().parent
@@ -65,7 +68,6 @@ class Converter:
         self.file.notes.append(text)
 
     def kind(self, index: int) -> str:
-        """The kind of a node: BSDF, Shape, Emitter, Texture, ..."""
         return str(self.state.nodes[index].type).rpartition(".")[2]
 
     def children(self, node: mi.parser.SceneNode) -> list[tuple[str, int]]:
@@ -160,7 +162,6 @@ class Converter:
         return self.names.unique(plain or Path(str(props.get("filename", ""))).stem or props.plugin_name())
 
     def add_shape(self, index: int) -> None:
-        """Add a shape, with its material and its emitter."""
         node = self.state.nodes[index]
         if node.props.plugin_name() == "shapegroup":
             return  # instances refer to it
@@ -251,8 +252,3 @@ class Converter:
             self.note("there is no light: a uniform white sky instead")
             self.file.lights.append(StockLight(self.names.unique("white-sky"), WHITE_SKY))
         return self.file
-
-
-def convert(path: Path) -> SceneFile:
-    """The content of a Mitsuba XML file. Raises BadInput, naming the file, if it cannot be used."""
-    return Converter(path).convert()

@@ -10,7 +10,7 @@ import numpy as np
 from errors import BadInput
 from render.backend import mi
 from render.loading import mitsuba_reason
-from render.scene_file.convert import convert
+from render.scene_file.convert import Converter
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
 from render.scene_file.mesh_file import load_mesh_file
@@ -91,8 +91,7 @@ class OwnScene:
             self.scene = replace(self.scene, camera=camera_framing(space.low, space.high))
 
     def from_xml(self) -> tuple[Scene, list[str]]:
-        """The scene of a Mitsuba file, with a static camera, and notes."""
-        found = convert(self.file)
+        found = Converter(self.file).convert()
         camera, notes = DEFAULT_CAMERA, [*found.notes]
         self.has_camera = found.sensor is not None
         if found.sensor:
@@ -105,7 +104,6 @@ class OwnScene:
         return Scene((), camera, depth, stock=tuple(found.shapes), lights=tuple(found.lights)), notes
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
-        """The scene of a glTF, OBJ or PLY file, and notes."""
         found = load_mesh_file(self.file, self.width / self.height)
         self.has_camera = found.camera is not None
         scene = Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky)
@@ -136,7 +134,6 @@ class OwnScene:
         return replace(self.animated(frames), camera=camera)
 
     def animated(self, frames: int) -> Scene:
-        """The scene with the motion and the changing lights of the TOML."""
         scene = self.scene
         by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
         motions = {

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -132,22 +131,18 @@ def upgrade(root: Element, path: Path) -> list[str]:
             elif child.tag == "blackbody":
                 parent[place] = named_like(child, "spectrum", type="blackbody")
                 for name in ("temperature", "scale"):
-                    value = child.get(name, "1").strip(" K")
-                    parent[place].append(Element("float", {"name": name, "value": value}))
+                    parent[place].append(Element("float", {"name": name, "value": child.get(name, "1").strip(" K")}))
             elif child.tag == "spectrum" and not (path.parent / child.get("filename", "")).exists():
                 notes.append(f"the file {child.get('filename')} of a spectrum is missing: 0.5 everywhere instead")
                 parent[place] = named_like(child, "spectrum", value="0.5")
     return [f"{notes.count(note)} times {note}" if notes.count(note) > 1 else note for note in dict.fromkeys(notes)]
 
 
-class Parsed(NamedTuple):
-    state: mi.parser.ParserState
-    searched: list[Path]  # folders for its files
-    notes: list[str]  # of omissions
+def parse(path: Path) -> tuple[mi.parser.ParserState, list[Path], list[str]]:
+    """The nodes of a scene file with references resolved, the folders for its files, and notes of omissions.
 
-
-def parse(path: Path) -> Parsed:
-    """The nodes of a scene file, with references resolved. Raises BadInput, naming the file, if it is invalid."""
+    Raises BadInput, naming the file, if it is invalid.
+    """
     path = path.resolve()
     searched = check_includes(path)
     config = mi.parser.ParserConfig(VARIANT)
@@ -162,4 +157,4 @@ def parse(path: Path) -> Parsed:
             mi.parser.transform_resolve_references(config, state)
         except (RuntimeError, ValueError) as error:
             raise BadInput(f"{path} cannot be read: {mitsuba_reason(error)}") from None
-    return Parsed(state, searched, notes)
+    return state, searched, notes

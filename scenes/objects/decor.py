@@ -87,7 +87,6 @@ def make_vase(rng: Rng) -> Thing:
 
 
 def make_bowl(rng: Rng) -> Thing:
-    """A bowl that widens upwards."""
     radii = np.linspace(rng.uniform(0.05, 0.2), 1, 6) ** rng.uniform(0.3, 0.7)
     radius, height = uniforms(rng, (0.07, 0.2), (0.05, 0.12))
     return vessel(rng, "bowl", radii, radius, height, ("ceramic", "wood", "metal", "glass"))

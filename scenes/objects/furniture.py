@@ -70,8 +70,7 @@ def fronts(rng: Rng, width: float, height: float, columns: int, rows: int) -> Su
     board = slab(cell_width - gap, cell_height - gap, 0.018)
     boards, grips = [], []
     for column, x in enumerate(evenly(width, columns)):
-        outward = 1 if column % 2 == 0 else -1
-        aside = (cell_width / 2 - 0.05) * outward if upright else 0
+        aside = (cell_width / 2 - 0.05) * (-1) ** column if upright else 0
         for y in evenly(height, rows) + height / 2:
             boards.append(board.at(x, y - (cell_height - gap) / 2, 0.009))
             grips.append(grip.at(x + aside, y, 0.018))
@@ -94,8 +93,7 @@ def make_table(rng: Rng) -> Thing:
         side = radius * math.sqrt(2)
         frame = pedestal(rng, radius, height) if rng.random() < 0.5 else legs(rng, side, side, height)
         board = disc(radius, thickness)
-        width = side
-        depth = side
+        width = depth = side
     else:
         width, depth = uniforms(rng, (0.5, 1.9), (0.45, 0.95))
         frame = legs(rng, width, depth, height)

@@ -38,7 +38,6 @@ class Support:
     clearance: float = math.inf  # free height above
 
     def at(self, x: float, y: float, z: float) -> "Support":
-        """Translated."""
         low = (self.low[0] + x, self.low[1] + z)
         high = (self.high[0] + x, self.high[1] + z)
         return replace(self, low=low, high=high, height=self.height + y)
@@ -57,7 +56,6 @@ class Thing:
 
     @property
     def bounds(self) -> Array:
-        """Lowest and highest x, y, z (2, 3)."""
         return enclosing_box(np.array([part.mesh.bounds for part in self.parts]))
 
 
@@ -69,7 +67,6 @@ def shifted(surfaces: SurfacesBySlot, x: float = 0.0, y: float = 0.0, z: float =
 
 
 def merged(*groups: SurfacesBySlot) -> SurfacesBySlot:
-    """All surfaces of all groups, by slot."""
     surfaces: SurfacesBySlot = {}
     for group in groups:
         for slot, of_slot in group.items():

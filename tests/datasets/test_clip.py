@@ -37,7 +37,7 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     profile = profile_of("tiny")
     scene, seed = scene_of_clip(clip.path, profile, 0)
     sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
-    frames = render_clip(scene, profile.frames, profile.height, profile.width, sampling, seed)
+    frames = render_clip(scene, *profile.size, sampling, seed)
     for index, (channels, _) in enumerate(frames):
         for name in ("direct", "depth", "motion", "dual_motion", "gradient", "normal", "mesh_id"):
             rendered = channels[name][0] if name == "direct" else channels[name]

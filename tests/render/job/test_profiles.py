@@ -59,7 +59,7 @@ def test_other_clip_names_are_refused():
 
 def small_profile(size: int, frames: int, quality: SamplingQuality) -> DataProfile:
     """For test clips of `size` x `size` pixels."""
-    return DataProfile(size, size, frames, boxes={}, rooms={}, quality={"test": quality})
+    return DataProfile((frames, size, size), {"test": quality})
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_references_stop_at_the_most(tmp_path):
 @pytest.mark.slow
 def test_rooms_that_would_need_too_many_samples_are_skipped():
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, skips_noisy_rooms=True)
-    profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 3}, quality={"test": bounded})
+    profile = DataProfile((2, 32, 32), {"test": bounded}, rooms={"test": 3})
     needed = choose_rooms(profile, 0, NO_OPTIONS, {})
     chosen = [f"test/{room}" for room in rooms_of(profile, "test", 0, needed)]
     assert len(chosen) == 3
@@ -177,7 +177,7 @@ def test_rooms_that_would_need_too_many_samples_are_skipped():
 def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
     monkeypatch.setattr(pilots, "needed_for", lambda *_: 4096)
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, skips_noisy_rooms=True)
-    profile = DataProfile(32, 32, 2, boxes={"test": 0}, rooms={"test": 2}, quality={"test": bounded})
+    profile = DataProfile((2, 32, 32), {"test": bounded}, rooms={"test": 2})
     with pytest.raises(BadInput, match="fewer than 2 in 64 rooms reach 90 dB within 128 spp"):
         choose_rooms(profile, 0, NO_OPTIONS, {})
 
@@ -228,7 +228,7 @@ def test_a_static_diffuse_box_takes_at_most_sixty_percent(lean):
 
 def test_gradients_of_a_still_clip_are_one_value(tmp_path):
     quality = {"test": SamplingQuality(realisations=1, reference_spp=4)}
-    profile = DataProfile(height=16, width=20, frames=3, boxes={}, rooms={}, quality=quality)
+    profile = DataProfile((3, 16, 20), quality)
     folder = tmp_path / "test" / "cornell_box_moving" / "still"
     folder.parent.mkdir(parents=True)
     render_to_folder(folder, profile, 0, tuple(CHANNELS))
