@@ -50,6 +50,10 @@ class Channel:
         """Whether it relates a frame to the one before."""
         return self.kind in ("motion", "gradient")
 
+    def shape(self, **sizes: int) -> list[int]:
+        """The stored shape, for the lengths of the axes given by name: F, S, H, W and M."""
+        return [axis if isinstance(axis, int) else sizes[axis] for axis in self.axes]
+
 
 RADIANCE = "W sr^-1 m^-2"
 LENGTH = "world units"

@@ -156,16 +156,11 @@ class Clip:
         return View._make(np.array(self.map(name)[frame]) for name in View._fields)
 
     def motion_to(
-        self,
-        frame: int,
-        other: int,
-        window: ImageWindow = WHOLE_IMAGE,
-        read: Callable[..., NDArray[Any]] | None = None,
+        self, frame: int, other: int, window: ImageWindow = WHOLE_IMAGE, read: Callable[..., NDArray[Any]] | None = None
     ) -> NDArray[np.float32]:
-        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame of the clip.
+        """Motion vectors (h, w, 2), in pixels, from `frame` to any `other` frame, of the surfaces that `read` returns.
 
-        They are computed from depth, the cameras and the poses of the meshes. They are those of visible surfaces, or of
-        the surfaces that `read` returns.
+        By default they are those of visible surfaces. They follow from depth, cameras and the poses of the meshes.
         """
         read = read or self.read_visible
         pixels = pixel_centres(self.height, self.width)[window]

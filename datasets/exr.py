@@ -24,10 +24,9 @@ def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """EXR channels (H, W), named LAYER.LETTER, of a clip's channel: (H, W, C), or (2, H, W, C) of two buffers."""
     channel = CHANNELS[name]
     exact = array.astype(np.uint32) if array.dtype == np.uint16 else array  # EXR has no 16-bit integers
-    images = zip(layer_names(name), exact if channel.has_buffers else [exact], strict=True)
     return {
         f"{layer}.{letter}": np.ascontiguousarray(image[..., i])
-        for layer, image in images
+        for layer, image in zip(layer_names(name), exact if channel.has_buffers else [exact], strict=True)
         for i, letter in enumerate(channel.letters)
     }
 
@@ -55,9 +54,7 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
 
     Layers are all channels of the clip, in their stored precision, and the noisy beauty image as plain R, G, B
     (float32). The header has `worldToCamera` (for row vectors, in the camera frame of docs/format.md), and the exact
-    cameras as JSON in `onespp`.
-
-    Raises BadInput where the disk is full or the folder cannot be written.
+    cameras as JSON in `onespp`. Raises BadInput where it cannot be written.
     """
     names = [name for name in clip.channels if CHANNELS[name].is_image]
     arrays = {name: clip.read(name, index, realisation=realisation) for name in names}

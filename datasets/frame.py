@@ -175,8 +175,7 @@ class Frame:
 
     def irradiance(self, signal: Signal) -> Tensor:
         """Noisy irradiance (B, 3, H, W): radiance without emission, divided by the albedo."""
-        reflected = self.indirect if signal == "indirect" else self.direct + self.indirect
-        return reflected / self.divisor
+        return (self.indirect if signal == "indirect" else self.direct + self.indirect) / self.divisor
 
     def reference_buffers(self, signal: Signal) -> Tensor:
         """Radiance without emission (B, 2, 3, H, W) of the reference, in two buffers whose noise is independent."""

@@ -1,18 +1,17 @@
-"""What is in a data set: its clips and how hard they are, how channels are stored, where the time went."""
+"""What is in a data set: its clips and how hard their light is to reconstruct, how channels are stored, render time."""
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS, OPTIONAL_STEPS, USUAL_CHANNELS
+from datasets.channels import ALBEDO_FLOOR, CHANNELS, OPTIONAL_STEPS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
-from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
-from datasets.tonemap import psnr
+from datasets.tonemap import luminance, psnr
 from errors import BadInput
 from files import read_json
 
@@ -20,8 +19,61 @@ if TYPE_CHECKING:
     from plotting import Figure
 
 BINS = 16  # of histograms
+MAX_MEASURED_FRAMES = 8  # spread evenly over a clip
 
 SecondsByStep = dict[str, float]
+
+
+class Difficulty(NamedTuple):
+    """Measures of the luminance of irradiance on surfaces."""
+
+    zeros: float  # share of pixels that are exactly black at 1 spp
+    relative_mse: float  # mean((x - r)^2) / mean(r)^2 of 1 spp x against the reference r
+    peak: float  # 99.9th percentile of 1 spp over its mean
+    contrast: float  # 95th over 5th percentile of the reference; infinite where a twentieth is black
+
+
+class Measure(NamedTuple):
+    head: str  # of its column in tables
+    title: str  # of its histogram
+    minimum: float  # of the histogram's axis; smaller values are shown there
+
+
+MEASURES = {  # by field of Difficulty
+    "zeros": Measure("zeros", "share of black pixels at 1 spp", 1e-3),
+    "relative_mse": Measure("rel. MSE", "relative MSE at 1 spp", 1e-2),
+    "peak": Measure("P99.9/mean", "P99.9 over mean at 1 spp", 1.0),
+    "contrast": Measure("P95/P5", "P95 over P5 of the reference", 1.0),
+}
+
+
+def difficulty_of_clip(clip: Clip) -> Difficulty:
+    """The mean over up to MAX_MEASURED_FRAMES frames of a clip, in its first noise realisation.
+
+    Measures are NaN where a frame shows no surface, or none that is lit.
+    """
+    frames = np.unique(np.linspace(0, clip.frames - 1, MAX_MEASURED_FRAMES).round().astype(int))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        measured = [difficulty_of_frame(clip, int(frame)) for frame in frames]
+    return Difficulty(*np.mean(measured, axis=0))
+
+
+def difficulty_of_frame(clip: Clip, frame: int) -> Difficulty:
+    albedo = np.maximum(clip.read("albedo", frame).astype(np.float64), ALBEDO_FLOOR)
+    surface = clip.read("mesh_id", frame)[..., 0] > 0
+    if not surface.any():
+        return Difficulty(*[math.nan] * len(MEASURES))
+    light = clip.read("direct", frame).astype(np.float64) + clip.read("indirect", frame)
+    buffers = clip.read("direct_reference", frame).astype(np.float64) + clip.read("indirect_reference", frame)
+    noisy = luminance(light / albedo)[surface]
+    reference = luminance(buffers / albedo).mean(axis=0)[surface]
+    low, high = np.percentile(reference, [5, 95])
+    return Difficulty(
+        zeros=float((noisy == 0).mean()),
+        relative_mse=float(((noisy - reference) ** 2).mean() / reference.mean() ** 2),
+        peak=float(np.percentile(noisy, 99.9) / noisy.mean()),
+        contrast=float(high / low),
+    )
 
 
 def summarise(root: Path, plot: Path | None = None) -> str:
@@ -143,10 +195,9 @@ def stored_size(clip: Clip, channel: str) -> int:
 
 def size_in_full(clip: Clip, channel: str) -> int:
     """Bytes that a channel would take with all its numbers written out."""
-    sizes = {"F": clip.frames, "S": clip.realisations, "H": clip.height, "W": clip.width}
-    sizes["M"] = len(clip.facts["meshes"])
-    count = math.prod(axis if isinstance(axis, int) else sizes[axis] for axis in CHANNELS[channel].axes)
-    return count * np.dtype(clip.channels.get(channel, {}).get("dtype", CHANNELS[channel].dtype)).itemsize
+    meshes = len(clip.facts["meshes"])
+    shape = CHANNELS[channel].shape(F=clip.frames, S=clip.realisations, H=clip.height, W=clip.width, M=meshes)
+    return math.prod(shape) * np.dtype(clip.channels.get(channel, {}).get("dtype", CHANNELS[channel].dtype)).itemsize
 
 
 def size_of(path: Path) -> int:

@@ -25,8 +25,6 @@ Report = list[tuple[str, str]]  # a quantity, and where it comes from
 
 @dataclass(frozen=True)
 class Analysis:
-    """How to read a sequence, and a line for each quantity that a denoiser reads."""
-
     conventions: InputConventions
     report: Report
 

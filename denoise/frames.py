@@ -30,8 +30,6 @@ TELEPHOTO = 1e8  # px: a focal length that makes all rays parallel
 
 @dataclass(frozen=True)
 class InputConventions:
-    """The conventions of all frames of a sequence."""
-
     motion: MotionConvention | None = None  # None where there are no motion vectors
     normals_are_encoded: bool = False  # in [0, 1] instead of [-1, 1]
     cameras: str | None = None  # from "positions", "header" or "arrays" beside the pixels; None where unknown
@@ -54,8 +52,6 @@ def are_encoded(normals: Image, surface: NDArray[np.bool_]) -> bool:
 
 @dataclass(frozen=True)
 class FrameViews:
-    """The camera of one frame: its view of the world, and of the coordinates of its positions."""
-
     world: View
     positions: View | None  # by which positions become depths
 

@@ -9,8 +9,6 @@ COLOUR = "colour"  # the quantity that a frame cannot do without
 
 
 class LayerNames(NamedTuple):
-    """How the layers of a quantity are called, and the components that they must have."""
-
     names: tuple[str, ...]  # best first; compared without case, spaces, _ and -
     components: tuple[str, ...]  # letters of channel names, best first
 

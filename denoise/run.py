@@ -41,8 +41,6 @@ from provenance import DENOISING, file_digest, versions
 
 DTYPES: dict[str | None, type | None] = {None: None, "half": np.float16, "float": np.float32}
 
-FrameReader = Callable[[FrameFiles], tuple[ExrImage, Frame, int]]
-
 
 @torch.inference_mode()
 def denoise(job: Job) -> None:
@@ -216,8 +214,9 @@ class SequenceDenoiser:
         """The frames of a shot, of which those before `start` are finished."""
         state: State | None = None
         read = self.frame_reader()
+        has_history = self.sources.is_ours or self.analysis.conventions.has_history
         for index, files in enumerate(shot):
-            needs_state = self.has_history and (index == 0 or type(state) is not State)
+            needs_state = has_history and (index == 0 or type(state) is not State)
             if start < len(shot) and (needs_state or index >= start):
                 image, frame, nonfinite = read(files)
                 if frame.size != self.size:
@@ -257,11 +256,7 @@ class SequenceDenoiser:
         first = ExrImage(self.shots[0][0].passes[COLOUR], header_only=True)
         return first.height, first.width
 
-    @property
-    def has_history(self) -> bool:
-        return self.sources.is_ours or self.analysis.conventions.has_history
-
-    def frame_reader(self) -> FrameReader:
+    def frame_reader(self) -> Callable[[FrameFiles], tuple[ExrImage, Frame, int]]:
         """A function from a frame's files to the image to write, the Frame, and how many pixels were not finite."""
         if self.sources.is_ours:
             own = OwnFrameBuilder(self.denoiser.reads)

@@ -172,7 +172,7 @@ class SampledChannels:
         gradient = self.samples.gradient(self.noisy_tracer, frame.view) if self.samples else still
         choice = stream_seed(self.seed, frame.index, GRADIENT_STREAM, 0)
         self.samples = GradientSamples.of(
-            frame.arrays, *self.first_sample, frame.view, stage.poses, self.draws[0][0], choice
+            frame.arrays, np.add(*self.first_sample), frame.view, stage.poses, self.draws[0][0], choice
         )
         return {"gradient": gradient}
 

@@ -52,20 +52,14 @@ class GradientSamples(NamedTuple):
 
     @staticmethod
     def of(
-        frame: dict[str, NDArray[Any]],
-        direct: NDArray[np.float32],
-        indirect: NDArray[np.float32],
-        view: View,
-        poses: int,
-        draw: SampleRange,
-        seed: int,
+        frame: dict[str, NDArray[Any]], light: NDArray[np.float32], view: View, poses: int, draw: SampleRange, seed: int
     ) -> "GradientSamples":
-        """One of each stratum of a `frame`, whose samples are `direct` and `indirect` (H, W, 3)."""
-        height, width = direct.shape[:2]
+        """One of each stratum of a `frame`, whose samples have that `light` (H, W, 3)."""
+        height, width = light.shape[:2]
         pixel = pixel_of_each_stratum(height, width, seed)
         centre = np.stack([pixel % width, pixel // width], axis=-1) + 0.5
         point = unproject(centre, frame["depth"].ravel()[pixel].astype(np.float64), view)
-        luminance = sample_luminance(direct.reshape(-1, 3)[pixel] + indirect.reshape(-1, 3)[pixel])
+        luminance = sample_luminance(light.reshape(-1, 3)[pixel])
         return GradientSamples(pixel, luminance, point, frame["mesh_id"].ravel()[pixel], view, poses, draw)
 
     def gradient(self, tracer: PathTracer, now: View) -> Array:

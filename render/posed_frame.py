@@ -11,7 +11,6 @@ FloatImage = NDArray[np.float64]  # (H, W, 3)
 
 
 def finite_or_zero(image: NDArray[np.floating]) -> FloatImage:
-    """The image in float64, with non-finite values set to 0."""
     return np.nan_to_num(image.astype(np.float64), nan=0, posinf=0, neginf=0)
 
 

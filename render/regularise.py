@@ -39,7 +39,6 @@ def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_bsdf(value: object) -> bool:
-    """Whether a value in a Mitsuba dictionary is a BSDF that may be nested in another."""
     return isinstance(value, dict) and value.get("type") in (*ROUGH, *ROUGH.values(), "principled", "diffuse")
 
 

@@ -61,7 +61,6 @@ class KeyframedTrack(Track):
     straight: bool = False
 
     def at(self, frame: float) -> Array:
-        """The value, (D,) or a scalar, in a `frame`, which may be fractional."""
         keys, times = self.keys, self.times
         if len(keys) == 1 or frame <= times[0]:
             return keys[0]
@@ -110,7 +109,6 @@ class FreeMotion:
     rotation: Track  # (3,) radians
 
     def matrix(self, frame: float) -> Array:
-        """object_to_world (4, 4), rigid."""
         turn = np.eye(3)
         for axis, angle in enumerate(self.rotation.at(frame)):
             turn = axis_rotation(axis, angle) @ turn

@@ -45,8 +45,7 @@ def empty_box() -> list[Shape]:
 
 def light(position: Track, radiance: Track) -> Shape:
     corners = [(-0.235, 0, -0.19), (0.235, 0, -0.19), (0.235, 0, 0.19), (-0.235, 0, 0.19)]
-    motion = RigidMotion(position, Track.constant(0.0))
-    return Shape("light", quad(*corners), WHITE, radiance, motion)
+    return Shape("light", quad(*corners), WHITE, radiance, RigidMotion(position, Track.constant(0.0)))
 
 
 def block(name: str, width: float, height: float, position: Track, angle: Track) -> Shape:

@@ -44,8 +44,6 @@ def black_and_white(rng: Rng, frames: int) -> Scene:
 
 
 def rescaled(scene: Scene, factor: float) -> Scene:
-    """The scene with all lengths times `factor`."""
-
     def grow(track: Track) -> Track:
         return replace(track, keys=track.keys * factor)
 

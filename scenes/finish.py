@@ -48,10 +48,6 @@ def principled_bsdf(rng: Rng, base: Bsdf) -> Bsdf:
     return {"type": "principled", "base_color": base, "metallic": metallic, "roughness": roughness, "specular": 0.5}
 
 
-def rough_glass_bsdf(rng: Rng) -> Bsdf:
-    return {"type": "roughdielectric", "alpha": log_uniform(rng, 0.02, 0.2), "int_ior": GLASS}
-
-
 FINISHES: dict[str, Callable[[Rng, Bsdf], Bsdf]] = {
     "rough plastic": lambda rng, base: (
         {"type": "roughplastic", "diffuse_reflectance": base, "alpha": log_uniform(rng, 0.03, 0.4)}
@@ -63,7 +59,9 @@ FINISHES: dict[str, Callable[[Rng, Bsdf], Bsdf]] = {
     ),
     "mirror": lambda rng, base: {"type": "conductor", "material": str(rng.choice(METALS))},
     "glass": lambda rng, base: (
-        rough_glass_bsdf(rng) if rng.random() < 0.2 else {"type": "dielectric", "int_ior": GLASS}
+        {"type": "roughdielectric", "alpha": log_uniform(rng, 0.02, 0.2), "int_ior": GLASS}
+        if rng.random() < 0.2
+        else {"type": "dielectric", "int_ior": GLASS}
     ),
 }
 # Weights of the finishes of a slot that is not plainly diffuse.

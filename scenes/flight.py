@@ -42,10 +42,9 @@ def flight_path(layout: Layout) -> Track:
 
 def image_points(points: Array, eye: Array, target: Array, x_fov: float) -> tuple[Array, NDArray[np.bool_]]:
     """Positions (N, 2) of `points` (N, 3) in widths of a square image, and whether they (N,) lie in it."""
-    K = intrinsics(x_fov, 1, 1)
     in_camera = (points - eye) @ look_at(eye, target)[:3, :3]
     ahead = in_camera[:, 2] > 0.2
-    pixels = (in_camera @ K.T)[:, :2] / np.where(ahead, in_camera[:, 2], 1)[:, None]
+    pixels = (in_camera @ intrinsics(x_fov, 1, 1).T)[:, :2] / np.where(ahead, in_camera[:, 2], 1)[:, None]
     return pixels, ahead & ((pixels > 0) & (pixels < 1)).all(axis=1)
 
 
@@ -58,8 +57,7 @@ def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
     rng, frames = layout.rng, layout.frames
     moments = sorted({0, frames // 4, frames // 2, 3 * frames // 4, frames - 1})
     things = np.stack(layout.centres)
-    walls = layout.boxes[: layout.walls]
-    in_sight = [first_hit(eye.at(moment), things, walls) > 1 for moment in moments]
+    in_sight = [first_hit(eye.at(moment), things, layout.boxes[: layout.walls]) > 1 for moment in moments]
     candidates = things[in_sight[0]] if in_sight[0].any() else things
     x_fov = float(rng.uniform(50, 80))
     wanted_speed = log_uniform(rng, MAX_SPEED / 40, MAX_SPEED)

@@ -57,7 +57,6 @@ def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
 
 
 def movers(layout: Layout, count: int) -> None:
-    """Add up to `count` moving things."""
     rng = layout.rng
     makers = [*FURNITURE.values(), *DECOR.values()]
     goal = layout.moving + count

@@ -131,8 +131,7 @@ class Layout:
 
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:
         """Add a thing to a wall if it fits, at (x, y) as visible from inside and `z` in front of it."""
-        place = wall_pose(wall, self.size) @ [x, y, z, 1]
-        motion = still(place[:3], wall * np.pi / 2)
+        motion = still((wall_pose(wall, self.size) @ [x, y, z, 1])[:3], wall * np.pi / 2)
         group = Group.of(thing)
         if not overlaps(self.swept(group.bounds, motion), self.boxes):
             self.add(group, motion)

@@ -192,8 +192,7 @@ def above_furniture(layout: Layout) -> list[Lamp]:
         return []
     motion, box = one_of(layout.rng, layout.backs)
     width, height, depth = box[1] - box[0]
-    tilt = -layout.rng.uniform(0, np.pi / 3)
-    place = turn_then_shift(0, tilt, 0, height + 0.08, box[0, 2] + depth / 4)
+    place = turn_then_shift(0, -layout.rng.uniform(0, np.pi / 3), 0, height + 0.08, box[0, 2] + depth / 4)
     return [Lamp(rectangle(width * 0.7, min(0.08, depth / 3), place), motion)]
 
 

@@ -83,8 +83,7 @@ def box_mapped(points: Array, normals: Array, faces: Faces, smooth: bool) -> Sur
     axis = np.abs(area_vectors(points, faces)).argmax(axis=1)
     keys, corners = np.unique(3 * faces + axis[:, None], return_inverse=True)
     vertex = keys // 3
-    across = np.array([[2, 1], [0, 2], [0, 1]])[keys % 3]
-    uv = np.take_along_axis(points[vertex], across, axis=1)
+    uv = np.take_along_axis(points[vertex], np.array([[2, 1], [0, 2], [0, 1]])[keys % 3], axis=1)
     return Surface(points[vertex], normals[vertex], uv, corners.reshape(-1, 3), smooth)
 
 
@@ -133,8 +132,7 @@ def superellipsoid(width: float, height: float, depth: float, power: float, subd
 def blob(rng: Rng, radius: float, roughness: float, subdivisions: int) -> Surface:
     """A ball of `radius` displaced by smooth noise of relative amplitude `roughness`, about the origin."""
     points, faces = unit_sphere(subdivisions)
-    waves = rng.normal(0, 2.0, (3, 12))
-    noise = np.sin(points @ waves + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / np.sqrt(6)
+    noise = np.sin(points @ rng.normal(0, 2.0, (3, 12)) + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / np.sqrt(6)
     return smooth_shaded(points * radius * np.exp(roughness * noise)[:, None], faces)
 
 
@@ -170,13 +168,12 @@ def profile_normals(profile: Array) -> tuple[Array, Array]:
         last = normals[-1] * mirror if profile[-1, 0] == 0 else normals[-1]
     else:
         last = normals[0]
-    after = np.concatenate([normals[1:], last[None]])
 
     def blend(other: Array) -> Array:
         soft = (normals * other).sum(axis=1, keepdims=True) > CREASE
         return unit(np.where(soft, normals + other, normals))
 
-    return blend(before), blend(after)
+    return blend(before), blend(np.concatenate([normals[1:], last[None]]))
 
 
 def lathe(profile: ArrayLike, segments: int = 32) -> Surface:

@@ -136,8 +136,7 @@ def outside(layout: Layout, style: Style) -> Array | None:
     if not style.day or (not layout.missing_walls and rng.random() < 0.5):
         return None
     sunny = rng.random() < (0.3 if layout.missing_walls else 0.75)
-    sun = sun_through(rng, next(iter(layout.openings)), layout.size) if sunny else None
-    return sky(rng, sun)
+    return sky(rng, sun_through(rng, next(iter(layout.openings)), layout.size) if sunny else None)
 
 
 def room(rng: Rng, frames: int) -> Scene:

@@ -80,8 +80,7 @@ def bond(columns: int, rows: int, shift: ArrayLike) -> tuple[NDArray[np.intp], A
     """
     row = (Y * rows).astype(int)
     along = X * columns + np.broadcast_to(shift, rows)[row]
-    across = Y * rows
-    distance = np.minimum((0.5 - np.abs(along % 1 - 0.5)) / columns, (0.5 - np.abs(across % 1 - 0.5)) / rows)
+    distance = np.minimum((0.5 - np.abs(along % 1 - 0.5)) / columns, (0.5 - np.abs(Y * rows % 1 - 0.5)) / rows)
     return row * columns + along.astype(int) % columns, distance
 
 

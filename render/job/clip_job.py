@@ -71,7 +71,7 @@ def render_to_folder(
     scene, seed = scene_of_clip(folder, profile, dataset_seed)
     clock = StepTimer()
     if needed_spp is None:
-        needed_spp = samples_needed(scene, *profile.size, quality, seed, options)
+        needed_spp = samples_needed(scene, profile.size, quality, seed, options)
         clock.lap("pilot")
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     sampling = Sampling(quality.realisations, noisy_spp, spp, options)

@@ -131,17 +131,14 @@ def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
 
     Raises BadInput at the end, naming the first clip that failed.
     """
-    ended: dict[str, list[ClipOutcome]] = {"rendered": [], "left": [], "failed": []}
+    ended = []
     for outcome in outcomes:
-        ended[outcome.ending].append(outcome)
-        if outcome.ending == "left":
-            tqdm.write(f"{outcome.path}: {outcome.reason}")
-        elif outcome.ending == "failed":
-            tqdm.write(f"{outcome.path}: failed, the others continue: {outcome.reason}")
-    if ended["failed"]:
-        first = ended["failed"][0]
-        clips = sum(map(len, ended.values()))
-        raise BadInput(
-            f"{len(ended['failed'])} of {clips} clips failed and can be tried again, first {first.path}: {first.reason}"
-        )
-    return len(ended["rendered"])
+        ended.append(outcome)
+        if outcome.ending != "rendered":
+            failed = "failed, the others continue: " if outcome.ending == "failed" else ""
+            tqdm.write(f"{outcome.path}: {failed}{outcome.reason}")
+    failures = [outcome for outcome in ended if outcome.ending == "failed"]
+    if failures:
+        first = f"first {failures[0].path}: {failures[0].reason}"
+        raise BadInput(f"{len(failures)} of {len(ended)} clips failed and can be tried again, {first}")
+    return sum(outcome.ending == "rendered" for outcome in ended)

@@ -32,13 +32,7 @@ def noise_of_reference(stage: Stage, frames: int, spp: int, seed: int, options: 
 
 
 def samples_needed(
-    scene: Scene,
-    frames: int,
-    height: int,
-    width: int,
-    quality: SamplingQuality,
-    seed: int,
-    options: Options = NO_OPTIONS,
+    scene: Scene, size: tuple[int, int, int], quality: SamplingQuality, seed: int, options: Options = NO_OPTIONS
 ) -> int:
     """Samples a pixel, of both buffers together, with which references reach the noise floor of `quality`.
 
@@ -50,6 +44,7 @@ def samples_needed(
     spp = quality.reference_spp
     if quality.floor is None:
         return spp
+    frames, height, width = size
     stage = Stage(scene, -(-height // 2), -(-width // 2))
     wanted_noise = 10 ** (-quality.floor / 10)
     while spp <= quality.most_spp:
@@ -63,7 +58,7 @@ def samples_needed(
 def needed_for(profile: DataProfile, room: str, seed: int, options: Options) -> int:
     """Samples a pixel that the references of a room, SPLIT/SCENE/CLIP, need."""
     scene, clip_seed = scene_of_clip(Path(room), profile, seed)
-    return samples_needed(scene, *profile.size, profile.quality[room.split("/")[0]], clip_seed, options)
+    return samples_needed(scene, profile.size, profile.quality[room.split("/")[0]], clip_seed, options)
 
 
 def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: NeededSpp) -> dict[str, int]:

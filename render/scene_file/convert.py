@@ -10,6 +10,7 @@ from errors import BadInput
 from render.backend import mi
 from render.scene_file.stand_ins import (
     GREY,
+    REPAIRS,
     SKIES,
     SURFACE_LIGHTS,
     WHITE_SKY,
@@ -17,7 +18,6 @@ from render.scene_file.stand_ins import (
     Properties,
     StandIn,
     plugins,
-    repaired,
     stand_in,
     turned_to_y,
 )
@@ -99,7 +99,7 @@ class Converter:
             self.note(f"this Mitsuba has no {kind.lower()} '{plugin}': {words} instead", node)
         else:
             found = self.with_files(node, kind, described)
-        repair = repaired(found) if found else None
+        repair = REPAIRS[found["type"]](found) if found and found["type"] in REPAIRS else None
         if repair is None:
             return found
         self.note(repair[1], node)

@@ -110,7 +110,6 @@ def read_description(path: Path) -> Description:
 
 
 def all_finite(value: Any) -> bool:
-    """Whether all numbers in plain data are finite."""
     if isinstance(value, dict | list | tuple):
         return all(map(all_finite, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, float) or math.isfinite(value)

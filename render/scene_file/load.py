@@ -52,9 +52,8 @@ def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[C
 def camera_framing(low: Array, high: Array) -> Camera:
     """A static camera slightly above the box from `low` (3,) to `high` (3,), with all of it in view."""
     centre = (low + high) / 2
-    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     away = np.array([0.3, 0.25, 1.0])
-    distance = radius / np.sin(np.radians(FOV_WITHOUT_CAMERA) / 2)
+    distance = max(float(np.linalg.norm(high - low)) / 2, 1e-6) / np.sin(np.radians(FOV_WITHOUT_CAMERA) / 2)
     eye = centre + away / np.linalg.norm(away) * distance
     return Camera.at_rest(eye, centre, FOV_WITHOUT_CAMERA)
 
@@ -106,8 +105,7 @@ class OwnScene:
     def from_meshes(self) -> tuple[Scene, list[str]]:
         found = load_mesh_file(self.file, self.width / self.height)
         self.has_camera = found.camera is not None
-        scene = Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky)
-        return scene, found.notes
+        return Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky), found.notes
 
     def check_names(self) -> None:
         """Raise BadInput for keyframes of a shape or light that is not in the file."""
@@ -161,7 +159,6 @@ def check_camera(camera: Camera, frames: int, path: Path) -> None:
 
 
 def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:
-    """The shape with its emission times `gain` over time."""
     if gain is None or shape.radiance is None:
         return shape
     return replace(shape, radiance=replace(gain, keys=np.outer(gain.keys, shape.radiance.at(0))))

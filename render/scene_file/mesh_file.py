@@ -32,8 +32,6 @@ SUN = np.array([0.4, 0.8, 0.45])  # the direction to it, y up
 
 @dataclass
 class MeshFile:
-    """The content of a mesh file; `notes` list what is not honoured, and its stand-ins."""
-
     shapes: list[Shape] = field(default_factory=list)
     camera: Camera | None = None
     sky: Array | None = None
@@ -180,10 +178,9 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
         colour = rgb(colour_factor(material.diffuse).tolist()) if image is None else texture(linear_image(image))
         return two_sided(colour), emission if emission.shape == (3,) and emission.any() else None
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind in ("vertex", "face"):
-        main = colour_factor(np.asarray(mesh.visual.main_color))
         places = {"vertex": "vertices", "face": "faces"}[mesh.visual.kind]
         notes.append(f"{name}: colours of its {places}: the most frequent one everywhere instead")
-        return two_sided(rgb(main.tolist())), None
+        return two_sided(rgb(colour_factor(np.asarray(mesh.visual.main_color)).tolist())), None
     notes.append(f"{name}: has no material: grey instead")
     return two_sided(GREY), None
 

@@ -220,11 +220,6 @@ REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
 }
 
 
-def repaired(described: Properties) -> StandIn | None:
-    """The stand-in for an object that cannot be rendered as described, else None."""
-    return REPAIRS[described["type"]](described) if described["type"] in REPAIRS else None
-
-
 def turned_to_y(described: Properties) -> Properties:
     """A sky of versions before 3, with its zenith at y instead of z."""
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

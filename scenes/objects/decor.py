@@ -130,8 +130,7 @@ def make_glass(rng: Rng) -> Thing:
 
 def make_basket(rng: Rng) -> Thing:
     radius, height, wire = uniforms(rng, (0.07, 0.16), (0.08, 0.25), (0.0015, 0.0035))
-    radii = radius * np.array([rng.uniform(0.6, 0.95), rng.uniform(0.8, 1.1), 1])
-    outer = silhouette(radii, height, 7)
+    outer = silhouette(radius * np.array([rng.uniform(0.6, 0.95), rng.uniform(0.8, 1.1), 1]), height, 7)
     hoops = [lathe(circle(r, wire, 5), 28).at(0, y) for r, y in outer]
     side = np.concatenate([[(0, 0)], outer])
     upright = tube(np.stack([side[:, 0], side[:, 1], np.zeros(len(side))], axis=1), wire, 4)
@@ -142,5 +141,4 @@ def make_candle(rng: Rng) -> Thing:
     height, radius, wax = uniforms(rng, (0.05, 0.28), (0.04, 0.07), (0.008, 0.02))
     holder = silhouette(radius * np.array([1, *rng.uniform(0.2, 0.6, 4), 0.8]), height, 24)
     stick = lathe(solid([(wax, 0), (wax * 0.95, rng.uniform(0.06, 0.18))]), 20).at(0, height)
-    slot = one_of(rng, ("metal", "ceramic", "wood"))
-    return standing("candle", {slot: [lathe(solid(holder))], "wax": [stick]})
+    return standing("candle", {one_of(rng, ("metal", "ceramic", "wood")): [lathe(solid(holder))], "wax": [stick]})

@@ -44,10 +44,8 @@ def legs(rng: Rng, width: float, depth: float, height: float) -> SurfacesBySlot:
 def pedestal(rng: Rng, radius: float, height: float) -> SurfacesBySlot:
     """A foot and a turned column that carry a round board of `radius` at `height`."""
     foot = radius * rng.uniform(0.5, 0.75)
-    column = rng.uniform(0.02, 0.05)
-    outer = silhouette(column * rng.uniform(0.7, 1.5, 6), height - 0.02, 20)
-    slot = one_of(rng, ("wood", "metal"))
-    return {slot: [disc(foot, 0.025), lathe(solid(outer), 20).at(0, 0.02)]}
+    outer = silhouette(rng.uniform(0.02, 0.05) * rng.uniform(0.7, 1.5, 6), height - 0.02, 20)
+    return {one_of(rng, ("wood", "metal")): [disc(foot, 0.025), lathe(solid(outer), 20).at(0, 0.02)]}
 
 
 def handle(rng: Rng, upright: bool) -> Surface:
@@ -98,8 +96,7 @@ def make_table(rng: Rng) -> Thing:
         width, depth = uniforms(rng, (0.5, 1.9), (0.45, 0.95))
         frame = legs(rng, width, depth, height)
         board = slab(width, thickness, depth)
-    slot = one_of(rng, ("wood", "wood", "wood", "stone", "glass"))
-    surfaces = merged({slot: [board.at(0, height)]}, frame)
+    surfaces = merged({one_of(rng, ("wood", "wood", "wood", "stone", "glass")): [board.at(0, height)]}, frame)
     return standing("table", surfaces, [top_support(width, depth, height + thickness)])
 
 
@@ -156,8 +153,7 @@ def make_column(rng: Rng) -> Thing:
     if rng.random() < 0.5:
         body = slab(width - 0.04, height - 0.1, width - 0.04).at(0, 0.05)
     else:
-        outer = silhouette(rng.uniform(0.28, 0.46, 7) * width, height - 0.1, 28)
-        body = lathe(solid(outer)).at(0, 0.05)
+        body = lathe(solid(silhouette(rng.uniform(0.28, 0.46, 7) * width, height - 0.1, 28))).at(0, 0.05)
     surfaces = {one_of(rng, ("stone", "wood")): [plate, body, plate.at(0, height - 0.05)]}
     return standing("column", surfaces, [top_support(width, width, height)])
 

@@ -16,9 +16,8 @@ def seat(rng: Rng, width: float, depth: float) -> tuple[SurfacesBySlot, float]:
         thickness = rng.uniform(0.02, 0.04)
         return {"wood": [slab(width, thickness, depth)]}, thickness
     thickness = rng.uniform(0.05, 0.09)
-    board = slab(width, 0.02, depth)
     cushion = superellipsoid(width, thickness - 0.01, depth, 6).at(0, 0.01)
-    return {"wood": [board], "cushion": [cushion]}, thickness
+    return {"wood": [slab(width, 0.02, depth)], "cushion": [cushion]}, thickness
 
 
 def back(rng: Rng, width: float, height: float) -> SurfacesBySlot:

@@ -9,8 +9,7 @@ from matplotlib import pyplot as plt
 
 from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
-from datasets.difficulty import MEASURES, Difficulty, difficulty_of_clip
-from datasets.info import BINS, difficulty_histograms, summarise
+from datasets.info import BINS, MEASURES, Difficulty, difficulty_histograms, difficulty_of_clip, summarise
 from datasets.writer import ClipWriter
 from errors import BadInput
 from plotting import DPI

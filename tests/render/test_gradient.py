@@ -26,7 +26,9 @@ def samples_of(tracer: PathTracer, frame: int, seed: int) -> GradientSamples:
     stage = tracer.stage
     view = stage.view(frame)
     light = tracer.radiance(stage.rays(view), seed, 1)
-    return GradientSamples.of(render_gbuffer(stage, view), *light, view, stage.poses, SampleRange(seed, 1), seed)
+    return GradientSamples.of(
+        render_gbuffer(stage, view), np.add(*light), view, stage.poses, SampleRange(seed, 1), seed
+    )
 
 
 def still_camera(scene: Scene) -> Scene:

@@ -145,7 +145,7 @@ def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
     stage = Stage(scene, 24, 24)
     wanted = 10**-2.6
     predicted = 16 * 2 ** np.ceil(np.log2(noise_of_reference(stage, 1, 16, 2, NO_OPTIONS) / wanted))
-    spp = samples_needed(scene, 1, 48, 48, quality, 2)
+    spp = samples_needed(scene, (1, 48, 48), quality, 2)
     assert spp > predicted
     assert spp > 1024 or noise_of_reference(stage, 1, spp, 2, NO_OPTIONS) <= wanted
 
@@ -153,9 +153,9 @@ def test_rare_bright_paths_are_found_with_the_samples_that_the_pilot_chose():
 def test_references_stop_at_the_most(tmp_path):
     quality = SamplingQuality(realisations=1, reference_spp=8)
     scene = build_scene("cornell_box", 0, 2)
-    assert samples_needed(scene, 2, 16, 16, quality, 1) == 8
+    assert samples_needed(scene, (2, 16, 16), quality, 1) == 8
     hopeless = quality._replace(floor=90.0, most_spp=64)
-    assert samples_needed(scene, 2, 16, 16, hopeless, 1) > 64
+    assert samples_needed(scene, (2, 16, 16), hopeless, 1) > 64
     path = tmp_path / "test" / "cornell_box" / "000"
     render_to_folder(path, small_profile(16, 2, hopeless), 0, tuple(CHANNELS))
     assert Clip(path).facts["reference_spp"] == 64
