@@ -1,5 +1,6 @@
 """`onespp export`: a trained denoiser as one file, with golden frames of a synthetic sequence."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +31,7 @@ def export(
     be exported or has no weights, and where packages are missing.
     """
     parsed = parse_name(name)
-    denoiser = str(parsed.with_budget(None))
+    denoiser = str(replace(parsed, budget=None))
     check_exportable(denoiser)
     check_installed(to)
     weights = weights or weights_of(parsed, runs)

@@ -82,7 +82,7 @@ def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
     wrapped = [replace(name, wrappers=(wrapper,)) for name in plain for wrapper in prototype(name).evaluated_with]
     for name in (*plain, *wrapped):
         yield name
-        trained = name.with_budget(budget)
+        trained = replace(name, budget=budget)
         if shipped_weights(name.base) and not untrained(runs, budget, trained):
             yield trained
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, TypeVar
+from typing import ClassVar, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -36,7 +36,18 @@ def matching_state(state: State | None, kind: type[S], frame: Frame) -> S | None
     return state if isinstance(state, kind) and frame.follows(state.moment) else None
 
 
-class Denoiser(torch.nn.Module):
+@torch.no_grad()
+def drop_inputs(layer: nn.Conv2d, first: int, values: Tensor) -> None:
+    """Remove the inputs from `first` on, which always have these `values`, from a convolution."""
+    last = first + len(values)
+    assert layer.bias is not None
+    layer.bias += layer.weight[:, first:last].sum(dim=(2, 3)) @ values
+    kept = torch.cat([layer.weight[:, :first], layer.weight[:, last:]], dim=1)
+    layer.weight = nn.Parameter(kept.contiguous(memory_format=torch.channels_last))  # as the images are
+    layer.in_channels -= len(values)
+
+
+class Denoiser(nn.Module):
     """One frame in, linear HDR radiance out.
 
     Facts of a denoiser are attributes of its class; wrappers (models/wrappers) take over those of the wrapped denoiser.
@@ -44,8 +55,7 @@ class Denoiser(torch.nn.Module):
 
     Attributes:
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
-        signal: what it returns; "total" denoises direct + indirect and adds emission back untouched. The class's is the
-            default for instances.
+        signal: what it returns; "total" denoises direct + indirect and adds emission back untouched.
         refuses: precisions that it does not compute in, with the reason.
         is_network: whether it needs trained weights.
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
@@ -56,7 +66,7 @@ class Denoiser(torch.nn.Module):
         evaluated_with: wrappers with which `onespp eval` runs it beside the denoiser itself.
         dispensable: channels that its network can do without where they do not vary, and its input for a value.
         inputs: the inputs of its network in order, and how many channels each has; channels by their names.
-        constants: channels that it does without, see models.specialise, and the value that each has everywhere.
+        constants: channels that it does without, see `specialise`, and the value that each has everywhere.
         precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
         device: "cpu" or "cuda", where it was moved to: frames have to be there, and its output is.
     """
@@ -89,8 +99,7 @@ class Denoiser(torch.nn.Module):
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """`forward`, with NaN and infinities replaced by 0. Raises BadInput where one of `constants` varies."""
         self.check_constants(frame)
-        result: tuple[Tensor, State] = super().__call__(frame.finite(), state)
-        return result
+        return cast(tuple[Tensor, State], super().__call__(frame.finite(), state))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """Radiance (B, 3, H, W) of `signal`, non-negative, and the state for the next frame.
@@ -106,6 +115,20 @@ class Denoiser(torch.nn.Module):
     def first_layers(self) -> Sequence[nn.Conv2d]:
         """The convolutions that read `inputs`."""
         raise NotImplementedError
+
+    def specialise(self, constants: Mapping[str, Sequence[float]]) -> None:
+        """Remove the inputs of `constants` from the network's first convolutions and add their effect to the biases.
+
+        `constants` maps channels to the value that each has in every pixel of every frame; those that the network needs
+        all the same stay. The output is equal up to rounding, except near the border, where convolutions see zeros.
+        """
+        for name in [name for name in self.inputs if name in self.dispensable and name in constants]:
+            names = list(self.inputs)
+            first = sum(self.inputs[other] for other in names[: names.index(name)])
+            for layer in self.first_layers():
+                drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
+            del self.inputs[name]
+            self.constants[name] = list(constants[name])
 
     def check_constants(self, frame: Frame) -> None:
         """Raise BadInput where a channel that the network was specialised to varies."""

@@ -1,5 +1,7 @@
 """Small operators on images. Tensors are (B, C, H, W), float32."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -27,10 +29,7 @@ def halve(image: Tensor, surface: Tensor | None = None) -> Tensor:
 
     Only pixels that show a `surface` count (see Frame.surface); without any, the mean is 0.
     """
-
-    def mean(x: Tensor) -> Tensor:
-        return F.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)
-
+    mean = partial(F.avg_pool2d, kernel_size=2, ceil_mode=True, count_include_pad=False)
     if surface is None:
         return mean(image)
     return mean(image * surface) / mean(surface).clamp(min=1 / 4)

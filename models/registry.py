@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -77,10 +77,6 @@ class DenoiserName:
     def __str__(self) -> str:
         return "+".join([f"{self.base}@{self.budget}" if self.budget else self.base, *self.wrappers])
 
-    def with_budget(self, budget: str | None) -> "DenoiserName":
-        """The same denoiser with the weights of another budget, or with the shipped weights."""
-        return replace(self, budget=budget)
-
 
 def create(name: str | DenoiserName, signal: Signal | None = None) -> Denoiser:
     """A denoiser by its name, with fresh weights if it is a network; `signal` is by default that of its class.
@@ -122,9 +118,6 @@ def parse_name(name: str | DenoiserName) -> DenoiserName:
 def channels_read(names: Sequence[str] = ()) -> tuple[str, ...]:
     """The channels that the named denoisers read, or all denoisers. Raises BadInput for an unknown name."""
     return tuple(sorted({channel for name in names or DENOISERS for channel in prototype(name).reads}))
-
-
-# --- Weights that come with onespp ------------------------------------------------------------------------------------
 
 
 def shipped_weights(name: str) -> Path | None:

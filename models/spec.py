@@ -1,7 +1,7 @@
 """A denoiser to run, described before anything is built: which, with what weights, and how it computes."""
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ class DenoiserSpec:
     def way(self) -> str:
         """Its name in the bench's tables, where weights make no difference: svgf (PyTorch)."""
         signal = f" ({self.returns})" if self.returns != self.facts.signal else ""
-        return f"{self.denoiser.with_budget(None)}{signal}" + ("" if self.compiled else " (PyTorch)")
+        return f"{replace(self.denoiser, budget=None)}{signal}" + ("" if self.compiled else " (PyTorch)")
 
     @property
     def label(self) -> str:

@@ -11,7 +11,6 @@ from safetensors.torch import save
 from errors import BadInput
 from files import write_file
 from models.denoiser import Denoiser
-from models.specialise import specialise
 
 
 def save_weights(
@@ -47,7 +46,7 @@ def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:
         raise BadInput(f"{path} is damaged or not a safetensors file ({error})") from None
     if metadata.get("denoiser") != name:
         raise BadInput(f"{path} holds weights of '{metadata.get('denoiser')}', not of '{name}'")
-    specialise(denoiser, json.loads(metadata.get("constants", "{}")))
+    denoiser.specialise(json.loads(metadata.get("constants", "{}")))
     try:
         denoiser.load_state_dict(tensors)
     except RuntimeError:

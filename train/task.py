@@ -7,7 +7,6 @@ from pathlib import Path
 from datasets.clip import Clip, Dataset, constant_channels
 from errors import BadInput
 from models.denoiser import Denoiser
-from models.specialise import specialise
 from models.weights import load_weights
 from train.recipe import Recipe
 from train.sequences import check_fits
@@ -68,5 +67,5 @@ class Task:
         if self.specialised:
             if not denoiser.dispensable:
                 raise BadInput(f"'{self.name}' cannot do without any of its inputs: train it without --specialise")
-            specialise(denoiser, constants)
+            denoiser.specialise(constants)
         return denoiser

@@ -50,7 +50,7 @@ def timed_specs(names: Sequence[str], device: str = "cpu", every_way: bool = Fal
     With `every_way` also in their other precisions, and in PyTorch where they have compiled kernels. Raises BadInput
     where a named one is unknown or cannot run.
     """
-    named = [str(parse_name(name).with_budget(None)) for name in names]  # weights do not change the time
+    named = [str(replace(parse_name(name), budget=None)) for name in names]  # weights do not change the time
     if named and not cannot_run(parse_name(BASELINE)):
         named.append(BASELINE)
     chosen = choose(named, map(DenoiserName, DENOISERS), cannot_run)

@@ -32,8 +32,7 @@ def strata_centres(image: Tensor) -> Tensor:
 
 def repeat_strata(strata: Tensor, size: tuple[int, int]) -> Tensor:
     """An image (B, C, H, W) of `size` (H, W) whose pixels have the values (B, C, h, w) of their strata."""
-    height, width = size
-    return strata.repeat_interleave(STRATUM, dim=-2).repeat_interleave(STRATUM, dim=-1)[..., :height, :width]
+    return strata.repeat_interleave(STRATUM, dim=-2).repeat_interleave(STRATUM, dim=-1)[..., : size[0], : size[1]]
 
 
 def strata_geometry(frame: Frame) -> Tensor:

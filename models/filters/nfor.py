@@ -48,10 +48,9 @@ FITTED_PIXELS = 256  # fitted at once, as whole rows: all taps of all features a
 
 def window_rows(image: Tensor) -> Iterator[Tensor]:
     """The taps of all pixels' windows, row by row: (B, WINDOW_SIDE, C, H, W); 0 outside the image (B, C, H, W)."""
-    height = image.shape[-2]
     padded = F.pad(image, (REACH,) * 4)
     for dy in range(WINDOW_SIDE):
-        yield padded[..., dy : dy + height, :].unfold(-1, WINDOW_SIDE, 1).movedim(-1, 1)
+        yield padded[..., dy : dy + image.shape[-2], :].unfold(-1, WINDOW_SIDE, 1).movedim(-1, 1)
 
 
 def box_means(image: Tensor, side: int) -> Tensor:

@@ -36,12 +36,6 @@ class RunningScale:
     log_luminance: RunningMean
     log_depth: RunningMean
 
-    @staticmethod
-    def neutral(like: Tensor) -> "RunningScale":
-        """Exposure 1 and depth scale 1 for a batch of `like` (B, ...), before the first valid frame."""
-        zero = like.new_zeros(len(like))
-        return RunningScale(RunningMean(zero + math.log(MIDDLE_GREY), zero), RunningMean(zero, zero))
-
     def exposure(self) -> Tensor:
         """0.18 / geometric mean luminance, (B, 1, 1, 1)."""
         return (MIDDLE_GREY * torch.exp(-self.log_luminance.value))[:, None, None, None]
@@ -77,9 +71,7 @@ def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
     stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
     depths = depth[..., ::stride_y, ::stride_x].flatten(1)
     median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
-    hit = ~median.isnan()
-    log_depth = torch.log(torch.where(hit, median, 1))
-    return torch.stack([torch.where(mean > 0, log_y, torch.nan), torch.where(hit, log_depth, torch.nan)], dim=1)
+    return torch.stack([torch.where(mean > 0, log_y, torch.nan), torch.log(median)], dim=1)
 
 
 def running_scale(
@@ -89,7 +81,9 @@ def running_scale(
 
     Of a training crop, `whole` (B, 2) are the logarithms of the frame that it was cut from.
     """
-    previous = previous or RunningScale.neutral(radiance)
+    if previous is None:  # exposure 1 and depth scale 1, until the first valid frame
+        zero = radiance.new_zeros(len(radiance))
+        previous = RunningScale(RunningMean(zero + math.log(MIDDLE_GREY), zero), RunningMean(zero, zero))
     new = log_luminance_and_depth(radiance, depth) if whole is None else whole
     log_luminance, log_depth = new.to(radiance).unbind(dim=1)
     return RunningScale(

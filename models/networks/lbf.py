@@ -72,9 +72,8 @@ def remove_spikes(image: Tensor, surface: Tensor) -> Tensor:
     mean = (taps * beside).sum(dim=2) / count.clamp(min=1)
     variance = ((taps - mean[:, :, None]).square() * beside).sum(dim=2) / (count - 1).clamp(min=1)
     is_spike = ((image - mean).square() > SPIKE**2 * variance).any(dim=1, keepdim=True)
-    ordered = torch.where(shown > 0, taps, torch.inf).sort(dim=2).values
     middle = ((count + 1) / 2).long()[:, :, None].expand(-1, 3, -1, -1, -1)
-    median = ordered.gather(2, middle)[:, :, 0]
+    median = torch.where(shown > 0, taps, torch.inf).sort(dim=2).values.gather(2, middle)[:, :, 0]
     return torch.where(is_spike & (count > 1) & (surface > 0), median, image)
 
 

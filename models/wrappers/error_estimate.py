@@ -28,15 +28,8 @@ from errors import BadInput
 from models.denoiser import State
 from models.filters.neighbours import mesh_sums, mesh_sums_9x9
 from models.operators import MIN_DIVISOR, image_luminance
-from models.wrappers.shrinkage import (
-    JamesStein,
-    blend,
-    comparison_unit,
-    denoised_irradiance,
-    relative,
-    shrinkage_weight,
-    significant_part,
-)
+from models.wrappers import shrinkage
+from models.wrappers.shrinkage import JamesStein
 
 MAX_SAMPLES = 2.0**20  # per pixel; no larger number is recommended
 
@@ -75,7 +68,7 @@ class ErrorEstimate:
         for sums in (middle, small):
             pixels = sums[:, 9:]
             correction = sums[:, :3] / pixels - smooth
-            smooth = smooth + significant_part(correction, sums[:, 3:6].sqrt() / pixels) * correction
+            smooth = smooth + shrinkage.significant_part(correction, sums[:, 3:6].sqrt() / pixels) * correction
         return torch.maximum(smooth, small[:, 6:9] / small[:, 9:])
 
     @property
@@ -146,12 +139,12 @@ def denoise_with_error(denoiser: JamesStein, frame: Frame, state: State | None) 
     frame = frame.finite()
     inner, signal = denoiser.inner, denoiser.signal
     output, after = inner(frame, state)
-    filtered = denoised_irradiance(output, frame, signal)
-    rho = shrinkage_weight(frame, filtered, signal)
+    filtered = shrinkage.denoised_irradiance(output, frame, signal)
+    rho = shrinkage.shrinkage_weight(frame, filtered, signal)
     buffers = [frame.buffer(which) for which in (0, 1)]
-    passes = [denoised_irradiance(inner(buffer, state)[0], buffer, signal) for buffer in buffers]
+    passes = [shrinkage.denoised_irradiance(inner(buffer, state)[0], buffer, signal) for buffer in buffers]
     estimate = estimate_error(frame, filtered, passes, [buffer.irradiance(signal) for buffer in buffers], rho)
-    return frame.remodulate(blend(frame, filtered, rho, signal), signal), after, estimate
+    return frame.remodulate(shrinkage.blend(frame, filtered, rho, signal), signal), after, estimate
 
 
 def estimate_error(
@@ -160,10 +153,10 @@ def estimate_error(
     """The estimate from irradiance (B, 3, H, W): F(N), [F(A), F(B)] and [A, B]."""
     mesh = frame.mesh_id
     sums = mesh_sums_9x9(torch.cat([image_luminance(filtered), torch.ones_like(mesh)], dim=1), mesh)
-    unit = comparison_unit(sums[:, :1] / sums[:, 1:])
+    unit = shrinkage.comparison_unit(sums[:, :1] / sums[:, 1:])
     mean = (passes[0] + passes[1]) / 2
-    error_a, error_b = (relative(buffer - mean, unit) for buffer in buffers)
-    difference = relative(passes[0] - passes[1], unit)
+    error_a, error_b = (shrinkage.relative(buffer - mean, unit) for buffer in buffers)
+    difference = shrinkage.relative(passes[0] - passes[1], unit)
     covariance = difference * (error_a - error_b) / 4
     return ErrorEstimate(
         filter_error=error_a * error_b + 2 * covariance,

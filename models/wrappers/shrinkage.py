@@ -78,8 +78,7 @@ def weight_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, sampl
 
 def significant_part(difference: Tensor, error: Tensor) -> Tensor:
     """The part of a difference that is not chance, in [0, 1], given its standard error."""
-    chance = STANDARD_ERRORS * error
-    return 1 - (chance / difference.abs().clamp(min=MIN_DIVISOR)).square().clamp(max=1)
+    return 1 - (STANDARD_ERRORS * error / difference.abs().clamp(min=MIN_DIVISOR)).square().clamp(max=1)
 
 
 def mesh_mean_3x3(image: Tensor, mesh_id: Tensor) -> Tensor:

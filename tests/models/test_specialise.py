@@ -10,11 +10,10 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from errors import BadInput
 from models import compiled, registry
-from models.denoiser import Denoiser
+from models.denoiser import Denoiser, drop_inputs
 from models.history.running_scale import running_scale
 from models.networks.wskp import network_features
 from models.spec import load
-from models.specialise import drop_inputs, specialise
 from models.weights import read_metadata, save_weights
 from tests.helpers.frames import chain, flat_frame, run
 
@@ -43,7 +42,7 @@ def pair(name: str) -> tuple[Denoiser, Denoiser]:
     general = registry.create(name)
     special = registry.create(name)
     special.load_state_dict(general.state_dict())
-    specialise(special, CONSTANTS)
+    special.specialise(CONSTANTS)
     return general, special
 
 
@@ -98,7 +97,7 @@ def test_every_network_can_do_without_what_does_not_vary(name, tmp_path):
     without_border(general, LEFT_OUT[name])
     special = registry.create(name)
     special.load_state_dict(general.state_dict())
-    specialise(special, CONSTANTS)
+    special.specialise(CONSTANTS)
     assert special.constants == {channel: CONSTANTS[channel] for channel in sorted(LEFT_OUT[name])}
     if name in FEWER:
         assert special.parameter_count() == general.parameter_count() - FEWER[name]
