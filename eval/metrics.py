@@ -130,12 +130,7 @@ def where_disoccluded(c: Comparison, error: Tensor) -> float | None:
 
 
 METRICS = {
-    "rmse": Metric(
-        "RMSE",
-        "{:.4f}",
-        of=lambda c: math.sqrt(c.mse),
-        floor=lambda c: math.sqrt(c.noise_mse),
-    ),
+    "rmse": Metric("RMSE", "{:.4f}", of=lambda c: math.sqrt(c.mse), floor=lambda c: math.sqrt(c.noise_mse)),
     "psnr": Metric(
         "PSNR dB",
         "{:.2f}",
@@ -152,64 +147,27 @@ METRICS = {
         floor=lambda c: ssim_floor(*c.displayed_buffers.split(1)),
         edge=lambda floor: 1 - twice(1 - floor),
     ),
-    "flip": Metric(
-        "FLIP",
-        "{:.4f}",
-        of=lambda c: flip(c.displayed, c.displayed_reference),
-        floor=flip_floor,
-    ),
+    "flip": Metric("FLIP", "{:.4f}", of=lambda c: flip(c.displayed, c.displayed_reference), floor=flip_floor),
     "mse_unbiased": Metric(
-        "unbiased MSE",
-        "{:.2e}",
-        of=mse_unbiased,
-        floor=mse_unbiased_error,
-        edge=twice,
-        floor_is_error=True,
+        "unbiased MSE", "{:.2e}", of=mse_unbiased, floor=mse_unbiased_error, edge=twice, floor_is_error=True
     ),
-    "temporal_error": Metric(
-        "temporal error",
-        "{:.4f}",
-        of=temporal_error,
-        floor=temporal_error_floor,
-    ),
+    "temporal_error": Metric("temporal error", "{:.4f}", of=temporal_error, floor=temporal_error_floor),
     "disocclusion_l1": Metric(
         "disocclusion L1",
         "{:.4f}",
         of=lambda c: where_disoccluded(c, (c.displayed - c.displayed_reference).abs()),
         floor=lambda c: where_disoccluded(c, c.displayed_noise.abs()),
     ),
-    "flicker": Metric(
-        "flicker",
-        "{:.4f}",
-        of=flicker,
-        floor=None,
-    ),
+    "flicker": Metric("flicker", "{:.4f}", of=flicker, floor=None),
     "l1": Metric(
         "L1",
         "{:.4f}",
         of=lambda c: (c.displayed - c.displayed_reference).abs().mean().item(),
         floor=lambda c: c.displayed_noise.abs().mean().item(),
     ),
-    "mse": Metric(
-        "MSE",
-        "{:.2e}",
-        of=lambda c: c.mse,
-        floor=lambda c: c.noise_mse,
-        edge=twice,
-    ),
-    "smape": Metric(
-        "SMAPE",
-        "{:.4f}",
-        of=smape,
-        floor=smape_floor,
-    ),
-    "rel_mse": Metric(
-        "relative MSE",
-        "{:.2e}",
-        of=relative_mse,
-        floor=relative_mse_floor,
-        edge=twice,
-    ),
+    "mse": Metric("MSE", "{:.2e}", of=lambda c: c.mse, floor=lambda c: c.noise_mse, edge=twice),
+    "smape": Metric("SMAPE", "{:.4f}", of=smape, floor=smape_floor),
+    "rel_mse": Metric("relative MSE", "{:.2e}", of=relative_mse, floor=relative_mse_floor, edge=twice),
 }
 
 

@@ -112,9 +112,5 @@ def bench_rendering(
     rows = [asdict(row) for name in names for row in times_to_floor(name, size, measured)]
     content = {"variant": VARIANT, "size": size, "frame": FRAME, "target_db": TARGET_DB, "rows": rows}
     write_json(bench_folder(runs) / "rendering.json", content)
-    heads = {
-        "samples_per_second": "samples/s",
-        "floor": "floor dB",
-        "seconds": f"seconds to {TARGET_DB:.0f} dB",
-    }
+    heads = {"samples_per_second": "samples/s", "floor": "floor dB", "seconds": f"seconds to {TARGET_DB:.0f} dB"}
     return tabulate(rows, heads, floatfmt=("", "", ".0f", ".2e", ".1f", ".2f", "", ".3f"))

@@ -24,12 +24,7 @@ def stock_sensor(stage: Stage, view: View) -> Any:
         "near_clip": 1e-3,
         "far_clip": 1e5,
         "to_world": mi.ScalarTransform4f(to_world.astype(np.float32)),
-        "film": {
-            "type": "hdrfilm",
-            "width": stage.width,
-            "height": stage.height,
-            "rfilter": {"type": "box"},
-        },
+        "film": {"type": "hdrfilm", "width": stage.width, "height": stage.height, "rfilter": {"type": "box"}},
     }
     return mi.load_dict(description)
 

@@ -51,11 +51,6 @@ def contact_sheet(
         axis.imshow(displayed_frame(name, seed, frames // 2, frames, height, width, spp), interpolation="nearest")
         axis.set_title(name, fontsize=8, pad=2)
     figure.subplots_adjust(
-        left=0,
-        right=1,
-        bottom=0,
-        top=1 - TITLE_INCHES / sheet_height,
-        wspace=0.01,
-        hspace=TITLE_INCHES * DPI / height,
+        left=0, right=1, bottom=0, top=1 - TITLE_INCHES / sheet_height, wspace=0.01, hspace=TITLE_INCHES * DPI / height
     )
     save_figure(path, figure)

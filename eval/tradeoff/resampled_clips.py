@@ -67,11 +67,7 @@ def with_samples(clip: Clip, dataset: Dataset, spp: int, root: Path, with_buffer
         raise BadInput(f"{clip.path} has {own} samples a pixel: {spp} are no multiple of that")
     path = root / clip.path.parent.parent.name / clip.scene / f"{clip.name}-{spp}spp"
     with_buffers = with_buffers and spp // own % 2 == 0
-    made_of = {
-        "clip": str(clip.path.resolve()),
-        "crc32": clip.fingerprint,
-        "buffers": with_buffers,
-    }
+    made_of = {"clip": str(clip.path.resolve()), "crc32": clip.fingerprint, "buffers": with_buffers}
     if (path / "clip.json").exists() and read_json(path / "clip.json").get("made_of") == made_of:
         return Clip(path)
     path.mkdir(parents=True, exist_ok=True)
