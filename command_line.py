@@ -181,7 +181,7 @@ def verify(data: Path = Path("data/quick")) -> None:
     Args:
         data: the dataset.
     """
-    from datasets.verify import find_problems
+    from datasets.info import find_problems
 
     problems = find_problems(data)
     for problem in problems:

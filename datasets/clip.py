@@ -74,28 +74,16 @@ class Clip:
         self.frames: int = self.facts["frames"]
         self.height: int = self.facts["height"]
         self.width: int = self.facts["width"]
+        self.exposure: float = self.facts["exposure"]  # multiplies radiance in pictures and metrics: clip_exposure
+        self.scene = path.parent.name  # such as "room-3"
+        self.name = path.name  # within its scene, such as "000" or "still"; see ClipKind
         self.channels: dict[str, dict[str, Any]] = self.facts["channels"]
         self._maps: dict[str, NDArray[Any]] = {}
-
-    @property
-    def scene(self) -> str:
-        """The scene's name, such as "room-3"."""
-        return self.path.parent.name
-
-    @property
-    def name(self) -> str:
-        """The clip's name within its scene, such as "000" or "still"; see ClipKind."""
-        return self.path.name
 
     @property
     def fingerprint(self) -> str:
         """The checksum (crc32, 8 hex digits) of clip.json, which contains those of all channels."""
         return f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
-
-    @property
-    def exposure(self) -> float:
-        """The factor by which pictures and metrics multiply the clip's radiance; see tonemap.clip_exposure."""
-        return float(self.facts["exposure"])
 
     @property
     def realisations(self) -> int:

@@ -1,7 +1,8 @@
-"""What is in a data set: its clips and how hard their light is to reconstruct, how channels are stored, render time."""
+"""What is in a data set: clips and how hard their light is to reconstruct, channels, render time, damaged files."""
 
 import math
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -206,3 +207,31 @@ def size_of(path: Path) -> int:
 
 def megabytes(count: int) -> str:
     return f"{count / 1e6:.1f}"
+
+
+def find_problems(root: Path) -> list[str]:
+    """Everything wrong with a data set, one line each. Raises BadInput where there is none at `root`."""
+    progress = tqdm(Dataset(root).planned(), "verify", unit="clip", leave=False)
+    return [problem for path in progress for problem in problems_of_clip(path)]
+
+
+def problems_of_clip(path: Path) -> Iterator[str]:
+    if not path.exists():
+        yield f"{path} has not been rendered"
+        return
+    try:
+        clip = Clip(path)
+    except BadInput as error:
+        yield str(error)
+        return
+    for name, entry in clip.channels.items():
+        if name not in CHANNELS:
+            yield f"{path}: clip.json has the unknown channel '{name}'"
+        elif "file" in entry:
+            try:
+                clip.map(name)
+            except BadInput as error:
+                yield str(error)
+                continue
+            if f"{zlib.crc32(np.memmap(path / entry['file'], mode='r').data):08x}" != entry["crc32"]:
+                yield f"{path / entry['file']} is damaged: its checksum is not {entry['crc32']}"

@@ -64,10 +64,7 @@ class StepTimer:
         return seconds
 
 
-NOISY_STREAM = 0
-REFERENCE_STREAM = 1
-GRADIENT_STREAM = 2
-SECOND_BUFFER_STREAM = 3
+NOISY_STREAM, REFERENCE_STREAM, GRADIENT_STREAM, SECOND_BUFFER_STREAM = range(4)
 
 
 def stream_seed(seed: int, frame: int, stream: int, index: int) -> int:

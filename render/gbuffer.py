@@ -29,24 +29,9 @@ class MirroredHit:
     tint: mi.Color3f  # the product of all mirrors' albedos
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]  # the world's, reflected by the mirrors from first to last
 
-    @staticmethod
-    def without_mirrors(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> "MirroredHit":
-        axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-        return MirroredHit(si, ray, mi.Float(0), mi.Color3f(1), axes)
-
     def in_mirrors(self, normal: mi.Vector3f) -> mi.Vector3f:
         """The mirror image of a world direction (3,)."""
         return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
-
-
-def trace_mirrors(stage: Stage, hit: MirroredHit) -> MirroredHit:
-    """Follow rays from mirrors that they hit, up to MAX_MIRRORS times."""
-    for _ in range(MAX_MIRRORS):
-        is_mirror, albedo = stage.materials.mirror_at(hit.si)
-        if not dr.any(is_mirror):
-            break
-        hit = reflected(stage, hit, is_mirror, albedo)
-    return hit
 
 
 def reflected(stage: Stage, hit: MirroredHit, is_mirror: mi.Bool, albedo: mi.Color3f) -> MirroredHit:
@@ -129,13 +114,18 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    direct = MirroredHit.without_mirrors(si, ray)
+    axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    direct = mirrored = MirroredHit(si, ray, mi.Float(0), mi.Color3f(1), axes)
     channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.materials.has_mirrors:
-        mirrored = trace_mirrors(stage, direct)
+        for _ in range(MAX_MIRRORS):
+            is_mirror, albedo = stage.materials.mirror_at(mirrored.si)
+            if not dr.any(is_mirror):
+                break
+            mirrored = reflected(stage, mirrored, is_mirror, albedo)
         shown = {MIRRORED[name]: value for name, value in surface_channels(stage, mirrored).items()}
         dr.eval(shown, mirrored.beyond)
         arrays |= {name: stage.image(value) for name, value in shown.items()}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
+from render.gbuffer import render_gbuffer
 from render.lights import Lights
 from render.palette import palette
 from render.regularise import BlurredTable
@@ -17,6 +18,7 @@ from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
 
 AnySampler = Sampler | HaltonSampler
+FloatImage = NDArray[np.float64]  # (H, W, 3)
 ROULETTE = 3.0  # survival probability over throughput
 
 
@@ -119,7 +121,7 @@ def sample_mean(
 
 
 class SampleRange(NamedTuple):
-    seed: int  # in [0, 2^32): different ones are independent
+    seed: int  # in [0, 2^32): different ones are independent, equal ones give equal bytes
     spp: int
     first: int = 0  # index of the first in a sequence
 
@@ -172,9 +174,30 @@ class PathTracer:
     def radiance(
         self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(direct, indirect) radiance (H, W, 3), without emission, along the primary rays of all pixels.
-
-        `seed` in [0, 2^32): different seeds are independent, equal seeds give equal bytes.
-        """
+        """(direct, indirect) radiance (H, W, 3), without emission, along the primary rays of all pixels."""
         direct, indirect = self.samples(ray, self.every_pixel, seed, spp, first)
         return self.stage.image(direct), self.stage.image(indirect)
+
+
+def finite_or_zero(image: NDArray[np.floating]) -> FloatImage:
+    return np.nan_to_num(image.astype(np.float64), nan=0, posinf=0, neginf=0)
+
+
+class PosedFrame:
+    """One frame of a scene. The constructor poses `stage`; valid until it is posed again."""
+
+    def __init__(self, stage: Stage, frame: int, regularise: bool = False):
+        stage.pose(frame)
+        self.stage = stage
+        self.view = stage.view(frame)
+        self.emission = render_gbuffer(stage, self.view)["emission"].astype(np.float64)
+        self.ray = stage.rays(self.view)
+        self.tracer = PathTracer(stage, regularise=regularise)
+
+    def reflected(self, seed: int, spp: int) -> FloatImage:
+        """Direct + indirect radiance (H, W, 3) of `spp` samples a pixel; non-finite values are 0."""
+        return finite_or_zero(np.add(*self.tracer.radiance(self.ray, seed, spp)))
+
+    def radiance(self, seed: int, spp: int) -> FloatImage:
+        """Emitted + reflected radiance (H, W, 3)."""
+        return self.reflected(seed, spp) + self.emission

@@ -14,7 +14,7 @@ from eval.bench.sizes import bench_folder
 from eval.bench.stock import Render, stock_render
 from files import write_json
 from render.backend import VARIANT, dr
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 from timing import take_turns

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import mi
-from render.posed_frame import FloatImage, PosedFrame, finite_or_zero
+from render.path import FloatImage, PosedFrame, finite_or_zero
 from render.stage import Stage
 from scenes.camera import View
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from datasets.tonemap import clip_exposure, display, luminance
 from plotting import DPI, plt, save_figure
 from render.job.plan import clip_of_own_scene
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 

@@ -18,7 +18,7 @@ from models.denoiser import Denoiser, State
 from plotting import Image
 from render.clip import Sampling
 from render.job.clip_job import write_clip
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 

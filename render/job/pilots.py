@@ -10,7 +10,7 @@ from errors import BadInput
 from render.clip import NO_OPTIONS, Options
 from render.job.plan import NeededSpp, rooms_of, scene_of_clip
 from render.job.profiles import DataProfile, SamplingQuality
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.animation import Scene
 

@@ -120,10 +120,7 @@ class OwnScene:
                 raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listing(names)}")
 
     def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
-        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight through free space.
-
-        The flight begins with the file's camera, or unless `from_here` at another place that can be reached from it.
-        """
+        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes."""
         if by_keyframes:
             camera = camera_of(self.described.camera, self.scene.camera, frames)
             check_camera(camera, frames, self.path)

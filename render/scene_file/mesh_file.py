@@ -185,13 +185,6 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
     return two_sided(GREY), None
 
 
-def shape_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> Shape:
-    bsdf, radiance = bsdf_of(mesh, name, notes)
-    if not isinstance(mesh.visual, TextureVisuals):
-        mesh.visual = TextureVisuals()
-    return Shape(name, mesh, bsdf, None if radiance is None else Track.constant(radiance), smooth=True)
-
-
 def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
     """A file's scene, and notes.
 
@@ -267,7 +260,11 @@ def load_mesh_file(path: Path, aspect: float) -> MeshFile:
         mesh.apply_transform(transform)
         if not len(mesh.faces) or not np.abs(mesh.vertices).max() < MAX_EXTENT:
             raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces or non-finite vertices")
-        found.shapes.append(shape_of(mesh, name, found.notes))
+        bsdf, radiance = bsdf_of(mesh, name, found.notes)
+        if not isinstance(mesh.visual, TextureVisuals):
+            mesh.visual = TextureVisuals()
+        emission = None if radiance is None else Track.constant(radiance)
+        found.shapes.append(Shape(name, mesh, bsdf, emission, smooth=True))
     if not found.shapes:
         raise BadInput("; ".join([f"{path} has no mesh to render", *found.notes]))
     if not any(shape.radiance for shape in found.shapes):

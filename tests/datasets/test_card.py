@@ -10,7 +10,7 @@ import pytest
 
 from datasets.card import CARD_FILE, PAGE_FILE, card_of, page_of
 from datasets.clip import Dataset
-from datasets.verify import find_problems
+from datasets.info import find_problems
 from render.job.generate import Share
 from tests.helpers.datasets import generate_tiny
 

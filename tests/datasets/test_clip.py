@@ -12,7 +12,7 @@ import pytest
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.frame import ChannelTensor, Frame
-from datasets.verify import find_problems, problems_of_clip
+from datasets.info import find_problems, problems_of_clip
 from errors import BadInput
 from render.clip import Sampling, render_clip
 from render.job.plan import scene_of_clip

@@ -8,7 +8,7 @@ import pytest
 from errors import BadInput
 from eval.bench.rendering import MAX_SPP, bench_rendering
 from eval.bench.stock import stock_render
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 

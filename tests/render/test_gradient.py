@@ -11,8 +11,7 @@ from datasets.channels import STRATUM
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import GradientSamples, pixel_of_each_stratum, sample_luminance
-from render.path import PathTracer, SampleRange
-from render.posed_frame import PosedFrame
+from render.path import PathTracer, PosedFrame, SampleRange
 from render.stage import Stage
 from scenes.animation import RigidMotion, Scene, Track
 from scenes.cornell import cornell_box

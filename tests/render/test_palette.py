@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from render.backend import VARIANT, dr
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene
 

@@ -6,7 +6,7 @@ import trimesh
 
 from errors import BadInput
 from render.gbuffer import render_gbuffer
-from render.posed_frame import PosedFrame
+from render.path import PosedFrame
 from render.scene_file.load import OwnScene
 from render.stage import Stage
 from scenes.camera import pixel_centres
