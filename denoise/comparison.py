@@ -36,12 +36,8 @@ def compare(
         comparison = Comparison(denoised, reference_pair, exposure)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in COMPARED_METRICS)])
     write_csv(out / "metrics.csv", ["frame", *COMPARED_METRICS], rows)
-    columns = zip(*(row[1:] for row in rows), strict=True)
-    means = [None if None in column else float(np.mean(column)) for column in columns]
-    cells = [
-        "-" if mean is None else METRICS[name].form.format(mean)
-        for name, mean in zip(COMPARED_METRICS, means, strict=True)
-    ]
+    columns = zip(COMPARED_METRICS, list(zip(*rows, strict=True))[1:], strict=True)
+    cells = ["-" if None in column else METRICS[name].form.format(np.mean(column)) for name, column in columns]
     return tabulate([cells], [f"mean {METRICS[name].title}" for name in COMPARED_METRICS], disable_numparse=True)
 
 

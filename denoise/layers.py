@@ -72,15 +72,16 @@ def layer_of(quantity: str, name: str, members: Mapping[str, str]) -> ExrLayer |
     return None
 
 
+def fitting_layers(quantity: str, channels: Iterable[str]) -> list[ExrLayer]:
+    """All layers that have the components of a quantity."""
+    return [layer for name, members in grouped(channels).items() if (layer := layer_of(quantity, name, members))]
+
+
 def candidates(quantity: str, channels: Iterable[str]) -> list[ExrLayer]:
     """All layers that hold a quantity by the last part of their names, best first."""
-    layers = sorted(grouped(channels).items(), key=lambda item: item[0].casefold().startswith("composite"))
-    return [
-        layer
-        for wanted in QUANTITIES[quantity].names
-        for name, members in layers
-        if normalised(name.rpartition(".")[2]) == wanted and (layer := layer_of(quantity, name, members))
-    ]
+    layers = sorted(fitting_layers(quantity, channels), key=lambda layer: layer.name.casefold().startswith("composite"))
+    wanted = QUANTITIES[quantity].names
+    return [layer for name in wanted for layer in layers if normalised(layer.name.rpartition(".")[2]) == name]
 
 
 def parse_layers(options: Sequence[str]) -> dict[str, str]:

@@ -12,8 +12,7 @@ from denoise.layers import (
     QUANTITIES,
     ExrLayer,
     candidates,
-    grouped,
-    layer_of,
+    fitting_layers,
     list_layers,
     named_layer,
     normalised,
@@ -95,7 +94,7 @@ def layer_of_pass(quantity: str, image: ExrImage) -> ExrLayer:
     Raises BadInput where no layer has the components of the quantity.
     """
     channels = list(image.channels)
-    fitting = [layer for name, members in grouped(channels).items() if (layer := layer_of(quantity, name, members))]
+    fitting = fitting_layers(quantity, channels)
     usual = [layer for name in PASS_LAYERS for layer in fitting if normalised(layer.name) == name]
     choice = [*candidates(quantity, channels), *usual, *fitting]
     if not choice:

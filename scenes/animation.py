@@ -217,8 +217,7 @@ class Scene:
 
     def still(self) -> "Scene":
         """The scene of frame 0 for ever: nothing moves or changes, the camera included."""
-        still: Scene = frozen(self)
-        return still
+        return frozen(self)
 
     def moves(self) -> bool:
         return any(shape.motion.varies() for shape in self.meshes)

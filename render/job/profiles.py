@@ -71,14 +71,7 @@ DATA_PROFILES = {
             "val": SamplingQuality(realisations=8, reference_spp=64),
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
-        special={
-            "test": [
-                "cornell_box_moving/still",
-                "cornell_box_moving/000-4spp",
-                "cornell_box_moving/000-64spp",
-                "cornell_box_moving/000-256spp",
-            ]
-        },
+        special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
     ),
 }
 

@@ -8,22 +8,10 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.scene_file.stand_ins import (
-    GREY,
-    REPAIRS,
-    SKIES,
-    SURFACE_LIGHTS,
-    WHITE_SKY,
-    Names,
-    Properties,
-    StandIn,
-    plugins,
-    stand_in,
-    turned_to_y,
-)
+from render.scene_file.stand_ins import GREY, REPAIRS, SURFACE_LIGHTS, Names, Properties, StandIn, plugins, stand_in
 from render.scene_file.xml import inside, parse
 from scenes.animation import StockLight, StockShape
-from scenes.bsdf import diffuse_bsdf
+from scenes.bsdf import diffuse_bsdf, rgb
 
 RENDERER_SETTINGS = ("Sampler", "Film", "ReconstructionFilter")  # of other renderers: frames here follow the TOML
 # By kind of object: the kinds that may be nested in it. Mitsuba crashes on some others.
@@ -33,7 +21,15 @@ PARTS = {
     "Emitter": ("Texture",),
     "Texture": ("Texture", "Volume"),
 }
+WHITE_SKY = {"type": "constant", "radiance": rgb([1.0, 1.0, 1.0])}
+SKIES = ("constant", "envmap", "sunsky")  # a scene has at most one
 OWN_INTEGRATORS = ("path", "direct")  # with the same light transport as here
+
+
+def turned_to_y(described: Properties) -> Properties:
+    """A sky of versions before 3, with its zenith at y instead of z."""
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    return described | {"to_world": described.get("to_world", np.eye(4)) @ turn}
 
 
 @dataclass

@@ -54,8 +54,7 @@ def camera_framing(low: Array, high: Array) -> Camera:
     centre = (low + high) / 2
     away = np.array([0.3, 0.25, 1.0])
     distance = max(float(np.linalg.norm(high - low)) / 2, 1e-6) / np.sin(np.radians(FOV_WITHOUT_CAMERA) / 2)
-    eye = centre + away / np.linalg.norm(away) * distance
-    return Camera.at_rest(eye, centre, FOV_WITHOUT_CAMERA)
+    return Camera.at_rest(centre + away / np.linalg.norm(away) * distance, centre, FOV_WITHOUT_CAMERA)
 
 
 DEFAULT_CAMERA = camera_framing(np.zeros(3), np.ones(3))  # until the extent of the scene is known

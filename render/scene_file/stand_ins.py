@@ -15,11 +15,9 @@ Properties = dict[str, Any]  # a Mitsuba dictionary
 StandIn = tuple[Properties | None, str]  # None is nothing; and a description of it
 
 GREY = rgb([0.5, 0.5, 0.5])
-WHITE_SKY = {"type": "constant", "radiance": rgb([1.0, 1.0, 1.0])}
 TEXTURES = ("rgb", "spectrum", "bitmap", "checkerboard", "mesh_attribute", "volume", "uniform", "srgb", "rawconstant")
 RESERVED_NAMES = ("type", "id", "sky")  # keys of a Mitsuba scene's dictionary
 SURFACE_LIGHTS = ("area", "directionalarea")  # emitters that belong to shapes, unlike all others
-SKIES = ("constant", "envmap", "sunsky")  # a scene has at most one
 
 
 class Names:
@@ -218,9 +216,3 @@ REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     "regular": regular,
     "blackbody": black_body,
 }
-
-
-def turned_to_y(described: Properties) -> Properties:
-    """A sky of versions before 3, with its zenith at y instead of z."""
-    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    return described | {"to_world": described.get("to_world", np.eye(4)) @ turn}

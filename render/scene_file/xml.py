@@ -123,9 +123,8 @@ def upgrade(root: Element, path: Path) -> list[str]:
                 parent[place] = ElementTree.Comment("subsurface")
             elif child.tag == "animation":
                 notes.append(f"an <animation> ('{child.get('name')}'): its first transform instead")
-                first = next(iter(child.findall("transform")), Element("transform"))
                 parent[place] = named_like(child, "transform")
-                parent[place].extend(first)
+                parent[place].extend(next(iter(child.findall("transform")), Element("transform")))
             elif child.tag == "srgb":
                 parent[place] = named_like(child, "rgb", value=linear_colour(child.get("value", "")))
             elif child.tag == "blackbody":

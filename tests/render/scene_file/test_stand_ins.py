@@ -5,7 +5,8 @@ import pytest
 
 from render.backend import mi
 from render.path import PosedFrame
-from render.scene_file.stand_ins import OLD_PLUGINS, black_body, mixture, phong, turned_to_y
+from render.scene_file.convert import turned_to_y
+from render.scene_file.stand_ins import OLD_PLUGINS, black_body, mixture, phong
 from render.stage import Stage
 from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
 
