@@ -63,10 +63,7 @@ def visible_channel(name: str, stored: Container[str], read: Callable[[str], NDA
 
 
 class Clip:
-    """One clip on disk; channels are read on demand.
-
-    Raises BadInput, naming the file, where the clip is missing, incomplete or damaged.
-    """
+    """One clip on disk, read on demand. Raises BadInput, naming the file, where it is missing or damaged."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -173,10 +170,7 @@ class Clip:
 
 
 class Dataset:
-    """A data set on disk: dataset.json and the clips that it plans for each split.
-
-    Raises BadInput where there is none, or one of another schema version.
-    """
+    """A data set on disk: dataset.json and the clips it plans. Raises BadInput where none of this schema is there."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -219,10 +213,7 @@ def constant_channels(clips: Sequence[Clip]) -> dict[str, list[float]]:
 
 
 def allow_open_files(count: int) -> None:
-    """Raise this process's limit of open files by `count`, as far as the system allows.
-
-    Every memory map keeps its file open, and the usual limit is 1024.
-    """
+    """Raise this process's limit of open files by `count`, as far as allowed: every memory map needs one."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY:
         wanted = soft + count if hard == resource.RLIM_INFINITY else min(soft + count, hard)

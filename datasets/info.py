@@ -164,10 +164,7 @@ def channel_table(clips: list[Clip]) -> str:
 
 
 def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
-    """Seconds by step, and what was saved where optional channels were not rendered.
-
-    The savings are estimated by the mean times per pixel in the clips that have them.
-    """
+    """Seconds by step, and what channels not rendered have saved, by the mean time per pixel of those that were."""
     seconds: SecondsByStep = {}
     for timing in timings:
         for step, spent in timing.items():

@@ -36,10 +36,7 @@ class RawChannel:
         self.float16_loses = False  # whether float16 would lose precision of what widens
 
     def add(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Append one frame, with the channel's axes but F. Non-finite numbers are counted and become 0.
-
-        Returns the frame as it was appended.
-        """
+        """Append a frame, with the channel's axes but F, and return it. Non-finite numbers are counted and become 0."""
         array = np.ascontiguousarray(array, dtype=self.working_dtype)
         if array.dtype.kind == "f":
             finite = np.isfinite(array)
@@ -63,10 +60,7 @@ class RawChannel:
         return np.fromfile(self.path, self.working_dtype, count, offset=offset).reshape(self.frame_shape)
 
     def finish(self, derived: str | None) -> dict[str, Any]:
-        """Write the final file where one is needed. Returns the entry of clip.json.
-
-        `derived` names what readers derive the channel from, if they do.
-        """
+        """Write the final file, if the channel is neither `derived` nor constant. Returns the entry of clip.json."""
         dtype = "<f4" if self.float16_loses else self.channel.dtype
         if derived:
             entry: dict[str, Any] = {"derived": derived}

@@ -93,10 +93,7 @@ class ExrImage:
                 self.channels[name] = home.channels[name] = OpenEXR.Channel(name, plane)
 
     def write(self, path: Path, note: str) -> None:
-        """Write all parts, layers and attributes atomically, with `note` as the attribute `denoised`.
-
-        Raises BadInput where the disk is full or the folder cannot be written.
-        """
+        """Write everything atomically, with `note` as the attribute `denoised`. Raises BadInput where that fails."""
         self.file.parts[0].header["denoised"] = note
         try:
             with replacing(path) as temporary:

@@ -78,10 +78,7 @@ def make_finite(arrays: dict[str, Image]) -> int:
 
 
 def surface_of(arrays: dict[str, Image], alpha: Image | None) -> NDArray[np.bool_]:
-    """Where pixels show a surface, (H, W): by distances, else positions, else normals and albedo; and by alpha.
-
-    An alpha channel that is 0 everywhere is ignored.
-    """
+    """Surface pixels (H, W): by distances, else positions, else normals and albedo; and by alpha, if any is above 0."""
     ranges = [arrays[name][..., 0] for name in ("depth", "distance") if name in arrays]
     if ranges:
         surface = (ranges[0] > 0) & (ranges[0] < MIN_SKY_DEPTH)

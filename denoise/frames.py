@@ -85,10 +85,7 @@ def camera_conventions(first: ForeignFrame) -> InputConventions:
 
 
 class FrameBuilder:
-    """Makes the Frames between two cuts, one after another, and keeps what the next one needs.
-
-    Raises BadInput where `spp` is no number of samples per pixel.
-    """
+    """Makes the Frames between two cuts, one after another. Raises BadInput where `spp` is no number of samples."""
 
     def __init__(self, conventions: InputConventions, reads: tuple[str, ...], source: str, spp: float = 1.0):
         if not 0 < spp < math.inf:

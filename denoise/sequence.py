@@ -36,10 +36,7 @@ def files_of(patterns: Sequence[str]) -> list[Path]:
 
 
 def numbered(paths: Sequence[Path]) -> dict[int, Path]:
-    """Files by frame number: of the numbers in their names the last that differs between all of them.
-
-    Raises BadInput where none does.
-    """
+    """Files by number: the last in their names that differs between all of them. Raises BadInput where none does."""
     runs = [re.findall(r"\d+", path.stem) for path in paths]
     if len(paths) == 1:
         return {int(runs[0][-1]) if runs[0] else 0: paths[0]}
@@ -86,10 +83,7 @@ def gaps(frames: Sequence[FrameFiles]) -> list[int]:
 
 
 def split_at_cuts(frames: Sequence[FrameFiles], resets: Sequence[int]) -> list[list[FrameFiles]]:
-    """The frames, cut before the numbers in `resets` and after missing frames: there history begins anew.
-
-    Raises BadInput where no frame has such a number.
-    """
+    """The frames, cut before the numbers `resets` and after missing ones. Raises BadInput for a number of no frame."""
     unknown = set(resets) - {frame.number for frame in frames}
     if unknown:
         raise BadInput(f"--reset-at {min(unknown)}: there is no such frame")

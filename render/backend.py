@@ -45,10 +45,7 @@ def installed_llvms() -> list[tuple[int, str]]:
 
 
 def choose_llvm() -> None:
-    """Set DRJIT_LIBLLVM_PATH, unless it is set, to the usable libLLVM nearest to the tested version.
-
-    Raises BadInput if there is none.
-    """
+    """Set DRJIT_LIBLLVM_PATH, unless set, to the usable libLLVM nearest to the tested one. Raises BadInput without."""
     if "DRJIT_LIBLLVM_PATH" in os.environ:
         return
     usable = [(abs(version - TESTED_LLVM), path) for version, path in installed_llvms() if version >= MIN_LLVM]

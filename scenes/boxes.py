@@ -12,8 +12,7 @@ def enclosing_box(boxes: Array) -> Array:
 
 def transformed_box(box: Array, matrix: Array) -> Array:
     """The bounding box (2, 3) of `box` (2, 3) transformed by `matrix` (4, 4)."""
-    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
-    transformed = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    transformed = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
     return np.stack([transformed.min(axis=0), transformed.max(axis=0)])
 
 

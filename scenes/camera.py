@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FAR_OUTSIDE = 1e5  # px, outside any image yet finite: what is behind the camera projects there
+FAR_OUTSIDE = 1e5  # px, outside any image yet finite: what is behind the camera projects there, in x and in y
 
 
 class View(NamedTuple):
@@ -84,10 +84,7 @@ def unproject(pixels: Array, depth: Array, view: View) -> Array:
 
 
 def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
-    """Pixel positions (..., 2) of `points` (..., 3), which are directions where `hit` (...,) is false.
-
-    What is behind the camera projects to (FAR_OUTSIDE, FAR_OUTSIDE).
-    """
+    """Pixel positions (..., 2) of `points` (..., 3), which are directions where `hit` (...,) is false."""
     relative = points - np.where(hit[..., None], view.camera_to_world[:3, 3], 0)
     in_camera = relative @ view.camera_to_world[:3, :3]
     depth = in_camera[..., 2]
@@ -98,10 +95,7 @@ def project(points: Array, hit: NDArray[np.bool_], view: View) -> Array:
 
 
 def move(points: Array, mesh_id: NDArray[np.integer], source: View, target: View) -> Array:
-    """Surface points (..., 3) of the frame `source` moved with their meshes to the frame `target`.
-
-    Background directions (`mesh_id` (...,) 0) stay.
-    """
+    """Surface points (..., 3) of frame `source` moved with their meshes to `target`; background directions stay."""
     relative = target.object_to_world @ inverse_pose(source.object_to_world)
     relative = np.concatenate([np.eye(4)[None], relative])
     # M times its inverse is not exactly the identity: a mesh at rest must not pick up rounding errors.

@@ -53,10 +53,7 @@ def block(name: str, width: float, height: float, position: Track, angle: Track)
 
 
 class Keys:
-    """Tracks through random keys at equal intervals; a clip lies in their middle.
-
-    The interval, and with it the speed, is the same in clips of any length.
-    """
+    """Tracks through random keys at equal intervals, the same in clips of any length; a clip lies in their middle."""
 
     def __init__(self, rng: Rng, frames: int):
         self.rng = rng

@@ -30,8 +30,7 @@ def flight_path(layout: Layout) -> Track:
         start = rng.uniform(low, high)
         heading = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(0, 0.5, 3))
         steps = np.stack([np.cos(heading), rng.normal(0, 0.25, 3), np.sin(heading)], axis=1) * reach / 3
-        keys = start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        track = Track(keys, 0, stop)
+        track = Track(start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]), 0, stop)
         points = np.stack([track.at(frame) for frame in range(layout.frames)])
         if (points > low).all() and (points < high).all() and keeps_clearance(points, layout.boxes, EYE_CLEARANCE):
             passed = [*points[:: max(1, layout.frames // 16)], points[-1]]

@@ -127,10 +127,7 @@ def check_versions(dataset: Dataset) -> None:
 
 
 def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
-    """Wait for all clips, print which were not rendered, and count those that were.
-
-    Raises BadInput at the end, naming the first clip that failed.
-    """
+    """Wait for all clips, report those not rendered and count the others. Raises BadInput at the end if any failed."""
     ended = []
     for outcome in outcomes:
         ended.append(outcome)

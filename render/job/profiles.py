@@ -118,10 +118,7 @@ def own_profile(path: Path) -> DataProfile:
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:
-    """The files of a user's own scene with their crc32; none of built-in scenes.
-
-    Raises BadInput, naming the file, if one cannot be read.
-    """
+    """The files of a user's own scene by name, with crc32; else none. Raises BadInput where one cannot be read."""
     if profile.own is None:
         return {}
     files = [profile.own, profile.own.parent / read_description(profile.own).file]

@@ -148,8 +148,7 @@ def path(space: Space, camera: Camera, start: Start, frames: int, rng: Rng) -> T
         heading = random_direction(rng, up, 0.3)
         steps = np.array([heading + 0.5 * random_direction(rng, up, 0.3) for _ in range(3)])
         steps *= reach / np.linalg.norm(steps, axis=1, keepdims=True) / 3
-        keys = start.eye + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        track = Track(keys, 0, max(frames - 1, 1))
+        track = Track(start.eye + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]), 0, max(frames - 1, 1))
         if space.is_free(np.stack([track.at(moment) for moment in moments]), start.clearance):
             return track
     return Track.constant(start.eye)

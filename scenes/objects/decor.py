@@ -109,8 +109,7 @@ def make_cup(rng: Rng) -> Thing:
     handle = tube(np.stack([out, up, 0 * angle], axis=1), height * 0.05)
     surfaces = [lathe(hollow(outer, 0.004, 0.006), 32).at(0, 0.004), handle.at(0, 0.004)]
     if rng.random() < 0.5:
-        saucer = silhouette(radius * np.array([0.9, 1.5, 1.8]), 0.015, 8)
-        surfaces.append(lathe(hollow(saucer, 0.004, 0.004), 32))
+        surfaces.append(lathe(hollow(silhouette(radius * np.array([0.9, 1.5, 1.8]), 0.015, 8), 0.004, 0.004), 32))
     return standing("cup", {"ceramic": surfaces})
 
 

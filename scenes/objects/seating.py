@@ -106,9 +106,8 @@ def make_armchair(rng: Rng) -> Thing:
 def make_bed(rng: Rng) -> Thing:
     """A bed with its head towards -z: frame, mattress, blanket and one or two pillows."""
     width, depth, level, thickness = uniforms(rng, (0.9, 1.8), (1.95, 2.15), (0.22, 0.4), (0.15, 0.26))
-    head = rng.uniform(0.4, 0.8)
     frame = [slab(width + 0.06, 0.1, depth + 0.06).at(0, level - 0.1)]
-    frame.append(slab(width + 0.06, level + head, 0.05).at(0, 0, -depth / 2 - 0.05))
+    frame.append(slab(width + 0.06, level + rng.uniform(0.4, 0.8), 0.05).at(0, 0, -depth / 2 - 0.05))
     frame += [slab(0.08, level - 0.1, 0.08).at(x, 0, z) for x, z in corners(width - 0.1, depth - 0.1)]
     cover = rng.uniform(0.5, 0.75) * depth
     blanket = superellipsoid(width + 0.04, thickness + 0.02, cover, 9, 3)
