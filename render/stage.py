@@ -13,7 +13,7 @@ from render.materials import MaterialTable, bsdfs_of, registry_index, registry_t
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
-from scenes.animation import Scene, Shape, StockLight, StockShape
+from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
 MAX_CUTOUTS = 32  # that a primary ray passes
@@ -38,11 +38,6 @@ def has_texture(emitter: dict[str, Any] | None) -> bool:
     return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
 
 
-def extent_of_mesh(shape: Shape) -> float:
-    """An upper bound of the mesh's coordinates in frame 0."""
-    return float(np.abs(shape.mesh.bounds).max() + np.abs(shape.motion.position.at(0)).max())
-
-
 class Stage:
     """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
 
@@ -58,7 +53,9 @@ class Stage:
         palette()
         loader = StockLoader()
         loaded = [loader.shape(shape) for shape in scene.stock]
-        self.unit = unit_of([*map(extent_of_mesh, scene.shapes), *(extent_of(shape.bbox()) for shape in loaded)])
+        # Upper bounds of coordinates in frame 0:
+        extents = [np.abs(each.mesh.bounds).max() + np.abs(each.motion.position.at(0)).max() for each in scene.shapes]
+        self.unit = unit_of([*extents, *(extent_of(shape.bbox()) for shape in loaded)])
         if self.unit != 1:
             loader = StockLoader(self.unit)
             loaded = [loader.shape(shape) for shape in scene.stock]

@@ -104,11 +104,6 @@ def texture(values: Array) -> Bsdf:
     return {"type": "bitmap", "data": np.ascontiguousarray(values[::-1], np.float32), "raw": True}
 
 
-def times_factor(image: Any, factor: Array) -> Bsdf:
-    """A colour: a factor (3,), times an image if there is one."""
-    return rgb(factor.tolist()) if image is None else texture(linear_image(image) * factor)
-
-
 def two_sided(colour: Bsdf) -> Bsdf:
     return {"type": "twosided", "bsdf": diffuse_bsdf(colour)}
 
@@ -129,7 +124,8 @@ def pbr_bsdf(material: PBRMaterial) -> Bsdf:
         channels = unit_values(material.metallicRoughnessTexture)
         roughness = texture(channels[..., 1:2] * roughness)
         metallic = texture(channels[..., 2:3] * metallic)
-    colour = times_factor(material.baseColorTexture, colour_factor(material.baseColorFactor))
+    factor, image = colour_factor(material.baseColorFactor), material.baseColorTexture
+    colour = rgb(factor.tolist()) if image is None else texture(linear_image(image) * factor)
     bsdf: Bsdf = {"type": "principled", "base_color": colour, "roughness": roughness, "metallic": metallic}
     bsdf = {"type": "twosided", "bsdf": bsdf | {"specular": 0.5}}
     if material.normalTexture is not None:
