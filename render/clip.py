@@ -82,14 +82,16 @@ class FrameInProgress:
     arrays: Arrays
 
 
-def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTimer) -> Iterator[FrameInProgress]:
+def noise_free_frames(
+    stage: Stage, frames: int, regularise: bool, wants_dual: bool, timer: StepTimer
+) -> Iterator[FrameInProgress]:
     """Yield every frame with its G-buffer and motion vectors.
 
     Dual motion vectors need rays through the scene of the previous frame, so the G-buffer is rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
     view = stage.view(0)
-    arrays = render_gbuffer(stage, view)
+    arrays = render_gbuffer(stage, view, regularise)
     arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
     if stage.materials.has_mirrors:
         arrays[MIRRORED["motion"]] = arrays["motion"]
@@ -98,7 +100,7 @@ def noise_free_frames(stage: Stage, frames: int, wants_dual: bool, timer: StepTi
     for index in range(1, frames):
         stage.pose(index)
         view = stage.view(index)
-        arrays = render_gbuffer(stage, view)
+        arrays = render_gbuffer(stage, view, regularise)
         timer.lap("gbuffer")
         surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
         arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
@@ -213,7 +215,7 @@ def render_clip(
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
     makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
     sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted)
-    for frame in noise_free_frames(stage, frames, "dual_motion" not in skipped, timer):
+    for frame in noise_free_frames(stage, frames, sampling.options.regularise, "dual_motion" not in skipped, timer):
         for step, maker in makers.items():
             frame.arrays |= maker(sampled, frame)
             timer.lap(step)

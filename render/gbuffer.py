@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datasets.channels import MIRRORED
 from render.backend import dr, mi
 from render.loading import columns
+from render.specular import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
 
@@ -99,13 +100,15 @@ def surface_channels(stage: Stage, hit: MirroredHit) -> dict[str, dr.AnyArray]:
     }
 
 
-def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
+def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[str, NDArray[Any]]:
     """The noise-free channels (H, W, C) of the channel table, with the stage posed for `view`'s frame.
+
+    `regularise` is that of the path tracer whose samples complete them.
 
     albedo: diffuse reflectance + specular reflectance at normal incidence, in [0, 1]; 1 for background.
     normal: the shading normal in world space, of unit length, toward the viewer; 0 for background.
     roughness: GGX alpha in [0, 1]; 1 for diffuse surfaces and background.
-    emission: the radiance of directly visible lights and sky.
+    emission: the radiance of lights and sky, directly visible or by way of perfectly specular surfaces alone.
     depth: along the viewing axis, in world units; 0 for background.
     mesh_id: index of the shape + 1; 0 for background.
 
@@ -119,6 +122,9 @@ def render_gbuffer(stage: Stage, view: View) -> dict[str, NDArray[Any]]:
     channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
+    if stage.specular.lobes:
+        emission = specular_light(stage.mitsuba_scene, stage.lights, stage.specular, ray, stage.max_events(regularise))
+        arrays["emission"] = emission.reshape(stage.height, stage.width, 3)
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.materials.has_mirrors:
         for _ in range(MAX_MIRRORS):

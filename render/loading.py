@@ -1,7 +1,7 @@
 """Mitsuba objects from descriptions of shapes and lights."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -108,7 +108,7 @@ def upload(values: NDArray[np.floating]) -> mi.Float:
     return mi.Float(aligned(values.astype(np.float32)))
 
 
-def columns(vector: dr.AnyArray) -> NDArray[Any]:
+def columns(vector: Iterable[dr.AnyArray]) -> NDArray[Any]:
     """(N, C) of a Dr.Jit vector of C components and N lanes, without compiling a kernel for this N."""
     return np.stack([np.array(component) for component in vector], axis=-1)
 

@@ -15,6 +15,7 @@ from render.lights import Lights
 from render.palette import palette
 from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
+from render.specular import SpecularSurfaces
 from render.stage import Stage
 
 AnySampler = Sampler | HaltonSampler
@@ -34,12 +35,14 @@ def bounce(
     bsdf: mi.BSDFPtr,
     throughput: mi.Color3f,
     last: mi.Bool,
+    specular: SpecularSurfaces,
+    chain: mi.Bool,
     sampler: AnySampler,
-) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool]:
-    """(radiance, si, throughput, active): direct light reflected at `si`, and the path's next vertex.
+) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool]:
+    """(radiance, si, throughput, active, chain): direct light reflected at `si`, and the path's next vertex.
 
     Emitter and BSDF sampling are combined. But a path's `last` ray is not traced from a diffuse surface, where emitter
-    sampling alone is the better choice.
+    sampling alone is the better choice. Light at the end of a `chain` of specular events is left out: it is emission.
     """
     u_emitter = sampler.next_2d()
     u_lobe = sampler.next_1d()
@@ -63,10 +66,11 @@ def bounce(
     towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in the index of the sky
     towards.emitter = emitter
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    chain &= delta & specular.at(bsdf, chain)
     emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
     mis = mis_weight(sample.pdf, emitter_pdf)
-    radiance += dr.select(active, throughput * emitter.eval(following, active) * mis, 0)
-    return radiance, following, throughput, active & following.is_valid()
+    radiance += dr.select(active & ~chain, throughput * emitter.eval(following, active) * mis, 0)
+    return radiance, following, throughput, active & following.is_valid(), chain
 
 
 def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Float) -> tuple[mi.Color3f, mi.Bool]:
@@ -87,12 +91,15 @@ def sample_mean(
     max_depth: mi.UInt32,
     draw: type[AnySampler],
     blurred: BlurredTable | None,
+    specular: SpecularSurfaces,
+    max_events: mi.UInt32,
 ) -> tuple[mi.Color3f, mi.Color3f]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
     Each ray draws the random numbers of its `pixel` (row-major). `seed`, `first` (the index of the first sample), `spp`
     and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended continues with its
-    next sample at once. `draw` is the sampler; `blurred` regularises (see PathTracer).
+    next sample at once. `draw` is the sampler; `blurred` regularises (see PathTracer). Light at the end of chains of up
+    to `max_events` specular events is left out.
     """
     primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     # Hash the pixel before combining it with the seed: a sum would make images of some seeds shifted copies.
@@ -102,11 +109,16 @@ def sample_mean(
     si = dr.copy(primary)
     throughput = mi.Color3f(1)
     depth = mi.UInt32(1)
+    chain = mi.Bool(True)
     index = mi.UInt32(0)
     while primary.is_valid() & (index < spp):
         sampler = draw(key, first + index, depth)
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
-        radiance, si, throughput, active = bounce(scene, lights, si, bsdf, throughput, depth + 1 == max_depth, sampler)
+        chain &= depth <= max_events
+        last = depth + 1 == max_depth
+        radiance, si, throughput, active, chain = bounce(
+            scene, lights, si, bsdf, throughput, last, specular, chain, sampler
+        )
         direct += dr.select(depth == 1, radiance, 0)
         indirect += dr.select(depth == 1, 0, radiance)
         throughput, active = survive(throughput, depth, active, sampler.next_1d())
@@ -115,6 +127,7 @@ def sample_mean(
         si = dr.select(ended, primary, si)
         throughput = dr.select(ended, 1, throughput)
         depth = dr.select(ended, 1, depth)
+        chain |= ended
         index += dr.select(ended, 1, 0)
     count = mi.Color3f(spp)
     return direct / count, indirect / count
@@ -167,6 +180,8 @@ class PathTracer:
             max_depth=dr.opaque(mi.UInt32, stage.scene.max_depth),
             draw=self.draw,
             blurred=self.blurred,
+            specular=stage.specular,
+            max_events=dr.opaque(mi.UInt32, stage.max_events(self.blurred is not None)),
         )
         dr.eval(direct, indirect)
         return direct, indirect
@@ -190,7 +205,7 @@ class PosedFrame:
         stage.pose(frame)
         self.stage = stage
         self.view = stage.view(frame)
-        self.emission = render_gbuffer(stage, self.view)["emission"].astype(np.float64)
+        self.emission = render_gbuffer(stage, self.view, regularise)["emission"].astype(np.float64)
         self.ray = stage.rays(self.view)
         self.tracer = PathTracer(stage, regularise=regularise)
 

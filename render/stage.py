@@ -13,6 +13,7 @@ from render.materials import MaterialTable, bsdfs_of, registry_index, registry_t
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
+from render.specular import MAX_EVENTS, SpecularSurfaces
 from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
@@ -77,6 +78,7 @@ class Stage:
         self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
         visible = [*self.shapes, *loader.grouped]
         self.materials = MaterialTable(visible)
+        self.specular = SpecularSurfaces(visible)
         self.normals = ShadingNormals(visible)
         # Masks have null transmission; so has thin glass.
         self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(visible).values())
@@ -114,6 +116,10 @@ class Stage:
             self.parameters.update()  # every update rebuilds the top level of the acceleration structure
             self.posed.update(changes)
             self.poses += 1
+
+    def max_events(self, regularise: bool = False) -> int:
+        """Of the chains of specular events whose light is emission; regularised paths have but one such event."""
+        return min(1 if regularise else MAX_EVENTS, self.scene.max_depth - 1)
 
     def image(self, value: dr.AnyArray) -> NDArray[Any]:
         """(H, W, C) of a Dr.Jit value of C components with a lane for each pixel, or one for all."""

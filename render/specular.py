@@ -1,0 +1,99 @@
+"""Light seen by way of mirrors and glass, as free of noise as light seen directly.
+
+Chains of perfectly specular events (delta lobes) need no random numbers: from each such surface every branch is
+followed, and the light at its end, weighted by the chain's throughput, is emission. The path tracer leaves it out.
+"""
+
+from collections.abc import Iterable
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from render.backend import dr, mi
+from render.lights import Lights
+from render.loading import columns, upload
+from render.materials import BsdfParameters, bsdfs_of, registry_index
+
+MAX_EVENTS = 8  # in a chain: through a vitrine of solid panes, and a bottle in it
+
+
+def is_masked(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF has a mask in it: Mitsuba cannot sample a single lobe of one."""
+    return bsdf.class_name() == "MaskBSDF" or any(map(is_masked, BsdfParameters(bsdf).nested.values()))
+
+
+class SpecularSurfaces:
+    """The BSDFs of `shapes` that chains continue from; `lobes` are the component indices of their delta lobes."""
+
+    DRJIT_STRUCT: ClassVar = {"continues": mi.Bool}
+
+    def __init__(self, shapes: Iterable[mi.Shape] | None = None):
+        if shapes is None:  # Dr.Jit creates empty instances
+            return
+        bsdfs = bsdfs_of(shapes)
+        continues = np.zeros(max(bsdfs, default=0) + 1, bool)
+        lobes: set[int] = set()
+        for index, bsdf in bsdfs.items():
+            delta = [i for i in range(bsdf.component_count()) if mi.has_flag(bsdf.flags(i), mi.BSDFFlags.Delta)]
+            if delta and not is_masked(bsdf):
+                continues[index] = True
+                lobes.update(delta)
+        self.lobes = sorted(lobes)
+        self.continues = mi.Bool(continues)
+        dr.make_opaque(self.continues)
+
+    def at(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Bool:
+        """Whether surfaces with this BSDF continue chains."""
+        return dr.gather(mi.Bool, self.continues, registry_index(bsdf), active)
+
+
+class Chains(NamedTuple):
+    """Chains of perfectly specular events: several for a pixel that shows glass, none for many."""
+
+    pixel: NDArray[np.integer]  # (N,)
+    rays: NDArray[np.float32]  # (N, 9): origin and direction of the last ray, and throughput
+
+
+def advance(
+    chains: Chains, scene: mi.Scene, lights: Lights, specular: SpecularSurfaces
+) -> tuple[NDArray[np.float32], Chains]:
+    """(radiance (N, 3) from the ends of the chains, chains with one event more: one for each delta lobe there)."""
+    components = [*map(upload, chains.rays.T)]
+    origin, direction, throughput = mi.Point3f(components[:3]), mi.Vector3f(components[3:6]), mi.Color3f(components[6:])
+    si = scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False)
+    radiance = throughput * lights.at(si).eval(si)
+    active = si.is_valid()
+    active &= specular.at(si.bsdf(), active)
+    branches = []
+    for lobe in specular.lobes:
+        context = mi.BSDFContext()
+        context.component = lobe
+        sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
+        weight = throughput * weight
+        follows = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight > 0)
+        onward = si.spawn_ray(si.to_world(sample.wo))
+        branches.append((follows, [*onward.o, *onward.d, *weight]))
+    dr.eval(radiance, branches)  # in one kernel
+    pixels = [chains.pixel[np.array(follows)] for follows, _ in branches]
+    rays = [columns(ray)[np.array(follows)] for follows, ray in branches]
+    return columns(radiance), Chains(np.concatenate(pixels), np.concatenate(rays))
+
+
+def specular_light(
+    scene: mi.Scene, lights: Lights, specular: SpecularSurfaces, ray: mi.Ray3f, max_events: int
+) -> NDArray[np.float32]:
+    """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events.
+
+    In a scene with specular surfaces.
+    """
+    count = dr.width(ray.d)
+    values = [*ray.o, *ray.d, *mi.Color3f(1)]
+    chains = Chains(np.arange(count), np.stack([np.broadcast_to(np.array(value), count) for value in values], axis=-1))
+    total = np.zeros((count, 3))
+    for _ in range(max_events + 1):
+        pixel = chains.pixel
+        if len(pixel):
+            radiance, chains = advance(chains, scene, lights, specular)
+            np.add.at(total, pixel, radiance)  # in the order of chains; Dr.Jit would add in any order
+    return total.astype(np.float32)
