@@ -45,7 +45,6 @@ eval: $(READY)
 
 bench: $(READY)
 	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
-	$(BIN)/onespp bench rendering --runs $(RUNS)
 
 stress: $(READY)
 	$(BIN)/onespp stress --long --budget $(BUDGET) --runs $(RUNS)

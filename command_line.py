@@ -264,13 +264,6 @@ def bench_denoisers(
     print(bench(runs, names, size, threads, every_way=every_way))
 
 
-def bench_rendering(names: Scenes = (), runs: Runs = RUNS) -> None:
-    """Measure samples per second and seconds to 40 dB beside stock Mitsuba, by default in eight scenes."""
-    from eval.bench.rendering import bench_rendering as bench
-
-    print(bench(runs, names))
-
-
 def bench_light(names: Denoisers = (), runs: Runs = RUNS, budget: Budget = "quick") -> None:
     """Measure how many frames the output lags after a light changes.
 
@@ -363,12 +356,12 @@ GROUPS: dict[str, Commands] = {
         "show": show,
         "trade": trade,
         "stress": stress,
-        "bench": {"denoisers": bench_denoisers, "light": bench_light, "rendering": bench_rendering},
+        "bench": {"denoisers": bench_denoisers, "light": bench_light},
     },
 }
 TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
-SUMMARIES = {"bench": "Measure speed and memory of denoisers, their lag after a light changes, and the renderer."}
+SUMMARIES = {"bench": "Measure speed and memory of denoisers, and their lag after a light changes."}
 
 
 def main(arguments: list[str] | None = None) -> None:

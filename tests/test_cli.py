@@ -45,7 +45,7 @@ def test_help_begins_with_the_pipeline(capsys):
     places = [shown.index(f"\n  {name} ") for name in ("preview", "dataset", "train", "eval", "report")]
     assert places == sorted(places) and places[-1] < shown.index("Datasets")
     assert all(f"\n  {name} " in shown for group in GROUPS.values() for name in group)
-    assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "light", "rendering"))
+    assert all(f"\n  {name} " in help_of(capsys, "bench") for name in ("denoisers", "light"))
 
 
 def test_help_names_every_profile_and_budget(capsys):
@@ -55,13 +55,13 @@ def test_help_names_every_profile_and_budget(capsys):
 
 def test_a_bench_refuses_unknown_options(capsys):
     with pytest.raises(SystemExit) as exit_:
-        main(["bench", "rendering", "room-3", "--threads", "1"])
+        main(["bench", "light", "svgf", "--threads", "1"])
     assert exit_.value.code == 2 and "--threads" in capsys.readouterr().err
 
 
 def test_unknown_commands(capsys):
     assert "unknown command 'onespp fly'" in fails(capsys, "fly")
-    assert "denoisers, light, rendering" in fails(capsys, "bench", "everything")
+    assert "denoisers, light" in fails(capsys, "bench", "everything")
 
 
 def test_unknown_names(capsys, tiny, tmp_path):
