@@ -4,18 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
 from datasets.clip import Clip
 from datasets.frame import Frame, Signal, disoccluded, read_frame, to_tensor
 from datasets.tonemap import display
 from eval.comparison import Comparison, Luminances
-from eval.disocclusion_crops import densest_crop
 from eval.means import mean_floor, means
 from eval.metrics import Values, measure, noise_floors, temporal_error_floor
 from eval.results import NOISE_FLOOR, Result, result_key, save_error, save_picture
@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # it imports all denoisers, and results of one must not depen
     from models.spec import DenoiserSpec
 
 METRICS_CHANNELS = ("motion", "dual_motion")
+SMALLEST_CROP = 16  # px
+CROPS_A_SIDE = 4  # a crop is a quarter of the image's shorter side
 
 
 @dataclass
@@ -109,6 +111,31 @@ class DenoiserRun:
     def result(self, clip: Clip) -> Result:
         precision = self.evaluated.spec.precision
         return result_of(self, clip, means(self.frames), nonfinite=self.nonfinite, precision=precision)
+
+
+class Crop(NamedTuple):
+    """A square window of an image, in pixels, and how many disoccluded pixels it contains."""
+
+    x: int
+    y: int
+    size: int
+    pixels: int
+
+
+def densest_crop(mask: Tensor) -> Crop | None:
+    """The window with most pixels of a mask (H, W), centred on them within the image; None for an empty mask."""
+    height, width = mask.shape
+    shorter = min(height, width)
+    size = min(shorter, max(SMALLEST_CROP, shorter // CROPS_A_SIDE))
+    best = int(avg_pool2d(mask[None, None].double(), size, stride=1).argmax())
+    y, x = divmod(best, width - size + 1)
+    inside = mask[y : y + size, x : x + size].nonzero().double()
+    if not len(inside):
+        return None
+    dy, dx = (inside.mean(dim=0) - (size - 1) / 2).round().int().tolist()
+    y = min(max(0, y + dy), height - size)
+    x = min(max(0, x + dx), width - size)
+    return Crop(x, y, size, int(mask[y : y + size, x : x + size].sum()))
 
 
 @dataclass

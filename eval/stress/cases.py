@@ -1,13 +1,17 @@
-"""The stress cases, as data: how each changes an ordinary sequence of frames, or the denoiser."""
+"""The stress cases, as data: how each changes a moving scene under light of irradiance 1, or the denoiser."""
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
-from datasets.channels import MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
-from datasets.frame import Frame
+import numpy as np
+
+from datasets.channels import CHANNELS, MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
+from datasets.frame import Frame, to_tensor
 from eval.bench.sizes import Size
+from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, split_into_buffers, synthetic_frame
 from eval.stress.changes import (
     LIGHT_CHANNELS,
     SURFACE_CHANNELS,
@@ -20,13 +24,36 @@ from eval.stress.changes import (
     near_to_far,
     unchanged,
 )
-from eval.stress.lit_frames import NOISE_PERIOD, lit_frame
 
 CASE_SIZE: Size = (32, 48)
 CASE_FRAMES = 10
 EVEN_FRAMES = 4  # of these, at the start
 SPOILED_FRAME = 2  # index of the frame with a bad pixel
 RECOVERY_LIMIT = 60  # frames after it: a second or two
+LIGHT_SHARES = {"direct": 0.7, "indirect": 0.3}  # of the irradiance
+HIT_SHARES = {"direct": HIT_DIRECT, "indirect": HIT_INDIRECT}  # of the pixels whose one sample finds light
+NOISE_PERIOD = 100  # frames until the noise of a long sequence repeats
+
+
+def lit(frame: Frame, seed: int | None) -> Frame:
+    """The frame under light of irradiance 1: with the noise of one sample per pixel, or without noise if no seed."""
+    reflected = (frame.divisor * (frame.depth > 0))[0].permute(1, 2, 0).double().numpy()
+    light = {name: share * reflected for name, share in LIGHT_SHARES.items()}
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        light = {name: noisy(rng, mean, HIT_SHARES[name]) for name, mean in light.items()}
+        buffers = split_into_buffers(light, (seed, 1))
+    else:
+        buffers = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
+    channels = light | buffers
+    tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
+    return replace(frame, channels=frame.channels | tensors)
+
+
+@lru_cache(maxsize=4 * NOISE_PERIOD)
+def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -> Frame:
+    """Frame `index` of the synthetic sequence, with surfaces changed before they are lit."""
+    return lit(surfaces(synthetic_frame(index, *size)), seed)
 
 
 @dataclass(frozen=True)

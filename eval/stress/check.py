@@ -1,18 +1,19 @@
 """One denoiser in one stress case: its errors, and the requirements that it breaks."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.stress.cases import RECOVERY_LIMIT, SPOILED_FRAME, StressCase
+from eval.bench.timed import network_of
+from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, StressCase
 from eval.stress.changes import FrameChange, PixelChange, unchanged
 from eval.stress.irradiance_range import ROUNDING, range_violation
-from eval.stress.lit_frames import NOISE_PERIOD
-from eval.stress.logits import largest_logits
 from models.denoiser import Denoiser
 from models.spec import PRECISIONS
 
@@ -21,6 +22,7 @@ ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by
 ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
 FRESH = "fresh"  # instead of a file: random weights
 BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
+MIN_LOGIT_SCALE = 1e-30  # divisor of logits that are all 0
 REQUIREMENTS = {
     "finite": "outputs are finite where inputs are finite",
     "range": "convex filters stay within the range of irradiance since the last reset; no other goes below 0",
@@ -61,6 +63,33 @@ def largest_finite(errors: Iterable[Tensor]) -> float | None:
 def max_residue(precision: str) -> float:
     """The largest change, relative to the brightest pixel, that counts as none in a precision of PRECISIONS."""
     return max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
+
+
+def last_layers(denoiser: Denoiser) -> list[nn.Module]:
+    """The layers of a kernel predictor whose outputs are its logits; empty for other denoisers."""
+    network = network_of(denoiser)
+    if isinstance(network, nn.Sequential):
+        return [network[-1]]
+    return list(getattr(network, "heads", ()))
+
+
+@contextmanager
+def largest_logits(denoiser: Denoiser, size: float | None) -> Iterator[None]:
+    """Scale the logits so that the largest of each frame is `size`, unless that is None."""
+    if size is None:
+        yield
+        return
+
+    def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
+        logits = output.float()  # the factor may overflow half precision
+        return (logits * (size / logits.abs().max().clamp(min=MIN_LOGIT_SCALE))).to(output.dtype)
+
+    hooks = [layer.register_forward_hook(scale) for layer in last_layers(denoiser)]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from tqdm import tqdm
 from errors import BadInput
 from eval.selection import cannot_run, choose, untrained, weights_file
 from eval.stress.cases import LONG_CASE, STRESS_CASES, StressCase
-from eval.stress.check import FRESH, StressCheck, StressRow
-from eval.stress.logits import last_layers
+from eval.stress.check import FRESH, StressCheck, StressRow, last_layers
 from eval.stress.tables import details, error_table, heat_map, verdict_text
 from files import write_file, write_json
 from models.denoiser import Denoiser
@@ -28,12 +27,9 @@ def stressed(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSpec
 
     Raises BadInput where a named one is unknown or cannot run, and for NAME@BUDGET without its weights.
     """
-
-    def lacks_its_own(name: DenoiserName) -> str | None:
-        return untrained(runs, budget, name) if name.budget else None
-
     specs = []
-    for name in choose(names, map(DenoiserName, DENOISERS), cannot_run, lacks_its_own):
+    obstacles = (cannot_run, lambda name: untrained(runs, budget, name) if name.budget else None)
+    for name in choose(names, map(DenoiserName, DENOISERS), *obstacles):
         file = weights_file(name, runs, budget)
         specs.append(DenoiserSpec(name, weights=file if file and file.exists() else None))
     return specs

@@ -16,16 +16,16 @@ from eval.bench.sample_cost import RENDERER, Cost, sample_cost
 from eval.bench.sizes import parse_size
 from eval.clip_run import NamedDenoiser
 from eval.harness import clips_of_one_spp, evaluate_clip
+from eval.metrics import METRICS
 from eval.results import ClipResults, Result, by_clip
 from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
-from eval.tradeoff.plots import draw_samples
 from eval.tradeoff.resampled_clips import scene_of, with_samples
 from eval.tradeoff.times import Times
 from eval.tradeoff.trades import Trade, front_table, samples_table, trades
 from files import write_json
 from models.registry import DENOISERS, DenoiserName, shipped_names
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
-from plotting import save_figure
+from plotting import DPI, Figure, plt, save_figure, ticker
 from provenance import DENOISING, device_in_words, versions
 from render.clip import Options
 
@@ -134,6 +134,35 @@ def sample_costs(clips: Sequence[Clip], dataset: Dataset, times: Times) -> dict[
         f"{clip.scene}/{clip.name}": sample_cost(scene_of(clip, dataset)[0], *times.size, times.threads, options)
         for clip in tqdm(clips, f"rendering {times.name}", unit="scene", leave=False)
     }
+
+
+def draw_samples(rows: Sequence[Trade], title: str) -> Figure:
+    """PSNR against samples per pixel, and against milliseconds of rendering and filtering; one row per signal."""
+    signals = list(dict.fromkeys(row.signal for row in rows))
+    size = (11, 4.5 * len(signals))
+    figure, axes = plt.subplots(len(signals), 2, figsize=size, dpi=DPI, layout="constrained", squeeze=False)
+    for (left, right), signal in zip(axes, signals, strict=True):
+        ours = [row for row in rows if row.signal == signal]
+        for label in dict.fromkeys(row.label for row in ours):
+            line = [row for row in ours if row.label == label]
+            psnr = [row.metrics["psnr"] for row in line]
+            (drawn,) = left.plot([row.spp for row in line], psnr, "o-", ms=4, lw=1.2, label=label)
+            if all(row.ms is not None for row in line):
+                right.plot([row.ms for row in line], psnr, "o-", ms=4, lw=1.2, color=drawn.get_color())
+        left.set_xscale("log", base=2)
+        left.set(xlabel="samples a pixel", ylabel=f"{METRICS['psnr'].title}, {signal} light")
+        levels = sorted({row.spp for row in ours})
+        left.set_xticks(levels, map(str, levels))
+        right.set(xlabel="ms a frame, rendering and filter")
+        right.set_xscale("log")
+        right.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        right.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))  # 2, 5, 10, 20 instead of powers
+        right.xaxis.set_minor_formatter(ticker.NullFormatter())
+        left.legend(fontsize=8)
+        for axis in (left, right):
+            axis.grid(alpha=0.3, which="both")
+    figure.suptitle(title, fontsize=9)
+    return figure
 
 
 def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, times: Times) -> str:

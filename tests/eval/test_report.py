@@ -17,7 +17,7 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.disocclusion_crops import Crop, densest_crop
+from eval.clip_run import Crop, densest_crop
 from eval.harness import evaluate_clip, named_denoisers
 from eval.metrics import METRICS, flip_map
 from eval.report.page import report

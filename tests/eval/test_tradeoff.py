@@ -16,9 +16,8 @@ from eval.means import compared_mean, joint_floor
 from eval.report.trade_plot import trade_plot
 from eval.results import NOISE_FLOOR, ClipResults, Result
 from eval.tradeoff.pareto import Point, dominated_by_name
-from eval.tradeoff.plots import draw_samples
 from eval.tradeoff.resampled_clips import rendered, scene_of, with_samples
-from eval.tradeoff.run import candidates, check_levels, trade
+from eval.tradeoff.run import candidates, check_levels, draw_samples, trade
 from eval.tradeoff.times import Times
 from eval.tradeoff.trades import Trade, trades
 from files import read_json, write_json
