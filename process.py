@@ -10,9 +10,15 @@ MMAP_MAX = -4
 
 
 def set_up_process() -> None:
-    """Keep freed memory, and let waiting threads sleep soon. Call it before PyTorch is imported."""
+    """Keep freed memory, and let OpenMP threads that wait for each other sleep after 2000 spins.
+
+    By default GCC's runtime spins 300 000 times: where other processes are busy, that takes the time slices of the very
+    thread that is waited for. Sleeping at once slows training steps of small layers on a quiet machine. A user's own
+    OMP_WAIT_POLICY is kept. Call it before PyTorch is imported.
+    """
     keep_freed_memory()
-    wait_briefly()
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 
 def keep_freed_memory() -> None:
@@ -24,13 +30,3 @@ def keep_freed_memory() -> None:
         libc = ctypes.CDLL(None)
         libc.mallopt(MMAP_MAX, 0)
         libc.mallopt(TRIM_THRESHOLD, 2**31 - 1)
-
-
-def wait_briefly() -> None:
-    """Let OpenMP threads that wait for each other sleep after 2000 spins, unless the user has set how they wait.
-
-    By default GCC's runtime spins 300 000 times: where other processes are busy, that takes the time slices of the very
-    thread that is waited for. Sleeping at once slows training steps of small layers on a quiet machine.
-    """
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", "2000")

@@ -26,29 +26,6 @@ def mean_floor(frames: list[Values]) -> Values:
     return floors
 
 
-def joint_floor(clips: Sequence[Values], floors: Sequence[Values]) -> Values:
-    """Noise floors of means over clips; None unless every clip is within its own floor."""
-
-    def near(metric: str) -> bool:
-        pairs = [(clip.get(metric), floor.get(metric)) for clip, floor in zip(clips, floors, strict=True)]
-        return all(within_floor(metric, *pair) for pair in pairs if pair[0] is not None)
-
-    return {metric: floor if near(metric) else None for metric, floor in mean_floor(list(floors)).items()}
-
-
-def compared_mean(metric: str, clips: Sequence[Values], floors: Sequence[Values]) -> float | None:
-    """The mean over clips, in the digits shown, by which denoisers are ranked.
-
-    The value of a clip within its noise floor is replaced by the floor's edge. None where the metric is never defined.
-    """
-    values = []
-    for value, floor in ((c[metric], f.get(metric)) for c, f in zip(clips, floors, strict=True)):
-        if value is not None:
-            near = floor is not None and within_floor(metric, value, floor)
-            values.append(METRICS[metric].edge(floor) if near else value)  # type: ignore[arg-type]
-    return float(METRICS[metric].form.format(fmean(values))) if values else None
-
-
 @dataclass(frozen=True)
 class ClipScores:
     """A denoiser's metrics on several clips, and the noise floors of these."""
@@ -62,10 +39,27 @@ class ClipScores:
 
     @property
     def joint_floor(self) -> Values:
-        return joint_floor(self.values, self.floors)
+        """Noise floors of the means; None unless every clip is within its own floor."""
+
+        def near(metric: str) -> bool:
+            pairs = [
+                (clip.get(metric), floor.get(metric)) for clip, floor in zip(self.values, self.floors, strict=True)
+            ]
+            return all(within_floor(metric, *pair) for pair in pairs if pair[0] is not None)
+
+        return {metric: floor if near(metric) else None for metric, floor in mean_floor(self.floors).items()}
 
     def compared(self, metric: str) -> float | None:
-        return compared_mean(metric, self.values, self.floors)
+        """The mean, in the digits shown, by which denoisers are ranked.
+
+        The value of a clip within its noise floor is replaced by the floor's edge. None where it is never defined.
+        """
+        values = []
+        for value, floor in ((c[metric], f.get(metric)) for c, f in zip(self.values, self.floors, strict=True)):
+            if value is not None:
+                near = floor is not None and within_floor(metric, value, floor)
+                values.append(METRICS[metric].edge(floor) if near else value)  # type: ignore[arg-type]
+        return float(METRICS[metric].form.format(fmean(values))) if values else None
 
 
 def scores_of(clips: Sequence[ClipResults], denoiser: str) -> ClipScores:

@@ -28,13 +28,6 @@ MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
 SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
-SOURCES = {
-    "eval": "onespp eval",
-    "bench": "onespp bench denoisers",
-    "trade": "onespp trade",
-    "stress": "onespp stress --long",
-    "times": "make",
-}
 
 
 # --- Extracts ---------------------------------------------------------------------------------------------------------
@@ -97,18 +90,18 @@ def extract_times(runs: Path) -> dict[str, Any]:
     return {"device": device_in_words()} | {name: int(file.read_text()) for name, file in files.items()}
 
 
-EXTRACTS: dict[str, Callable[[Path], dict[str, Any]]] = {
-    "eval": extract_eval,
-    "bench": extract_bench,
-    "trade": extract_trade,
-    "stress": extract_stress,
-    "times": extract_times,
+EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the command that measures, and the extract
+    "eval": ("onespp eval", extract_eval),
+    "bench": ("onespp bench denoisers", extract_bench),
+    "trade": ("onespp trade", extract_trade),
+    "stress": ("onespp stress --long", extract_stress),
+    "times": ("make", extract_times),
 }
 
 
 def collect(runs: Path) -> Iterator[Path]:
     """Extract what RUNS holds of EXTRACTS into docs/measured; yields the files."""
-    for name, extract in EXTRACTS.items():
+    for name, (_, extract) in EXTRACTS.items():
         try:
             content = extract(runs)
         except BadInput as missing:
@@ -125,7 +118,7 @@ def measured(name: str) -> dict[str, Any]:
     """An extract. Raises BadInput, naming the command that measures it, where there is none."""
     path = MEASURED / f"{name}.json"
     if not path.exists():
-        raise BadInput(f"not measured: `{SOURCES[name]}`, then `python -m eval.pages RUNS`")
+        raise BadInput(f"not measured: `{EXTRACTS[name][0]}`, then `python -m eval.pages RUNS`")
     return read_json(path)
 
 

@@ -122,31 +122,25 @@ def facts(name: str) -> str:
     metadata = read_metadata(weights)
     recipe = metadata["recipe"]
     data = recipe["data"]
+    fields = {key: recipe[key] for key in ("parameters", "budget", "seed", "step", "validation")}
+    fields |= {key: measured[key] for key in ("signal", "precision", "device", "versions")}
     return FACTS.format(
+        **fields,
         name=name,
-        parameters=recipe["parameters"],
         bytes=weights.stat().st_size,
         digest=file_digest(weights),
         licence=WEIGHTS_LICENCE,
-        budget=recipe["budget"],
-        seed=recipe["seed"],
         data=Path(data["profile"]).name,
         data_seed=data["seed"],
         generator=data["generator"],
         scenes=len(data["scenes"]),
         start=f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
-        step=recipe["step"],
-        validation=recipe["validation"],
         recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
         makers=" and ".join(
             f"{version_list(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]
         ),
         count=measured["clips"],
         dataset="`, `".join(measured["datasets"]),
-        signal=measured["signal"],
-        precision=measured["precision"],
-        device=measured["device"],
-        versions=measured["versions"],
         means=tabulate(measured["means"], "keys", "github", disable_numparse=True),
         metric=METRICS["psnr"].title,
         clips=tabulate(measured["psnr"], "keys", "github", disable_numparse=True),

@@ -67,15 +67,11 @@ class AccumulatedCrops(TorchDataset[Crops]):
         self.clips = clips
         self.crop = crop
         self.seed = seed
-        self.epoch = 0
+        self.epoch = 0  # that whose crops come next
         self.channels = (*network.filter_reads, *REFERENCE_CHANNELS)
         frames = np.array([clip.frames for clip in clips])
         self.share = frames / frames.sum()
         self.count = int(count * frames.sum())
-
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch whose crops come next."""
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return self.count

@@ -86,15 +86,11 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         self.augmentation = augmentation
         self.seed = seed
         self.whole_frames = WholeFrames(signal) if signal else None
-        self.epoch = 0
+        self.epoch = 0  # that whose sequences come next
         pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
         self.probabilities = pixels / pixels.sum()
         area = crop * crop if crop else pixels.sum() / sum(clip.frames for clip in clips)
         self.count = max(1, round(pixels.sum() / (length * area)))
-
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch whose sequences come next."""
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return self.count

@@ -183,7 +183,7 @@ class Training:
         world = self.fabric.world_size
         while not self.finished:
             epoch, first = divmod(self.position.done, self.per_epoch)
-            self.items.set_epoch(epoch)
+            self.items.epoch = epoch
             batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.micro_batch, rank, world)
             for batch in in_parts(loader(self.items, batches), self.parts):
                 row = self.step(batch)

@@ -19,7 +19,6 @@ from eval.selection import evaluated
 from files import write_file, write_json
 from models.denoiser import Denoiser, State
 from models.operators import finite
-from models.spec import DenoiserSpec
 from plotting import DPI, Figure, plt, save_figure
 from provenance import device_in_words
 from render.clip import Sampling
@@ -100,13 +99,6 @@ def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[floa
     return values
 
 
-def lag_of(spec: DenoiserSpec, clips: dict[str, Clip]) -> Lag:
-    """PSNR of a denoiser on all clips, at the exposure of the one whose light does not change."""
-    denoiser = spec.build()
-    exposure = clips[STEADY].exposure
-    return Lag(spec.name, {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()})
-
-
 def lag_table(lags: Sequence[Lag]) -> str:
     """One row per denoiser, sorted by the loss in the last column."""
     heads = ["denoiser", f"steady light, frame {LIGHT_CLIP_SIZE[0] - 1}", *(f"loss {n} frames after" for n in AFTER)]
@@ -141,7 +133,11 @@ def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
     specs = evaluated(names, runs, budget)
     folder = bench_folder(runs) / "light"
     clips = {change: clip_of(change, folder) for change in BEFORE}
-    lags = [lag_of(spec, clips) for spec in tqdm(specs, "denoisers", unit="denoiser")]
+    exposure = clips[STEADY].exposure  # of all clips
+    lags = []
+    for spec in tqdm(specs, "denoisers", unit="denoiser"):
+        denoiser = spec.build()
+        lags.append(Lag(spec.name, {name: psnr_of_frames(denoiser, clip, exposure) for name, clip in clips.items()}))
     save_figure(folder / "plot.png", lag_figure(lags))
     table = lag_table(lags)
     write_file(folder / "table.md", f"{table}\n".encode())

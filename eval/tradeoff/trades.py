@@ -47,28 +47,6 @@ class Trade:
         return value_cell(metric, self.metrics[metric], self.floors.get(metric))
 
 
-def trade_of(
-    spec: DenoiserSpec, spp: int, clips: Sequence[ClipResults], render_ms: float, filter_ms: float | None, name: str
-) -> Trade:
-    """A row that has not been compared with others."""
-    scores = scores_of(by_signal(clips)[spec.returns], spec.label)
-    return Trade(
-        name=name,
-        label=spec.label,
-        denoiser=spec.name,
-        dtype=spec.precision,
-        signal=spec.returns,
-        spp=spp,
-        render_ms=render_ms,
-        filter_ms=filter_ms,
-        ms=None if filter_ms is None else render_ms + filter_ms,
-        metrics=scores.means,
-        floors=scores.joint_floor,
-        compared={metric: scores.compared(metric) for metric in TRADED},
-        dominated_by={},
-    )
-
-
 def trades(
     specs: Sequence[DenoiserSpec],
     results: Mapping[int, Sequence[ClipResults]],
@@ -82,7 +60,24 @@ def trades(
     rows = []
     for spp, spec in product(results, specs):
         name = spec.label if len(results) == 1 else f"{spec.label}, {spp} spp"
-        rows.append(trade_of(spec, spp, results[spp], render_ms[spp], times.of(spec), name))
+        scores = scores_of(by_signal(results[spp])[spec.returns], spec.label)
+        filter_ms = times.of(spec)
+        row = Trade(
+            name=name,
+            label=spec.label,
+            denoiser=spec.name,
+            dtype=spec.precision,
+            signal=spec.returns,
+            spp=spp,
+            render_ms=render_ms[spp],
+            filter_ms=filter_ms,
+            ms=None if filter_ms is None else render_ms[spp] + filter_ms,
+            metrics=scores.means,
+            floors=scores.joint_floor,
+            compared={metric: scores.compared(metric) for metric in TRADED},
+            dominated_by={},
+        )
+        rows.append(row)
     for signal, metric in product(dict.fromkeys(row.signal for row in rows), TRADED):
         alike = [row for row in rows if row.signal == signal]
         beaten = dominated_by_name({row.name: Point.of(row.ms, row.compared[metric]) for row in alike}, metric)

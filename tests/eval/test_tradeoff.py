@@ -12,7 +12,7 @@ from datasets.frame import read_frame
 from errors import BadInput
 from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.harness import clips_of_one_spp
-from eval.means import compared_mean, joint_floor
+from eval.means import ClipScores
 from eval.report.trade_plot import trade_plot
 from eval.results import NOISE_FLOOR, ClipResults, Result
 from eval.tradeoff.pareto import Point, dominated_by_name
@@ -69,30 +69,30 @@ def test_fronts_by_brute_force(metric, sign):
 
 
 def test_digits_that_are_not_shown_do_not_make_a_front():
-    shown = [compared_mean("psnr", [{"psnr": psnr}], [{"psnr": 99.0}]) for psnr in (30.001, 30.004, 30.011)]
+    shown = [ClipScores([{"psnr": psnr}], [{"psnr": 99.0}]).compared("psnr") for psnr in (30.001, 30.004, 30.011)]
     assert shown == [30.0, 30.0, 30.01]
 
 
 def test_values_within_the_noise_floor_are_equal():
     floor = [{"psnr": 40.0}]
-    assert [compared_mean("psnr", [{"psnr": psnr}], floor) for psnr in (30.0, 36.0, 38.0, 41.0)] == [
+    assert [ClipScores([{"psnr": psnr}], floor).compared("psnr") for psnr in (30.0, 36.0, 38.0, 41.0)] == [
         30,
         36,
         36.99,
         36.99,
     ]
-    assert compared_mean("mse_unbiased", [{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]) == 2e-6
-    assert compared_mean("ssim", [{"ssim": None}], floor) is None
+    assert ClipScores([{"mse_unbiased": -1e-9}], [{"mse_unbiased": 1e-6}]).compared("mse_unbiased") == 2e-6
+    assert ClipScores([{"ssim": None}], floor).compared("ssim") is None
 
 
 def test_a_hard_clips_floor_hides_no_error_of_another():
     """Within the mean of the floors, 0.55, by far; but on the second clip 0.8 and 0.95 are apart."""
     floors = [{"ssim": 0.1, "mse_unbiased": 1e-6}, {"ssim": 1.0, "mse_unbiased": 1e-6}]
     a, b = ([{"ssim": 0.3, "mse_unbiased": 0.0}, {"ssim": s, "mse_unbiased": 0.0}] for s in (0.8, 0.95))
-    assert joint_floor(a, floors) == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
-    assert compared_mean("ssim", a, floors) < compared_mean("ssim", b, floors)
+    assert ClipScores(a, floors).joint_floor == {"ssim": None, "mse_unbiased": pytest.approx(1e-6 / math.sqrt(2))}
+    assert ClipScores(a, floors).compared("ssim") < ClipScores(b, floors).compared("ssim")
     both = [{"ssim": 0.1, "mse_unbiased": 1e-6}] * 2
-    assert joint_floor(a, both)["ssim"] == pytest.approx(0.1)
+    assert ClipScores(a, both).joint_floor["ssim"] == pytest.approx(0.1)
 
 
 def clip_results(**psnr: float) -> ClipResults:

@@ -56,7 +56,7 @@ def test_a_crop_depends_on_seed_epoch_and_index_only(clips, cache):
     _ = b[0], b[1]  # whatever was read before
     assert torch.equal(a[5].irradiance, b[5].irradiance)
     assert not torch.equal(a[5].irradiance, a[6].irradiance)
-    b.set_epoch(1)
+    b.epoch = 1
     assert not torch.equal(a[5].irradiance, b[5].irradiance)
     assert not torch.equal(a[5].irradiance, crops(clips, cache, seed=1)[5].irradiance)
     assert len(a) == 3 * sum(clip.frames for clip in clips)

@@ -147,7 +147,7 @@ def are_equal(a: Frame, b: Frame) -> bool:
 
 def test_batches_are_the_same_whatever_the_number_of_workers(clips):
     data = sequences(clips, AUGMENTATIONS["all"])
-    data.set_epoch(4)
+    data.epoch = 4
     numbers = list(range(len(data)))
     batches = [numbers[first : first + 2] for first in range(0, len(data), 2)]
     alone, shared = (list(loader(data, batches, workers)) for workers in (0, 2))
@@ -160,13 +160,13 @@ def test_an_item_depends_on_seed_epoch_and_index_only(clips):
     a = sequences(clips, AUGMENTATIONS["all"])
     b = sequences(clips, AUGMENTATIONS["all"])
     for epoch in (3, 0):
-        a.set_epoch(epoch)
-        b.set_epoch(epoch)
+        a.epoch = epoch
+        b.epoch = epoch
         a[5]  # reading another item in between changes nothing
         for x, y in zip(a[2], b[2], strict=True):
             assert are_equal(x, y)
     first = a[0][0].direct
-    a.set_epoch(1)
+    a.epoch = 1
     assert not torch.equal(first, a[0][0].direct)
     assert not torch.equal(first, sequences(clips, AUGMENTATIONS["all"], seed=1)[0][0].direct)
 
