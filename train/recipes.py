@@ -113,17 +113,11 @@ ONE_BUDGETS: Budgets = {
 
 PAPERS_AND_BUDGETS: dict[str, tuple[Recipe, Budgets]] = {
     "rae": (RAE_RECIPE, RAE_BUDGETS),
-    "wskp3": (WSKP_RECIPE, WSKP_BUDGETS),
-    "wskp6": (WSKP_RECIPE, WSKP_BUDGETS),
-    "wskp-mr": (WSKP_RECIPE, WSKP_BUDGETS),
-    "kp": (WSKP_RECIPE, WSKP_BUDGETS),
-    "mr-kp": (WSKP_RECIPE, WSKP_BUDGETS),
+    **dict.fromkeys(("wskp3", "wskp6", "wskp-mr", "kp", "mr-kp"), (WSKP_RECIPE, WSKP_BUDGETS)),
     "nbgd": (NBGD_RECIPE, NBGD_BUDGETS),
     "lbf": (LBF_RECIPE, LBF_BUDGETS),
-    "ntd-a": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
-    "ntd-b": (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS),
-    "ntd": (NTD_RECIPE, NTD_BUDGETS),
-    "ntd-mean": (NTD_RECIPE, NTD_BUDGETS),
+    **dict.fromkeys(("ntd-a", "ntd-b"), (NTD_RECIPE_WITHOUT_OCCLUSION, NTD_BUDGETS)),
+    **dict.fromkeys(("ntd", "ntd-mean"), (NTD_RECIPE, NTD_BUDGETS)),
     "one": (ONE_RECIPE, ONE_BUDGETS),
 }
 

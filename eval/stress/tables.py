@@ -31,19 +31,14 @@ def error_cell(row: StressRow | None) -> str:
     return short(row.error) + (" !" if row.broken else "")
 
 
-def weights_cell(weights: str | None) -> str:
-    if weights is None:
-        return "-"
-    return FRESH if weights == FRESH else "trained"
-
-
 def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
     """One column per denoiser: its error in each case, and a summary of the rest."""
     weights = {row.denoiser: row.weights for row in rows}
     by_case = {(row.denoiser, row.extreme): row for row in rows}
     by_denoiser = {name: [row for row in rows if row.denoiser == name] for name in weights}
 
-    lines = [["weights", *(weights_cell(file) for file in weights.values())]]
+    cells = {None: "-", FRESH: FRESH}
+    lines = [["weights", *(cells.get(file, "trained") for file in weights.values())]]
     lines += [[case.name, *(error_cell(by_case.get((name, case.name))) for name in weights)] for case in cases]
     for case in cases:
         if case.only is not None:
