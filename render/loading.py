@@ -17,6 +17,9 @@ from scenes.bsdf import Bsdf
 T = TypeVar("T", np.float32, np.uint32)
 
 
+PLACE = "_place"  # where a file describes it: a key in descriptions that Mitsuba does not get
+
+
 def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
     """A Mitsuba dictionary with the numpy arrays of bitmaps as Mitsuba's types."""
 
@@ -29,7 +32,7 @@ def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
             return mi.TensorXf(upload(np.float32(value).ravel()), value.shape)
         return value
 
-    return {key: convert(key, value) for key, value in description.items()}
+    return {key: convert(key, value) for key, value in description.items() if key != PLACE}
 
 
 def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
@@ -140,7 +143,7 @@ class StockLoader:
 
     def load(self, description: Mapping[str, Any]) -> Any:
         if id(description) not in self.loaded:
-            what = str(description.get("filename", f"a {description['type']}"))
+            what = f"{description.get('filename', description['type'])}{description.get(PLACE, '')}"
             loaded = self.made(self.resolved(description), what)
             self.loaded[id(description)] = (description, loaded)
             if isinstance(loaded, mi.Shape):
@@ -160,7 +163,7 @@ class StockLoader:
                 return mi.ScalarTransform4f(value)
             return to_mitsuba({key: value})[key]
 
-        return {key: resolve(key, value) for key, value in description.items()}
+        return {key: resolve(key, value) for key, value in description.items() if key != PLACE}
 
     def placed(self, geometry: Mapping[str, Any]) -> dict[str, Any]:
         """The description of a shape or light, scaled from world units."""
@@ -172,7 +175,8 @@ class StockLoader:
         """Raises BadInput, naming the shape and its file, if it cannot be loaded or is damaged."""
         parts = {"bsdf": shape.bsdf, "emitter": shape.emitter}
         nested = {key: self.load(value) for key, value in parts.items() if value is not None}
-        where = f"shape '{shape.name}'" + (f" ({shape.geometry['filename']})" if "filename" in shape.geometry else "")
+        where = f"shape '{shape.name}'{shape.geometry.get(PLACE, '')}"
+        where += f" ({shape.geometry['filename']})" if "filename" in shape.geometry else ""
         loaded = self.made(self.resolved(self.placed(shape.geometry)) | nested | {"id": shape.name}, where)
         check_shape(loaded, where)
         return loaded
@@ -184,7 +188,8 @@ class StockLoader:
             emitter["position"] = [x / self.unit for x in emitter["position"]]
         else:
             emitter = self.placed(emitter)
-        return self.made(self.resolved(emitter) | {"id": light.name}, f"light '{light.name}'")
+        where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
+        return self.made(self.resolved(emitter) | {"id": light.name}, where)
 
 
 def unreferenced(error: RuntimeError) -> set[str]:

@@ -8,8 +8,9 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
+from render.loading import PLACE
 from render.scene_file.stand_ins import GREY, REPAIRS, SURFACE_LIGHTS, Names, Properties, StandIn, plugins, stand_in
-from render.scene_file.xml import inside, parse
+from render.scene_file.xml import ParsedFile, inside
 from scenes.animation import StockLight, StockShape
 from scenes.bsdf import diffuse_bsdf, rgb
 
@@ -52,15 +53,17 @@ class Converter:
 
     def __init__(self, path: Path):
         self.root = path.resolve().parent
-        self.state, self.searched, notes = parse(path)
+        self.parsed = ParsedFile(path)
+        self.state = self.parsed.state
         self.made: dict[int, Properties | None] = {}
-        self.file = SceneFile(path.resolve(), notes=notes)
+        self.file = SceneFile(path.resolve(), notes=self.parsed.notes)
         self.names = Names()
 
     def note(self, text: str, node: mi.parser.SceneNode | None = None) -> None:
         """Add a note, on a node by its id, its file, or its plugin."""
         if node is not None:
-            text = f"{node.props.id() or str(node.props.get('filename', '')) or node.props.plugin_name()}: {text}"
+            name = node.props.id() or str(node.props.get("filename", "")) or node.props.plugin_name()
+            text = f"{name}{self.parsed.line_of(node)}: {text}"
         self.file.notes.append(text)
 
     def kind(self, index: int) -> str:
@@ -81,7 +84,7 @@ class Converter:
         node = self.state.nodes[index]
         kind = self.kind(index)
         plugin = node.props.plugin_name()
-        described: Properties = {"type": plugin}
+        described: Properties = {"type": plugin, PLACE: self.parsed.line_of(node)}
         for key in node.props:
             value = self.value(node, key)
             if key == "type":  # in dictionaries this is the plugin's name
@@ -98,7 +101,8 @@ class Converter:
         repair = REPAIRS[found["type"]](found) if found and found["type"] in REPAIRS else None
         if repair is None:
             return found
-        self.note(repair[1], node)
+        if repair[1]:
+            self.note(repair[1], node)
         return repair[0]
 
     def value(self, node: mi.parser.SceneNode, key: str) -> Any:
@@ -138,7 +142,7 @@ class Converter:
         if "filename" not in described:
             return described
         name = str(described["filename"])
-        for folder in self.searched:
+        for folder in self.parsed.searched:
             path = inside(self.root, str(folder / name), self.file.path)
             if path.is_file():
                 return described | {"filename": str(path)}

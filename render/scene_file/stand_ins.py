@@ -114,6 +114,24 @@ def with_properties(words: str, **properties: Any) -> Callable[[Properties], Sta
     return lambda described: (described | properties, words)
 
 
+def old_sky(described: Properties) -> StandIn:
+    return {"type": "sunsky", "sky_scale": 1.0, "sun_scale": 0.0} | renamed(
+        described, scale="sky_scale"
+    ), "the sky of sunsky"
+
+
+def old_sun(described: Properties) -> StandIn:
+    degrees = 0.5358 * number_of(described, "sun_radius_scale", 1.0)
+    sun = {"type": "sunsky", "sun_scale": 1.0, "sky_scale": 0.0, "sun_aperture": degrees}
+    return sun | renamed(described, scale="sun_scale", sun_radius_scale=None), "the sun of sunsky"
+
+
+def renamed(described: Properties, **names: str | None) -> Properties:
+    """The properties but for the type, some of them under other names, or left out."""
+    pairs = ((names.get(name, name), value) for name, value in described.items() if name != "type")
+    return {name: value for name, value in pairs if name is not None}
+
+
 # By plugins of versions before 3.
 OLD_PLUGINS: dict[str, Callable[[Properties], StandIn]] = {
     "phong": phong,
@@ -122,12 +140,13 @@ OLD_PLUGINS: dict[str, Callable[[Properties], StandIn]] = {
     "roughcoating": coated,
     "mixturebsdf": mixture,
     "bump": with_properties("bumpmap, its current name", type="bumpmap"),
-    "sky": with_properties("the sky of sunsky", type="sunsky", sun_scale=0.0),
-    "sun": with_properties("the sun of sunsky", type="sunsky", sky_scale=0.0),
+    "sky": old_sky,
+    "sun": old_sun,
     "scale": scaled,
     "gridtexture": with_properties("a checkerboard", type="checkerboard"),
     "ldrtexture": with_properties("bitmap, its current name", type="bitmap"),
     "exrtexture": with_properties("bitmap, its current name", type="bitmap"),
+    "perspective_rdist": with_properties("a perspective camera without distortion", type="perspective"),
 }
 
 
@@ -200,13 +219,70 @@ def black_body(described: Properties) -> StandIn:
     return tabulated(nm, radiance * number_of(described, "scale", 1))
 
 
-# By plugins of this Mitsuba: the stand-in if an object cannot be rendered as described, else None.
+DISTRIBUTIONS = ("beckmann", "ggx")
+FILTERS = ("bilinear", "nearest")
+WRAP_MODES = ("repeat", "mirror", "clamp")
+
+
+def valid_microfacets(described: Properties) -> StandIn | None:
+    """Before version 3 there were the distributions "phong" and "as", with the width of Beckmann's for an alpha."""
+    distribution = described.get("distribution", "beckmann")
+    if distribution in DISTRIBUTIONS:
+        return valid_metal(described)
+    valid = described | {"distribution": "beckmann"}
+    return (valid_metal(valid) or (valid, ""))[0], f"Beckmann's distribution instead of '{distribution}'"
+
+
+def valid_metal(described: Properties) -> StandIn | None:
+    """Metals are tabulated in files of Mitsuba's; "none" is a perfect mirror."""
+    metal = described.get("material", "none")
+    if metal == "none" or (Path(mi.__file__).parent / "data" / "ior" / f"{metal}.eta.spd").exists():
+        return None
+    return described | {"material": "none"}, f"this Mitsuba has no material '{metal}': a perfect mirror instead"
+
+
+def valid_bitmap(described: Properties) -> StandIn | None:
+    """Bitmaps of versions before 3 had other filters and edges, and a gamma; 1 is for values that are no colours."""
+    if "filename" not in described:
+        return GREY, "grey, because its file is not named"
+    wraps = {str(described[name]) for name in ("wrap_mode", "wrap_mode_u", "wrap_mode_v") if name in described}
+    wrap = next(iter(sorted(wraps & {*WRAP_MODES})), "clamp") if wraps else "repeat"
+    gamma = described.get("gamma", -1)
+    words = []
+    if wraps - {wrap}:
+        words.append(f"wrapped as '{wrap}'")
+    if described.get("filter_type", "bilinear") not in FILTERS:
+        words.append("filtered bilinearly")
+    if gamma not in (-1, 1):
+        words.append(f"decoded as sRGB, not with a gamma of {gamma}")
+    old = ("wrap_mode_u", "wrap_mode_v", "gamma", "cache", "max_anisotropy")
+    if not words and not described.keys() & {*old}:
+        return None
+    valid = renamed(described, **dict.fromkeys(old)) | {"type": "bitmap", "wrap_mode": wrap}
+    if valid.get("filter_type") not in FILTERS:
+        valid["filter_type"] = "bilinear"
+    return valid | ({"raw": True} if gamma == 1 else {}), ", ".join(words)
+
+
+def valid_lens(described: Properties) -> StandIn | None:
+    length = described.get("focal_length", "")
+    return None if isinstance(length, str) else (described | {"focal_length": f"{length}mm"}, "")
+
+
+# By plugins of this Mitsuba: the stand-in if an object cannot be rendered as described, else None;
+# its description is empty where that makes no difference.
 REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     "bumpmap": without_relief,
     "normalmap": without_relief,
     # Mitsuba crashes without a volume, and without a file or values.
     "volume": lambda described: None if has_volume(described) else (GREY, "grey, because its volume is missing"),
-    "bitmap": lambda described: None if "filename" in described else (GREY, "grey, because its file is not named"),
+    "bitmap": valid_bitmap,
+    "conductor": valid_metal,
+    "roughconductor": valid_microfacets,
+    "roughdielectric": valid_microfacets,
+    "roughplastic": valid_microfacets,
+    "perspective": valid_lens,
+    "thinlens": valid_lens,
     "spot": spot_without_texture,
     "shapegroup": dark_group,
     "instance": lambda described: None if nested(described) else (None, "an instance of nothing is left out"),

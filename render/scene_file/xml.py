@@ -1,11 +1,14 @@
 """Parses Mitsuba's XML files of this and earlier versions; nothing outside of their folder is read."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from typing import cast
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.parsers import expat
 
 import numpy as np
 
@@ -99,61 +102,185 @@ def searched_in(folder: Path) -> Iterator[None]:
             resolver.append(path)
 
 
+class LocatedElement(Element):
+    """An element that remembers its file and line."""
+
+    place = ""
+
+
+def read_elements(path: Path, folder: Path) -> LocatedElement:
+    """The root of an XML file, with the content of included files of the same version in place."""
+    parser = expat.ParserCreate()
+
+    def element(tag: str, attributes: dict[str, str]) -> LocatedElement:
+        made = LocatedElement(tag, attributes)
+        made.place = f"{path} line {parser.CurrentLineNumber}"
+        return made
+
+    builder = ElementTree.TreeBuilder(element_factory=element)
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(path.read_bytes(), True)
+    root = cast(LocatedElement, builder.close())
+    for include in root.findall("include[@filename]"):
+        part = read_elements(inside(folder, include.get("filename", ""), path), folder)
+        if part.get("version") == root.get("version"):
+            place = [*root].index(include)
+            root[place : place + 1] = [*part]
+    return root
+
+
+# --- Elements of old files --------------------------------------------------------------------------------------------
+
+Upgrade = Callable[[LocatedElement, Path], tuple[Element, str]]  # the element instead, and a note
+
+
+def split_numbers(text: str) -> list[str]:
+    return text.replace(",", " ").split()
+
+
 def linear_colour(colour: str) -> str:
     """The linear values of a colour of old files: #rrggbb, or three sRGB values."""
     if colour.startswith("#"):
         encoded = np.array([*bytes.fromhex(colour[1:7])]) / 255
     else:
-        encoded = np.array([float(value) for value in colour.replace(",", " ").split()])
+        encoded = np.array([float(value) for value in split_numbers(colour)])
     return ", ".join(f"{value:.6f}" for value in srgb_to_linear(encoded))
 
 
-def named_like(element: Element, tag: str, **attributes: str) -> Element:
-    """Another element under the same name."""
-    return Element(tag, {"name": element.get("name", "")} | attributes)
+def named_like(element: LocatedElement, tag: str, **attributes: str) -> LocatedElement:
+    """Another element under the same name, at the same place."""
+    made = LocatedElement(tag, {"name": element.get("name", "")} | attributes)
+    made.place = element.place
+    return made
 
 
-def upgrade(root: Element, path: Path) -> list[str]:
-    """Replace elements of old files that Mitsuba's parser does not support any more. Returns notes."""
+def with_parameters(element: LocatedElement, tag: str = "float", **parameters: str) -> LocatedElement:
+    for name, value in parameters.items():
+        parameter = LocatedElement(tag, {"name": name, "value": value})
+        parameter.place = element.place
+        element.append(parameter)
+    return element
+
+
+def old_subsurface(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    comment = cast(Element, ElementTree.Comment("subsurface"))
+    return comment, "subsurface scattering is left out: the surface alone is rendered"
+
+
+def old_animation(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    first = named_like(element, "transform")
+    first.extend(next(iter(element.findall("transform")), []))
+    return first, f"an <animation> ('{element.get('name')}'): its first transform instead"
+
+
+def old_srgb(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    return named_like(element, "rgb", value=linear_colour(element.get("value", ""))), ""
+
+
+def old_rgb(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    """Hexadecimal values are linear."""
+    value = element.get("value", "")
+    if value.startswith("#"):
+        element.set("value", ", ".join(f"{byte / 255:.6f}" for byte in bytes.fromhex(value[1:7])))
+    return element, ""
+
+
+def old_blackbody(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    parameters = {name: element.get(name, "1").strip(" K") for name in ("temperature", "scale")}
+    return with_parameters(named_like(element, "spectrum", type="blackbody"), **parameters), ""
+
+
+def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    """Three values without wavelengths are red, green and blue; more are evenly spaced from 360 to 830 nm."""
+    file = element.get("filename")
+    if file is not None and not (folder / file).exists():
+        note = f"the file {file} of a spectrum is missing: 0.5 everywhere instead"
+        return named_like(element, "spectrum", value="0.5"), note
+    values = split_numbers(element.get("value", ""))
+    if len(values) < 3 or any(":" in value for value in values):
+        return element, ""
+    if len(values) == 3:
+        return named_like(element, "rgb", value=", ".join(values)), ""
+    regular = named_like(element, "spectrum", type="regular")
+    with_parameters(regular, wavelength_min="360", wavelength_max="830")
+    return with_parameters(regular, "string", values=", ".join(values)), ""
+
+
+UPGRADES: dict[str, Upgrade] = {
+    "subsurface": old_subsurface,
+    "animation": old_animation,
+    "srgb": old_srgb,
+    "rgb": old_rgb,
+    "blackbody": old_blackbody,
+    "spectrum": old_spectrum,
+}
+RENAMED = {"lookAt": "lookat", "camera": "sensor", "luminaire": "emitter"}
+
+
+def upgrade(root: LocatedElement, folder: Path) -> list[str]:
+    """Replace what Mitsuba's parser does not support any more. Returns notes.
+
+    Raises ValueError, with its place, for an element whose value is invalid.
+    """
     notes = []
+    if root.get("version") is None:
+        notes.append("the file names no version: read as one of Mitsuba 0.6")
+        root.set("version", "0.6.0")
     for parent in root.iter():
-        for place, child in enumerate([*parent]):
-            if child.tag == "subsurface":
-                notes.append("subsurface scattering is left out: the surface alone is rendered")
-                parent[place] = ElementTree.Comment("subsurface")
-            elif child.tag == "animation":
-                notes.append(f"an <animation> ('{child.get('name')}'): its first transform instead")
-                parent[place] = named_like(child, "transform")
-                parent[place].extend(next(iter(child.findall("transform")), Element("transform")))
-            elif child.tag == "srgb":
-                parent[place] = named_like(child, "rgb", value=linear_colour(child.get("value", "")))
-            elif child.tag == "blackbody":
-                parent[place] = named_like(child, "spectrum", type="blackbody")
-                for name in ("temperature", "scale"):
-                    parent[place].append(Element("float", {"name": name, "value": child.get(name, "1").strip(" K")}))
-            elif child.tag == "spectrum" and not (path.parent / child.get("filename", "")).exists():
-                notes.append(f"the file {child.get('filename')} of a spectrum is missing: 0.5 everywhere instead")
-                parent[place] = named_like(child, "spectrum", value="0.5")
+        for index, child in enumerate(cast(list[LocatedElement], [*parent])):
+            child.attrib.pop("intent", None)
+            child.tag = RENAMED.get(child.tag, child.tag)
+            if child.tag in UPGRADES:
+                try:
+                    parent[index], note = UPGRADES[child.tag](child, folder)
+                except ValueError as error:
+                    raise ValueError(f"{child.place}, <{child.tag}>: {error}") from None
+                notes += [note] if note else []
     return [f"{notes.count(note)} times {note}" if notes.count(note) > 1 else note for note in dict.fromkeys(notes)]
 
 
-def parse(path: Path) -> tuple[mi.parser.ParserState, list[Path], list[str]]:
-    """The nodes of a scene file with references resolved, the folders for its files, and notes of omissions.
+# --- Parsing ----------------------------------------------------------------------------------------------------------
 
-    Raises BadInput, naming the file, if it is invalid.
+
+class ParsedFile:
+    """The nodes of a scene file with references resolved; `searched` are the folders for its files.
+
+    `notes` list omissions. Raises BadInput, naming file, line and element, if it is invalid.
     """
-    path = path.resolve()
-    searched = check_includes(path)
-    config = mi.parser.ParserConfig(VARIANT)
-    config.unused_parameters = mi.LogLevel.Debug
-    keeping_lines = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
-    root = ElementTree.fromstring(path.read_bytes(), keeping_lines)
-    with searched_in(path.parent):
+
+    def __init__(self, path: Path):
+        path = path.resolve()
+        self.searched = check_includes(path)
+        config = mi.parser.ParserConfig(VARIANT)
+        config.unused_parameters = mi.LogLevel.Debug
         try:
-            notes = upgrade(root, path)
-            state = mi.parser.parse_string(config, ElementTree.tostring(root, "unicode"))
-            mi.parser.transform_upgrade(config, state)
-            mi.parser.transform_resolve_references(config, state)
+            root = read_elements(path, path.parent)
+            self.notes = upgrade(root, path.parent)
+            self.elements = [element for element in root.iter() if isinstance(element, LocatedElement)]
+            self.text = ElementTree.tostring(root, "unicode")
+            with searched_in(path.parent):
+                self.state = mi.parser.parse_string(config, self.text)
+                mi.parser.transform_upgrade(config, self.state)
+                mi.parser.transform_resolve_references(config, self.state)
         except (RuntimeError, ValueError) as error:
-            raise BadInput(f"{path} cannot be read: {mitsuba_reason(error)}") from None
-    return state, searched, notes
+            raise BadInput(f"{path} cannot be read: {self.reason(error)}") from None
+
+    def element(self, offset: int) -> LocatedElement:
+        """The element that begins at an offset in the text, or the last one before it."""
+        return self.elements[len(re.findall(r"<[^/!?]", self.text[: offset + 1])) - 1]
+
+    def line_of(self, node: mi.parser.SceneNode) -> str:
+        """Where a node is described: " (line 12)"; nothing for one of a file that Mitsuba includes."""
+        return "" if node.file_index else f" ({self.element(node.offset + 1).place.rpartition('/')[2]})"
+
+    def reason(self, error: Exception) -> str:
+        """An error's message with the place and tag of the element that it is about."""
+        position = re.search(r"string \(line (\d+), col (\d+)\): (.*)", str(error), re.DOTALL)
+        if not position:
+            return mitsuba_reason(error)
+        line, column = int(position[1]), int(position[2])
+        before = self.text.split("\n")[: line - 1]
+        element = self.element(sum(len(each) + 1 for each in before) + column)
+        return f"{element.place}, <{element.tag}>: {mitsuba_reason(RuntimeError(position[3]))}"

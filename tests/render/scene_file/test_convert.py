@@ -74,7 +74,9 @@ def test_depth_is_that_of_the_innermost_integrator(tmp_path):
 def test_nothing_to_render(tmp_path):
     with pytest.raises(BadInput, match="no shape to render"):
         converted(tmp_path, xml(shape=""))
-    with pytest.raises(BadInput, match=r"no shape to render; gone.obj: the file gone.obj is missing"):
+    with pytest.raises(
+        BadInput, match=r"no shape to render; gone.obj \(scene.xml line 1\): the file gone.obj is missing"
+    ):
         converted(tmp_path, xml(shape='<shape type="obj"><string name="filename" value="gone.obj"/></shape>'))
 
 

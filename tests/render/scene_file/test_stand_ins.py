@@ -89,7 +89,7 @@ CASES = {
         2,
     ),
     "medium": (xml(shape("cube", '<medium type="homogeneous" name="interior"/>')), "a medium is left out", 2, 1),
-    "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m: a medium is left out"),
+    "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m (scene.xml line 1): a medium is left out"),
     "subsurface": (old('<subsurface type="dipole"/><bsdf type="plastic"/>'), "surface alone"),
     "spectrum": (
         new('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.9"/></bsdf>'),

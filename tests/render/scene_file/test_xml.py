@@ -3,7 +3,7 @@
 import pytest
 
 from errors import BadInput
-from render.scene_file.xml import MAX_INCLUDE_DEPTH, MAX_INCLUDES, linear_colour, parse
+from render.scene_file.xml import MAX_INCLUDE_DEPTH, MAX_INCLUDES, ParsedFile, linear_colour
 from tests.helpers.scene_files import old_xml, xml
 
 
@@ -15,7 +15,7 @@ def refusal(folder, content: str | bytes, name: str = "scene.xml") -> str:
     """The one line that refuses a file."""
     (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(BadInput) as error:
-        parse(folder / name)
+        ParsedFile(folder / name)
     text = str(error.value)
     assert "\n" not in text and ".cpp" not in text and len(text) < 600
     return text
@@ -28,18 +28,27 @@ def included(name: str) -> str:
 def test_what_is_damaged(tmp_path):
     for path in (tmp_path / "gone.xml", tmp_path):
         with pytest.raises(BadInput, match="cannot be read"):
-            parse(path)
+            ParsedFile(path)
     assert "empty or damaged" in refusal(tmp_path, "")
     assert "empty or damaged" in refusal(tmp_path, xml()[:-20])
     assert "empty or damaged" in refusal(tmp_path, b"\x89PNG\r\n\x1a\n" + bytes(range(1, 256)))
     assert "banana" in refusal(tmp_path, xml("<banana/>"))
-    assert "version" in refusal(tmp_path, "<scene/>")
     assert "version" in refusal(tmp_path, xml().replace("3.0.0", "new"))
     assert "$r" in refusal(tmp_path, xml('<shape type="sphere"><float name="radius" value="$r"/></shape>'))
     assert 'id="gone"' in refusal(tmp_path, xml('<shape type="cube"><ref id="gone"/></shape>'))
     assert "ball" in refusal(tmp_path, xml('<shape type="cube" id="ball"/>'))
     assert "abc" in refusal(tmp_path, xml('<shape type="sphere"><float name="radius" value="abc"/></shape>'))
-    assert "cannot be read" in refusal(tmp_path, old_xml('<bsdf type="diffuse"><srgb name="x" value="red"/></bsdf>'))
+
+
+def test_errors_name_file_line_and_element(tmp_path):
+    """Also of an element that spans lines, after one that was upgraded, and in an included file."""
+    sphere = '<shape\n type="sphere">\n<float name="radius" value="abc"/></shape>'
+    content = f'<scene version="0.6.0">\n<camera type="perspective"/>\n{sphere}</scene>'
+    assert "scene.xml line 5, <float>: could not parse" in refusal(tmp_path, content)
+    (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">\n\n{sphere}</scene>')
+    assert "part.xml line 5, <float>: could not parse" in refusal(tmp_path, included("part.xml"))
+    red = old_xml('\n<bsdf type="diffuse"><srgb name="x" value="red"/></bsdf>')
+    assert "scene.xml line 2, <srgb>: could not" in refusal(tmp_path, red)
 
 
 OUTSIDE = [
@@ -94,10 +103,11 @@ def test_includes_defaults_aliases_and_comments(tmp_path):
     )
     path = tmp_path / "scene.xml"
     path.write_text(xml(*parts))
-    state, searched, notes = parse(path)
+    parsed = ParsedFile(path)
+    state = parsed.state
     assert {"disk", "sphere", "cube", "plastic"} <= set(kinds(state))
     assert 0.25 in [node.props.get("radius", None) for node in state.nodes]
-    assert searched == [tmp_path.resolve()] and notes == []
+    assert parsed.searched == [tmp_path.resolve()] and parsed.notes == []
 
 
 def test_elements_of_old_files(tmp_path):
@@ -112,7 +122,8 @@ def test_elements_of_old_files(tmp_path):
             '<bsdf type="diffuse" id="d"><srgb name="reflectance" value="#ff8000"/></bsdf>',
         )
     )
-    state, _, notes = parse(path)
+    parsed = ParsedFile(path)
+    state, notes = parsed.state, parsed.notes
     assert "blackbody" in kinds(state)
     moved = [node.props["to_world"] for node in state.nodes if "to_world" in node.props]
     assert any(transform.matrix[0, 3] == 7 for transform in moved)
