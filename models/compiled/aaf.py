@@ -7,8 +7,8 @@ from torch import Tensor
 
 from models.compiled.arrays import Image, Index, Row, Signals, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
-from models.compiled.lines import add_line, add_product, columns_with_tap, copy_line, divide_line
+from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.lines import add_line, add_product, columns_with_tap, copy_line, divide_line, triple_of_lines
 
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
 MAX_REACH = 50  # px
@@ -53,39 +53,33 @@ def weigh(weight: Row, distance: Row, along: Row, width: Row, max_width: Row) ->
         weight[i] = exp(-min(exponent, MAX_GAUSSIAN_EXPONENT)) if reached else f32(0)
 
 
-@jit_with_memory
-def filter_row(
-    out: Signals, row: Index, image: Signals, width: Image, max_width: Image, geometry: Image, down: bool
-) -> None:
-    """A row of out (S, 3, H, W) from image (S, 3, H, W), width and max_width (S, H, W)."""
-    signals, _, height, columns = image.shape
-    totals = np.ones((signals, columns), np.float32)
-    space = np.empty((3, columns), np.float32)
-    for s in range(signals):
-        for c in range(3):
-            copy_line(out[s, c, row], image[s, c, row])
-    for step in range(-MAX_REACH, MAX_REACH + 1):
-        dx, dy = (0, step) if down else (step, 0)
-        left, right = columns_with_tap(row, dx, dy, height, columns)
-        if step == 0 or left >= right:
-            continue
-        distance, along, weight = space[0, : right - left], space[1, : right - left], space[2, : right - left]
-        measure(distance, along, geometry, row, left, dx, dy)
-        for s in range(signals):
-            here, there = width[s, row, left:right], max_width[s, row + dy, left + dx : right + dx]
-            weigh(weight, distance, along, here, there)
-            add_line(totals[s, left:right], weight)
-            for c in range(3):
-                add_product(out[s, c, row, left:right], weight, image[s, c, row + dy, left + dx : right + dx])
-    for s in range(signals):
-        for c in range(3):
-            divide_line(out[s, c, row], out[s, c, row], totals[s])
-
-
 @jit_parallel
 def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, geometry: Image, down: bool) -> None:
-    for row in numba.prange(image.shape[2]):
-        filter_row(out, np.int64(row), image, width, max_width, geometry, down)
+    """out (S, 3, H, W) from image (S, 3, H, W), width and max_width (S, H, W)."""
+    signals, _, height, columns = image.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        totals = np.ones((signals, columns), np.float32)
+        space = np.empty((3, columns), np.float32)
+        for s in range(signals):
+            for c in range(3):
+                copy_line(out[s, c, row], image[s, c, row])
+        for step in range(-MAX_REACH, MAX_REACH + 1):
+            dx, dy = (0, step) if down else (step, 0)
+            left, right = columns_with_tap(row, dx, dy, height, columns)
+            if step == 0 or left >= right:
+                continue
+            distance, along, weight = triple_of_lines(space, 0, right - left)
+            measure(distance, along, geometry, row, left, dx, dy)
+            for s in range(signals):
+                here, there = width[s, row, left:right], max_width[s, row + dy, left + dx : right + dx]
+                weigh(weight, distance, along, here, there)
+                add_line(totals[s, left:right], weight)
+                for c in range(3):
+                    add_product(out[s, c, row, left:right], weight, image[s, c, row + dy, left + dx : right + dx])
+        for s in range(signals):
+            for c in range(3):
+                divide_line(out[s, c, row], out[s, c, row], totals[s])
 
 
 def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from models.compiled.affinity import pull_weights, scale_gradient
 from models.compiled.arrays import Image, Index, Row, Rows, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.jit import array, jit_in_any_order, jit_parallel
 from models.compiled.lines import (
     add_product,
     add_square,
@@ -82,26 +82,20 @@ def weigh_tap(
     decay_where(weight, exponent, surface[0, to, there])
 
 
-@jit_with_memory
-def filter_row(out: Image, total: Image, planes: Planes, row: Index) -> None:
-    """A row of out (3, H, W) and total (1, H, W)."""
-    height, width = planes.surface.shape[1:]
-    scratch = np.empty((3 + GROUP_COUNT, width), np.float32)
-    out[:, row] = f32(0)
-    total[:, row] = f32(0)
-    for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
-        lines = scratch[:, : right - left]
-        weigh_tap(lines[0], lines[1], lines[2:], planes, row, left, dx, dy)
-        there = triple(planes.image, row + dy, left + dx, right + dx)
-        add_weighted(triple(out, row, left, right), total[0, row, left:right], lines[0], there)
-    scale_line(total[0, row], planes.surface[0, row])
-    normalise(triple(out, row, 0, width), total[0, row])
-
-
 @jit_parallel
 def filter_image(out: Image, total: Image, planes: Planes) -> None:
-    for row in numba.prange(out.shape[1]):
-        filter_row(out, total, planes, np.int64(row))
+    """Add to out (3, H, W) and total (1, H, W), which are 0."""
+    _, height, width = out.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        scratch = np.empty((3 + GROUP_COUNT, width), np.float32)
+        for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
+            lines = scratch[:, : right - left]
+            weigh_tap(lines[0], lines[1], lines[2:], planes, row, left, dx, dy)
+            there = triple(planes.image, row + dy, left + dx, right + dx)
+            add_weighted(triple(out, row, left, right), total[0, row, left:right], lines[0], there)
+        scale_line(total[0, row], planes.surface[0, row])
+        normalise(triple(out, row, 0, width), total[0, row])
 
 
 def planes_of(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
@@ -110,8 +104,8 @@ def planes_of(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
 
 def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
     """See models.networks.cross_bilateral.weighted_mean."""
-    out = torch.empty_like(pixels.image, memory_format=torch.contiguous_format)
-    total = torch.empty_like(pixels.surface, memory_format=torch.contiguous_format)
+    out = torch.zeros_like(pixels.image, memory_format=torch.contiguous_format)
+    total = torch.zeros_like(pixels.surface, memory_format=torch.contiguous_format)
     for item in range(len(out)):
         filter_image(out[item].numpy(), total[item].numpy(), planes_of(pixels, sharpness, item))
     return out, total
@@ -133,36 +127,31 @@ def subtract_product(line: Row, a: Row, b: Row) -> None:
         line[x] -= a[x] * b[x]
 
 
-@jit_with_memory
-def pull_row(pulled: Image, gradient: Image, out: Image, total: Image, planes: Planes, row: Index) -> None:
-    """A row of pulled (1 + GROUP_COUNT, H, W)."""
-    height, width = planes.surface.shape[1:]
-    scratch = np.empty((4 + GROUP_COUNT, width), np.float32)
-    scaled = np.empty((3, width), np.float32)
-    dots = np.zeros(width, np.float32)
-    pulled[:, row] = f32(0)
-    for c in range(3):
-        scale_gradient(scaled[c], dots, gradient[c, row], out[c, row], total[0, row])
-    for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
-        lines = scratch[:, : right - left]
-        weight, exponent, pull, distances = lines[0], lines[1], lines[2], lines[3:]
-        weigh_tap(weight, exponent, distances, planes, row, left, dx, dy)
-        there = triple(planes.image, row + dy, left + dx, right + dx)
-        pull_weights(pull, weight, triple_of_lines(scaled, left, right), dots[left:right], there)
-        zero_clamped(pull, exponent)
-        for s in range(1 + GROUP_COUNT):
-            subtract_product(pulled[s, row, left:right], pull, distances[s])
-
-
 @jit_parallel
 def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes: Planes) -> None:
-    for row in numba.prange(out.shape[1]):
-        pull_row(pulled, gradient, out, total, planes, np.int64(row))
+    """Add to pulled (1 + GROUP_COUNT, H, W)."""
+    _, height, width = out.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        scratch = np.empty((4 + GROUP_COUNT, width), np.float32)
+        scaled = np.empty((3, width), np.float32)
+        dots = np.zeros(width, np.float32)
+        for c in range(3):
+            scale_gradient(scaled[c], dots, gradient[c, row], out[c, row], total[0, row])
+        for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
+            lines = scratch[:, : right - left]
+            weight, exponent, pull, distances = lines[0], lines[1], lines[2], lines[3:]
+            weigh_tap(weight, exponent, distances, planes, row, left, dx, dy)
+            there = triple(planes.image, row + dy, left + dx, right + dx)
+            pull_weights(pull, weight, triple_of_lines(scaled, left, right), dots[left:right], there)
+            zero_clamped(pull, exponent)
+            for s in range(1 + GROUP_COUNT):
+                subtract_product(pulled[s, row, left:right], pull, distances[s])
 
 
 def pull_sharpness(gradient: Tensor, pixels: "Pixels", sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:
     """See models.networks.cross_bilateral.pull_sharpness."""
-    pulled = torch.empty_like(sharpness, memory_format=torch.contiguous_format)
+    pulled = torch.zeros_like(sharpness, memory_format=torch.contiguous_format)
     for item in range(len(pulled)):
         planes = planes_of(pixels, sharpness, item)
         pull_image(pulled[item].numpy(), array(gradient[item]), array(out[item]), array(total[item]), planes)

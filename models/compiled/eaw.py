@@ -7,7 +7,7 @@ from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Row, Rows, Scalar, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.jit import array, jit_in_any_order, jit_parallel
 from models.compiled.lines import add_square, divide_line, fill_line, triple, triple_of_lines, window_taps
 from models.filters.atrous import RADIUS, SPLINE
 
@@ -47,18 +47,15 @@ def sum_row(sums: Rows, space: Row, row: Index, colour: Image, features: Image, 
         add_tap(triple_of_lines(sums, left, right), sums[3, left:right], h, distance, there)
 
 
-@jit_with_memory
-def filter_row(out: Image, row: Index, colour: Image, features: Image, step: int) -> None:
-    sums = np.zeros((4, colour.shape[2]), np.float32)
-    sum_row(sums, np.empty(colour.shape[2], np.float32), row, colour, features, step)
-    for c in range(3):
-        divide_line(out[c, row], sums[c], sums[3])
-
-
 @jit_parallel
 def filter_image(out: Image, colour: Image, features: Image, step: int) -> None:
-    for row in numba.prange(colour.shape[1]):
-        filter_row(out, np.int64(row), colour, features, step)
+    _, height, width = colour.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        sums = np.zeros((4, width), np.float32)
+        sum_row(sums, np.empty(width, np.float32), row, colour, features, step)
+        for c in range(3):
+            divide_line(out[c, row], sums[c], sums[3])
 
 
 def eaw_level(colour: Tensor, features: Tensor, step: int) -> Tensor:

@@ -52,26 +52,22 @@ def sum_row(sums: Image, to: Index, image: Image, mesh: Plane, row: Index, step:
             add_product(sums[c, to, left:right], same, image[c, row + dy, left + dx : right + dx])
 
 
-@jit_with_memory
-def sum_colours_row(sums: Image, image: Image, mesh: Plane, row: Index) -> None:
-    """A row of sums (SUMS, H, W) over 3 x 3 pixels of the same mesh."""
-    height, width = mesh.shape
-    space = np.empty(width, np.float32)
-    sums[:, row] = 0
-    for dx, dy, left, right in window_taps(row, 1, 1, height, width):
-        same = space[left:right]
-        compare(same, mesh[row, left:right], mesh[row + dy, left + dx : right + dx])
-        for c in range(3):
-            add_product(sums[c, row, left:right], same, image[c, row + dy, left + dx : right + dx])
-        there = triple(image, row + dy, left + dx, right + dx)
-        add_luminances(sums[3, row, left:right], sums[4, row, left:right], same, there)
-        add_line(sums[5, row, left:right], same)
-
-
 @jit_parallel
 def sum_colours(sums: Image, image: Image, mesh: Plane) -> None:
-    for row in numba.prange(len(mesh)):
-        sum_colours_row(sums, image, mesh, np.int64(row))
+    """sums (SUMS, H, W) over 3 x 3 pixels of the same mesh."""
+    height, width = mesh.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        space = np.empty(width, np.float32)
+        sums[:, row] = 0
+        for dx, dy, left, right in window_taps(row, 1, 1, height, width):
+            same = space[left:right]
+            compare(same, mesh[row, left:right], mesh[row + dy, left + dx : right + dx])
+            for c in range(3):
+                add_product(sums[c, row, left:right], same, image[c, row + dy, left + dx : right + dx])
+            there = triple(image, row + dy, left + dx, right + dx)
+            add_luminances(sums[3, row, left:right], sums[4, row, left:right], same, there)
+            add_line(sums[5, row, left:right], same)
 
 
 @jit_parallel

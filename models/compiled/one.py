@@ -12,10 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from datasets.frame import Frame
-from models.compiled.arrays import Image, Index, Matrix, Plane, Row, Rows, Scalar
+from models.compiled.affinity import four
+from models.compiled.arrays import RGB, Image, Index, Matrix, Row, Rows, Scalar, f32
 from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
-from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line
+from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line, triple
 from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
@@ -77,13 +78,6 @@ def filter_levels(outputs: int) -> int:
 FIRST_CHANNELS = itertools.accumulate([row.channels for row in ONE_INPUTS[:-1]], initial=0)
 NOISY, MEAN_3X3, MEAN_9X9, OUTPUT, ACCUMULATED, DEVIATION, NEWEST, OLDEST, HAS_HISTORY, *OTHERS = FIRST_CHANNELS
 LATENT_INPUT, ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = OTHERS
-ONE = np.float32(1)
-ZERO = np.float32(0)
-TWO = np.float32(2)
-LEAST_EXPONENT = np.float32(MIN_EXPONENT)
-MAX_LOGIT32 = np.float32(MAX_LOGIT)
-MIN_LENGTH32 = np.float32(MIN_LENGTH)
-MAX_EXPOSED32 = np.float32(MAX_EXPOSED)
 CHUNK = 512
 ROOM = CHUNK + 16  # for a line: lines that begin a power of two apart would fall on the same set of the cache
 AT_ONCE = 4  # inputs of a layer that two outputs are summed from in one pass
@@ -97,19 +91,16 @@ class LinearLayer(NamedTuple):
 
     @staticmethod
     def of(layer: nn.Linear) -> "LinearLayer":
-        weight = array(layer.weight)
-        outputs, inputs = weight.shape
-        rows, columns = outputs + outputs % 2, -(-inputs // AT_ONCE) * AT_ONCE
-        padded = np.zeros((rows, columns), np.float32)
-        padded[:outputs, :inputs] = weight
-        bias = np.zeros(rows, np.float32)
-        bias[:outputs] = 0 if layer.bias is None else array(layer.bias)
-        return LinearLayer(padded, bias)
+        outputs, inputs = layer.weight.shape
+        bias = np.zeros(outputs, np.float32) if layer.bias is None else array(layer.bias)
+        weight = np.pad(array(layer.weight), ((0, outputs % 2), (0, -inputs % AT_ONCE)))
+        return LinearLayer(weight, np.pad(bias, (0, outputs % 2)))
 
 
 @jit_inlined_in_any_order
-def add_products(first: Row, second: Row, a: Row, b: Row, c: Row, d: Row, w: Row, v: Row) -> None:
-    """Add w · (a, b, c, d) to the first row and v · (a, b, c, d) to the second."""
+def add_products(first: Row, second: Row, inputs: tuple[Row, Row, Row, Row], w: Row, v: Row) -> None:
+    """Add w · inputs to the first row and v · inputs to the second."""
+    a, b, c, d = inputs
     wa, wb, wc, wd = w[0], w[1], w[2], w[3]
     va, vb, vc, vd = v[0], v[1], v[2], v[3]
     for x in range(first.size):
@@ -122,38 +113,31 @@ def add_layer(lines: Rows, inputs: Rows, weight: Matrix, n: int) -> None:
     """lines (outputs, n) += weight (outputs, inputs) · inputs (inputs, n), for the first n pixels."""
     for o in range(0, weight.shape[0], 2):
         for i in range(0, weight.shape[1], AT_ONCE):
-            add_products(
-                lines[o, :n],
-                lines[o + 1, :n],
-                inputs[i, :n],
-                inputs[i + 1, :n],
-                inputs[i + 2, :n],
-                inputs[i + 3, :n],
-                weight[o, i : i + AT_ONCE],
-                weight[o + 1, i : i + AT_ONCE],
-            )
+            w, v = weight[o, i : i + AT_ONCE], weight[o + 1, i : i + AT_ONCE]
+            add_products(lines[o, :n], lines[o + 1, :n], four(inputs, i, 0, n), w, v)
 
 
 @jit_in_any_order
 def log_exposed(line: Row, image: Row, gain: Scalar) -> None:
     for x in range(line.size):
-        line[x] = log(ONE + min(max(image[x], ZERO) * gain, MAX_EXPOSED32))
+        line[x] = log(f32(1) + min(max(image[x], f32(0)) * gain, f32(MAX_EXPOSED)))
 
 
 @jit_in_any_order
 def log1p_row(line: Row, image: Row) -> None:
     for x in range(line.size):
-        line[x] = log(ONE + image[x])
+        line[x] = log(f32(1) + image[x])
 
 
 @jit_in_any_order
 def reciprocal_length(line: Row, length: Row, has_history: Row, samples: Scalar) -> None:
     for x in range(line.size):
-        line[x] = ONE / (length[x] * has_history[x] + samples)
+        line[x] = f32(1) / (length[x] * has_history[x] + samples)
 
 
 @jit_in_any_order
-def dot(line: Row, nx: Row, ny: Row, nz: Row, axis: Row) -> None:
+def dot(line: Row, normal: RGB, axis: Row) -> None:
+    nx, ny, nz = normal
     ax, ay, az = axis[0], axis[1], axis[2]
     for x in range(line.size):
         line[x] = ax * nx[x] + ay * ny[x] + az * nz[x]
@@ -162,29 +146,34 @@ def dot(line: Row, nx: Row, ny: Row, nz: Row, axis: Row) -> None:
 @jit_in_any_order
 def log_exposed_history(line: Row, has_history: Row, past: Row, other: Row, gain: Scalar) -> None:
     for x in range(line.size):
-        value = past[x] if has_history[x] > ZERO else other[x]
-        line[x] = log(ONE + min(max(value, ZERO) * gain, MAX_EXPOSED32))
+        value = past[x] if has_history[x] > f32(0) else other[x]
+        line[x] = log(f32(1) + min(max(value, f32(0)) * gain, f32(MAX_EXPOSED)))
 
 
 @jit_in_any_order
 def relu(line: Row, sums: Row) -> None:
     for x in range(line.size):
-        line[x] = max(sums[x], ZERO)
+        line[x] = max(sums[x], f32(0))
 
 
-class InputImages(NamedTuple):
-    """What the network's inputs are computed from."""
+class PixelArrays(NamedTuple):
+    """models.networks.one.PixelInputs of one item."""
 
     noisy: Image
     mean_3x3: Image
     mean_9x9: Image
-    deviation: Plane
-    history: Image  # see models.networks.one.PixelInputs
-    has_history: Plane
+    deviation: Image
+    history: Image
+    has_history: Image
+
+
+class SurfaceArrays(NamedTuple):
+    """What else the network's inputs of one item are computed from."""
+
     albedo: Image
     normal: Image
-    depth: Plane
-    roughness: Plane
+    depth: Image
+    roughness: Image
     gain: Row  # (3): exposure times the frame's gain
     samples: Scalar
     to_view: Matrix  # (3, 3)
@@ -192,31 +181,31 @@ class InputImages(NamedTuple):
 
 
 @jit_in_any_order
-def fill_lines(lines: Rows, images: InputImages, y: Index, x: Index, n: int) -> None:
+def fill_lines(lines: Rows, pixels: PixelArrays, surfaces: SurfaceArrays, y: Index, x: Index, n: int) -> None:
     """The network's inputs (C, ·) of n pixels of a row from x on, in the order of ONE_INPUTS."""
     row = slice(x, x + n)
-    valid = images.has_history[y, row]
-    history = images.history
+    noisy, _, mean_9x9, _, history, _ = pixels
+    valid = pixels.has_history[0, y, row]
     for c in range(3):
-        gain = images.gain[c]
-        log_exposed(lines[NOISY + c, :n], images.noisy[c, y, row], gain)
-        log_exposed(lines[MEAN_3X3 + c, :n], images.mean_3x3[c, y, row], gain)
-        log_exposed(lines[MEAN_9X9 + c, :n], images.mean_9x9[c, y, row], gain)
-        log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], images.mean_9x9[c, y, row], gain)
-        log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], images.noisy[c, y, row], gain)
-    log1p_row(lines[DEVIATION, :n], images.deviation[y, row])
-    lines[NEWEST, :n] = ONE / images.samples
-    reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, images.samples)
+        gain = surfaces.gain[c]
+        log_exposed(lines[NOISY + c, :n], noisy[c, y, row], gain)
+        log_exposed(lines[MEAN_3X3 + c, :n], pixels.mean_3x3[c, y, row], gain)
+        log_exposed(lines[MEAN_9X9 + c, :n], mean_9x9[c, y, row], gain)
+        log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], mean_9x9[c, y, row], gain)
+        log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], noisy[c, y, row], gain)
+    log1p_row(lines[DEVIATION, :n], pixels.deviation[0, y, row])
+    lines[NEWEST, :n] = f32(1) / surfaces.samples
+    reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, surfaces.samples)
     copy_line(lines[HAS_HISTORY, :n], valid)
     for c in range(LATENT):
         copy_line(lines[LATENT_INPUT + c, :n], history[7 + c, y, row])
         scale_line(lines[LATENT_INPUT + c, :n], valid)
-    nx, ny, nz = images.normal[0, y, row], images.normal[1, y, row], images.normal[2, y, row]
+    normal = triple(surfaces.normal, y, x, x + n)
     for c in range(3):
-        copy_line(lines[ALBEDO + c, :n], images.albedo[c, y, row])
-        dot(lines[VIEW_NORMAL + c, :n], nx, ny, nz, images.to_view[c])
-    scale_depth(lines[DEPTH, :n], images.depth[y, row], images.depth_scale)
-    copy_line(lines[ROUGHNESS, :n], images.roughness[y, row])
+        copy_line(lines[ALBEDO + c, :n], surfaces.albedo[c, y, row])
+        dot(lines[VIEW_NORMAL + c, :n], normal, surfaces.to_view[c])
+    scale_depth(lines[DEPTH, :n], surfaces.depth[0, y, row], surfaces.depth_scale)
+    copy_line(lines[ROUGHNESS, :n], surfaces.roughness[0, y, row])
 
 
 @jit_in_any_order
@@ -228,9 +217,11 @@ def write_patches(patches: Matrix, y: Index, x: Index, lines: Rows, n: int) -> N
 
 
 @jit_parallel
-def write_inputs(patches: Matrix, hidden: Image, images: InputImages, layer: LinearLayer) -> None:
+def write_inputs(
+    patches: Matrix, hidden: Image, pixels: PixelArrays, surfaces: SurfaceArrays, layer: LinearLayer
+) -> None:
     """Patches (H / 2, W / 2, 2, 2, C), borders repeated, and hidden (c, h, w): ReLU of the layer of each pixel."""
-    height, width = images.depth.shape
+    _, height, width = pixels.noisy.shape
     for row in numba.prange(2 * patches.shape[0]):
         bottom = np.int64(row)
         y = min(bottom, height - 1)
@@ -238,7 +229,7 @@ def write_inputs(patches: Matrix, hidden: Image, images: InputImages, layer: Lin
         sums = np.empty((layer.weight.shape[0], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
-            fill_lines(lines, images, y, x, n)
+            fill_lines(lines, pixels, surfaces, y, x, n)
             write_patches(patches, bottom, x, lines, n)
             if bottom > y:
                 continue
@@ -264,23 +255,11 @@ def network_inputs(
     depth_scales = array(scale.log_depth.value.exp())
     to_view = array(frame.to_view)
     for item in range(batch):
-        images = InputImages(
-            array(inputs.noisy[item]),
-            array(inputs.mean_3x3[item]),
-            array(inputs.mean_9x9[item]),
-            array(inputs.deviation[item, 0]),
-            array(inputs.history[item]),
-            array(inputs.has_history[item, 0]),
-            array(frame.albedo[item]),
-            array(frame.normal[item]),
-            array(frame.depth[item, 0]),
-            array(frame.roughness[item, 0]),
-            gains[item],
-            np.float32(frame.samples[item].item()),
-            to_view[item],
-            depth_scales[item],
-        )
-        write_inputs(out[item].numpy(), sums[item].numpy(), images, LinearLayer.of(hidden))
+        pixels = PixelArrays(*(array(image[item]) for image in inputs))
+        images = (array(image[item]) for image in (frame.albedo, frame.normal, frame.depth, frame.roughness))
+        samples = np.float32(frame.samples[item].item())
+        surfaces = SurfaceArrays(*images, gains[item], samples, to_view[item], depth_scales[item])
+        write_inputs(out[item].numpy(), sums[item].numpy(), pixels, surfaces, LinearLayer.of(hidden))
     return out.flatten(3).permute(0, 3, 1, 2), sums
 
 
@@ -298,52 +277,52 @@ def transpose(lines: Rows, pixels: Matrix) -> None:
 @jit_in_any_order
 def softplus(line: Row, head: Row) -> None:
     for x in range(line.size):
-        line[x] = max(head[x], ZERO) + log(ONE + exp(max(-abs(head[x]), LEAST_EXPONENT)))
+        line[x] = max(head[x], f32(0)) + log(f32(1) + exp(max(-abs(head[x]), f32(MIN_EXPONENT))))
 
 
 @jit_in_any_order
 def clamp_logit(line: Row, head: Row) -> None:
     for x in range(line.size):
-        line[x] = min(max(head[x], -MAX_LOGIT32), MAX_LOGIT32)
+        line[x] = min(max(head[x], -f32(MAX_LOGIT)), f32(MAX_LOGIT))
 
 
 @jit_in_any_order
 def tanh(line: Row, head: Row) -> None:
     for x in range(line.size):
-        shrunk = exp(max(-TWO * abs(head[x]), LEAST_EXPONENT))
-        size = (ONE - shrunk) / (ONE + shrunk)
-        line[x] = size if head[x] > ZERO else -size
+        shrunk = exp(max(-f32(2) * abs(head[x]), f32(MIN_EXPONENT)))
+        size = (f32(1) - shrunk) / (f32(1) + shrunk)
+        line[x] = size if head[x] > f32(0) else -size
 
 
 @jit_in_any_order
 def sigmoid(line: Row, head: Row, has_history: Row) -> None:
     """1 / (1 + exp(-head)), or 1 without history."""
     for x in range(line.size):
-        against = exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))
-        line[x] = ONE / (ONE + against) if has_history[x] > ZERO else ONE
+        against = exp(min(max(-head[x], f32(MIN_EXPONENT)), -f32(MIN_EXPONENT)))
+        line[x] = f32(1) / (f32(1) + against) if has_history[x] > f32(0) else f32(1)
 
 
 @jit_in_any_order
 def accumulation_alpha(line: Row, head: Row, has_history: Row, length: Row, samples: Scalar) -> None:
     """σ(head - ln(length / samples)), or 1 without history: for head = 0 the plain mean of all samples."""
     for x in range(line.size):
-        past = max(length[x], MIN_LENGTH32) / samples
-        against = past * exp(min(max(-head[x], LEAST_EXPONENT), -LEAST_EXPONENT))
-        line[x] = ONE / (ONE + against) if has_history[x] > ZERO else ONE
+        past = max(length[x], f32(MIN_LENGTH)) / samples
+        against = past * exp(min(max(-head[x], f32(MIN_EXPONENT)), -f32(MIN_EXPONENT)))
+        line[x] = f32(1) / (f32(1) + against) if has_history[x] > f32(0) else f32(1)
 
 
 @jit_in_any_order
 def effective_length(length: Row, past: Row, alpha: Row, samples: Scalar) -> None:
     """1 / (α² / samples + (1 - α)² / past)."""
     for x in range(length.size):
-        kept = ONE - alpha[x]
-        length[x] = ONE / (alpha[x] * alpha[x] / samples + kept * kept / max(past[x], MIN_LENGTH32))
+        kept = f32(1) - alpha[x]
+        length[x] = f32(1) / (alpha[x] * alpha[x] / samples + kept * kept / max(past[x], f32(MIN_LENGTH)))
 
 
 @jit_in_any_order
 def lerp(line: Row, past: Row, new: Row, alpha: Row) -> None:
     for x in range(line.size):
-        line[x] = alpha[x] * new[x] + (ONE - alpha[x]) * past[x]
+        line[x] = alpha[x] * new[x] + (f32(1) - alpha[x]) * past[x]
 
 
 class DecodedImages(NamedTuple):
@@ -355,20 +334,13 @@ class DecodedImages(NamedTuple):
     alpha: Image
     latent: Image
     accumulated: Image
-    length: Plane
-
-
-class AccumulationInputs(NamedTuple):
-    """What the new accumulation is blended from."""
-
-    noisy: Image
-    history: Image
-    has_history: Plane
-    samples: Scalar
+    length: Image
 
 
 @jit_in_any_order
-def decode_lines(decoded: DecodedImages, lines: Rows, inputs: AccumulationInputs, y: Index, x: Index, n: int) -> None:
+def decode_lines(
+    decoded: DecodedImages, lines: Rows, inputs: PixelArrays, samples: Scalar, y: Index, x: Index, n: int
+) -> None:
     """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of head_channels."""
     k = 0
     for c in range(decoded.features.shape[0]):
@@ -380,16 +352,16 @@ def decode_lines(decoded: DecodedImages, lines: Rows, inputs: AccumulationInputs
     for c in range(decoded.logits.shape[0]):
         clamp_logit(decoded.logits[c, y, x : x + n], lines[k, :n])
         k += 1
-    valid = inputs.has_history[y, x : x + n]
+    valid = inputs.has_history[0, y, x : x + n]
     length = inputs.history[6, y, x : x + n]
     alpha = decoded.alpha[0, y, x : x + n]
-    accumulation_alpha(alpha, lines[k, :n], valid, length, inputs.samples)
+    accumulation_alpha(alpha, lines[k, :n], valid, length, samples)
     sigmoid(decoded.alpha[1, y, x : x + n], lines[k + 1, :n], valid)
     k += 2
     for c in range(decoded.latent.shape[0]):
         tanh(decoded.latent[c, y, x : x + n], lines[k, :n])
         k += 1
-    effective_length(decoded.length[y, x : x + n], length, alpha, inputs.samples)
+    effective_length(decoded.length[0, y, x : x + n], length, alpha, samples)
     for c in range(3):
         past, noisy = inputs.history[3 + c, y, x : x + n], inputs.noisy[c, y, x : x + n]
         lerp(decoded.accumulated[c, y, x : x + n], past, noisy, alpha)
@@ -397,21 +369,21 @@ def decode_lines(decoded: DecodedImages, lines: Rows, inputs: AccumulationInputs
 
 @jit_parallel
 def decode_images(
-    decoded: DecodedImages, pixels: Matrix, hidden: Image, layer: LinearLayer, inputs: AccumulationInputs
+    decoded: DecodedImages, head: Image, hidden: Image, layer: LinearLayer, inputs: PixelArrays, samples: Scalar
 ) -> None:
-    """Decode the U-Net's outputs, pixels (H, W, C), plus the layer of hidden (c, H, W)."""
-    height, width, _ = pixels.shape
+    """Decode the U-Net's outputs, head (H, W, C), plus the layer of hidden (c, H, W)."""
+    height, width, _ = head.shape
     for row in numba.prange(height):
         y = np.int64(row)
         lines = np.empty((layer.weight.shape[0], ROOM), np.float32)
         columns = np.empty((layer.weight.shape[1], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
-            transpose(lines, pixels[y, x : x + n])
+            transpose(lines, head[y, x : x + n])
             for c in range(hidden.shape[0]):
                 copy_line(columns[c, :n], hidden[c, y, x : x + n])
             add_layer(lines, columns, layer.weight, n)
-            decode_lines(decoded, lines, inputs, y, x, n)
+            decode_lines(decoded, lines, inputs, samples, y, x, n)
 
 
 def decode_head(
@@ -423,17 +395,8 @@ def decode_head(
     counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     for item in range(batch):
-        features, sharpness, logits, alpha, latent, accumulated, length = (each[item].numpy() for each in out)
-        decode_images(
-            DecodedImages(features, sharpness, logits, alpha, latent, accumulated, length[0]),
-            head[item].movedim(0, -1).numpy(),
-            array(hidden[item]),
-            LinearLayer.of(last),
-            AccumulationInputs(
-                array(inputs.noisy[item]),
-                array(inputs.history[item]),
-                array(inputs.has_history[item, 0]),
-                np.float32(samples[item].item()),
-            ),
-        )
+        decoded = DecodedImages(*(each[item].numpy() for each in out))
+        pixels = PixelArrays(*(array(image[item]) for image in inputs))
+        head_and_hidden = head[item].movedim(0, -1).numpy(), array(hidden[item])
+        decode_images(decoded, *head_and_hidden, LinearLayer.of(last), pixels, np.float32(samples[item].item()))
     return out[0], out[1], *out[2].split(levels, dim=1), *out[3:]

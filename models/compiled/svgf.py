@@ -21,7 +21,6 @@ from models.compiled.jit import (
     jit_in_any_order,
     jit_inlined_in_any_order,
     jit_parallel,
-    jit_with_memory,
     jit_with_reciprocals,
     plane_or_empty,
 )
@@ -146,39 +145,35 @@ def depth_steps(step: Row, depth: Row, to_depth: Row, mesh: Row, to_mesh: Row) -
         step[i] = to_depth[i] - depth[i] if mesh[i] == to_mesh[i] else f32(np.inf)
 
 
-@jit_with_memory
-def pack_geometry_row(packed: Image, row: Index, depth: Plane, normal: Image, mesh: Plane) -> None:
-    """A row of packed (GEOMETRY, H, W): unit normal, depth z, σ_z ∇z, ε_z |z|."""
-    height, width = depth.shape
-    z = depth[row]
-    here = mesh[row]
-    ahead = np.full(width, f32(np.inf))
-    behind = np.full(width, f32(np.inf))
-    across = np.full(width + 1, f32(np.inf))
-    if row + 1 < height:
-        depth_steps(ahead, z, depth[row + 1], here, mesh[row + 1])
-    if row > 0:
-        depth_steps(behind, depth[row - 1], z, mesh[row - 1], here)
-    depth_steps(across[1:width], z[:-1], z[1:], here[:-1], here[1:])
-    x, y, n_z = triple(normal, row, 0, width)
-    out_x, out_y, out_z = triple(packed, row, 0, width)
-    out_depth, along_x, along_y, tolerance = packed[3, row], packed[4, row], packed[5, row], packed[6, row]
-    for i in range(width):
-        length = np.sqrt(x[i] * x[i] + y[i] * y[i] + n_z[i] * n_z[i])
-        normalise = f32(1) / max(length, f32(MIN_DIVISOR)) if z[i] > 0 else f32(0)
-        out_x[i] = x[i] * normalise
-        out_y[i] = y[i] * normalise
-        out_z[i] = n_z[i] * normalise
-        out_depth[i] = z[i]
-        along_x[i] = f32(SIGMA_Z) * nearer_to_zero(across[i + 1], across[i])
-        along_y[i] = f32(SIGMA_Z) * nearer_to_zero(ahead[i], behind[i])
-        tolerance[i] = f32(EPSILON_Z) * abs(z[i]) + f32(MIN_DIVISOR)
-
-
 @jit_parallel
 def pack_geometry_image(packed: Image, depth: Plane, normal: Image, mesh: Plane) -> None:
-    for row in numba.prange(depth.shape[0]):
-        pack_geometry_row(packed, np.int64(row), depth, normal, mesh)
+    """packed (GEOMETRY, H, W): unit normal, depth z, σ_z ∇z, ε_z |z|."""
+    height, width = depth.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        z = depth[row]
+        here = mesh[row]
+        ahead = np.full(width, f32(np.inf))
+        behind = np.full(width, f32(np.inf))
+        across = np.full(width + 1, f32(np.inf))
+        if row + 1 < height:
+            depth_steps(ahead, z, depth[row + 1], here, mesh[row + 1])
+        if row > 0:
+            depth_steps(behind, depth[row - 1], z, mesh[row - 1], here)
+        depth_steps(across[1:width], z[:-1], z[1:], here[:-1], here[1:])
+        x, y, n_z = triple(normal, row, 0, width)
+        out_x, out_y, out_z = triple(packed, row, 0, width)
+        out_depth, along_x, along_y, tolerance = packed[3, row], packed[4, row], packed[5, row], packed[6, row]
+        for i in range(width):
+            length = np.sqrt(x[i] * x[i] + y[i] * y[i] + n_z[i] * n_z[i])
+            normalise = f32(1) / max(length, f32(MIN_DIVISOR)) if z[i] > 0 else f32(0)
+            out_x[i] = x[i] * normalise
+            out_y[i] = y[i] * normalise
+            out_z[i] = n_z[i] * normalise
+            out_depth[i] = z[i]
+            along_x[i] = f32(SIGMA_Z) * nearer_to_zero(across[i + 1], across[i])
+            along_y[i] = f32(SIGMA_Z) * nearer_to_zero(ahead[i], behind[i])
+            tolerance[i] = f32(EPSILON_Z) * abs(z[i]) + f32(MIN_DIVISOR)
 
 
 def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
@@ -318,35 +313,31 @@ def divide_sums(filtered: Signals, signals: Signals, row: Index, s: int, first: 
         line[p] = (sums[unsigned(i + 3 * LEVEL_BLOCK)] + h * h * centre[p]) * normalise * normalise
 
 
-@jit_with_memory
-def filter_row(filtered: Signals, signals: Signals, surfaces: Image, row: Index, margin: int, step: int) -> None:
-    height, count_signals, _, width = signals.shape
-    sums = np.empty((count_signals, 5 * LEVEL_BLOCK), np.float32)
-    weights = np.empty(2 * VARIANCE_TAPS * LEVEL_BLOCK, np.float32)
-    h = np.empty(VARIANCE_TAPS, np.float32)
-    for first in range(margin, width - margin, LEVEL_BLOCK):
-        count = min(LEVEL_BLOCK, width - margin - first)
-        sums[:] = 0
-        for j in range(-RADIUS, RADIUS + 1):
-            to = row + j * step
-            if to < 0 or to >= height:
-                continue
-            h[:] = SPLINE[j + RADIUS] * SPLINE
-            if j == 0:
-                h[RADIUS] = 0  # the pixel itself, which divide_sums adds
-            taps = TapRow(row, to, step, first, count)
-            weigh_taps(weights, h, surfaces, taps)
-            for s in range(count_signals):
-                add_taps(sums[s], weights, signals, s, taps)
-        for s in range(count_signals):
-            divide_sums(filtered, signals, row, s, first, count, sums[s])
-
-
 @jit_parallel
 def filter_image(filtered: Signals, signals: Signals, surfaces: Image, margin: int, step: int) -> None:
     """Colour and variance of `filtered`, as `signals`, by one level with taps `step` pixels apart."""
-    for row in numba.prange(len(signals)):
-        filter_row(filtered, signals, surfaces, np.int64(row), margin, step)
+    height, count_signals, _, width = signals.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        sums = np.empty((count_signals, 5 * LEVEL_BLOCK), np.float32)
+        weights = np.empty(2 * VARIANCE_TAPS * LEVEL_BLOCK, np.float32)
+        h = np.empty(VARIANCE_TAPS, np.float32)
+        for first in range(margin, width - margin, LEVEL_BLOCK):
+            count = min(LEVEL_BLOCK, width - margin - first)
+            sums[:] = 0
+            for j in range(-RADIUS, RADIUS + 1):
+                to = row + j * step
+                if to < 0 or to >= height:
+                    continue
+                h[:] = SPLINE[j + RADIUS] * SPLINE
+                if j == 0:
+                    h[RADIUS] = 0  # the pixel itself, which divide_sums adds
+                taps = TapRow(row, to, step, first, count)
+                weigh_taps(weights, h, surfaces, taps)
+                for s in range(count_signals):
+                    add_taps(sums[s], weights, signals, s, taps)
+            for s in range(count_signals):
+                divide_sums(filtered, signals, row, s, first, count, sums[s])
 
 
 @jit_in_any_order
@@ -369,24 +360,20 @@ def finish_edge(y: Row, scale: Row, colour: RGB, columns: Row, inside: Row) -> N
         scale[x] = f32(1) / (f32(SIGMA_L) * np.sqrt(mean / max(share, MIN_GAUSSIAN_SHARE) + f32(EPSILON_L)))
 
 
-@jit_with_memory
-def edge_row(signals: Signals, surfaces: Image, row: Index, s: int) -> None:
-    """Luminance and models.filters.svgf.edge_scale of a row."""
-    height, _, _, width = signals.shape
-    columns = np.zeros(width + 2, np.float32)
-    inside = np.zeros(width + 2, np.float32)
-    for y in range(max(row - 1, 0), min(row + 2, height)):
-        h = f32(0.5) if y == row else f32(0.25)
-        add_surfaces(columns[1:-1], inside[1:-1], h, signals[y, s, 3], surfaces[y, 3])
-    colour = signals[row, s, 0], signals[row, s, 1], signals[row, s, 2]
-    finish_edge(signals[row, s, 4], signals[row, s, 5], colour, columns, inside)
-
-
 @jit_parallel
 def edge_image(signals: Signals, surfaces: Image) -> None:
-    for row in numba.prange(len(signals)):
-        for s in range(signals.shape[1]):
-            edge_row(signals, surfaces, np.int64(row), s)
+    """Fill in luminance and models.filters.svgf.edge_scale."""
+    height, count_signals, _, width = signals.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        for s in range(count_signals):
+            columns = np.zeros(width + 2, np.float32)
+            inside = np.zeros(width + 2, np.float32)
+            for y in range(max(row - 1, 0), min(row + 2, height)):
+                h = f32(0.5) if y == row else f32(0.25)
+                add_surfaces(columns[1:-1], inside[1:-1], h, signals[y, s, 3], surfaces[y, 3])
+            colour = signals[row, s, 0], signals[row, s, 1], signals[row, s, 2]
+            finish_edge(signals[row, s, 4], signals[row, s, 5], colour, columns, inside)
 
 
 @jit_in_any_order
@@ -481,35 +468,28 @@ def sum_spatial_block(
         there = slice(left + dx, right + dx)
         for s in range(signals):
             to = triple_of_lines(sums[s], left - first, right - first)
-            add_spatial_tap(
-                to, weight, mean[s, row, left:right], mean[s, row + dy, there], variance[s, row + dy, there]
-            )
-
-
-@jit_with_memory
-def spatial_variance_row(out: Image, row: Index, variance: Image, mean: Image, geometry: Image, where: Mask) -> None:
-    """A row of out (S, H, W) `where` (H, W) it is wanted."""
-    signals, _, width = variance.shape
-    sums = np.empty((signals, 3, SPATIAL_BLOCK), np.float32)
-    space = np.empty(SPATIAL_BLOCK, np.float32)
-    for first in range(0, width, SPATIAL_BLOCK):
-        last = min(first + SPATIAL_BLOCK, width)
-        if not where[row, first:last].any():
-            continue
-        sum_spatial_block(sums, space, row, first, last, variance, mean, geometry)
-        for s in range(signals):
-            for x in range(first, last):
-                if where[row, x]:
-                    total = sums[s, 0, x - first]
-                    means = sums[s, 1, x - first]
-                    squares = sums[s, 2, x - first]
-                    out[s, row, x] = max(squares / total - (means / total) ** 2, f32(0))
+            centre, noise = mean[s, row, left:right], variance[s, row + dy, there]
+            add_spatial_tap(to, weight, centre, mean[s, row + dy, there], noise)
 
 
 @jit_parallel
 def spatial_variance_image(out: Image, variance: Image, mean: Image, geometry: Image, where: Mask) -> None:
-    for row in numba.prange(variance.shape[1]):
-        spatial_variance_row(out, np.int64(row), variance, mean, geometry, where)
+    """out (S, H, W) `where` (H, W) it is wanted."""
+    signals, height, width = variance.shape
+    for number in numba.prange(height):
+        row = np.int64(number)
+        sums = np.empty((signals, 3, SPATIAL_BLOCK), np.float32)
+        space = np.empty(SPATIAL_BLOCK, np.float32)
+        for first in range(0, width, SPATIAL_BLOCK):
+            last = min(first + SPATIAL_BLOCK, width)
+            if not where[row, first:last].any():
+                continue
+            sum_spatial_block(sums, space, row, first, last, variance, mean, geometry)
+            for s in range(signals):
+                for x in range(first, last):
+                    if where[row, x]:
+                        total, means, squares = sums[s, 0, x - first], sums[s, 1, x - first], sums[s, 2, x - first]
+                        out[s, row, x] = max(squares / total - (means / total) ** 2, f32(0))
 
 
 def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
