@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Scalar, f32
-from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory, plane_or_empty
+from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory
 from models.compiled.lines import fill_line, triple
 
 GUIDES = 256  # values of a guide (Meng et al. 2020), which cells of a grid divide as they divide pixels
@@ -47,7 +47,7 @@ def splat_line(
     """Add a line of pixels, weighted by_row, to a row of cells."""
     red, green, blue = colour
     for x in range(guide.size):
-        if surface.size > 0 and surface[x] == f32(0):
+        if surface[x] == f32(0):
             continue
         first, right, behind = cells_of_pixel(x, guide[x], levels, per_cell)
         for tap in range(4):
@@ -81,7 +81,7 @@ def slice_line(
     """Fill a line of pixels, `down` of the way from the middle of the row of cells above to that of the one below."""
     red, green, blue = colour
     for x in range(guide.size):
-        if surface.size > 0 and surface[x] == f32(0):
+        if surface[x] == f32(0):
             red[x] = green[x] = blue[x] = f32(0)
             continue
         first, right, behind = cells_of_pixel(x, guide[x], levels, per_cell)
@@ -102,11 +102,6 @@ def slice_line(
 
 
 @jit_with_memory
-def row_or_empty(surface: Plane, y: Index) -> Row:
-    return surface[min(y, surface.shape[0] - 1)] if surface.size > 0 else surface.ravel()
-
-
-@jit_with_memory
 def fill_cells(cells: Row, row: Index, image: Image, guide: Plane, surface: Plane, levels: int, spacing: int) -> None:
     """The means of a row of cells; 0 in a row outside the grid."""
     height, width = guide.shape
@@ -117,14 +112,13 @@ def fill_cells(cells: Row, row: Index, image: Image, guide: Plane, surface: Plan
     first = row * spacing - spacing // 2
     for y in range(max(first, 0), min(first + 2 * spacing, height)):
         by_row = f32(1) - abs(in_cells(f32(y), per_cell) - f32(row + 1))
-        colour = triple(image, y, 0, width)
-        splat_line(cells, by_row, colour, guide[y], row_or_empty(surface, y), levels, per_cell)
+        splat_line(cells, by_row, triple(image, y, 0, width), guide[y], surface[y], levels, per_cell)
     normalise_cells(cells, levels)
 
 
 @jit_parallel
 def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing: int) -> None:
-    """See models.networks.bilateral_grid.grid_mean; surface is (H, W) or empty."""
+    """See models.networks.bilateral_grid.grid_mean."""
     height, width = guide.shape
     levels = GUIDES // spacing + 2
     columns = (width + spacing - 1) // spacing + 2
@@ -142,14 +136,14 @@ def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing
             top = row * spacing - spacing // 2
             for y in range(max(top, 0), min(top + spacing, height)):
                 down = in_cells(f32(y), per_cell) - f32(row)
-                lines = guide[y], row_or_empty(surface, y)
-                slice_line(triple(out, y, 0, width), above, below, down, *lines, levels, per_cell)
+                slice_line(triple(out, y, 0, width), above, below, down, guide[y], surface[y], levels, per_cell)
 
 
 def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None = None) -> Tensor:
     """See models.networks.bilateral_grid.grid_mean."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
+    surface = torch.ones_like(guide) if surface is None else surface
     for item in range(len(image)):
-        planes = array(image[item]), array(guide[item, 0]), plane_or_empty(surface, item)
+        planes = array(image[item]), array(guide[item, 0]), array(surface[item, 0])
         filter_image(out[item].numpy(), *planes, spacing)
     return out

@@ -115,16 +115,10 @@ def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @jit_in_any_order
-def zero_clamped(pull: Row, exponent: Row) -> None:
-    """No gradient where the exponent is clamped."""
+def pull_exponent(pull: Row, exponent: Row) -> None:
+    """pull (n), of the weights times these, becomes the gradient of the exponent: 0 where that is clamped."""
     for x in range(pull.size):
-        pull[x] = pull[x] if exponent[x] < f32(MAX_EXPONENT) else f32(0)
-
-
-@jit_in_any_order
-def subtract_product(line: Row, a: Row, b: Row) -> None:
-    for x in range(line.size):
-        line[x] -= a[x] * b[x]
+        pull[x] = -pull[x] if exponent[x] < f32(MAX_EXPONENT) else f32(0)
 
 
 @jit_parallel
@@ -144,9 +138,9 @@ def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes:
             weigh_tap(weight, exponent, distances, planes, row, left, dx, dy)
             there = triple(planes.image, row + dy, left + dx, right + dx)
             pull_weights(pull, weight, triple_of_lines(scaled, left, right), dots[left:right], there)
-            zero_clamped(pull, exponent)
+            pull_exponent(pull, exponent)
             for s in range(1 + GROUP_COUNT):
-                subtract_product(pulled[s, row, left:right], pull, distances[s])
+                add_product(pulled[s, row, left:right], pull, distances[s])
 
 
 def pull_sharpness(gradient: Tensor, pixels: "Pixels", sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Rows, Scalar, Signals, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
-from models.compiled.jit import array, jit_in_any_order, jit_with_memory, plane_or_empty
+from models.compiled.jit import array, jit_in_any_order, jit_with_memory
 from models.compiled.lines import add_line, copy_line, exclude, fill_line, raise_line, triple, triple_of_lines
 from models.operators import MIN_DIVISOR
 
@@ -253,7 +253,7 @@ def fuse_strips(
     shares: Signals,
     weighted: Signals,
 ) -> None:
-    """fused (3, H, W) += image (3, H, W) filtered, strips in parallel; surface (H, W) is empty where all pixels count.
+    """fused (3, H, W) += image (3, H, W) filtered, of the pixels of the surface (H, W), strips in parallel.
 
     logits (threads, M, rows, W), shares (threads, M, THREAD_ROWS, W) and weighted (threads, 4, rows, W) are scratch of
     the threads' own: memory that is allocated within the loop would be cleared anew for every strip.
@@ -274,7 +274,7 @@ def fuse_strips(
             softmax(my_shares, y - start, scratch[0], scratch[1])
         for y in range(first, last):
             split_row(my_logits, y - first, importance, y)
-            if surface.size > 0 and surface[y].min() == 0:
+            if surface[y].min() == 0:
                 for i in range(windows.size):
                     exclude(my_logits[i, y - first], surface[y], f32(OUTSIDE_LOGIT))
         for i in range(windows.size):
@@ -305,6 +305,7 @@ def fuse(
 ) -> Tensor:
     """See models.networks.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
+    surface = torch.ones_like(image[:, :1]) if surface is None else surface
     threads = numba.get_num_threads()
     width = image.shape[-1]
     rows = THREAD_ROWS + max(windows)
@@ -314,7 +315,7 @@ def fuse(
         np.empty((threads, 4, rows, width), np.float32),
     )
     for item in range(len(image)):
-        images = fused[item].numpy(), array(image[item]), plane_or_empty(surface, item)
+        images = fused[item].numpy(), array(image[item]), array(surface[item, 0])
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
         compiled_fuse_strips()(*images, *maps, np.array(windows), *scratch)
     return fused

@@ -55,11 +55,6 @@ def array(tensor: Tensor) -> NDArray[np.float32]:
     return tensor.detach().float().contiguous().numpy()
 
 
-def plane_or_empty(images: Tensor | None, item: int) -> NDArray[np.float32]:
-    """One of images (B, 1, H, W), as (H, W); (0, 0) for None, so that kernels need no second version."""
-    return np.empty((0, 0), np.float32) if images is None else array(images[item, 0])
-
-
 @jit_parallel
 def nothing() -> None:
     for _ in numba.prange(2):

@@ -119,14 +119,9 @@ def add_layer(lines: Rows, inputs: Rows, weight: Matrix, n: int) -> None:
 
 @jit_in_any_order
 def log_exposed(line: Row, image: Row, gain: Scalar) -> None:
+    """ln(1 + gain image), in the range of exposed irradiance."""
     for x in range(line.size):
         line[x] = log(f32(1) + min(max(image[x], f32(0)) * gain, f32(MAX_EXPOSED)))
-
-
-@jit_in_any_order
-def log1p_row(line: Row, image: Row) -> None:
-    for x in range(line.size):
-        line[x] = log(f32(1) + image[x])
 
 
 @jit_in_any_order
@@ -193,7 +188,7 @@ def fill_lines(lines: Rows, pixels: PixelArrays, surfaces: SurfaceArrays, y: Ind
         log_exposed(lines[MEAN_9X9 + c, :n], mean_9x9[c, y, row], gain)
         log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], mean_9x9[c, y, row], gain)
         log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], noisy[c, y, row], gain)
-    log1p_row(lines[DEVIATION, :n], pixels.deviation[0, y, row])
+    log_exposed(lines[DEVIATION, :n], pixels.deviation[0, y, row], f32(1))
     lines[NEWEST, :n] = f32(1) / surfaces.samples
     reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, surfaces.samples)
     copy_line(lines[HAS_HISTORY, :n], valid)
@@ -256,9 +251,10 @@ def network_inputs(
     to_view = array(frame.to_view)
     for item in range(batch):
         pixels = PixelArrays(*(array(image[item]) for image in inputs))
-        images = (array(image[item]) for image in (frame.albedo, frame.normal, frame.depth, frame.roughness))
-        samples = np.float32(frame.samples[item].item())
-        surfaces = SurfaceArrays(*images, gains[item], samples, to_view[item], depth_scales[item])
+        albedo, normal = array(frame.albedo[item]), array(frame.normal[item])
+        depth, roughness = array(frame.depth[item]), array(frame.roughness[item])
+        numbers = gains[item], np.float32(frame.samples[item].item()), to_view[item], depth_scales[item]
+        surfaces = SurfaceArrays(albedo, normal, depth, roughness, *numbers)
         write_inputs(out[item].numpy(), sums[item].numpy(), pixels, surfaces, LinearLayer.of(hidden))
     return out.flatten(3).permute(0, 3, 1, 2), sums
 

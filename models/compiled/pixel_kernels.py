@@ -10,7 +10,7 @@ from torch import Tensor
 
 from models.compiled.arrays import Image, Index, Plane, Row, Rows, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory, plane_or_empty
+from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory
 from models.compiled.lines import add_product, exclude, raise_line, window_taps
 
 MIN_RELATIVE_LOGIT = np.float32(-87)  # to the largest: exp of less is denormal in float32, which is slow
@@ -41,10 +41,7 @@ def to_weights(logits: Row, top: Row, total: Row) -> None:
 
 @jit_with_memory
 def apply_to_row(output: Image, image: Image, surface: Plane, row: Rows, y: Index, size: int) -> None:
-    """Row y of output, filtered by the softmax of row (size², W + PADDING), whose contents are lost.
-
-    surface (H, W) is empty where all pixels count.
-    """
+    """Row y of output, filtered by the softmax of row (size², W + PADDING), whose contents are lost."""
     channels, height, width = image.shape
     radius = size // 2
     top = np.full(width, f32(-np.inf))
@@ -52,8 +49,7 @@ def apply_to_row(output: Image, image: Image, surface: Plane, row: Rows, y: Inde
     sums = np.zeros((channels, width), np.float32)
     for dx, dy, low, high in window_taps(y, radius, 1, height, width):
         logits = row[(dy + radius) * size + dx + radius, low:high]
-        if surface.size > 0:
-            exclude(logits, surface[y + dy, low + dx : high + dx], f32(-np.inf))
+        exclude(logits, surface[y + dy, low + dx : high + dx], f32(-np.inf))
         raise_line(top[low:high], logits)
     for dx, dy, low, high in window_taps(y, radius, 1, height, width):
         logits = row[(dy + radius) * size + dx + radius, low:high]
@@ -78,10 +74,11 @@ def apply_to_image(
 def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
     """See models.networks.pixel_kernels.apply_kernels; logits are read in place, bfloat16 without a copy."""
     output = torch.empty_like(image, memory_format=torch.contiguous_format)
+    surface = torch.ones_like(image[:, :1]) if surface is None else surface
     bfloat = logits.dtype == torch.bfloat16
     bits = logits.view(torch.int16) if bfloat else logits.float()
     for item in range(len(image)):
         values = bits[item].detach().numpy()
-        images = array(image[item]), plane_or_empty(surface, item)
+        images = array(image[item]), array(surface[item, 0])
         apply_to_image(output[item].numpy(), *images, values, math.isqrt(logits.shape[1]), bfloat)
     return output

@@ -194,12 +194,6 @@ def is_consistent(x: Index, y: Index, pixel: Index, mesh: Scalar, taps: RowTaps,
 
 
 @jit_with_reciprocals
-def compare_meshes(good: Row, mesh: Scalar, other: Row) -> None:
-    for i in range(good.size):
-        good[i] = f32(1) if other[i] == mesh else f32(0)
-
-
-@jit_with_reciprocals
 def compare_normals(good: Row, predicted: RGB, normal: RGB) -> None:
     """good (n) becomes 0 where the normals of taps differ from those predicted."""
     nx, ny, nz = predicted
@@ -235,7 +229,9 @@ def compare(good: Row, taps: RowTaps, x: Index, y: Index, low: Index, mesh: Scal
     if y < 0 or y >= pair.mesh_then.shape[0]:
         good[:] = f32(0)
         return
-    compare_meshes(good, mesh, pair.mesh_then[y, x:end])
+    other = pair.mesh_then[y, x:end]
+    for i in range(good.size):
+        good[i] = f32(1) if other[i] == mesh else f32(0)
     if mesh == BACKGROUND_ID:
         return
     normal = triple(pair.normal_then, y, x, end)

@@ -16,14 +16,7 @@ from torch import Tensor
 from datasets.frame import Frame
 from models.compiled.arrays import RGB, Image, Index, Mask, Plane, Row, Scalar, Signals, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import (
-    array,
-    jit_in_any_order,
-    jit_inlined_in_any_order,
-    jit_parallel,
-    jit_with_reciprocals,
-    plane_or_empty,
-)
+from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel, jit_with_reciprocals
 from models.compiled.lines import block_count, copy_line, luminance, rows_of_block, triple, triple_of_lines, window_taps
 from models.compiled.reprojection import FramePair, find_taps, gather, new_taps
 from models.filters.atrous import RADIUS, SPLINE
@@ -124,7 +117,8 @@ def integrate_samples(
         out = IntegratedArrays(colour[item].numpy(), moments[item].numpy(), length[item, 0].numpy())
         past = (array(image) for image in (previous.colour[item], previous.moments[item], previous.length[item, 0]))
         pair = FramePair.of(frame, previous.gbuffer, item)
-        integrate_image(out, array(noisy[item]), IntegratedArrays(*past), plane_or_empty(change, item), pair)
+        dropped = np.empty((0, 0), np.float32) if change is None else array(change[item, 0])
+        integrate_image(out, array(noisy[item]), IntegratedArrays(*past), dropped, pair)
     return colour, moments, length
 
 
@@ -369,9 +363,10 @@ def edge_image(signals: Signals, surfaces: Image) -> None:
         for s in range(count_signals):
             columns = np.zeros(width + 2, np.float32)
             inside = np.zeros(width + 2, np.float32)
-            for y in range(max(row - 1, 0), min(row + 2, height)):
-                h = f32(0.5) if y == row else f32(0.25)
-                add_surfaces(columns[1:-1], inside[1:-1], h, signals[y, s, 3], surfaces[y, 3])
+            for y in (row - 1, row, row + 1):
+                if 0 <= y < height:
+                    h = f32(0.5) if y == row else f32(0.25)
+                    add_surfaces(columns[1:-1], inside[1:-1], h, signals[y, s, 3], surfaces[y, 3])
             colour = signals[row, s, 0], signals[row, s, 1], signals[row, s, 2]
             finish_edge(signals[row, s, 4], signals[row, s, 5], colour, columns, inside)
 
