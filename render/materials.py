@@ -249,6 +249,7 @@ class MaterialTable:
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
         self.depth = max(map(depth_of, trees), default=0)
         rows = [self.add(tree) for tree in trees]
+        self.transmits = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs.values())
         self.has_mirrors = any(map(may_be_mirror, bsdfs.values(), trees))
         if not rows:
             self.add(Material(constant(1), constant(1), constant(0), UNSCALED))  # an empty scene needs a row too

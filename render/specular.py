@@ -75,18 +75,15 @@ def advance(
         onward = si.spawn_ray(si.to_world(sample.wo))
         branches.append((follows, [*onward.o, *onward.d, *weight]))
     dr.eval(radiance, branches)  # in one kernel
-    pixels = [chains.pixel[np.array(follows)] for follows, _ in branches]
-    rays = [columns(ray)[np.array(follows)] for follows, ray in branches]
+    pixels = [chains.pixel[:0], *(chains.pixel[np.array(follows)] for follows, _ in branches)]
+    rays = [chains.rays[:0], *(columns(ray)[np.array(follows)] for follows, ray in branches)]
     return columns(radiance), Chains(np.concatenate(pixels), np.concatenate(rays))
 
 
 def specular_light(
     scene: mi.Scene, lights: Lights, specular: SpecularSurfaces, ray: mi.Ray3f, max_events: int
 ) -> NDArray[np.float32]:
-    """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events.
-
-    In a scene with specular surfaces.
-    """
+    """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events."""
     count = dr.width(ray.d)
     values = [*ray.o, *ray.d, *mi.Color3f(1)]
     chains = Chains(np.arange(count), np.stack([np.broadcast_to(np.array(value), count) for value in values], axis=-1))

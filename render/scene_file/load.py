@@ -9,14 +9,16 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.loading import mitsuba_reason
+from render.loading import columns, mitsuba_reason
+from render.path import PathTracer
 from render.scene_file.convert import Converter
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
 from render.scene_file.mesh_file import load_mesh_file
+from render.specular import MAX_EVENTS, specular_light
 from render.stage import Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
-from scenes.camera import Array, look_at
+from scenes.camera import Array, look_at, pixel_centres
 
 DEFAULT_DEPTH = 3  # path edges: one indirect bounce
 MAX_DEPTH = 64  # for files with endless paths; Russian roulette ends them before
@@ -60,6 +62,41 @@ def camera_framing(low: Array, high: Array) -> Camera:
 DEFAULT_CAMERA = camera_framing(np.zeros(3), np.ones(3))  # until the extent of the scene is known
 
 
+PROBED_PIXELS = 2000
+PROBE_SPP = 32
+PROBED_DEPTHS = (5, 9, 17)
+
+
+def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
+    """Whether most light needs longer paths than the scene's: that of lamps in glass, or behind it."""
+    if not stage.materials.transmits:
+        return []
+    count = stage.height * stage.width
+    pixel = np.arange(0, count, max(1, count // PROBED_PIXELS))
+    centres = pixel_centres(stage.height, stage.width).reshape(-1, 2)
+    rays = stage.rays(scene.view(0, stage.height, stage.width), centres[pixel])
+    shows_no_lamp = ~specular_light(stage.mitsuba_scene, stage.lights, stage.specular, rays, MAX_EVENTS).any(axis=1)
+    tracer = PathTracer(stage)
+
+    def light(depth: int) -> float:
+        """Mean radiance of surfaces, each pixel's at most 1: fireflies would hide how much most of them get."""
+        stage.scene = replace(scene, max_depth=depth)
+        direct, indirect = tracer.samples(rays, mi.UInt32(pixel.astype(np.uint32)), 0, PROBE_SPP)
+        return float(np.minimum(columns(direct + indirect), 1).mean(axis=1) @ shows_no_lamp)
+
+    own = light(scene.max_depth)
+    lights = {depth: light(depth) for depth in PROBED_DEPTHS if depth > scene.max_depth}
+    stage.scene = scene
+    if not lights or own >= 0.5 * max(lights.values()):
+        return []
+    enough = next(depth for depth, value in lights.items() if value >= 0.9 * max(lights.values()))
+    share = 100 * own / max(lights.values())
+    few = (
+        f"with {scene.max_depth - 1} bounces only {share:.0f} % of the light of {PROBED_DEPTHS[-1] - 1} bounces arrives"
+    )
+    return [f"{few}, perhaps because lamps shine through glass: set `bounces = {enough - 1}` in the TOML"]
+
+
 class OwnScene:
     """The scene that a TOML describes, at rest.
 
@@ -87,6 +124,7 @@ class OwnScene:
             self.notes.append("there is no camera: one that frames the whole scene instead")
             space = Space(self.stage)
             self.scene = replace(self.scene, camera=camera_framing(space.low, space.high))
+        self.notes += note_on_depth(self.stage, self.scene)
 
     def from_xml(self) -> tuple[Scene, list[str]]:
         found = Converter(self.file).convert()

@@ -168,3 +168,22 @@ def test_points_of_no_size_and_deep_mixtures(tmp_path):
     blends = '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse"/>'
     deep = own(tmp_path, xml(shape=painted(blends * 30 + '<bsdf type="plastic"/>' + "</bsdf>" * 30)))
     assert deep.stage.materials.depth == 6
+
+
+def bulb_in_a_room(max_depth: int) -> str:
+    """A lamp in a hollow ball of glass in a closed room, from within."""
+    ball = '<shape type="sphere"><float name="radius" value="{}"/>{}</shape>'
+    walls = '<shape type="cube"><boolean name="flip_normals" value="true"/>'
+    walls += '<transform name="to_world"><scale value="8"/></transform></shape>'
+    lamp = ball.format(0.3, '<emitter type="area"><rgb name="radiance" value="20"/></emitter>')
+    depth = f'<integrator type="path"><integer name="max_depth" value="{max_depth}"/></integrator>'
+    glass = '<bsdf type="dielectric"><float name="int_ior" value="{}"/><float name="ext_ior" value="{}"/></bsdf>'
+    inner = ball.format(0.4, glass.format(1, 1.5))
+    return xml(depth, walls, lamp, inner, light="", shape=ball.format(0.5, glass.format(1.5, 1)))
+
+
+def test_lamps_that_shine_through_glass_alone_need_more_bounces(tmp_path):
+    assert own(tmp_path, bulb_in_a_room(6)).notes == []
+    (note,) = own(tmp_path, bulb_in_a_room(3)).notes
+    assert note.startswith("with 2 bounces only 0 % of the light") and "set `bounces = " in note
+    assert own(tmp_path, bulb_in_a_room(3), "bounces = 4").notes == []
