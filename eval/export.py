@@ -6,9 +6,8 @@ from typing import Literal
 
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.selection import weights_of
-from models.export.package import Export, write_export
+from models.export.package import Export, check_exportable, write_export
 from models.export.program import Format, check_installed
-from models.export.registry import check_exportable
 from models.export.step import Warp
 from models.registry import parse_name
 

@@ -1,4 +1,4 @@
-"""The folder of an exported denoiser: its file, a manifest, golden frames, and instructions for calling it."""
+"""Which denoisers can be exported, and the folder of an export: file, manifest, golden frames, instructions."""
 
 import os
 import shutil
@@ -13,26 +13,39 @@ import torch
 from datasets.frame import Frame
 from errors import BadInput
 from files import read_json, write_json
+from models.denoiser import Denoiser
+from models.export.one import OneStep
 from models.export.page import instructions
-from models.export.program import (
-    OPSET,
-    Format,
-    Operators,
-    check_installed,
-    play,
-    run_onnx,
-    run_pt2,
-    trace,
-    write_onnx,
-    write_pt2,
-)
-from models.export.registry import load_step
+from models.export.program import OPSET, RUN, WRITE, Format, Operators, check_installed, play, trace
 from models.export.step import Port, Step, Tensors, Warp
+from models.export.wskp import WSKPStep
+from models.networks.one import One
+from models.networks.wskp import WSKP
+from models.registry import DENOISERS, prototype
 from models.spec import PRECISIONS, load
 from provenance import file_digest, versions
 
 MANIFEST = "manifest.json"
 PACKAGES = ("onespp", "torch", "onnx", "onnxscript", "onnxruntime")
+EXPORT_STEPS: dict[type[Denoiser], type[Step]] = {WSKP: WSKPStep, One: OneStep}  # by class, subclasses included
+EXPORTABLE = [name for name, kind in DENOISERS.items() if issubclass(kind, tuple(EXPORT_STEPS))]
+
+
+def check_exportable(name: str) -> None:
+    """Raise BadInput for the name of a denoiser that has no step."""
+    if not isinstance(prototype(name), tuple(EXPORT_STEPS)):
+        raise BadInput(f"'{name}' cannot be exported; {', '.join(EXPORTABLE)} can")
+
+
+def step_of(denoiser: Denoiser, warp: Warp) -> Step:
+    """The step of a denoiser, which is prepared for inference and must not be used afterwards."""
+    return next(step for kind, step in EXPORT_STEPS.items() if isinstance(denoiser, kind))(denoiser, warp)
+
+
+def load_step(name: str, weights: Path, precision: torch.dtype, warp: Warp) -> Step:
+    """The step of a named denoiser with the weights of a file. Raises BadInput where either does not fit."""
+    check_exportable(name)
+    return step_of(load(name, weights, precision), warp)
 
 
 @dataclass(frozen=True)
@@ -74,7 +87,7 @@ def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], gold
     from_golden = from_ours = 0.0
     with torch.no_grad():
         expected = list(play(step, frames, step))
-        actual = play(step, frames, run_onnx(path) if export.to == "onnx" else run_pt2(path))
+        actual = play(step, frames, RUN[export.to](path))
         for index, (frame, (inputs, outputs), (_, theirs)) in enumerate(zip(frames, expected, actual, strict=True)):
             write_golden(golden, index, inputs, outputs)
             from_golden = max(from_golden, *(largest_difference(theirs[name], outputs[name]) for name in outputs))
@@ -85,6 +98,7 @@ def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], gold
 
 def manifest(export: Export, step: Step, operators: Operators, differences: dict[str, float]) -> dict[str, Any]:
     """The content of manifest.json without the hashes of files."""
+    total = sum(operators.kinds.values())  # outside of branches
     return {
         "schema": 1,
         "denoiser": export.name,
@@ -100,7 +114,7 @@ def manifest(export: Export, step: Step, operators: Operators, differences: dict
             for each in step.carried
         ],
         "weights_sha256": file_digest(export.weights),
-        "operators": {"total": operators.total, "branches": operators.branches, "kinds": operators.kinds},
+        "operators": {"total": total, "branches": operators.branches, "kinds": operators.kinds},
         "largest_difference": differences,
         "versions": versions(PACKAGES),
     }
@@ -111,7 +125,7 @@ def write_files(folder: Path, export: Export, frames: Sequence[Frame]) -> dict[s
     step = load_step(export.name, export.weights, PRECISIONS[export.precision], export.warp)
     program = trace(step, frames[0])
     path = folder / export.file
-    operators = write_onnx(program, step, path) if export.to == "onnx" else write_pt2(program, path)
+    operators = WRITE[export.to](program, step, path)
     golden = folder / "golden"
     golden.mkdir()
     content = manifest(export, step, operators, verify(export, path, step, frames, golden))

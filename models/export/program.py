@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -40,8 +40,7 @@ def quiet() -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         logger.setLevel(level)
@@ -70,31 +69,9 @@ class Operators:
     kinds: dict[str, int]
     branches: dict[str, int]
 
-    @property
-    def total(self) -> int:
-        """Outside of branches."""
-        return sum(self.kinds.values())
-
-    @staticmethod
-    def of_onnx(nodes: Iterable[Any]) -> "Operators":
-        nodes = list(nodes)
-        attributes = [attribute for node in nodes for attribute in node.attributes.values()]
-        branches = {each.name: len(each.value) for each in attributes if each.type.name == "GRAPH"}
-        return Operators(dict(Counter(sorted(node.op_type for node in nodes))), branches)
-
-    @staticmethod
-    def of_pt2(program: ExportedProgram) -> "Operators":
-        def calls(graph: torch.fx.Graph) -> list[str]:
-            return sorted(str(node.target) for node in graph.nodes if node.op == "call_function")
-
-        branches = program.graph_module.named_children()
-        inner = {name: len(calls(each.graph)) for name, each in branches if isinstance(each, torch.fx.GraphModule)}
-        return Operators(dict(Counter(calls(program.graph))), inner)
-
 
 def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
-    """Write one file, weights included. Raises BadInput where packages are missing."""
-    check_installed("onnx")
+    """Write one file, weights included."""
     from onnxscript.optimizer import remove_unused_nodes
 
     with quiet():
@@ -110,22 +87,31 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
         assert written is not None
         remove_unused_nodes(written.model)  # the exporter leaves constants in branches, of which runtimes warn
         written.save(path, external_data=False)
-    return Operators.of_onnx(written.model.graph)
+    nodes = list(written.model.graph)
+    attributes = [attribute for node in nodes for attribute in node.attributes.values()]
+    branches = {each.name: len(each.value) for each in attributes if each.type.name == "GRAPH"}
+    return Operators(dict(Counter(sorted(node.op_type for node in nodes))), branches)
 
 
-def write_pt2(program: ExportedProgram, path: Path) -> Operators:
+def write_pt2(program: ExportedProgram, step: Step, path: Path) -> Operators:
     """Write one file, weights included."""
+
+    def calls(graph: torch.fx.Graph) -> list[str]:
+        return sorted(str(node.target) for node in graph.nodes if node.op == "call_function")
+
     with quiet():
         torch.export.save(program, path)
-    return Operators.of_pt2(program)
+    children = program.graph_module.named_children()
+    branches = {name: len(calls(each.graph)) for name, each in children if isinstance(each, torch.fx.GraphModule)}
+    return Operators(dict(Counter(calls(program.graph))), branches)
 
 
-def run_onnx(path: Path, threads: int | None = None) -> Compute:
-    """The file's step on the CPU, by default with as many threads as PyTorch uses."""
+def run_onnx(path: Path) -> Compute:
+    """The file's step on the CPU, with as many threads as PyTorch uses."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or torch.get_num_threads()
+    options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3  # errors
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
@@ -150,21 +136,20 @@ def run_pt2(path: Path) -> Compute:
     return compute
 
 
-def warped(step: Step, state: dict[str, Tensor], frame: Frame, previous: Frame) -> dict[str, Tensor]:
-    """The state with those images reprojected that the caller must reproject."""
-    names = [each.port.name for each in step.carried if each.warped]
-    return {**state, **{name: reproject(frame, state[name], GBuffer.of(previous))[0] for name in names}}
+WRITE = {"onnx": write_onnx, "pt2": write_pt2}
+RUN = {"onnx": run_onnx, "pt2": run_pt2}
 
 
 def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tuple[Tensors, Tensors]]:
     """Inputs and outputs of each frame (B = 1). After a cut the state is the initial one."""
+    warped = [each.port.name for each in step.carried if each.warped]
     previous: Frame | None = None
     state: dict[str, Tensor] = {}
     for frame in frames:
         if previous is None or not frame.follows(previous.moment):
             state = step.initial_state(frame)
         else:
-            state = warped(step, state, frame, previous)
+            state |= {name: reproject(frame, state[name], GBuffer.of(previous))[0] for name in warped}
         inputs = {**step.frame_inputs(frame), **state}
         outputs = compute(inputs)
         yield inputs, outputs

@@ -32,10 +32,6 @@ class Port:
     dtype: torch.dtype = torch.float32
     of_frame: OfFrame | None = None  # how a frame provides it, if it does
 
-    def zeros(self, sizes: Mapping[str, int]) -> Tensor:
-        """A tensor of this shape, for named `sizes`."""
-        return torch.zeros([size if isinstance(size, int) else sizes[size] for size in self.shape], dtype=self.dtype)
-
 
 def image(name: str, channels: int, of_frame: OfFrame | None, meaning: str, dtype: torch.dtype = torch.float32) -> Port:
     """A port for images (1, channels, H, W)."""
@@ -136,8 +132,10 @@ class Step(nn.Module):
 
     def initial_state(self, frame: Frame) -> dict[str, Tensor]:
         """The state before a sequence of frames of this one's size."""
-        height, width = frame.size
-        return {each.port.name: each.port.zeros({HEIGHT: height, WIDTH: width}) for each in self.carried}
+        sizes = dict(zip((HEIGHT, WIDTH), frame.size, strict=True))
+        ports = [each.port for each in self.carried]
+        shapes = ([size if isinstance(size, int) else sizes[size] for size in port.shape] for port in ports)
+        return {port.name: torch.zeros(shape, dtype=port.dtype) for port, shape in zip(ports, shapes, strict=True)}
 
     def next_state(self, inputs: Tensors, outputs: Tensors) -> dict[str, Tensor]:
         """The state after a frame, not yet warped."""

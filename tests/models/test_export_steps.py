@@ -22,9 +22,8 @@ from models.denoiser import Denoiser
 from models.export import program as programs
 from models.export.history import GraphGBuffer, expected_surfaces, pixel_coordinates, reprojected, reprojection_table
 from models.export.one import affinity_level, mesh_sums
-from models.export.package import Export, largest_difference, write_export
+from models.export.package import EXPORTABLE, Export, largest_difference, load_step, step_of, write_export
 from models.export.program import play, run_onnx, run_pt2, trace, write_onnx, write_pt2
-from models.export.registry import EXPORTABLE, load_step, step_of
 from models.export.wskp import BoxWindows
 from models.filters import neighbours
 from models.history.geometry import GBuffer, to_previous_camera
@@ -283,7 +282,7 @@ def files_of(step, folder):
     """The step as ONNX and pt2 files, each as a callable."""
     program = trace(step, synthetic_frame(0, 24, 32))
     write_onnx(program, step, folder / "step.onnx")
-    write_pt2(program, folder / "step.pt2")
+    write_pt2(program, step, folder / "step.pt2")
     return run_onnx(folder / "step.onnx"), run_pt2(folder / "step.pt2")
 
 
