@@ -1,9 +1,9 @@
 """Kernels compiled at first use: fast versions of functions that models/ has in PyTorch.
 
-`by` puts a kernel beside the PyTorch function of the same signature and decides which of both runs. Numba compiles
-kernels for the CPU and keeps them on disk from run to run. `with_gradients` is for kernels with gradients of their
-own. What no kernel can compute (other gradients, half precision, nearly everything on GPUs) runs in PyTorch; tests
-hold kernels to that.
+`by` puts a kernel beside the PyTorch function of the same name and signature, whose docstring is for both, and decides
+which of them runs. Numba compiles kernels for the CPU and keeps them on disk from run to run. `with_gradients` is for
+kernels with gradients of their own. What no kernel can compute (other gradients, half precision, nearly everything on
+GPUs) runs in PyTorch; tests hold kernels to that.
 
 The constants of a paper stand at the top of its kernel file, as Python numbers, from where the PyTorch version takes
 them; kernels round them with `f32`. Limits that several share are in models.operators.

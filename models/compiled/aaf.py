@@ -83,7 +83,6 @@ def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, g
 
 
 def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
-    """See models.filters.aaf.filter_lines."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         images = array(image[item]), array(width[item, :, 0]), array(max_width[item, :, 0]), array(geometry[item, 0])

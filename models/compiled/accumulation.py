@@ -53,7 +53,6 @@ def accumulate_image(
 def accumulate_samples(
     frame: Frame, noisy: Tensor, past_irradiance: Tensor, past_length: Tensor, gbuffer: GBuffer
 ) -> tuple[Tensor, Tensor]:
-    """See models.history.accumulation.accumulate_samples."""
     irradiance = torch.empty_like(noisy, memory_format=torch.contiguous_format)
     length = torch.empty_like(past_length, memory_format=torch.contiguous_format)
     for item in range(len(noisy)):

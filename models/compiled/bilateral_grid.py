@@ -118,7 +118,6 @@ def fill_cells(cells: Row, row: Index, image: Image, guide: Plane, surface: Plan
 
 @jit_parallel
 def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing: int) -> None:
-    """See models.networks.bilateral_grid.grid_mean."""
     height, width = guide.shape
     levels = GUIDES // spacing + 2
     columns = (width + spacing - 1) // spacing + 2
@@ -140,7 +139,6 @@ def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing
 
 
 def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None = None) -> Tensor:
-    """See models.networks.bilateral_grid.grid_mean."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     surface = torch.ones_like(guide) if surface is None else surface
     for item in range(len(image)):

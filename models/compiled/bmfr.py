@@ -141,25 +141,6 @@ def write_block(plane: Plane, values: Doubles, top: Index, left: Index) -> None:
             plane[y, x] = values[row + x]
 
 
-@jit_with_memory
-def regress_block(fitted: Image, inputs: RegressionInputs, top: Index, left: Index) -> None:
-    columns = np.empty((REGRESSORS, PIXELS))
-    matrix = np.empty((COLUMNS, PIXELS))
-    coefficients = np.empty((3, REGRESSORS))
-    light = matrix[REGRESSORS:]
-    if gather_block(columns, light, inputs, top, left):
-        scale_positions(columns)
-        matrix[:REGRESSORS] = columns + inputs.noise
-        triangularise(matrix)
-        substitute(coefficients, matrix)
-        for c in range(3):
-            light[c] = 0.0
-            for i in range(REGRESSORS):
-                add_multiple(light[c], columns[i], coefficients[c, i])
-    for c in range(3):
-        write_block(fitted[c], light[c], top, left)
-
-
 @jit_parallel
 def regress_image(fitted: Image, inputs: RegressionInputs, above: int, before: int) -> None:
     """fitted (3, H, W), by blocks of which the first begins `above` and `before` the image."""
@@ -167,14 +148,28 @@ def regress_image(fitted: Image, inputs: RegressionInputs, above: int, before: i
     down = (height + above + BLOCK_SIDE - 1) // BLOCK_SIDE
     across = (width + before + BLOCK_SIDE - 1) // BLOCK_SIDE
     for block in numba.prange(down * across):
-        number = np.int64(block)
-        regress_block(fitted, inputs, number // across * BLOCK_SIDE - above, number % across * BLOCK_SIDE - before)
+        top = np.int64(block) // across * BLOCK_SIDE - above
+        left = np.int64(block) % across * BLOCK_SIDE - before
+        columns = np.empty((REGRESSORS, PIXELS))
+        matrix = np.empty((COLUMNS, PIXELS))
+        coefficients = np.empty((3, REGRESSORS))
+        light = matrix[REGRESSORS:]
+        if gather_block(columns, light, inputs, top, left):
+            scale_positions(columns)
+            matrix[:REGRESSORS] = columns + inputs.noise
+            triangularise(matrix)
+            substitute(coefficients, matrix)
+            for c in range(3):
+                light[c] = 0.0
+                for i in range(REGRESSORS):
+                    add_multiple(light[c], columns[i], coefficients[c, i])
+        for c in range(3):
+            write_block(fitted[c], light[c], top, left)
 
 
 def regress(
     irradiance: Tensor, normal: Tensor, depth: Tensor, axes: Tensor, noise: Tensor, offset: tuple[int, int]
 ) -> Tensor:
-    """See models.filters.bmfr.regress."""
     fitted = torch.empty_like(irradiance, memory_format=torch.contiguous_format)
     doubles = noise.T.contiguous().numpy()
     for item in range(len(irradiance)):

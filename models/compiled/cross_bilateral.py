@@ -103,7 +103,6 @@ def planes_of(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
 
 
 def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
-    """See models.networks.cross_bilateral.weighted_mean."""
     out = torch.zeros_like(pixels.image, memory_format=torch.contiguous_format)
     total = torch.zeros_like(pixels.surface, memory_format=torch.contiguous_format)
     for item in range(len(out)):
@@ -144,7 +143,6 @@ def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes:
 
 
 def pull_sharpness(gradient: Tensor, pixels: "Pixels", sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:
-    """See models.networks.cross_bilateral.pull_sharpness."""
     pulled = torch.zeros_like(sharpness, memory_format=torch.contiguous_format)
     for item in range(len(pulled)):
         planes = planes_of(pixels, sharpness, item)

@@ -59,7 +59,6 @@ def filter_image(out: Image, colour: Image, features: Image, step: int) -> None:
 
 
 def eaw_level(colour: Tensor, features: Tensor, step: int) -> Tensor:
-    """See models.filters.eaw.eaw_level."""
     out = torch.empty_like(colour, memory_format=torch.contiguous_format)
     for item in range(len(colour)):
         filter_image(out[item].numpy(), array(colour[item]), array(features[item]), step)

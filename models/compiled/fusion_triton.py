@@ -87,7 +87,6 @@ def fuse_rows(
 def fuse(
     image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int], surface: Tensor | None = None
 ) -> Tensor:
-    """See models.networks.fusion.fuse."""
     batch, _, height, width = image.shape
     fused = torch.empty_like(image, memory_format=torch.contiguous_format)
     radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)

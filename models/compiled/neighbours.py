@@ -91,7 +91,6 @@ def sum_taps(sums: Image, image: Image, mesh: Plane, step: int) -> None:
 
 
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
-    """See models.filters.neighbours.mesh_sums."""
     sums = torch.empty_like(image, memory_format=torch.contiguous_format)
     for item in range(len(image)):
         sum_taps(sums[item].numpy(), array(image[item]), array(mesh_id[item, 0]), step)
@@ -99,7 +98,6 @@ def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
 
 
 def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.filters.neighbours.mesh_means."""
     mean_3x3 = torch.empty_like(image, memory_format=torch.contiguous_format)
     mean_9x9 = torch.empty_like(mean_3x3)
     deviation = torch.empty_like(mesh_id, memory_format=torch.contiguous_format)

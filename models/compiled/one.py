@@ -385,7 +385,6 @@ def decode_images(
 def decode_head(
     head: Tensor, hidden: Tensor, last: nn.Linear, inputs: "PixelInputs", samples: Tensor
 ) -> tuple[Tensor, ...]:
-    """See models.networks.one.decode_head."""
     batch, _, height, width = head.shape
     levels = filter_levels(head.shape[1])
     counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1)

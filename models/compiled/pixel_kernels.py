@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.compiled.arrays import Image, Index, Plane, Row, Rows, f32
+from models.compiled.arrays import Image, Plane, Row, Rows, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_order, jit_parallel, jit_with_memory
+from models.compiled.jit import array, jit_in_order, jit_parallel
 from models.compiled.lines import add_product, exclude, raise_line, window_taps
 
 MIN_RELATIVE_LOGIT = np.float32(-87)  # to the largest: exp of less is denormal in float32, which is slow
@@ -39,36 +39,30 @@ def to_weights(logits: Row, top: Row, total: Row) -> None:
         total[x] += logits[x]
 
 
-@jit_with_memory
-def apply_to_row(output: Image, image: Image, surface: Plane, row: Rows, y: Index, size: int) -> None:
-    """Row y of output, filtered by the softmax of row (size², W + PADDING), whose contents are lost."""
-    channels, height, width = image.shape
-    radius = size // 2
-    top = np.full(width, f32(-np.inf))
-    total = np.zeros(width, np.float32)
-    sums = np.zeros((channels, width), np.float32)
-    for dx, dy, low, high in window_taps(y, radius, 1, height, width):
-        logits = row[(dy + radius) * size + dx + radius, low:high]
-        exclude(logits, surface[y + dy, low + dx : high + dx], f32(-np.inf))
-        raise_line(top[low:high], logits)
-    for dx, dy, low, high in window_taps(y, radius, 1, height, width):
-        logits = row[(dy + radius) * size + dx + radius, low:high]
-        to_weights(logits, top[low:high], total[low:high])
-        for c in range(channels):
-            add_product(sums[c, low:high], logits, image[c, y + dy, low + dx : high + dx])
-    for c in range(channels):
-        output[c, y] = sums[c] / np.maximum(total, f32(1))
-
-
 @jit_parallel
 def apply_to_image(
     output: Image, image: Image, surface: Plane, logits: NDArray[np.float32 | np.int16], size: int, bfloat: bool
 ) -> None:
-    _, height, width = image.shape
-    for y in numba.prange(height):
+    channels, height, width = image.shape
+    radius = size // 2
+    for number in numba.prange(height):
+        y = np.int64(number)
         row = np.empty((size * size, width + PADDING), np.float32)
+        top = np.full(width, f32(-np.inf))
+        total = np.zeros(width, np.float32)
+        sums = np.zeros((channels, width), np.float32)
         to_float32(row, logits[:, y], bfloat)
-        apply_to_row(output, image, surface, row, np.int64(y), size)
+        for dx, dy, low, high in window_taps(y, radius, 1, height, width):
+            line = row[(dy + radius) * size + dx + radius, low:high]
+            exclude(line, surface[y + dy, low + dx : high + dx], f32(-np.inf))
+            raise_line(top[low:high], line)
+        for dx, dy, low, high in window_taps(y, radius, 1, height, width):
+            weight = row[(dy + radius) * size + dx + radius, low:high]
+            to_weights(weight, top[low:high], total[low:high])
+            for c in range(channels):
+                add_product(sums[c, low:high], weight, image[c, y + dy, low + dx : high + dx])
+        for c in range(channels):
+            output[c, y] = sums[c] / np.maximum(total, f32(1))
 
 
 def apply_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:

@@ -104,8 +104,7 @@ def locate(shift: Integers, fraction: Row, motion: Row, start: np.int32, step: n
 def split(runs: Integers, mesh: Row, across: Integers, down: Integers) -> int:
     """runs (W, 4) of pixels with one mesh and shift; returns their number."""
     width = mesh.size
-    count = 0
-    first = 0
+    count = first = 0
     for x in range(1, width + 1):
         if x < width and mesh[x] == mesh[first] and across[x] == across[first] and down[x] == down[first]:
             continue
@@ -183,8 +182,7 @@ def is_consistent(x: Index, y: Index, pixel: Index, mesh: Scalar, taps: RowTaps,
     px = f32(x) + f32(0.5)
     py = f32(y) + f32(0.5)
     depth = pair.depth_then[y, x]
-    off_plane = f32(0)
-    cosine = f32(0)
+    off_plane = cosine = f32(0)
     for i in range(3):
         n = pair.normal_then[i, y, x]
         visible = depth * (axes[0, i] * px + axes[1, i] * py + axes[2, i])
@@ -385,7 +383,6 @@ def gather_image(gathered: Image, valid: Mask, history: Image, pair: FramePair) 
 
 
 def reproject(frame: Frame, history: Tensor, gbuffer: GBuffer) -> tuple[Tensor, Tensor]:
-    """See models.history.reprojection.reproject."""
     gathered = torch.empty_like(history, memory_format=torch.contiguous_format)
     valid = torch.empty((len(history), 1, *frame.size), dtype=torch.bool)
     for item in range(len(history)):

@@ -52,7 +52,6 @@ def sum_image(sums: Signals, image: Image, guides: Rows, gaussians: Plane) -> No
 
 
 def window_sums(image: Tensor, guides: Tensor, gaussians: Tensor) -> Tensor:
-    """See models.filters.sbf.window_sums."""
     batch, channels, height, width = image.shape
     sums = torch.empty(batch, gaussians.shape[1], channels, height, width)
     flat = F.pad(guides.flatten(2), (0, 0, 0, -guides.shape[1] % STRIDE))  # features are compared so many at a time

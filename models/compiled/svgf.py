@@ -110,7 +110,6 @@ def integrate_image(
 def integrate_samples(
     frame: Frame, noisy: Tensor, previous: "Integrated", change: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.filters.svgf.integrate_samples."""
     images = noisy, previous.moments, previous.length
     colour, moments, length = (torch.empty_like(image, memory_format=torch.contiguous_format) for image in images)
     for item in range(len(noisy)):
@@ -171,7 +170,6 @@ def pack_geometry_image(packed: Image, depth: Plane, normal: Image, mesh: Plane)
 
 
 def pack_geometry(depth: Tensor, normal: Tensor, mesh_id: Tensor) -> Tensor:
-    """See models.filters.svgf.pack_geometry."""
     packed = depth.new_empty(len(depth), 1, GEOMETRY, *depth.shape[-2:])
     for item in range(len(depth)):
         images = array(depth[item, 0]), array(normal[item]), array(mesh_id[item, 0])
@@ -268,11 +266,7 @@ def add_taps(sums: Row, weights: Row, signals: Signals, s: int, taps: TapRow) ->
     y, scale = signals[row, s, 4], signals[row, s, 5]
     for i in range(count):
         p = unsigned(first + i)
-        red = f32(0)
-        green = f32(0)
-        blue = f32(0)
-        spread = f32(0)
-        total = f32(0)
+        red = green = blue = spread = total = f32(0)
         for tap in range(VARIANCE_TAPS):
             q = unsigned(first + i + (tap - RADIUS) * step)
             exponent = weights[unsigned((2 * tap + 1) * LEVEL_BLOCK + i)]
@@ -404,7 +398,6 @@ def planes_of(signals: Signals, margin: int) -> Tensor:
 def svgf_levels(
     colour: Tensor, variance: Tensor, geometry: Tensor, steps: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See models.filters.svgf.svgf_levels."""
     count_signals, _, height, width = colour.shape[1:]
     margin = RADIUS * max(steps)
     first = torch.empty_like(colour, memory_format=torch.contiguous_format)
@@ -488,7 +481,6 @@ def spatial_variance_image(out: Image, variance: Image, mean: Image, geometry: I
 
 
 def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Tensor) -> Tensor:
-    """See models.filters.svgf.spatial_variance."""
     out = variance.clone(memory_format=torch.contiguous_format)
     for item in range(len(variance)):
         images = array(variance[item, :, 0]), array(mean[item, :, 0]), array(geometry[item, 0])
