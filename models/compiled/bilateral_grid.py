@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Scalar, f32
 from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory
-from models.compiled.lines import fill_line, triple
+from models.compiled.lines import triple
 
 GUIDES = 256  # values of a guide (Meng et al. 2020), which cells of a grid divide as they divide pixels
 GRID_STRIP_ROWS = 64  # of pixels that a thread filters at once; a multiple of all spacings
@@ -106,7 +106,7 @@ def fill_cells(cells: Row, row: Index, image: Image, guide: Plane, surface: Plan
     """The means of a row of cells; 0 in a row outside the grid."""
     height, width = guide.shape
     per_cell = f32(1) / f32(spacing)
-    fill_line(cells, f32(0))
+    cells[:] = f32(0)
     if not 0 <= row * spacing < height:
         return
     first = row * spacing - spacing // 2

@@ -15,7 +15,6 @@ from models.compiled.lines import (
     add_product,
     add_square,
     add_weighted,
-    fill_line,
     normalise,
     scale_line,
     triple,
@@ -68,13 +67,13 @@ def weigh_tap(
     there = slice(left + dx, left + dx + weight.size)
     image, variance, features, surface, sharpness = planes
     to = row + dy
-    fill_line(exponent, f32(0))
+    exponent[:] = f32(0)
     for c in range(3):
         noise, noise_there = variance[c, row, here], variance[c, to, there]
         add_colour_distance(exponent, image[c, row, here], image[c, to, there], noise, noise_there)
-    fill_line(distances[0], f32(dy * dy + dx * dx))
+    distances[0][:] = f32(dy * dy + dx * dx)
     for group in range(GROUP_COUNT):
-        fill_line(distances[1 + group], f32(0))
+        distances[1 + group][:] = f32(0)
         for f in range(FIRST_OF_GROUP[group], FIRST_OF_GROUP[group + 1]):
             add_square(distances[1 + group], features[f, row, here], features[f, to, there])
     for s in range(1 + GROUP_COUNT):

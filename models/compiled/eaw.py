@@ -8,7 +8,7 @@ from torch import Tensor
 from models.compiled.arrays import RGB, Image, Index, Row, Rows, Scalar, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
-from models.compiled.lines import add_square, divide_line, fill_line, triple, triple_of_lines, window_taps
+from models.compiled.lines import add_square, divide_line, triple, triple_of_lines, window_taps
 from models.filters.atrous import RADIUS, SPLINE
 
 MAX_DECAY = 30  # e^-30 = 1e-13 counts as 0: denormal numbers are slow
@@ -39,7 +39,7 @@ def sum_row(sums: Rows, space: Row, row: Index, colour: Image, features: Image, 
     _, height, width = colour.shape
     for dx, dy, left, right in window_taps(row, RADIUS, step, height, width):
         distance = space[: right - left]
-        fill_line(distance, f32(0))
+        distance[:] = f32(0)
         for c in range(len(features)):
             add_square(distance, features[c, row, left:right], features[c, row + dy, left + dx : right + dx])
         h = SPLINE[dy // step + RADIUS] * SPLINE[dx // step + RADIUS]

@@ -13,7 +13,7 @@ from datasets.frame import Frame
 from models.compiled.arrays import Image, Plane, Row, Scalar, f32
 from models.compiled.exponential import exp, log
 from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
-from models.compiled.lines import block_count, interleave, rows_of_block, scale_depth
+from models.compiled.lines import block_count, rows_of_block, scale_depth, transpose
 from models.history.running_scale import RunningScale
 
 FEATURE_CHANNELS = {"colour": 3, "albedo": 3, "normal": 3, "depth": 1}  # inputs' channels (Fan et al. 2021, §5.1)
@@ -61,7 +61,7 @@ def feature_image(out: Image, arrays: FeatureArrays, with_albedo: bool, with_nor
                 if with_normal:
                     scale_normal(lines[after_albedo + c], arrays.normal[c, y])
             scale_depth(lines[out.shape[2] - 1], arrays.depth[y], arrays.scale)
-            interleave(out[y], lines)
+            transpose(out[y], lines)
 
 
 def network_features(

@@ -18,7 +18,7 @@ from torch import Tensor
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Rows, Scalar, Signals, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_with_memory
-from models.compiled.lines import add_line, copy_line, exclude, fill_line, raise_line, triple, triple_of_lines
+from models.compiled.lines import add_line, copy_line, exclude, raise_line, triple, triple_of_lines
 from models.operators import MIN_DIVISOR
 
 WINDOWS = (3, 5, 7, 9, 11, 13)  # Fan et al. 2021, §5.3
@@ -154,7 +154,7 @@ def softmax(shares: Image, y: Index, top: Row, total: Row) -> None:
     copy_line(top, shares[0, y])
     for i in range(1, count):
         raise_line(top, shares[i, y])
-    fill_line(total, f32(0))
+    total[:] = f32(0)
     for i in range(count):
         share = shares[i, y]
         for x in range(width):
@@ -309,11 +309,8 @@ def fuse(
     threads = numba.get_num_threads()
     width = image.shape[-1]
     rows = THREAD_ROWS + max(windows)
-    scratch = (
-        np.empty((threads, len(windows), rows, width), np.float32),
-        np.empty((threads, len(windows), THREAD_ROWS, width), np.float32),
-        np.empty((threads, 4, rows, width), np.float32),
-    )
+    shapes = (len(windows), rows), (len(windows), THREAD_ROWS), (4, rows)
+    scratch = [np.empty((threads, *shape, width), np.float32) for shape in shapes]
     for item in range(len(image)):
         images = fused[item].numpy(), array(image[item]), array(surface[item, 0])
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()

@@ -92,8 +92,7 @@ def fuse(
     radii = torch.tensor([window // 2 for window in windows], dtype=torch.int32, device=image.device)
     given = (image, importance, mixture, image if surface is None else surface)
     tensors = (tensor.float().contiguous() for tensor in given)
-    masked = surface is not None
     grid = (triton.cdiv(width, PROGRAM_WIDTH), height, batch)
     with torch.cuda.device(image.device) if image.is_cuda else nullcontext():
-        fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), masked, PROGRAM_WIDTH)
+        fuse_rows[grid](fused, *tensors, radii, height, width, len(windows), surface is not None, PROGRAM_WIDTH)
     return fused

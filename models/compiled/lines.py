@@ -19,12 +19,6 @@ def copy_line(line: Row, source: Row) -> None:
 
 
 @jit_in_any_order
-def fill_line(line: Row, value: Scalar) -> None:
-    for x in range(line.size):
-        line[x] = value
-
-
-@jit_in_any_order
 def add_line(line: Row, other: Row) -> None:
     for x in range(line.size):
         line[x] += other[x]
@@ -100,11 +94,10 @@ def scale_depth(line: Row, depth: Row, scale: Scalar) -> None:
 
 
 @jit_in_any_order
-def interleave(out: Plane, lines: Rows) -> None:
-    """out (n, C) = lines (C, n), transposed."""
-    for x in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[x, c] = lines[c, x]
+def transpose(out: Plane, plane: Plane) -> None:
+    for j in range(plane.shape[1]):
+        for i in range(plane.shape[0]):
+            out[j, i] = plane[i, j]
 
 
 @jit_inlined

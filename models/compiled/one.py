@@ -16,7 +16,7 @@ from models.compiled.affinity import four
 from models.compiled.arrays import RGB, Image, Index, Matrix, Row, Rows, Scalar, f32
 from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
-from models.compiled.lines import copy_line, fill_line, scale_depth, scale_line, triple
+from models.compiled.lines import copy_line, scale_depth, scale_line, transpose, triple
 from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def write_inputs(
             if bottom > y:
                 continue
             for c in range(sums.shape[0]):
-                fill_line(sums[c, :n], layer.bias[c])
+                sums[c, :n][:] = layer.bias[c]
             add_layer(sums, lines, layer.weight, n)
             for c in range(hidden.shape[0]):
                 relu(hidden[c, y, x : x + n], sums[c, :n])
@@ -260,14 +260,6 @@ def network_inputs(
 
 
 # --- Head outputs -----------------------------------------------------------------------------------------------------
-
-
-@jit_in_any_order
-def transpose(lines: Rows, pixels: Matrix) -> None:
-    """lines (C, n) = pixels (n, C), transposed."""
-    for c in range(pixels.shape[1]):
-        for x in range(pixels.shape[0]):
-            lines[c, x] = pixels[x, c]
 
 
 @jit_in_any_order

@@ -325,8 +325,11 @@ def mix_taps(line: Row, weight: Rows, low: Index, upper: Row, lower: Row) -> Non
 
 
 @jit_with_reciprocals
-def gather_runs(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
-    """The weighted sums of consistent taps, in line (W)."""
+def gather(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
+    """line (W): the previous frame's `plane` (H, W) for the pixels of row y, 0 where there is no history.
+
+    That is the weighted sum of consistent taps, or the mean of the consistent ones of 3 x 3 pixels.
+    """
     height, width = plane.shape
     weight = taps.weight
     for run in range(taps.counts[0]):
@@ -345,11 +348,6 @@ def gather_runs(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
                 beside = min(max(x + left + 1, 0), width - 1)
                 line[x] = weight[0, x] * upper[column] + weight[1, x] * upper[beside]
                 line[x] += weight[2, x] * lower[column] + weight[3, x] * lower[beside]
-
-
-@jit_with_reciprocals
-def gather_boxes(line: Row, plane: Plane, taps: RowTaps) -> None:
-    """The means of the consistent ones of 3 x 3 pixels."""
     for box in range(taps.counts[1]):
         column = np.int64(taps.boxes[box, 1])
         row = np.int64(taps.boxes[box, 2])
@@ -361,13 +359,6 @@ def gather_boxes(line: Row, plane: Plane, taps: RowTaps) -> None:
                 total += plane[row + tap // 3 - 1, column + tap % 3 - 1]
                 count += 1
         line[taps.boxes[box, 0]] = total / f32(count)
-
-
-@jit_with_reciprocals
-def gather(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
-    """line (W): the previous frame's `plane` (H, W) for the pixels of row y, 0 where there is no history."""
-    gather_runs(line, plane, y, taps)
-    gather_boxes(line, plane, taps)
 
 
 @jit_parallel

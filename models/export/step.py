@@ -112,15 +112,12 @@ class Step(nn.Module):
             StatePort(SCALE, "new_scale"),
             *(previous if inside else ()),
         )
+        self.inputs = (*self.images, *(each.port for each in self.carried))
         self.outputs = (
             image("radiance", 3, None, "denoised radiance including emission, linear RGB"),
             Port("new_history", self.history.shape, "the next frame's history"),
             Port("new_scale", SCALE.shape, "the next frame's scale"),
         )
-
-    @property
-    def inputs(self) -> tuple[Port, ...]:
-        return *self.images, *(each.port for each in self.carried)
 
     def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """The outputs, by name, of all inputs by name."""

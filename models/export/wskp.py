@@ -29,11 +29,6 @@ def in_windows(windows: Sequence[int]) -> Tensor:
     return torch.stack([offset.abs() <= window // 2 for window in windows])
 
 
-def box_kernels(windows: Sequence[int]) -> Tensor:
-    """Columns of ones in zeros, (SUMMED M, 1, k, 1): each channel's own box."""
-    return in_windows(windows).float()[:, None].expand(-1, SUMMED, -1).flatten(0, 1)[:, None, :, None]
-
-
 def box_sums_by_maximum(logits: Tensor, values: Sequence[Tensor], windows: Sequence[int]) -> Tensor:
     """Box sums (M, C, H, W) relative to the largest of the logits (M, 1, H, W) in every window.
 
@@ -75,7 +70,9 @@ class BoxWindows(nn.Module):
         def shifted(importance: Tensor, values: Tensor, surface: Tensor, high: Tensor, low: Tensor) -> Tensor:
             weights = torch.exp(importance - (high + low) / 2)
             products = (weights[:, :, None] * values[:, None]).flatten(1, 2)
-            columns = box_kernels(self.windows)
+            # Columns of ones in zeros, (SUMMED M, 1, k, 1): each channel's own box.
+            boxes = in_windows(self.windows).float()[:, None].expand(-1, SUMMED, -1).flatten(0, 1)
+            columns = boxes[:, None, :, None]
             sums = F.conv2d(products, columns, padding=(margin, 0), groups=groups)
             return F.conv2d(sums, columns.transpose(2, 3), padding=(0, margin), groups=groups)
 
