@@ -8,7 +8,7 @@ from torch import Tensor
 from models.compiled.arrays import Image, Index, Row, Signals, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
-from models.compiled.lines import add_line, add_product, columns_with_tap, copy_line, divide_line, triple_of_lines
+from models.compiled.lines import add_line, add_product, columns_with_tap, divide_line, triple_of_lines
 
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
 MAX_REACH = 50  # px
@@ -55,15 +55,12 @@ def weigh(weight: Row, distance: Row, along: Row, width: Row, max_width: Row) ->
 
 @jit_parallel
 def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, geometry: Image, down: bool) -> None:
-    """out (S, 3, H, W) from image (S, 3, H, W), width and max_width (S, H, W)."""
+    """out (S, 3, H, W), a copy of the image, becomes the filtered one; width and max_width are (S, H, W)."""
     signals, _, height, columns = image.shape
     for number in numba.prange(height):
         row = np.int64(number)
         totals = np.ones((signals, columns), np.float32)
         space = np.empty((3, columns), np.float32)
-        for s in range(signals):
-            for c in range(3):
-                copy_line(out[s, c, row], image[s, c, row])
         for step in range(-MAX_REACH, MAX_REACH + 1):
             dx, dy = (0, step) if down else (step, 0)
             left, right = columns_with_tap(row, dx, dy, height, columns)
@@ -83,7 +80,7 @@ def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, g
 
 
 def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
-    out = torch.empty_like(image, memory_format=torch.contiguous_format)
+    out = image.clone(memory_format=torch.contiguous_format)
     for item in range(len(image)):
         images = array(image[item]), array(width[item, :, 0]), array(max_width[item, :, 0]), array(geometry[item, 0])
         filter_image(out[item].numpy(), *images, down)

@@ -142,6 +142,5 @@ def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     surface = torch.ones_like(guide) if surface is None else surface
     for item in range(len(image)):
-        planes = array(image[item]), array(guide[item, 0]), array(surface[item, 0])
-        filter_image(out[item].numpy(), *planes, spacing)
+        filter_image(out[item].numpy(), array(image[item]), array(guide[item, 0]), array(surface[item, 0]), spacing)
     return out

@@ -306,11 +306,9 @@ def fuse(
     """See models.networks.fusion.fuse. The maps are read as they lie in memory."""
     fused = torch.zeros_like(image, memory_format=torch.contiguous_format)
     surface = torch.ones_like(image[:, :1]) if surface is None else surface
-    threads = numba.get_num_threads()
-    width = image.shape[-1]
     rows = THREAD_ROWS + max(windows)
     shapes = (len(windows), rows), (len(windows), THREAD_ROWS), (4, rows)
-    scratch = [np.empty((threads, *shape, width), np.float32) for shape in shapes]
+    scratch = [np.empty((numba.get_num_threads(), *shape, image.shape[-1]), np.float32) for shape in shapes]
     for item in range(len(image)):
         images = fused[item].numpy(), array(image[item]), array(surface[item, 0])
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()

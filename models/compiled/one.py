@@ -330,25 +330,21 @@ def decode_lines(
     decoded: DecodedImages, lines: Rows, inputs: PixelArrays, samples: Scalar, y: Index, x: Index, n: int
 ) -> None:
     """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of head_channels."""
-    k = 0
-    for c in range(decoded.features.shape[0]):
-        copy_line(decoded.features[c, y, x : x + n], lines[k, :n])
-        k += 1
-    for c in range(decoded.sharpness.shape[0]):
-        softplus(decoded.sharpness[c, y, x : x + n], lines[k, :n])
-        k += 1
-    for c in range(decoded.logits.shape[0]):
-        clamp_logit(decoded.logits[c, y, x : x + n], lines[k, :n])
-        k += 1
+    levels = decoded.sharpness.shape[0]
+    k = FEATURES + 3 * levels
+    for c in range(FEATURES):
+        copy_line(decoded.features[c, y, x : x + n], lines[c, :n])
+    for c in range(levels):
+        softplus(decoded.sharpness[c, y, x : x + n], lines[FEATURES + c, :n])
+    for c in range(2 * levels):
+        clamp_logit(decoded.logits[c, y, x : x + n], lines[FEATURES + levels + c, :n])
     valid = inputs.has_history[0, y, x : x + n]
     length = inputs.history[6, y, x : x + n]
     alpha = decoded.alpha[0, y, x : x + n]
     accumulation_alpha(alpha, lines[k, :n], valid, length, samples)
     sigmoid(decoded.alpha[1, y, x : x + n], lines[k + 1, :n], valid)
-    k += 2
-    for c in range(decoded.latent.shape[0]):
-        tanh(decoded.latent[c, y, x : x + n], lines[k, :n])
-        k += 1
+    for c in range(LATENT):
+        tanh(decoded.latent[c, y, x : x + n], lines[k + 2 + c, :n])
     effective_length(decoded.length[0, y, x : x + n], length, alpha, samples)
     for c in range(3):
         past, noisy = inputs.history[3 + c, y, x : x + n], inputs.noisy[c, y, x : x + n]

@@ -20,13 +20,11 @@ PADDING = 16  # numbers; keeps the rows of a buffer from falling on the same set
 @jit_in_order
 def to_float32(row: Rows, logits: NDArray[np.float32 | np.int16], bfloat: bool) -> None:
     """row (taps, W) from logits of float32, or of the bits of bfloat16, which are the upper half of a float32."""
-    if bfloat:
-        for x in range(logits.shape[1]):
-            for tap in range(logits.shape[0]):
+    for x in range(logits.shape[1]):
+        for tap in range(logits.shape[0]):
+            if bfloat:
                 row[tap, x] = np.int32(np.int32(logits[tap, x]) << np.int32(16)).view(np.float32)
-    else:
-        for x in range(logits.shape[1]):
-            for tap in range(logits.shape[0]):
+            else:
                 row[tap, x] = logits[tap, x]
 
 

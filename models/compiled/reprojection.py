@@ -326,10 +326,7 @@ def mix_taps(line: Row, weight: Rows, low: Index, upper: Row, lower: Row) -> Non
 
 @jit_with_reciprocals
 def gather(line: Row, plane: Plane, y: Index, taps: RowTaps) -> None:
-    """line (W): the previous frame's `plane` (H, W) for the pixels of row y, 0 where there is no history.
-
-    That is the weighted sum of consistent taps, or the mean of the consistent ones of 3 x 3 pixels.
-    """
+    """line (W): the previous frame's `plane` (H, W) for the pixels of row y, by taps and boxes; 0 without history."""
     height, width = plane.shape
     weight = taps.weight
     for run in range(taps.counts[0]):

@@ -26,7 +26,6 @@ from models.networks.one import (
 )
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
-TO_VIEW = (-1.0, 1.0, -1.0)  # see Frame.to_view
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
 
 
@@ -143,7 +142,7 @@ class OneStep(Step):
         """The inputs of models.networks.one.network_inputs, for pixels."""
         images = torch.cat(exposed_images(inputs), dim=1)
         colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=MAX_EXPOSED))
-        to_view = torch.tensor(TO_VIEW)[:, None] * x["camera_to_world"][:3, :3].T
+        to_view = torch.tensor((-1.0, 1.0, -1.0))[:, None] * x["camera_to_world"][:3, :3].T  # see Frame.to_view
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])
         surfaces = surface_inputs(x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
         return torch.cat([colours, *per_pixel_inputs(inputs, x["samples"]), *surfaces], dim=1)

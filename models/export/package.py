@@ -17,7 +17,7 @@ from models.denoiser import Denoiser
 from models.export.one import OneStep
 from models.export.page import instructions
 from models.export.program import OPSET, RUN, WRITE, Format, Operators, check_installed, play, trace
-from models.export.step import Port, Step, Tensors, Warp
+from models.export.step import Port, Step, Warp
 from models.export.wskp import WSKPStep
 from models.networks.one import One
 from models.networks.wskp import WSKP
@@ -73,15 +73,11 @@ def port_entry(port: Port) -> dict[str, Any]:
     return {"name": port.name, "dtype": dtype, "shape": port.shape, "meaning": port.meaning}
 
 
-def write_golden(folder: Path, index: int, inputs: Tensors, outputs: Tensors) -> None:
-    """One frame: arrays input.NAME and output.NAME."""
-    arrays = {f"input.{name}": tensor.numpy() for name, tensor in inputs.items()}
-    arrays |= {f"output.{name}": tensor.numpy() for name, tensor in outputs.items()}
-    np.savez_compressed(folder / f"{index:03}.npz", **arrays)  # type: ignore[arg-type]  # no array is called so
-
-
 def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], golden: Path) -> dict[str, float]:
-    """Write golden frames. Returns how much the file's outputs differ at most from them, and from the denoiser's."""
+    """Write golden frames: arrays input.NAME and output.NAME.
+
+    Returns how much the file's outputs differ at most from them, and from the denoiser's.
+    """
     ours = load(export.name, export.weights, PRECISIONS[export.precision])
     state = None
     from_golden = from_ours = 0.0
@@ -89,7 +85,9 @@ def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], gold
         expected = list(play(step, frames, step))
         actual = play(step, frames, RUN[export.to](path))
         for index, (frame, (inputs, outputs), (_, theirs)) in enumerate(zip(frames, expected, actual, strict=True)):
-            write_golden(golden, index, inputs, outputs)
+            arrays = {f"input.{name}": tensor.numpy() for name, tensor in inputs.items()}
+            arrays |= {f"output.{name}": tensor.numpy() for name, tensor in outputs.items()}
+            np.savez_compressed(golden / f"{index:03}.npz", **arrays)  # type: ignore[arg-type]  # no array is called so
             from_golden = max(from_golden, *(largest_difference(theirs[name], outputs[name]) for name in outputs))
             radiance, state = ours(frame, state)
             from_ours = max(from_ours, largest_difference(theirs[step.outputs[0].name], radiance))
@@ -136,11 +134,6 @@ def write_files(folder: Path, export: Export, frames: Sequence[Frame]) -> dict[s
     return content
 
 
-def is_export(folder: Path) -> bool:
-    manifest = folder / MANIFEST
-    return manifest.exists() and "sha256" in read_json(manifest)
-
-
 def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[str, Any]:
     """Write an export to `folder` as a whole, replacing an earlier export. Returns the manifest.
 
@@ -148,7 +141,9 @@ def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[
     missing, or the folder contains anything else.
     """
     check_installed(export.to)
-    if folder.exists() and any(folder.iterdir()) and not is_export(folder):
+    earlier = folder / MANIFEST
+    is_export = earlier.exists() and "sha256" in read_json(earlier)
+    if folder.exists() and any(folder.iterdir()) and not is_export:
         raise BadInput(f"{folder} contains files that are not an export: choose another --out")
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")

@@ -84,8 +84,6 @@ class Step(nn.Module):
 
     Attributes:
         reads: names of the FRAME_PORTS that it takes, apart from those of the warp.
-        history: the history image.
-        precision: of the network.
         warp: whether the step reprojects the history itself.
         images: inputs that each frame brings.
         carried: inputs that are state.
