@@ -22,10 +22,8 @@ def card_in(root: Path) -> dict:
 def test_it_agrees_with_the_files(tiny):
     card = card_in(tiny)
     clips = {str(path.parent.relative_to(tiny)): path for path in sorted(tiny.glob("*/*/*/clip.json"))}
-    assert card["clips"].keys() == clips.keys() and card["splits"]["train"] == card["splits"]["train"] | {
-        "clips": 2,
-        "frames": 16,
-    }
+    assert card["clips"].keys() == clips.keys()
+    assert card["splits"]["train"].items() >= {"clips": 2, "frames": 16}.items()
     for name, path in clips.items():
         facts = json.loads(path.read_text())
         row = card["clips"][name]
@@ -34,15 +32,11 @@ def test_it_agrees_with_the_files(tiny):
         assert row["floor_db"] == pytest.approx(-10 * math.log10(facts["floor_mse"]), abs=0.006)
         assert (row["reference_spp"], row["realisations"]) == ((64, 2) if "train" in name else (128, 1))
     assert card["bytes"] == sum(clip["bytes"] for clip in card["clips"].values())
-    assert card["splits"]["test"]["worst_floor_db"] == min(
-        clip["floor_db"] for name, clip in card["clips"].items() if name.startswith("test/")
-    )
+    floors = [clip["floor_db"] for name, clip in card["clips"].items() if name.startswith("test/")]
+    assert card["splits"]["test"]["worst_floor_db"] == min(floors)
     assert card["licence"] == "CC0-1.0" and card["command"] == "onespp dataset --profile tiny --seed 0"
-    assert card["channels"]["depth"] == {
-        "axes": ["F", "H", "W", 1],
-        "unit": "world units",
-        "splits": ["train", "val", "test"],
-    }
+    depth = card["channels"]["depth"]
+    assert depth == {"axes": ["F", "H", "W", 1], "unit": "world units", "splits": ["train", "val", "test"]}
 
 
 def test_the_page_names_what_the_card_has(tiny):

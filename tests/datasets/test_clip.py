@@ -36,8 +36,7 @@ def test_stored_arrays_are_what_was_rendered(tiny):
     clip = Dataset(tiny).clips("test")[1]
     profile = profile_of("tiny")
     scene, seed = scene_of_clip(clip.path, profile, 0)
-    sampling = Sampling(1, 1, profile.quality["test"].reference_spp)
-    frames = render_clip(scene, *profile.size, sampling, seed)
+    frames = render_clip(scene, *profile.size, Sampling(1, 1, profile.quality["test"].reference_spp), seed)
     for index, (channels, _) in enumerate(frames):
         for name in ("direct", "depth", "motion", "dual_motion", "gradient", "normal", "mesh_id"):
             rendered = channels[name][0] if name == "direct" else channels[name]
@@ -145,8 +144,7 @@ def test_flipped_bits_in_a_header_are_found(tiny_copy):
     """Numpy reads the header of an .npy file as Python."""
     path = tiny_copy / "test" / "cornell_box" / "000"
     content = (path / "depth.npy").read_bytes()
-    rng = np.random.default_rng(0)
-    for bit in rng.integers(0, 128 * 8, 60):
+    for bit in np.random.default_rng(0).integers(0, 128 * 8, 60):
         data = bytearray(content)
         data[bit // 8] ^= 1 << (bit % 8)
         (path / "depth.npy").write_bytes(data)

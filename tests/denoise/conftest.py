@@ -11,25 +11,14 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
 
-CHANNELS = (
-    "direct",
-    "indirect",
-    "emission",
-    "albedo",
-    "normal",
-    "depth",
-    "roughness",
-    "mesh_id",
-    "motion",
-    "dual_motion",
-)
+READS = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
 
 
 @pytest.fixture(scope="session")
 def box(tiny: Path) -> list[Frame]:
     """A camera moves through the Cornell box, where nothing else does."""
     clip = next(clip for clip in Dataset(tiny).clips("test") if clip.scene == "cornell_box")
-    return [read_frame(clip, index, CHANNELS) for index in range(5)]
+    return [read_frame(clip, index, READS) for index in range(5)]
 
 
 @pytest.fixture(scope="session")

@@ -51,8 +51,7 @@ def test_positions_in_half_precision_determine_the_camera():
 
 
 def test_left_handed_worlds_project_alike():
-    view = some_view(2)
-    mirrored = points_of(view) * [1, 1, -1]
+    mirrored = points_of(some_view(2)) * [1, 1, -1]
     fitted_view = view_of_positions(mirrored, SURFACE)
     assert fitted_view is not None
     np.testing.assert_allclose(project(mirrored, SURFACE, fitted_view), pixel_centres(HEIGHT, WIDTH), atol=1e-2)

@@ -13,9 +13,8 @@ from denoise.foreign_frame import open_passes, read_foreign_frame
 from denoise.frames import FrameBuilder, camera_conventions
 from denoise.sequence import sequence_of
 from denoise.sources import find_sources
+from tests.denoise.conftest import READS
 from tests.helpers import foreign
-
-READS = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion", "dual_motion")
 
 
 def frames_of(folder: Path) -> list[Frame]:
@@ -60,15 +59,12 @@ def test_positions_give_our_cameras(box, tmp_path):
 def test_a_dolly_moves_the_parallel_camera(box, tmp_path):
     """Without cameras, the parallel view moves by the median change of depth."""
     foreign.write_sequence(tmp_path, box, foreign.blender)
-    built = frames_of(tmp_path)
-    for before, now in pairwise(built):
+    for before, now in pairwise(frames_of(tmp_path)):
         assert now.follows(before.moment)
         step = now.now.camera_to_world[0, :3, 3] - now.previous.camera_to_world[0, :3, 3]
-        forward = now.now.camera_to_world[0, :3, 2]
-        expected = float((step * forward).sum())
+        expected = float((step * now.now.camera_to_world[0, :3, 2]).sum())
         assert abs(expected) == pytest.approx(float(step.norm()), abs=1e-9)
-        change = float(before.depth.median() - now.depth.median())
-        assert abs(expected - change) < 0.02 * float(now.depth.median())
+        assert abs(expected - float(before.depth.median() - now.depth.median())) < 0.02 * float(now.depth.median())
 
 
 def test_what_is_background(tmp_path):

@@ -38,8 +38,7 @@ CASES = [
 
 @pytest.mark.parametrize(("quantity", "layer", "prefix"), CASES)
 def test_common_names_are_recognised(quantity, layer, prefix):
-    names = channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer)
-    layers = candidates(quantity, names)
+    layers = candidates(quantity, channels("Mist.Z", "Crypto00.RGBA", "uv.UV", prefix + layer))
     assert len(layers) == 1 and set(layers[0].channels) <= set(channels(prefix + layer))
     others = set(QUANTITIES) - {quantity}
     assert not any(candidates(other, channels(prefix + layer)) for other in others)

@@ -40,8 +40,7 @@ def moving():
         return blurred(np.ascontiguousarray(texture[rows + 30 + dy, columns + 30 + dx]))
 
     to_previous = np.broadcast_to([5.0, 3.0], (HEIGHT, WIDTH, 2))
-    to_next = np.broadcast_to([-4.0, 9.0], (HEIGHT, WIDTH, 2))
-    return shifted(-5, -3), shifted(0, 0), to_previous, to_next
+    return shifted(-5, -3), shifted(0, 0), to_previous, np.broadcast_to([-4.0, 9.0], (HEIGHT, WIDTH, 2))
 
 
 @pytest.mark.parametrize("components", [2, 4])
@@ -73,8 +72,7 @@ def test_moving_objects_before_a_moving_camera():
 
 
 def test_steady_motion_is_read_from_the_first_pair():
-    rng = np.random.default_rng(2)
-    texture = rng.random((HEIGHT, 2 * WIDTH, 3), np.float32)
+    texture = np.random.default_rng(2).random((HEIGHT, 2 * WIDTH, 3), np.float32)
     now, before = (blurred(np.ascontiguousarray(texture[:, start : start + WIDTH])) for start in (10, 6))
     step = np.broadcast_to([4.0, 0.0], (HEIGHT, WIDTH, 2))
     detector = ConventionDetector(4)
@@ -90,8 +88,7 @@ def test_no_motion_and_random_motion_are_uncertain():
     detector.add(still, still, np.zeros((HEIGHT, WIDTH, 2), np.float32))
     assert detector.detection() == replace(detector.detection(), convention=MotionConvention(), certain=False)
     assert "nothing moves" in detector.detection().reason
-    rng = np.random.default_rng(3)
-    detector.add(guides(20), still, rng.normal(0, 20, (HEIGHT, WIDTH, 2)).astype(np.float32))
+    detector.add(guides(20), still, np.random.default_rng(3).normal(0, 20, (HEIGHT, WIDTH, 2)).astype(np.float32))
     assert not detector.detection().certain and "no convention warps well" in detector.detection().reason
 
 

@@ -20,6 +20,5 @@ def with_buffers(a: Tensor, b: Tensor, **channels: Tensor) -> Frame:
 def noisy_buffers(truth: Tensor, deviation: float, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Two independent unbiased estimates, never negative, with noise relative to the truth."""
     shape = 1 / deviation**2
-    gamma = np.random.default_rng(seed).gamma(shape, 1 / shape, (2, *truth.shape))
-    a, b = torch.from_numpy(gamma).float() * truth
+    a, b = torch.from_numpy(np.random.default_rng(seed).gamma(shape, 1 / shape, (2, *truth.shape))).float() * truth
     return a, b

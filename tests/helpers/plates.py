@@ -45,6 +45,5 @@ def frames_of(
 ) -> list[Arrays]:
     """The camera looks along -z at a wall at z = 0."""
     eye = np.array([[0.0, 0, DISTANCE], [3 * eye_slides, 0, DISTANCE]])
-    camera = Camera(Track(eye, 0, 3), Track(eye - [0, 0, 1], 0, 3), Track.constant(90.0))
-    scene = Scene(shapes, camera, sky=sky)
+    scene = Scene(shapes, Camera(Track(eye, 0, 3), Track(eye - [0, 0, 1], 0, 3), Track.constant(90.0)), sky=sky)
     return [arrays for arrays, _ in render_clip(scene, frames, SIZE, SIZE, sampling, 1)]

@@ -111,8 +111,7 @@ def as_command(name: str, data: Path, runs: Path, **recipe: Any) -> list[str]:
 
 
 def start_training(name: str, data: Path, runs: Path, **recipe: Any) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, *as_command(name, data, runs, **recipe)]
-    return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, *as_command(name, data, runs, **recipe)], stderr=subprocess.DEVNULL)
 
 
 def main(name: str, data: str, runs: str, recipe: str) -> None:

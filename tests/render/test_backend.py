@@ -23,5 +23,4 @@ def test_one_core_is_enough_to_read_exr(tmp_path):
     with OpenEXR.File(header, {"RGB": np.ones((64, 128, 3), np.float32)}) as file:
         file.write(str(path))
     command = [sys.executable, "-c", READ_ON_ONE_CORE, str(path)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert run.stdout == "[128, 64]\n"
+    assert subprocess.run(command, capture_output=True, text=True, timeout=60).stdout == "[128, 64]\n"

@@ -31,8 +31,7 @@ def test_square_before_a_black_sky(square):
 
 
 def test_normals_face_the_viewer_from_behind(square):
-    camera = replace(square.camera, eye=Track.constant([0.0, 0, -3]))
-    stage = Stage(replace(square, camera=camera), 16, 16)
+    stage = Stage(replace(square, camera=replace(square.camera, eye=Track.constant([0.0, 0, -3]))), 16, 16)
     buffer = render_gbuffer(stage, stage.view(0))
     np.testing.assert_allclose(buffer["normal"][8, 8], [0, 0, -1], atol=1e-6)
     assert buffer["emission"].max() == 0  # lamps shine to one side
@@ -68,8 +67,7 @@ def test_colours_lie_on_their_walls(stage):
 
 
 def test_other_materials_are_measured(square):
-    shape = replace(square.shapes[0], bsdf={"type": "hair"})
-    stage = Stage(replace(square, shapes=(shape,)), 8, 8)
+    stage = Stage(replace(square, shapes=(replace(square.shapes[0], bsdf={"type": "hair"}),)), 8, 8)
     buffer = render_gbuffer(stage, stage.view(0))
     assert all(np.isfinite(buffer[name]).all() for name in ("albedo", "roughness"))
     assert buffer["albedo"].min() >= 0 and buffer["albedo"].max() <= 1

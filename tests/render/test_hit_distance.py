@@ -21,15 +21,13 @@ LAMP = plate("c lamp", SIDE, (2.5, 0, HEIGHT), radiance=50, faces=TO_THE_WALL)
 def of_frame(frame, realisation=0):
     """Of the wall: distances to what paths hit, to blockers and to the lamp, the lamp's angle, direct light; (N,)."""
     channels = [frame[name][realisation] for name in ("hit_distance", "light_distance", "light_angle", "direct")]
-    values = np.moveaxis(np.concatenate(channels, axis=-1)[frame["mesh_id"][..., 0] == 1], -1, 0)
-    return values[:5]
+    return np.moveaxis(np.concatenate(channels, axis=-1)[frame["mesh_id"][..., 0] == 1], -1, 0)[:5]
 
 
 @pytest.mark.parametrize("blocker_height", [0.5, 1.5])
 def test_blockers_follow_similar_triangles(blocker_height):
     """Along every shadow ray, as high in proportion as over the wall; and light comes by the same rays."""
-    blocker = plate("b blocker", 1.2, (1.6, 0, blocker_height))
-    (frame,) = frames_of(WALL, blocker, LAMP, frames=1)
+    (frame,) = frames_of(WALL, plate("b blocker", 1.2, (1.6, 0, blocker_height)), LAMP, frames=1)
     _, blocked, light, _, direct = of_frame(frame)
     shaded = blocked > 0
     assert 20 < shaded.sum() < 0.5 * shaded.size
@@ -69,11 +67,9 @@ def test_means_count_the_samples_that_met_something():
     stage = Stage(build_scene("cornell_box", 3, 24), 16, 16)
     tracer = PathTracer(stage)
     first, second = (hit_channels(tracer, stage.view(0), [SampleRange(7, 1, first)]) for first in (0, 1))
-    both = hit_channels(tracer, stage.view(0), [SampleRange(7, 2)])
-    for name, means in both.items():
+    for name, means in hit_channels(tracer, stage.view(0), [SampleRange(7, 2)]).items():
         pair = np.stack([first[name], second[name]])
-        expected = np.ma.masked_equal(pair, 0).mean(axis=0).filled(0)
-        np.testing.assert_allclose(means, expected, rtol=1e-6)
+        np.testing.assert_allclose(means, np.ma.masked_equal(pair, 0).mean(axis=0).filled(0), rtol=1e-6)
 
 
 def test_realisations_have_their_own_and_no_other_channel_is_changed():

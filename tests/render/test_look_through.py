@@ -14,6 +14,7 @@ from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
 from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, painted, panel, placed, room
+from tests.helpers.rendering import rgb
 from tests.helpers.scene_files import own
 
 SURFACE = ("normal", "depth", "roughness", "albedo")
@@ -95,8 +96,7 @@ def test_what_is_no_mirror_is_not_looked_through(surface):
 
 
 def test_a_mirror_that_shows_the_sky_is_a_mirror():
-    scene = Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA)
-    stage = Stage(scene, *SIZE)
+    stage = Stage(Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA), *SIZE)
     buffer = render_gbuffer(stage, stage.view(0))
     assert buffer["mesh_id"].mean() > 0.6
     for name in (*SURFACE, "mesh_id"):
@@ -105,19 +105,13 @@ def test_a_mirror_that_shows_the_sky_is_a_mirror():
 
 def test_a_tinted_mirror_tints_albedo():
     """By its reflectance at normal incidence, the more often the more mirrors there are."""
-    tinted = {
-        "type": "conductor",
-        "material": "none",
-        "specular_reflectance": {"type": "rgb", "value": [0.9, 0.6, 0.3]},
-    }
-    stage = Stage(room(tinted), *SIZE)
+    gold = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.9, 0.6, 0.3)}
+    stage = Stage(room(gold), *SIZE)
     buffer = render_gbuffer(stage, stage.view(0))
     behind_glass = buffer["mirrored_mesh_id"][..., 0] == 3
     assert behind_glass.any()
-    expected = np.array([0.7, 0.4, 0.6]) * [0.9, 0.6, 0.3]
-    np.testing.assert_allclose(
-        buffer["mirrored_albedo"][behind_glass], np.broadcast_to(expected, (behind_glass.sum(), 3)), rtol=1e-5
-    )
+    tints = buffer["mirrored_albedo"][behind_glass] / [0.7, 0.4, 0.6]
+    np.testing.assert_allclose(tints, np.broadcast_to([0.9, 0.6, 0.3], tints.shape), rtol=1e-5)
 
 
 def test_mirrors_in_mirrors_turn_what_they_show_in_their_order():
@@ -129,11 +123,7 @@ def test_mirrors_in_mirrors_turn_what_they_show_in_their_order():
     across = placed(panel(4, 4), [2.0, 0, 0])
     other = across.copy()
     other.apply_transform(trimesh.transformations.rotation_matrix(-angle, [0, 1, 0]))
-    shapes = (
-        Shape("a", across, SILVER),
-        Shape("b", other, SILVER),
-        Shape("ball", ball, painted(0.5), smooth=True),
-    )
+    shapes = (Shape("a", across, SILVER), Shape("b", other, SILVER), Shape("ball", ball, painted(0.5), smooth=True))
     camera = Camera(Track.constant([3.0, 0.4, 1.4]), Track.constant([0.0, 0, 0]), Track.constant(70.0))
     stage = Stage(Scene(shapes, camera), 96, 96)
     view = stage.view(0)

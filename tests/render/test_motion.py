@@ -36,11 +36,8 @@ def carry(points: np.ndarray, mesh_id: np.ndarray, source: View, target: View) -
 
 
 def test_rays_are_those_of_mitsubas_perspective_camera():
-    eye = [0.3, -0.2, 2.0]
-    target = [0.1, 0.4, -1.0]
-    fov = 55.0
-    height = 24
-    width = 40
+    eye, target, fov = [0.3, -0.2, 2.0], [0.1, 0.4, -1.0], 55.0
+    height, width = 24, 40
     sensor = mi.load_dict(
         {
             "type": "perspective",
@@ -52,12 +49,10 @@ def test_rays_are_those_of_mitsubas_perspective_camera():
         }
     )
     view = View(intrinsics(fov, height, width), look_at(np.array(eye), np.array(target)), np.zeros((0, 4, 4)))
-    centres = pixel_centres(height, width).reshape(-1, 2)
-    film = mi.Point2f(np.float32(centres / [width, height]).T)
+    film = mi.Point2f(np.float32(pixel_centres(height, width).reshape(-1, 2) / [width, height]).T)
     theirs, _ = sensor.sample_ray(0, 0, film, 0)
     camera = Camera(Track.constant(eye), Track.constant(target), Track.constant(fov))
-    scene = build_scene("cornell_box", 0, 1)
-    ours = Stage(Scene(scene.shapes, camera), height, width).rays(view)
+    ours = Stage(Scene(build_scene("cornell_box", 0, 1).shapes, camera), height, width).rays(view)
     np.testing.assert_allclose(np.array(ours.d), np.array(theirs.d), atol=2e-6)
 
 

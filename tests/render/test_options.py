@@ -51,8 +51,7 @@ def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
 
 def test_a_clip_walks_through_the_cycle():
     scene = build_scene("cornell_box", 3, 2).still()
-    sampling = Sampling(2, 1, 8, Options(halton=True))
-    frames = [arrays for arrays, _ in render_clip(scene, CYCLE + 2, 16, 16, sampling, 1)]
+    frames = [arrays for arrays, _ in render_clip(scene, CYCLE + 2, 16, 16, Sampling(2, 1, 8, Options(halton=True)), 1)]
     for frame in (0, 1):
         assert np.array_equal(frames[frame]["direct"], frames[frame + CYCLE]["direct"])
         assert not np.array_equal(frames[frame]["direct_reference"], frames[frame + CYCLE]["direct_reference"])

@@ -39,10 +39,9 @@ def test_scenes_share_their_kernels():
 
 def test_placement_of_textures_moves_into_texture_coordinates():
     scene = build_scene("room-1", 0, 4)
-    placed = Stage(scene, 8, 8).scene
     textured = [
         (before, after)
-        for before, after in zip(scene.shapes, placed.shapes, strict=True)
+        for before, after in zip(scene.shapes, Stage(scene, 8, 8).scene.shapes, strict=True)
         if before.bsdf.get("reflectance", {}).get("type") == "bitmap"
     ]
     assert textured

@@ -43,8 +43,7 @@ def test_reference_averages_to_the_stock_integrator(stage):
 
 
 def test_a_scene_may_ask_for_more_bounces():
-    scene = replace(build_scene("cornell_box", 3, 24), max_depth=5)
-    stage = Stage(scene, 64, 64)
+    stage = Stage(replace(build_scene("cornell_box", 3, 24), max_depth=5), 64, 64)
     stage.pose(POSED_FRAME)
     direct, indirect = realisations(stage, 250)
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
@@ -93,16 +92,14 @@ def test_equal_seeds_equal_bytes_and_different_seeds_uncorrelated_noise(stage):
     ray = stage.rays(stage.view(POSED_FRAME))
     tracer = PathTracer(stage)
     images = [np.add(*tracer.radiance(ray, seed, spp=1)) for seed in range(8)]
-    again = np.add(*tracer.radiance(ray, 7, spp=1))
-    assert images[7].tobytes() == again.tobytes()
+    assert images[7].tobytes() == np.add(*tracer.radiance(ray, 7, spp=1)).tobytes()
     mean = np.add(*tracer.radiance(ray, 1000, spp=1024))
     noise = np.stack([((image - mean) / (mean + 0.01)).mean(axis=-1) for image in images])
     pairs = 28
 
     def mean_correlation(shift: int) -> float:
-        correlation = np.corrcoef(
-            noise[:, :, shift:].reshape(8, -1), np.roll(noise, shift, axis=2)[:, :, shift:].reshape(8, -1)
-        )
+        shifted = np.roll(noise, shift, axis=2)
+        correlation = np.corrcoef(*(images[:, :, shift:].reshape(8, -1) for images in (noise, shifted)))
         return float(np.abs(correlation[:8, 8:][np.triu_indices(8, 1)].mean()))
 
     # Independent images correlate by 1 / sqrt(pixels); neither alike nor shifted copies of each other.
@@ -118,10 +115,7 @@ def test_direct_light_on_a_square_in_closed_form():
         corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1.0]]) * half
         return trimesh.Trimesh(corners, faces, process=False)
 
-    albedo = 0.5
-    radiance = 7.0
-    half = 0.01
-    distance = 2.0
+    albedo, radiance, half, distance = 0.5, 7.0, 0.01, 2.0
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [albedo] * 3}}
     above = RigidMotion(Track.constant([0.0, distance, 0]), Track.constant(0.0))
     lamp = Shape("lamp", quad(half, up=False), grey, Track.constant([radiance] * 3), above)

@@ -20,8 +20,7 @@ def sampler_points(key: int, count: int, skip: int = 0) -> np.ndarray:
 def test_every_elementary_interval_holds_one_point(key, bits):
     p = sampler_points(key, 2**bits, skip=key % 3)
     for k in range(bits + 1):
-        cells = (p * [2**k, 2 ** (bits - k)]).astype(int)
-        assert len({tuple(cell) for cell in cells}) == 2**bits
+        assert len({tuple(cell) for cell in (p * [2**k, 2 ** (bits - k)]).astype(int)}) == 2**bits
 
 
 def test_second_dimension_is_sobol():
@@ -42,8 +41,7 @@ def test_single_samples_are_uniform_and_independent():
     dimensions = np.stack([*np.array(sampler.next_2d()), np.array(sampler.next_1d()), *np.array(sampler.next_2d())])
     assert (dimensions >= 0).all() and (dimensions < 1).all()
     for u in dimensions:
-        histogram = np.bincount((u * 64).astype(int), minlength=64)
-        chi2 = ((histogram - count / 64) ** 2 / (count / 64)).sum()
+        chi2 = ((np.bincount((u * 64).astype(int), minlength=64) - count / 64) ** 2 / (count / 64)).sum()
         assert abs(chi2 - 63) < 5 * np.sqrt(2 * 63)
         assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 5 / np.sqrt(count)
     correlations = np.corrcoef(dimensions) - np.eye(len(dimensions))

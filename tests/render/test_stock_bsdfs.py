@@ -102,8 +102,7 @@ def test_roughness_is_how_far_reflections_spread(buffer, name):
     _, towards, valid = samples_of(BSDFS[name])
     half = np.add(towards, [0, 0, 1])[valid & (towards[:, 2] > 0)]
     spread = np.median((half[:, :2] ** 2).sum(axis=1) / half[:, 2] ** 2)
-    roughness = buffer["roughness"][0, list(BSDFS).index(name), 0]
-    assert roughness == pytest.approx(np.sqrt(spread), rel=0.1)
+    assert buffer["roughness"][0, list(BSDFS).index(name), 0] == pytest.approx(np.sqrt(spread), rel=0.1)
 
 
 def test_what_is_diffuse_is_rough_and_what_mirrors_is_not(buffer):

@@ -97,15 +97,13 @@ def test_radiance_is_that_of_mitsuba_with_all_kinds_of_lights():
     )
     holes = {"type": "mask", "opacity": 0.5, "nested": WHITE}
     veil = StockShape("veil", {"type": "rectangle", "to_world": placed(0, -1, 1.5, 0.7)}, holes)
-    scene = kinds()
-    stage = Stage(Scene((), CAMERA, 4, stock=(*scene.stock, lamp, veil), lights=lights), SIZE, SIZE)
+    stage = Stage(Scene((), CAMERA, 4, stock=(*kinds().stock, lamp, veil), lights=lights), SIZE, SIZE)
     stage.pose(5)
     tracer = PathTracer(stage)
     emission = render_gbuffer(stage, stage.view(5))["emission"]
     ray = stage.rays(stage.view(5))
     ours = [np.add(*tracer.radiance(ray, seed, 32)) + emission for seed in range(24)]
-    theirs = [stock_radiance(stage, 4, 32, 100 + seed) for seed in range(24)]
-    assert_same_mean(np.array(ours), np.array(theirs))
+    assert_same_mean(np.array(ours), np.array([stock_radiance(stage, 4, 32, 100 + seed) for seed in range(24)]))
 
 
 def test_lights_and_emitters_change_by_their_gain():

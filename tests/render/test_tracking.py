@@ -43,8 +43,7 @@ def test_a_reflection_moves_as_what_stands_behind_the_mirror(eye_slides):
     """The image of what is 1 in front of the mirror stands 1 behind it."""
     mirror = plate("a mirror", 20, (0, 0, 0), MIRROR)
     thing = plate("b thing", 1.0, (1.5, 0, 1), slides=STEP)
-    lamp = plate("c lamp", 0.5, (0, 3, 6), radiance=1)
-    for frame in frames_of(mirror, thing, lamp, eye_slides=eye_slides)[1:]:
+    for frame in frames_of(mirror, thing, plate("c lamp", 0.5, (0, 3, 6), radiance=1), eye_slides=eye_slides)[1:]:
         visible = tracked(frame, "reflection_motion", 1)
         back = (eye_slides - STEP) * FOCAL / (DISTANCE + 1)
         of_thing = visible[np.abs(visible[:, 0] - back) < 5e-3]
@@ -52,8 +51,7 @@ def test_a_reflection_moves_as_what_stands_behind_the_mirror(eye_slides):
 
 
 def test_the_sky_s_reflection_moves_with_the_view_alone():
-    mirror = plate("a mirror", 20, (0, 0, 0), MIRROR)
-    for frame in frames_of(mirror, eye_slides=0.2, sky=np.ones((2, 4, 3)))[1:]:
+    for frame in frames_of(plate("a mirror", 20, (0, 0, 0), MIRROR), eye_slides=0.2, sky=np.ones((2, 4, 3)))[1:]:
         assert np.abs(frame["reflection_motion"]).max() < 1e-3 and np.abs(frame["motion"][..., 0]).min() > 1
 
 

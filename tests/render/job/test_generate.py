@@ -186,10 +186,7 @@ def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
     monkeypatch.setattr(render.job.clip_job, "render_clip", faulty)
     assert generate_tiny(tiny_copy) == 2
     box, moving = Dataset(tiny_copy).clips("val")
-    assert {name: count for name, count in box.facts["nonfinite"].items() if count} == {
-        "direct": 6,
-        "indirect_reference": 1,
-    }
+    assert {name: n for name, n in box.facts["nonfinite"].items() if n} == {"direct": 6, "indirect_reference": 1}
     assert not any(moving.facts["nonfinite"].values())
     assert (box.read("direct", 3)[5, 5:7] == 0).all()
     head, *rows = (

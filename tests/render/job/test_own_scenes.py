@@ -36,8 +36,7 @@ def made(tmp_path_factory):
     """A dataset of an old Mitsuba file. Read only."""
     root = tmp_path_factory.mktemp("own")
     own_scene.cache_clear()
-    toml = write(root, CONTENT, SPLITS)
-    main(["dataset", "--scene", str(toml), "--data", str(root / "data"), "--reads", "wskp6"])
+    main(["dataset", "--scene", str(write(root, CONTENT, SPLITS)), "--data", str(root / "data"), "--reads", "wskp6"])
     return root
 
 

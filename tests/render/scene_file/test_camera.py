@@ -51,8 +51,7 @@ def test_a_scene_without_camera_is_seen_whole(aspect):
     low, high = np.array([-1.0, 0, 2]), np.array([3.0, 1, 5])
     camera = camera_framing(low, high)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    view = Scene((), camera).view(0, 100, int(100 / aspect))
-    visible = project(corners, np.ones(8, bool), view)
+    visible = project(corners, np.ones(8, bool), Scene((), camera).view(0, 100, int(100 / aspect)))
     assert camera.x_fov.at(0) == FOV_WITHOUT_CAMERA
     assert (visible > 0).all() and (visible < [100 / aspect, 100]).all()
 

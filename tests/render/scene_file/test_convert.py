@@ -21,14 +21,8 @@ def test_names_are_unique_and_usable(tmp_path):
     ids = ("a.b c/ü", "sky", "type", "group 0", "_group 0", "id", "to_world", "sphere-2")
     cubes = "".join(f'<shape type="cube" id="{name}"/>' for name in ids)
     parts = (cubes, '<shape type="sphere"/>' * 3, '<emitter type="point" id="constant-2"/>', '<emitter type="point"/>')
-    scene = own(
-        tmp_path,
-        xml(
-            *parts,
-            '<shape type="shapegroup" id="g"><shape type="disk"/></shape>',
-            '<shape type="instance"><ref id="g"/></shape>',
-        ),
-    )
+    group = '<shape type="shapegroup" id="g"><shape type="disk"/></shape><shape type="instance"><ref id="g"/></shape>'
+    scene = own(tmp_path, xml(*parts, group))
     names = [shape.name for shape in scene.scene.stock] + [light.name for light in scene.scene.lights]
     assert len(names) == 1 + len(ids) + 3 + 1 + 3 and len(set(names)) == len(names)
     assert "a_b c/ü" in names and "group 0" in names and not {"sky", "type", "id"} & set(names)

@@ -74,8 +74,7 @@ def test_flights_keep_their_distance_and_are_smooth(stages, place):
             assert inside.all() or not inside.any()
             assert inside.all() == (box == ROOM)
         eyes = np.array([camera.eye.at(frame) for frame in range(FRAMES)])
-        targets = np.array([camera.target.at(frame) for frame in range(FRAMES)])
-        directions = targets - eyes
+        directions = np.array([camera.target.at(frame) for frame in range(FRAMES)]) - eyes
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
         moves += steps.max() > 0.01

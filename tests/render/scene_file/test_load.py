@@ -114,8 +114,7 @@ def test_keyframes_move_and_brighten(tmp_path):
     light = "constant"
     keyframes = [{ time = 0, gain = 1 }, { time = 1, gain = 3 }]
     """
-    scene = own(tmp_path, xml(), toml)
-    clip = scene.clip(2, 0, by_keyframes=True, from_here=True)
+    clip = own(tmp_path, xml(), toml).clip(2, 0, by_keyframes=True, from_here=True)
     assert clip.max_depth == 2
     stage = Stage(clip, 24, 32)
     first, last = (PosedFrame(stage, frame).emission.max() for frame in (0, 1))
@@ -123,8 +122,7 @@ def test_keyframes_move_and_brighten(tmp_path):
     centres = []
     for frame in (0, 1):
         stage.pose(frame)
-        columns = np.nonzero(render_gbuffer(stage, stage.view(frame))["mesh_id"][..., 0])[1]
-        centres.append(columns.mean())
+        centres.append(np.nonzero(render_gbuffer(stage, stage.view(frame))["mesh_id"][..., 0])[1].mean())
     expected = 0.5 / 5 * abs(stage.view(0).K[0, 0])  # a right shift of half a unit, five units away
     assert centres[1] - centres[0] == pytest.approx(expected, abs=0.3)
 

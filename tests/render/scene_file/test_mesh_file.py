@@ -52,12 +52,8 @@ def gltf(folder, change, **material):
 
 
 def test_materials_of_gltf(tmp_path):
-    found = loaded(
-        tmp_path,
-        world(
-            baseColorTexture=picture(), metallicRoughnessTexture=picture(1), metallicFactor=0.5, roughnessFactor=0.25
-        ),
-    )
+    textures = {"baseColorTexture": picture(), "metallicRoughnessTexture": picture(1)}
+    found = loaded(tmp_path, world(**textures, metallicFactor=0.5, roughnessFactor=0.25))
     (box,) = found.shapes
     assert box.name == "box" and box.smooth and box.radiance is None
     np.testing.assert_allclose(box.mesh.bounds, [[0.5, 1.5, 2.5], [1.5, 2.5, 3.5]])
@@ -72,17 +68,9 @@ def test_materials_of_gltf(tmp_path):
 
 
 def test_factors_relief_and_light_of_gltf(tmp_path):
-    found = loaded(
-        tmp_path,
-        world(
-            baseColorFactor=[1.0, 0.5, 0.25, 0.5],
-            normalTexture=picture(),
-            emissiveFactor=[1.0, 0.5, 0.2],
-            emissiveTexture=picture(),
-            alphaMode="BLEND",
-            metallicFactor=0.0,
-        ),
-    )
+    factors = {"baseColorFactor": [1.0, 0.5, 0.25, 0.5], "emissiveFactor": [1.0, 0.5, 0.2], "metallicFactor": 0.0}
+    textures = {"normalTexture": picture(), "emissiveTexture": picture()}
+    found = loaded(tmp_path, world(**factors, **textures, alphaMode="BLEND"))
     (box,) = found.shapes
     assert found.sky is None
     np.testing.assert_allclose(box.radiance.at(3), [1, 0.5, 0.2])
@@ -101,16 +89,14 @@ def test_srgb_pictures_become_linear():
 @pytest.mark.parametrize("aspect", [0.5, 1.5])
 def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
     def add(content):
-        lens = {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.0}}
-        content["cameras"] = [lens]
+        content["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.0}}]
         content["nodes"].append({"camera": 0, "translation": [0, 0, 4], "name": "eye"})
         content["nodes"][0].setdefault("children", []).append(len(content["nodes"]) - 1)
 
     camera = load_mesh_file(gltf(tmp_path, add), aspect).camera
     np.testing.assert_allclose(camera.eye.at(0), [0, 0, 4])
     np.testing.assert_allclose(camera.target.at(0), [0, 0, 3])
-    half = np.tan(np.radians(camera.x_fov.at(0)) / 2)
-    assert half / aspect == pytest.approx(np.tan(0.4))
+    assert np.tan(np.radians(camera.x_fov.at(0)) / 2) / aspect == pytest.approx(np.tan(0.4))
 
 
 def test_what_gltf_says_beyond_meshes(tmp_path):
@@ -126,8 +112,7 @@ def test_names_are_unique(tmp_path):
     scene = trimesh.Scene()
     for name in ("sky", "a.b", "a_b", "größe 1"):
         scene.add_geometry(trimesh.creation.box(), node_name=name)
-    found = loaded(tmp_path, scene)
-    assert {shape.name for shape in found.shapes} == {"sky-2", "a_b", "a_b-2", "größe 1"}
+    assert {shape.name for shape in loaded(tmp_path, scene).shapes} == {"sky-2", "a_b", "a_b-2", "größe 1"}
 
 
 def test_materials_of_obj(tmp_path):
@@ -140,9 +125,8 @@ def test_materials_of_obj(tmp_path):
     assert ["gloss" in note for note in found.notes] == [True, False] and "transparency" in found.notes[1]
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0 0 0\nd 1\nmap_Kd tex.png\n")
     found = load_mesh_file(tmp_path / "scene.obj", 1.0)
-    np.testing.assert_allclose(
-        found.shapes[0].bsdf["bsdf"]["reflectance"]["data"], linear_image(picture())[::-1], rtol=1e-6
-    )
+    stored = found.shapes[0].bsdf["bsdf"]["reflectance"]["data"]
+    np.testing.assert_allclose(stored, linear_image(picture())[::-1], rtol=1e-6)
     assert len(found.notes) == 1  # of the sky
 
 
@@ -203,11 +187,8 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
 @pytest.mark.parametrize("suffix", ["glb", "gltf", "obj", "ply"])
 def test_damaged_files(tmp_path, suffix):
     path = tmp_path / f"scene.{suffix}"
-    whole = (
-        world().export(file_type="glb")
-        if suffix == "glb"
-        else trimesh.creation.box().export(file_type=suffix if suffix != "gltf" else "ply")
-    )
+    mesh = world() if suffix == "glb" else trimesh.creation.box()
+    whole = mesh.export(file_type=suffix if suffix != "gltf" else "ply")
     whole = whole if isinstance(whole, bytes) else whole.encode()
     for content in (b"", b"\xff" * 99, bytes(range(256)) * 4, whole[:40], whole[: len(whole) * 2 // 3]):
         if suffix == "obj" and content.startswith(b"#"):

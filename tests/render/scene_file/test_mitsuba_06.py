@@ -191,10 +191,7 @@ OTHERS = {
     "hideEmitters": (integrator("path", values("boolean", hideEmitters="true")), "lights stay visible"),
     **{kind: (integrator(kind, DEPTH), "path tracing instead") for kind in OTHER_INTEGRATORS.split()},
     "default": ('<default name="n" value="4"/>' + integrator("path", values("integer", maxDepth="$n")), ""),
-    "alias": (
-        bsdf("diffuse").replace(">", ' id="a">', 1) + '<alias id="a" as="b"/>' + shape("cube", '<ref id="b"/>'),
-        "",
-    ),
+    "alias": ('<bsdf type="diffuse" id="a"/><alias id="a" as="b"/>' + shape("cube", '<ref id="b"/>'), ""),
 }
 IOR_CASES = {ior: (bsdf("dielectric", strings(intIOR=ior)), "") for ior in IORS.split(", ")}
 METAL_CASES = {metal: (bsdf("conductor", strings(material=metal)), "") for metal in METALS.split()}
@@ -249,9 +246,8 @@ def test_numbers_mean_what_they_meant(tmp_path):
     assert colour("0.1, 0.2 0.3") == pytest.approx([0.1, 0.2, 0.3])
     assert colour("#ff8000", "rgb") == pytest.approx([1, 128 / 255, 0], abs=1e-6)
     assert colour("#ff8000", "srgb") == pytest.approx([1, 0.2158605, 0], abs=1e-6)
-    lens = described(
-        tmp_path, f'<scene version="0.6.0">{sensor("perspective", floats(focalLength=35))}{SKY}{BALL}</scene>'
-    )
+    camera = sensor("perspective", floats(focalLength=35))
+    lens = described(tmp_path, f'<scene version="0.6.0">{camera}{SKY}{BALL}</scene>')
     assert lens["sensor"]["focal_length"] == "35.0mm"
     sky = described(tmp_path, old_xml(light=light("sky", floats(scale=2))))["light"]
     assert (sky["type"], sky["sky_scale"], sky["sun_scale"]) == ("sunsky", 2, 0)
@@ -260,22 +256,16 @@ def test_numbers_mean_what_they_meant(tmp_path):
 
 
 def test_a_file_without_version_is_old(tmp_path):
-    assert own(tmp_path, old_xml().replace(' version="0.6.0"', "")).notes == [
-        "the file names no version: read as one of Mitsuba 0.6"
-    ]
+    notes = own(tmp_path, old_xml().replace(' version="0.6.0"', "")).notes
+    assert notes == ["the file names no version: read as one of Mitsuba 0.6"]
 
 
 def test_included_files_are_upgraded_too(tmp_path):
-    (tmp_path / "part.xml").write_text(
-        f'<scene version="0.6.0">\n{bitmap(filterType="ewa")}</scene>'.replace("<bsdf ", '<bsdf id="a" ', 1)
-    )
-    (tmp_path / "part.xml").write_text((tmp_path / "part.xml").read_text().replace("picture.png", "gone.png"))
-    (tmp_path / "scene.xml").write_text(
-        old_xml(
-            '<include filename="part.xml"/>',
-            shape("cube", '<ref id="a"/><transform name="toWorld"><lookAt origin="0 0 0" target="0 0 1"/></transform>'),
-        )
-    )
+    material = bitmap(filterType="ewa").replace("<bsdf ", '<bsdf id="a" ', 1).replace("picture.png", "gone.png")
+    (tmp_path / "part.xml").write_text(f'<scene version="0.6.0">\n{material}</scene>')
+    place = '<transform name="toWorld"><lookAt origin="0 0 0" target="0 0 1"/></transform>'
+    cube = shape("cube", '<ref id="a"/>', place)
+    (tmp_path / "scene.xml").write_text(old_xml('<include filename="part.xml"/>', cube))
     assert ParsedFile(tmp_path / "scene.xml").notes == []
     notes = Converter(tmp_path / "scene.xml").convert().notes
     assert notes == ["gone.png (part.xml line 2): the file gone.png is missing: grey instead of this texture"]

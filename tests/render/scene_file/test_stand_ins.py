@@ -25,6 +25,15 @@ def new(bsdf: str) -> str:
     return xml(shape=painted(bsdf))
 
 
+def diffuse(reflectance: str) -> str:
+    return f'<bsdf type="diffuse">{reflectance}</bsdf>'
+
+
+def texture(plugin: str, content: str = "") -> str:
+    """A material whose reflectance is a texture."""
+    return diffuse(f'<texture type="{plugin}" name="reflectance">{content}</texture>')
+
+
 def shape(plugin: str, content: str = "") -> str:
     return f'<shape type="{plugin}" id="thing">{content}</shape>'
 
@@ -36,140 +45,79 @@ def named(tag: str, plugin: str, file: str, name: str = "") -> str:
 CHECKS = '<texture type="checkerboard" name="{}"/>'
 GROUP = '<shape type="shapegroup" id="g">{}</shape><shape type="instance"><ref id="g"/></shape>'
 BLACK_BODY = '<spectrum type="blackbody" name="radiance"><float name="temperature" value="5000"/></spectrum>'
+NO_OBJ = '<string name="filename" value="no.obj"/>'
+MIXTURE = '<bsdf type="mixturebsdf"><string name="weights" value="{}"/>{}</bsdf>'
+IRREGULAR = '<string name="wavelengths" value="400, 700"/><string name="values" value="0.1, 0.2"/>'
+LENS = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/>'
+WOBBLE = '<float name="{}" value="3"/>'
+MOVED = '<animation name="toWorld"><transform time="0"/></animation>'
 # Content, words of its note, and how many shapes and lights are left if not one each.
 CASES = {
     "phong": (old('<bsdf type="phong"><float name="exponent" value="50"/></bsdf>'), "rough plastic"),
     "ward": (old('<bsdf type="ward"/>'), "rough plastic"),
     "coating": (old('<bsdf type="coating"><bsdf type="roughconductor"/></bsdf>'), "under the coat"),
     "roughcoating": (old('<bsdf type="roughcoating"/>'), "diffuse surface"),
-    "mixture": (
-        old(
-            '<bsdf type="mixturebsdf"><string name="weights" value="0.7, 0.3"/><bsdf type="plastic"/>'
-            '<bsdf type="diffuse"/></bsdf>'
-        ),
-        "blendbsdf",
-    ),
-    "mixture of what": (old('<bsdf type="mixturebsdf"><string name="weights" value="x"/></bsdf>'), "diffuse"),
-    "bump": (old(f'<bsdf type="bump">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "bumpmap"),
-    "bumps of checks": (new(f'<bsdf type="bumpmap">{CHECKS.format("t")}<bsdf type="diffuse"/></bsdf>'), "flat"),
-    "lost normals": (
-        new(f'<bsdf type="normalmap">{named("texture", "bitmap", "no.png", "normalmap")}<bsdf type="diffuse"/></bsdf>'),
-        "flat",
-    ),
+    "mixture": (old(MIXTURE.format("0.7, 0.3", '<bsdf type="plastic"/><bsdf type="diffuse"/>')), "blendbsdf"),
+    "mixture of what": (old(MIXTURE.format("x", "")), "diffuse"),
+    "bump": (old(f'<bsdf type="bump">{CHECKS.format("t")}{diffuse("")}</bsdf>'), "bumpmap"),
+    "bumps of checks": (new(f'<bsdf type="bumpmap">{CHECKS.format("t")}{diffuse("")}</bsdf>'), "flat"),
+    "lost normals": (new(f'<bsdf type="normalmap">{named("texture", "bitmap", "no.png", "normalmap")}{diffuse("")}'
+                         "</bsdf>"), "flat"),
     "unknown material": (old('<bsdf type="irawan"/>'), "diffuse surface"),
-    "grid": (old('<bsdf type="diffuse"><texture type="gridtexture" name="reflectance"/></bsdf>'), "checkerboard"),
-    "scale": (old('<bsdf type="diffuse"><texture type="scale" name="reflectance"/></bsdf>'), "grey"),
-    "wireframe": (old('<bsdf type="diffuse"><texture type="wireframe" name="reflectance"/></bsdf>'), "grey"),
-    "lost texture": (
-        new(f'<bsdf type="diffuse">{named("texture", "bitmap", "no.png", "reflectance")}</bsdf>'),
-        "no.png is missing: grey",
-    ),
-    "lost volume": (new('<bsdf type="diffuse"><texture type="volume" name="reflectance"/></bsdf>'), "volume"),
+    "grid": (old(texture("gridtexture")), "checkerboard"),
+    "scale": (old(texture("scale")), "grey"),
+    "wireframe": (old(texture("wireframe")), "grey"),
+    "lost texture": (new(diffuse(named("texture", "bitmap", "no.png", "reflectance"))), "no.png is missing: grey"),
+    "lost volume": (new(texture("volume")), "volume"),
     "lost measurements": (new(named("bsdf", "measured", "no.bsdf")), "grey diffuse"),
-    "lost mesh": (xml(shape("obj", '<string name="filename" value="no.obj"/>')), "no.obj is missing"),
+    "lost mesh": (xml(shape("obj", NO_OBJ)), "no.obj is missing"),
     "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "uniform white sky"),
-    "lost spectrum": (
-        new('<bsdf type="diffuse"><spectrum name="reflectance" filename="no.spd"/></bsdf>'),
-        "no.spd of a spectrum is missing",
-    ),
+    "lost spectrum": (new(diffuse('<spectrum name="reflectance" filename="no.spd"/>')),
+                      "no.spd of a spectrum is missing"),
     "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no shape 'hair': nothing"),
     "unknown shape": (old_xml(shape("heightfield")), "has no shape 'heightfield': nothing"),
     "old sky": (old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'), "sky of sunsky"),
-    "old sun": (
-        old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
-        "sun of sunsky",
-    ),
+    "old sun": (old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
+                "sun of sunsky"),
     "unknown light": (old_xml('<emitter type="collimated"/>'), "has no emitter 'collimated': nothing"),
     "no light": (xml(light=""), "there is no light: a uniform white sky"),
     "two skies": (xml(SKY), "a second sky is left out"),
-    "spot without picture": (
-        xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
-        "without its texture",
-        1,
-        2,
-    ),
+    "spot without picture": (xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
+                             "without its texture", 1, 2),
     "medium": (xml(shape("cube", '<medium type="homogeneous" name="interior"/>')), "a medium is left out", 2, 1),
     "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m (scene.xml line 1): a medium is left out"),
     "subsurface": (old('<subsurface type="dipole"/><bsdf type="plastic"/>'), "surface alone"),
-    "spectrum": (
-        new('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.9"/></bsdf>'),
-        "red, green and blue",
-    ),
-    "irregular": (
-        new(
-            '<bsdf type="diffuse"><spectrum type="irregular" name="reflectance"><string name="wavelengths" '
-            'value="400, 700"/><string name="values" value="0.1, 0.2"/></spectrum></bsdf>'
-        ),
-        "red, green and blue",
-    ),
+    "spectrum": (new(diffuse('<spectrum name="reflectance" value="400:0.1, 700:0.9"/>')), "red, green and blue"),
+    "irregular": (new(diffuse(f'<spectrum type="irregular" name="reflectance">{IRREGULAR}</spectrum>')),
+                  "red, green and blue"),
     "black body": (xml(shape("disk", f'<emitter type="area">{BLACK_BODY}</emitter>')), "red, green and blue", 2, 1),
     "integrator": (old_xml('<integrator type="bdpt"/>'), "'bdpt': path tracing"),
-    "volpath": (
-        xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
-        "hide_emitters",
-    ),
+    "volpath": (xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
+                "hide_emitters"),
     "two cameras": (xml(CAMERA), "a further sensor is left out"),
-    "lens": (
-        xml(
-            camera=CAMERA.replace("perspective", "thinlens").replace(
-                "<transform",
-                '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/><transform',
-            )
-        ),
-        "a pinhole instead",
-    ),
-    "clipping": (
-        xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
-        "near_clip",
-    ),
-    "orthographic": (
-        xml(camera=CAMERA.replace("perspective", "orthographic").replace('name="fov"', 'name="near_clip"')),
-        "frames the whole scene",
-    ),
+    "lens": (xml(camera=CAMERA.replace("perspective", "thinlens").replace("<transform", f"{LENS}<transform")),
+             "a pinhole instead"),
+    "clipping": (xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
+                 "near_clip"),
+    "orthographic": (xml(camera=CAMERA.replace("perspective", "orthographic").replace("fov", "near_clip")),
+                     "frames the whole scene"),
     "no camera": (xml(camera=""), "there is no camera: one that frames the whole scene"),
     "sensor on a shape": (xml(shape("disk", '<sensor type="irradiancemeter"/>')), "a sensor on a shape", 2, 1),
-    "shining group": (
-        xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')),
-        "do not emit light",
-        2,
-        1,
-    ),
-    "empty group": (
-        xml(GROUP.format('<shape type="obj"><string name="filename" value="no.obj"/></shape>')),
-        "an instance of nothing",
-    ),
-    "unknown property": (
-        xml(
-            shape("cube", '<float name="wobble" value="3"/><bsdf type="diffuse"><float name="jolt" value="3"/></bsdf>')
-        ),
-        "does not have 'wobble'",
-        2,
-        1,
-    ),
+    "shining group": (xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')),
+                      "do not emit light", 2, 1),
+    "empty group": (xml(GROUP.format(f'<shape type="obj">{NO_OBJ}</shape>')), "an instance of nothing"),
+    "unknown property": (xml(shape("cube", WOBBLE.format("wobble") + diffuse(WOBBLE.format("jolt")))),
+                         "does not have 'wobble'", 2, 1),
     "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun does not move"),
-    "bitmap of nothing": (
-        new('<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>'),
-        "its file is not named",
-    ),
-    "wrong parts": (
-        new(
-            '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><bsdf type="plastic"/></texture>'
-            "</bsdf>"
-        ),
-        "a bsdf cannot be nested here",
-    ),
+    "bitmap of nothing": (new(texture("bitmap")), "its file is not named"),
+    "wrong parts": (new(texture("checkerboard", '<bsdf type="plastic"/>')), "a bsdf cannot be nested here"),
     "sky on a shape": (xml(shape("cube", SKY)), "a light of the kind constant on a shape", 2, 1),
     "light of no shape": (xml('<emitter type="area"/>'), "on none: left out"),
     "no place": (xml(shape("cube", '<float name="to_world" value="2"/>')), "its to_world is no transform", 2, 1),
     "material merged": (xml('<shape type="merge"><bsdf type="diffuse"/></shape>'), "merged shapes"),
     "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
-    "animation": (
-        old_xml(shape("cube", '<animation name="toWorld"><transform time="0"/></animation>')),
-        "its first transform instead",
-        2,
-        1,
-    ),
-}
+    "animation": (old_xml(shape("cube", MOVED)), "its first transform instead", 2, 1),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -201,13 +149,13 @@ def test_files_of_pictures(tmp_path):
     values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     mi.Bitmap(values).write(str(tmp_path / "sky.exr"))
     mi.Bitmap(np.uint8(255 * values)).write(str(tmp_path / "tex.png"))
-    texture = named("texture", "bitmap", "tex.png", "{}")
+    picture = named("texture", "bitmap", "tex.png", "{}")
     parts = (
-        shape("cube", f'<bsdf type="bumpmap">{texture.format("t")}<bsdf type="plastic"/></bsdf>'),
-        f'<shape type="disk"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
-        f'<shape type="cube"><emitter type="area">{texture.format("radiance")}</emitter></shape>',
+        shape("cube", f'<bsdf type="bumpmap">{picture.format("t")}<bsdf type="plastic"/></bsdf>'),
+        f'<shape type="disk"><emitter type="area">{picture.format("radiance")}</emitter></shape>',
+        f'<shape type="cube"><emitter type="area">{picture.format("radiance")}</emitter></shape>',
     )
-    ball = painted(f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>')
+    ball = painted(diffuse(picture.format("reflectance")))
     scene = own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
     assert scene.notes == [] and len(scene.scene.stock) == 4
     assert scene.scene.stock[1].bsdf["type"] == "bumpmap"
