@@ -12,21 +12,25 @@ from numpy.typing import NDArray
 
 from datasets.channels import MIRRORED
 from render.backend import dr, mi
-from render.loading import columns
+from render.loading import columns, upload
 from render.specular import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
 
 MAX_MIRRORS = 4  # along a ray
+# Of what a surface reflects, in pixels: where it is blurred more, its own guides serve denoisers better.
+MAX_BLUR = 0.75
 
 
 @dataclass
 class MirroredHit:
-    """What rays hit behind all mirrors, or the last mirror where that shows only sky."""
+    """What rays hit behind all mirrors that show it sharply, or the last mirror where that shows only sky."""
 
     si: mi.SurfaceInteraction3f
     ray: mi.Ray3f  # the last one
     beyond: mi.Float  # path length after the first mirror in Mitsuba's units; 0 without one
+    spread: mi.Float  # by which rays diverge, in radians: twice the GGX alpha of each mirror
+    blur: mi.Float  # how far they have diverged, in Mitsuba's units
     tint: mi.Color3f  # the product of all mirrors' albedos
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]  # the world's, reflected by the mirrors from first to last
 
@@ -35,9 +39,13 @@ class MirroredHit:
         return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
 
 
-def reflected(stage: Stage, hit: MirroredHit, is_mirror: mi.Bool, albedo: mi.Color3f) -> MirroredHit:
-    """The hits of the rays that mirrors reflect; unchanged elsewhere, and where a reflected ray misses."""
+def reflected(stage: Stage, hit: MirroredHit, eye_distance: mi.Float, focal: mi.Float) -> MirroredHit:
+    """The hits of the rays that mirrors reflect; unchanged elsewhere, and where a ray misses or the picture is blurred.
+
+    `eye_distance` is the length of primary rays, `focal` the focal length in pixels.
+    """
     here = hit.si
+    is_mirror, albedo, alpha = stage.materials.mirror_at(here)
     normal = stage.normals.evaluate(here, is_mirror)
 
     def flipped(direction: mi.Vector3f) -> mi.Vector3f:
@@ -45,10 +53,14 @@ def reflected(stage: Stage, hit: MirroredHit, is_mirror: mi.Bool, albedo: mi.Col
 
     onward = stage.past_cutouts(here.spawn_ray(flipped(hit.ray.d)))
     there = stage.mitsuba_scene.ray_intersect(onward, mi.RayFlags.All, coherent=False, active=is_mirror)
-    distance = hit.beyond + dr.norm(there.p - here.p)
+    step = dr.norm(there.p - here.p)
+    beyond = hit.beyond + step
+    spread = hit.spread + 2 * alpha
+    blur = hit.blur + spread * step
+    is_sharp = blur * focal < MAX_BLUR * (eye_distance + beyond)
     x, y, z = map(flipped, hit.axes)
-    shown = MirroredHit(there, onward, distance, hit.tint * albedo, (x, y, z))
-    result: MirroredHit = dr.select(is_mirror & there.is_valid(), shown, hit)
+    shown = MirroredHit(there, onward, beyond, spread, blur, hit.tint * albedo, (x, y, z))
+    result: MirroredHit = dr.select(is_mirror & there.is_valid() & is_sharp, shown, hit)
     dr.eval(result)
     return result
 
@@ -118,7 +130,7 @@ def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[s
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-    direct = mirrored = MirroredHit(si, ray, mi.Float(0), mi.Color3f(1), axes)
+    direct = mirrored = MirroredHit(si, ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Color3f(1), axes)
     channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
@@ -127,11 +139,12 @@ def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[s
         arrays["emission"] = emission.reshape(stage.height, stage.width, 3)
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.materials.has_mirrors:
+        focal = upload(np.abs(view.K[:1, 0]))
         for _ in range(MAX_MIRRORS):
-            is_mirror, albedo = stage.materials.mirror_at(mirrored.si)
-            if not dr.any(is_mirror):
+            before = mirrored.beyond
+            mirrored = reflected(stage, mirrored, si.t, focal)
+            if dr.all(mirrored.beyond == before):
                 break
-            mirrored = reflected(stage, mirrored, is_mirror, albedo)
         shown = {MIRRORED[name]: value for name, value in surface_channels(stage, mirrored).items()}
         dr.eval(shown, mirrored.beyond)
         arrays |= {name: stage.image(value) for name, value in shown.items()}

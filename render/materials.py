@@ -90,7 +90,7 @@ def reflectance_at_normal(eta: float) -> float:
 
 
 UNSCALED = np.ones(3, np.float32)
-MAX_MIRROR_ALPHA = 0.002  # GGX; blurs reflections by a few pixels at most
+MAX_MIRROR_ALPHA = 0.1  # GGX; rougher surfaces show nothing sharply but what touches them
 
 
 def diffuse_material(parameters: BsdfParameters) -> Material:
@@ -289,14 +289,14 @@ class MaterialTable:
         albedo, alpha = self.mixed(row, self.depth, si, hit)
         return dr.select(hit, dr.clip(albedo, 0, 1), 1), dr.select(hit, dr.clip(alpha, 0, 1), 1)
 
-    def mirror_at(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Bool, mi.Color3f]:
-        """(whether there is a mirror, its albedo) at `si`."""
+    def mirror_at(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Bool, mi.Color3f, mi.Float]:
+        """(whether there is a mirror, its albedo, its GGX alpha) at `si`."""
         hit = si.is_valid()
         flags = si.bsdf().flags()
         faces = (si.wi.z > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
         no_mirror = scatters(flags)
         albedo, alpha = self.evaluate(si, hit)
-        return hit & faces & ~no_mirror & (alpha < MAX_MIRROR_ALPHA), albedo
+        return hit & faces & ~no_mirror & (alpha < MAX_MIRROR_ALPHA), albedo, alpha
 
     def mixed(
         self, row: mi.UInt32, depth: int, si: mi.SurfaceInteraction3f, hit: mi.Bool

@@ -9,7 +9,7 @@ import trimesh
 
 from provenance import ROOT
 from render.clip import Sampling, render_clip
-from render.gbuffer import render_gbuffer
+from render.gbuffer import MAX_BLUR, render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
@@ -77,7 +77,7 @@ def test_a_scene_without_mirrors_has_no_such_channels():
     "surface",
     [
         painted(0.5),
-        {"type": "roughconductor", "material": "Ag", "alpha": 0.01},
+        {"type": "roughconductor", "material": "Ag", "alpha": 0.3},
         {"type": "dielectric"},
         {"type": "plastic"},
         {"type": "conductor", "material": "Ag"},  # whose back is black
@@ -93,6 +93,24 @@ def test_what_is_no_mirror_is_not_looked_through(surface):
     buffer = render_gbuffer(stage, stage.view(0))
     for name in (*SURFACE, "mesh_id"):
         np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
+
+
+def test_a_glossy_surface_shows_what_it_shows_sharply():
+    """Near it, up to MAX_BLUR: rays that leave it spread by twice its alpha."""
+    alpha = 0.0098
+    glossy = {"type": "twosided", "bsdf": {"type": "roughconductor", "material": "none", "alpha": alpha}}
+    stages = [Stage(room(surface), *SIZE) for surface in (SILVER, glossy)]
+    view = stages[0].view(0)
+    smooth, rough = (render_gbuffer(stage, view) for stage in stages)
+    whole, first = (smooth[name][..., 0].astype(float) for name in ("mirrored_depth", "depth"))
+    blur = 2 * alpha * (whole - first) / np.maximum(whole, 1e-9) * abs(view.K[0, 0])
+    sharp = blur < MAX_BLUR
+    decided = np.abs(blur - MAX_BLUR) > 0.01
+    picture = smooth["mesh_id"][..., 0] == 1
+    assert (picture & sharp).sum() > 50 and (picture & ~sharp).sum() > 50
+    for name in (*SURFACE, "mesh_id"):
+        shown = np.where(sharp[..., None], smooth[f"mirrored_{name}"], rough[name])
+        np.testing.assert_allclose(rough[f"mirrored_{name}"][decided], shown[decided], rtol=1e-5, atol=1e-5)
 
 
 def test_a_mirror_that_shows_the_sky_is_a_mirror():
