@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 from typing import cast
 from xml.etree import ElementTree
@@ -35,57 +34,87 @@ def inside(root: Path, name: str, source: Path) -> Path:
     return path
 
 
-def elements(file: Path, content: bytes) -> Iterator[Element]:
-    """All elements of an XML file, with their attributes. Raises BadInput if it is damaged or too deep."""
+class LocatedElement(Element):
+    """An element that remembers its file and line."""
+
+    place = ""
+
+
+def elements_of(file: Path, content: bytes) -> LocatedElement:
+    """The root of an XML file. Raises BadInput if it is damaged or too deep."""
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content or b"\0" in content:
         raise BadInput(f"{file} declares entities, which scene files do not need, or is not in UTF-8")
-    depth = 0
+    parser = expat.ParserCreate()
+    opened: list[Element] = []
+
+    def element(tag: str, attributes: dict[str, str]) -> LocatedElement:
+        made = LocatedElement(tag, attributes)
+        made.place = f"{file} line {parser.CurrentLineNumber}"
+        return made
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        opened.append(builder.start(tag, attributes))
+        if len(opened) > MAX_ELEMENT_DEPTH:
+            raise BadInput(f"{file}: more than {MAX_ELEMENT_DEPTH} elements within each other")
+
+    builder = ElementTree.TreeBuilder(element_factory=element)
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: (builder.end(tag), opened.pop())
+    parser.CharacterDataHandler = builder.data
     try:
-        for event, element in ElementTree.iterparse(BytesIO(content), ("start", "end")):
-            depth += 1 if event == "start" else -1
-            if depth > MAX_ELEMENT_DEPTH:
-                raise BadInput(f"{file}: more than {MAX_ELEMENT_DEPTH} elements within each other")
-            if event == "start":
-                yield element
-    except ElementTree.ParseError as error:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
         raise BadInput(f"{file} is empty or damaged: it is not XML ({error})") from None
+    return cast(LocatedElement, builder.close())
 
 
-def check_includes(path: Path) -> list[Path]:
-    """The folders in which the file and all that it includes search for files.
+class IncludeReader:
+    """Reads a scene file and all that it includes; `searched` are the folders in which they search for files.
 
     Raises BadInput unless they are XML of bounded size and name nothing outside of their folder.
     """
-    root = path.parent
-    searched = [root]
-    waiting = [(path, 0)]
-    total = 0
-    included = -1
-    while waiting:
-        file, depth = waiting.pop()
-        included += 1
-        if depth > MAX_INCLUDE_DEPTH or included > MAX_INCLUDES:
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.searched = [path.parent]
+        self.bytes = 0
+        self.included = -1
+
+    def read(self, file: Path, depth: int = 0) -> LocatedElement:
+        """The root of `file`, with the content of included files of its version in place."""
+        self.included += 1
+        if depth > MAX_INCLUDE_DEPTH or self.included > MAX_INCLUDES:
             limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
-            raise BadInput(f"{path} includes more than {limits}: merge some")
+            raise BadInput(f"{self.path} includes more than {limits}: merge some")
         try:
             content = file.read_bytes()
         except OSError as error:
             raise BadInput(f"{file} cannot be read: {error.strerror}") from None
-        total += len(content)
-        if total > MAX_BYTES:
-            raise BadInput(f"{path}: more than {MAX_BYTES >> 20} MiB of XML")
-        for element in elements(file, content):
-            name = element.get("value" if element.tag == "path" else "filename")
-            if element.tag not in ("path", "include", "spectrum") or name is None:
-                continue
-            if "$" in name:
-                raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
-            named = inside(root, name, file)
-            if element.tag == "path":
-                searched.append(named)
-            elif element.tag == "include":
-                waiting.append((named, depth + 1))
-    return searched
+        self.bytes += len(content)
+        if self.bytes > MAX_BYTES:
+            raise BadInput(f"{self.path}: more than {MAX_BYTES >> 20} MiB of XML")
+        root = elements_of(file, content)
+        for parent in [*root.iter()]:
+            for child in [*parent]:
+                name = child.get("value" if child.tag == "path" else "filename")
+                if child.tag in ("path", "include", "spectrum") and name is not None:
+                    self.follow(root, parent, child, self.named(name, file), depth)
+        return root
+
+    def named(self, name: str, file: Path) -> Path:
+        if "$" in name:
+            raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
+        return inside(self.path.parent, name, file)
+
+    def follow(self, root: Element, parent: Element, child: Element, named: Path, depth: int) -> None:
+        """Note the folder of a <path>; put the content of an <include> in its place."""
+        if child.tag == "path":
+            self.searched.append(named)
+        elif child.tag == "include":
+            part = self.read(named, depth + 1)
+            if part.get("version") == root.get("version"):
+                place = [*parent].index(child)
+                parent[place : place + 1] = [*part]
 
 
 @contextmanager
@@ -100,35 +129,6 @@ def searched_in(folder: Path) -> Iterator[None]:
         resolver.clear()
         for path in before:
             resolver.append(path)
-
-
-class LocatedElement(Element):
-    """An element that remembers its file and line."""
-
-    place = ""
-
-
-def read_elements(path: Path, folder: Path) -> LocatedElement:
-    """The root of an XML file, with the content of included files of the same version in place."""
-    parser = expat.ParserCreate()
-
-    def element(tag: str, attributes: dict[str, str]) -> LocatedElement:
-        made = LocatedElement(tag, attributes)
-        made.place = f"{path} line {parser.CurrentLineNumber}"
-        return made
-
-    builder = ElementTree.TreeBuilder(element_factory=element)
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    parser.Parse(path.read_bytes(), True)
-    root = cast(LocatedElement, builder.close())
-    for include in root.findall("include[@filename]"):
-        part = read_elements(inside(folder, include.get("filename", ""), path), folder)
-        if part.get("version") == root.get("version"):
-            place = [*root].index(include)
-            root[place : place + 1] = [*part]
-    return root
 
 
 # --- Elements of old files --------------------------------------------------------------------------------------------
@@ -252,11 +252,12 @@ class ParsedFile:
 
     def __init__(self, path: Path):
         path = path.resolve()
-        self.searched = check_includes(path)
+        reader = IncludeReader(path)
+        self.searched = reader.searched
         config = mi.parser.ParserConfig(VARIANT)
         config.unused_parameters = mi.LogLevel.Debug
         try:
-            root = read_elements(path, path.parent)
+            root = reader.read(path)
             self.notes = upgrade(root, path.parent)
             self.elements = [element for element in root.iter() if isinstance(element, LocatedElement)]
             self.text = ElementTree.tostring(root, "unicode")
