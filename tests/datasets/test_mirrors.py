@@ -15,8 +15,8 @@ from denoise.exr_image import ExrImage
 from denoise.frames import OwnFrameBuilder
 from render.clip import Sampling
 from render.job.clip_job import write_clip
-from scenes.animation import Scene, Shape
-from tests.helpers.mirrors import FRAMES, SILVER, SIZE, painted, panel, placed, room
+from scenes.animation import Scene
+from tests.helpers.mirrors import FRAMES, HAND_MIRROR, SILVER, SIZE, painted, room
 
 LAST = FRAMES - 1
 OTHER_MOTION = ("dual_motion", "shadow_motion", "reflection_motion")
@@ -36,10 +36,9 @@ def clip(tmp_path_factory) -> Clip:
 
 def test_the_input_of_denoisers_is_what_mirrors_show(clip):
     frame = read_frame(clip, LAST, VISIBLE)
-    stored = {
-        name: np.moveaxis(clip.read(name, LAST).astype(np.float32), -1, 0) for name in clip.channels if name in VISIBLE
-    }
-    shown = {name: np.moveaxis(clip.read(MIRRORED[name], LAST).astype(np.float32), -1, 0) for name in MIRRORED}
+    planes = {name: np.moveaxis(np.float32(clip.read(name, LAST)), -1, 0) for name in (*VISIBLE, *MIRRORED.values())}
+    stored = {name: planes[name] for name in VISIBLE}
+    shown = {name: planes[mirrored] for name, mirrored in MIRRORED.items()}
     picture = stored["mesh_id"][0] == 1
     for name in MIRRORED:
         np.testing.assert_array_equal(frame.channel(name)[0], shown[name], err_msg=name)
@@ -81,10 +80,9 @@ def test_only_what_is_rendered_is_rendered_of_mirrors(tmp_path):
     few = clip_of(room(SILVER), tmp_path / "few", (*reads, "K", "camera_to_world", "object_to_world"))
     expected = {MIRRORED[name] for name in ("albedo", "depth", "mesh_id")}
     assert {name for name in few.channels if name in MIRRORED.values()} == expected
-    none = clip_of(room(painted(0.5)), tmp_path / "none")
     scene = room(painted(0.5))
-    hand_mirror = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
-    unseen = clip_of(replace(scene, shapes=(*scene.shapes, hand_mirror)), tmp_path / "unseen")
+    none = clip_of(scene, tmp_path / "none")
+    unseen = clip_of(replace(scene, shapes=(*scene.shapes, HAND_MIRROR)), tmp_path / "unseen")
     assert not set(MIRRORED.values()) & (none.channels.keys() | unseen.channels.keys())
     assert not [path.name for path in unseen.path.iterdir() if "mirrored" in path.name]
 

@@ -150,8 +150,7 @@ def test_exposure_by_hand():
     assert clip_exposure(np.full((2, 3), 0.18)) == pytest.approx(1)
     assert clip_exposure(np.full((2, 3), 1e-7)) == pytest.approx(1.8e6)
     # A dark room with one lamp: a tenth of the pixels at 100. The geometric mean alone would clip the lamp.
-    room = np.array([0.01] * 90 + [100.0] * 10)
-    assert clip_exposure(room) == pytest.approx(1 / 100)
+    assert clip_exposure(np.array([0.01] * 90 + [100.0] * 10)) == pytest.approx(1 / 100)
     # Zeros count as 1e-4 of the mean.
     assert clip_exposure(np.array([0.0, 2.0] * 50)) == pytest.approx(min(0.18 / np.sqrt(1e-4 * 2), 1 / 2))
     np.testing.assert_allclose(display(np.array([-1.0, 0, 0.25, 0.5, 9]), 2.0), [0, 0, 0.5 ** (1 / 2.2), 1, 1])

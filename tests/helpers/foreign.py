@@ -71,9 +71,8 @@ def write(path: Path, layers: Layers, header: Mapping[str, Any] | None = None, d
 
 def blender(frame: Frame) -> Layers:
     """Multi-layer files of Cycles; `Vector` is as its users describe it: positive where it came from."""
-    depth = image(frame, "depth")
+    depth, motion = image(frame, "depth"), image(frame, "motion")
     alpha = np.ones_like(depth)
-    motion = image(frame, "motion")
     return {
         "ViewLayer.Combined.RGBA": np.concatenate([0.5 * beauty(frame), alpha], axis=-1),  # some other image
         "ViewLayer.Noisy Image.RGBA": np.concatenate([beauty(frame), alpha], axis=-1),

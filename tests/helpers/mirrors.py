@@ -28,15 +28,11 @@ def placed(mesh: trimesh.Trimesh, at: list[float]) -> trimesh.Trimesh:
     return copy
 
 
+HAND_MIRROR = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
 BOX = placed(trimesh.creation.box([0.5, 0.8, 0.4]), [-0.3, 0.2, 1.2])
-GLIDES = RigidMotion(
-    Track(np.array([[0.0, 0, 0], [0.5, 0.2, 0]]), last=FRAMES - 1.0), Track.constant(0.0)
-)  # along the mirror
-CAMERA = Camera(
-    Track(np.array([[1.2, 0.3, 3.0], [1.5, 0.2, 2.8]]), last=FRAMES - 1.0),
-    Track.constant([0.0, 0, 0]),
-    Track.constant(60.0),
-)
+GLIDE = Track(np.array([[0.0, 0, 0], [0.5, 0.2, 0]]), last=FRAMES - 1.0)  # along the mirror
+EYE = Track(np.array([[1.2, 0.3, 3.0], [1.5, 0.2, 2.8]]), last=FRAMES - 1.0)
+CAMERA = Camera(EYE, Track.constant([0.0, 0, 0]), Track.constant(60.0))
 
 
 def slanted() -> trimesh.Trimesh:
@@ -50,7 +46,7 @@ def room(surface: Bsdf) -> Scene:
     """A picture on the wall of which is `surface`, a box that glides along it and a slanted wall behind the camera."""
     shapes = (
         Shape("picture", panel(5, 5), surface),
-        Shape("box", BOX, painted(0.2), motion=GLIDES),
+        Shape("box", BOX, painted(0.2), motion=RigidMotion(GLIDE, Track.constant(0.0))),
         Shape("wall", slanted(), painted(0.7), radiance=Track.constant([1.0, 1.0, 1.0])),
     )
     return Scene(shapes, CAMERA)

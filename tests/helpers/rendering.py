@@ -4,8 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
+from render.clip import Arrays
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
+from scenes.animation import Scene
 from scenes.bsdf import Bsdf
 from scenes.camera import Array, View, motion_vectors, pixel_centres
 
@@ -16,6 +18,12 @@ BLOCK_SIZE = 4  # px
 def rgb(*value: float) -> Bsdf:
     """A colour in a Mitsuba dictionary."""
     return {"type": "rgb", "value": list(value)}
+
+
+def first_gbuffer(scene: Scene, height: int, width: int) -> Arrays:
+    """The G-buffer of a scene's first frame."""
+    stage = Stage(scene, height, width)
+    return render_gbuffer(stage, stage.view(0))
 
 
 def posed_surfaces(stage: Stage, frame: int) -> tuple[View, View, Array, NDArray[np.integer], Array]:
@@ -54,8 +62,7 @@ def block_means(images: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def assert_same_mean(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> None:
     """Blocks of pixels of many independent images (N, H, W, 3) agree: 98 % within 3 standard errors, all within 5."""
-    a = block_means(ours)
-    b = block_means(theirs)
+    a, b = block_means(ours), block_means(theirs)
     error = np.sqrt(a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b))
     z = np.abs(a.mean(axis=0) - b.mean(axis=0)) / np.maximum(error, 1e-6)
     assert (z < 3).mean() >= 0.98

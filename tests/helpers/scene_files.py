@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import pytest
+
+from errors import BadInput
 from render.scene_file.load import OwnScene
 
 LOOK = '<transform name="{}"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>'
@@ -37,3 +40,12 @@ def write(folder: Path, content: str | bytes, toml: str = "", name: str = "scene
 def own(folder: Path, content: str | bytes, toml: str = "", name: str = "scene.xml") -> OwnScene:
     """The scene in a file with that content."""
     return OwnScene(write(folder, content, toml, name))
+
+
+def refusal(folder: Path, content: str | bytes, toml: str = "", name: str = "scene.xml") -> str:
+    """The one line that refuses a file with that content."""
+    with pytest.raises(BadInput) as error:
+        own(folder, content, toml, name)
+    text = str(error.value)
+    assert "\n" not in text and ".cpp" not in text and "Traceback" not in text and len(text) < 600
+    return text

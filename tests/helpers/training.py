@@ -27,12 +27,8 @@ from train.registry import task_for
 from train.task import WEIGHTS_FILE, Task, run_folder
 
 # Two to ten steps of the tiny budget.
-SHORT: dict[str, dict[str, Any]] = {
-    "rae": {"epochs": 1},
-    "wskp6": {"epochs": 2, "crops": (2, 1)},
-    "ntd": {"epochs": 1},
-    "one": {"epochs": 1},
-}
+ONE_EPOCH: dict[str, Any] = {"epochs": 1}
+SHORT = {"rae": ONE_EPOCH, "wskp6": {"epochs": 2, "crops": (2, 1)}, "ntd": ONE_EPOCH, "one": ONE_EPOCH}
 
 
 def short_task(
@@ -71,8 +67,7 @@ def makers_of(weights: Path) -> list[dict[str, Any]]:
 
 def same_weights(a: Path, b: Path) -> bool:
     """Whether two trainings, given their folders, ended with the same weights bit for bit."""
-    x = tensors(a / WEIGHTS_FILE)
-    y = tensors(b / WEIGHTS_FILE)
+    x, y = (tensors(folder / WEIGHTS_FILE) for folder in (a, b))
     return x.keys() == y.keys() and all(torch.equal(x[key], y[key]) for key in x)
 
 

@@ -41,9 +41,8 @@ def test_extreme_scene_becomes_a_clip(name, tmp_path):
 def test_units_do_not_matter(factor):
     """The same samples in other units: the same picture and motion, depth times the factor."""
     scene = build_scene("cornell_box_moving", 5, FRAMES)
-    plain, other = (
-        list(render_clip(s, FRAMES, SIZE, SIZE, Sampling(1, 1, 64), 5))[2][0] for s in (scene, rescaled(scene, factor))
-    )
+    clips = [render_clip(s, FRAMES, SIZE, SIZE, Sampling(1, 1, 64), 5) for s in (scene, rescaled(scene, factor))]
+    plain, other = (list(clip)[2][0] for clip in clips)
     same = plain["mesh_id"] == other["mesh_id"]
     assert same.mean() > 0.99
     np.testing.assert_allclose(other["depth"][same], plain["depth"][same] * factor, rtol=1e-4)

@@ -15,11 +15,11 @@ from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
 from scenes.registry import build_scene
+from tests.helpers.rendering import first_gbuffer
 
 
 def test_square_before_a_black_sky(square):
-    stage = Stage(square, 32, 32)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(square, 32, 32)
     hit = np.zeros((32, 32), bool)
     hit[8:24, 8:24] = True  # half the width, a quarter of the area, in the middle
     assert np.array_equal(buffer["mesh_id"][..., 0], hit)
@@ -31,8 +31,7 @@ def test_square_before_a_black_sky(square):
 
 
 def test_normals_face_the_viewer_from_behind(square):
-    stage = Stage(replace(square, camera=replace(square.camera, eye=Track.constant([0.0, 0, -3]))), 16, 16)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(replace(square, camera=replace(square.camera, eye=Track.constant([0.0, 0, -3]))), 16, 16)
     np.testing.assert_allclose(buffer["normal"][8, 8], [0, 0, -1], atol=1e-6)
     assert buffer["emission"].max() == 0  # lamps shine to one side
 
@@ -49,8 +48,7 @@ def test_smooth_mesh_keeps_and_turns_its_vertex_normals():
         view = stage.view(frame)
         buffer = render_gbuffer(stage, view)
         hit = buffer["mesh_id"][..., 0] > 0
-        points = unproject(pixel_centres(48, 48), buffer["depth"][..., 0].astype(float), view)
-        expected = points - centre
+        expected = unproject(pixel_centres(48, 48), buffer["depth"][..., 0].astype(float), view) - centre
         expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
         assert hit.sum() > 300
         assert np.abs(buffer["normal"] - expected)[hit].max() < 5e-3  # facets are off by up to 0.03
@@ -61,14 +59,12 @@ def test_colours_lie_on_their_walls(stage):
     buffer = render_gbuffer(stage, stage.view(0))
     for index, shape in enumerate(stage.scene.shapes):
         visible = buffer["albedo"][buffer["mesh_id"][..., 0] == index + 1]
-        np.testing.assert_allclose(
-            visible, np.broadcast_to(shape.bsdf["reflectance"]["value"], visible.shape), rtol=1e-5
-        )
+        colour = np.broadcast_to(shape.bsdf["reflectance"]["value"], visible.shape)
+        np.testing.assert_allclose(visible, colour, rtol=1e-5)
 
 
 def test_other_materials_are_measured(square):
-    stage = Stage(replace(square, shapes=(replace(square.shapes[0], bsdf={"type": "hair"}),)), 8, 8)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(replace(square, shapes=(replace(square.shapes[0], bsdf={"type": "hair"}),)), 8, 8)
     assert all(np.isfinite(buffer[name]).all() for name in ("albedo", "roughness"))
     assert buffer["albedo"].min() >= 0 and buffer["albedo"].max() <= 1
 
@@ -110,8 +106,7 @@ def test_no_kernel_is_recompiled_from_frame_to_frame(tmp_path):
 
 def test_mesh_ids_are_scene_order():
     scene = build_scene("cornell_box", 0, 2)
-    reordered = replace(scene, shapes=scene.shapes[::-1])
-    a, b = (Stage(s, 32, 32) for s in (scene, reordered))
+    a, b = (Stage(s, 32, 32) for s in (scene, replace(scene, shapes=scene.shapes[::-1])))
     ids = [render_gbuffer(s, s.view(0))["mesh_id"] for s in (a, b)]
     assert np.array_equal(ids[0], len(scene.shapes) + 1 - ids[1])
 

@@ -13,8 +13,8 @@ from render.gbuffer import MAX_BLUR, render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject
-from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, painted, panel, placed, room
-from tests.helpers.rendering import rgb
+from tests.helpers.mirrors import CAMERA, FRAMES, HAND_MIRROR, SILVER, SIZE, painted, panel, placed, room
+from tests.helpers.rendering import first_gbuffer, rgb
 from tests.helpers.scene_files import own
 
 SURFACE = ("normal", "depth", "roughness", "albedo")
@@ -35,6 +35,14 @@ def room_twice() -> Scene:
     )
     far = replace(ours[0], mesh=placed(ours[0].mesh, [0, 0, -1000]))
     return Scene((far, *ours[1:], Shape("nothing", placed(panel(1, 1), [0, 0, 900]), SILVER), box, wall), CAMERA)
+
+
+def show_themselves(scene: Scene) -> dict[str, np.ndarray]:
+    """Assert that all surfaces in the first frame show nothing but themselves. Returns its G-buffer."""
+    buffer = first_gbuffer(scene, *SIZE)
+    for name in (*SURFACE, "mesh_id"):
+        np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
+    return buffer
 
 
 def rendered(scene: Scene) -> list[dict]:
@@ -73,26 +81,16 @@ def test_a_scene_without_mirrors_has_no_such_channels():
     assert not [name for name in frame if name.startswith("mirrored")]
 
 
-@pytest.mark.parametrize(
-    "surface",
-    [
-        painted(0.5),
-        {"type": "roughconductor", "material": "Ag", "alpha": 0.3},
-        {"type": "dielectric"},
-        {"type": "plastic"},
-        {"type": "conductor", "material": "Ag"},  # whose back is black
-    ],
-    ids=lambda bsdf: bsdf["type"],
-)
+METALS = [{"type": "roughconductor", "material": "Ag", "alpha": 0.3}, {"type": "conductor", "material": "Ag"}]
+OTHERS = [painted(0.5), {"type": "dielectric"}, {"type": "plastic"}, *METALS]
+
+
+@pytest.mark.parametrize("surface", OTHERS, ids=lambda bsdf: bsdf["type"])
 def test_what_is_no_mirror_is_not_looked_through(surface):
     scene = room(surface)
     if surface["type"] == "conductor":
-        scene.shapes[0].mesh.invert()
-    hand_mirror = Shape("hand mirror", placed(panel(0.1, 0.1), [0, 0, 50]), SILVER)  # out of sight
-    stage = Stage(replace(scene, shapes=(*scene.shapes, hand_mirror)), *SIZE)
-    buffer = render_gbuffer(stage, stage.view(0))
-    for name in (*SURFACE, "mesh_id"):
-        np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
+        scene.shapes[0].mesh.invert()  # its back is black
+    show_themselves(replace(scene, shapes=(*scene.shapes, HAND_MIRROR)))
 
 
 def test_a_glossy_surface_shows_what_it_shows_sharply():
@@ -114,18 +112,14 @@ def test_a_glossy_surface_shows_what_it_shows_sharply():
 
 
 def test_a_mirror_that_shows_the_sky_is_a_mirror():
-    stage = Stage(Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA), *SIZE)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = show_themselves(Scene((Shape("mirror", panel(20, 20), SILVER),), CAMERA))
     assert buffer["mesh_id"].mean() > 0.6
-    for name in (*SURFACE, "mesh_id"):
-        np.testing.assert_array_equal(buffer[f"mirrored_{name}"], buffer[name], err_msg=name)
 
 
 def test_a_tinted_mirror_tints_albedo():
     """By its reflectance at normal incidence, the more often the more mirrors there are."""
     gold = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.9, 0.6, 0.3)}
-    stage = Stage(room(gold), *SIZE)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(room(gold), *SIZE)
     behind_glass = buffer["mirrored_mesh_id"][..., 0] == 3
     assert behind_glass.any()
     tints = buffer["mirrored_albedo"][behind_glass] / [0.7, 0.4, 0.6]

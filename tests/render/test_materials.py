@@ -5,12 +5,11 @@ import pytest
 import trimesh
 
 from render.backend import dr, mi
-from render.gbuffer import render_gbuffer
 from render.loading import to_mitsuba
 from render.materials import MaterialTable
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
-from tests.helpers.rendering import rgb
+from tests.helpers.rendering import first_gbuffer, rgb
 
 
 def textured_square(bsdf: dict) -> Scene:
@@ -52,8 +51,7 @@ METAL_BSDFS = [
 
 @pytest.mark.parametrize("bsdf", METAL_BSDFS)
 def test_albedo_of_metals_is_what_they_reflect(bsdf):
-    stage = Stage(textured_square(bsdf), 4, 4)
-    albedo = render_gbuffer(stage, stage.view(0))["albedo"]
+    albedo = first_gbuffer(textured_square(bsdf), 4, 4)["albedo"]
     np.testing.assert_allclose(albedo, np.broadcast_to(reflected(bsdf), albedo.shape), rtol=0.02)
 
 
@@ -61,16 +59,14 @@ def test_albedo_of_metals_is_what_they_reflect(bsdf):
 @pytest.mark.parametrize("eta", [1.3, 1.9])
 def test_albedo_of_plastics_is_diffuse_plus_specular(bsdf, eta):
     bsdf = {**bsdf, "int_ior": eta, "ext_ior": 1.0, "diffuse_reflectance": rgb(0.1, 0.4, 0.7)}
-    stage = Stage(textured_square(bsdf), 4, 4)
-    albedo = render_gbuffer(stage, stage.view(0))["albedo"][0, 0]
+    albedo = first_gbuffer(textured_square(bsdf), 4, 4)["albedo"][0, 0]
     coat = reflected({**bsdf, "diffuse_reflectance": rgb(0, 0, 0)})
     np.testing.assert_allclose(albedo, np.array([0.1, 0.4, 0.7]) + coat, rtol=0.02)
 
 
 def test_principled_mixes_by_metallic():
     bsdf = {"type": "principled", "base_color": rgb(0.2, 0.4, 0.6), "metallic": 0.25, "specular": 0.5, "roughness": 0.3}
-    stage = Stage(textured_square({"type": "twosided", "bsdf": bsdf}), 4, 4)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(textured_square({"type": "twosided", "bsdf": bsdf}), 4, 4)
     base = np.array([0.2, 0.4, 0.6])
     expected = base * 0.75 + (0.08 * 0.5 * 0.75 + base * 0.25)
     np.testing.assert_allclose(buffer["albedo"][0, 0], expected, rtol=1e-5)
@@ -79,8 +75,7 @@ def test_principled_mixes_by_metallic():
 
 @pytest.mark.parametrize("kind", ["dielectric", "thindielectric", "roughdielectric"])
 def test_what_only_transmits_is_white(kind):
-    stage = Stage(textured_square({"type": kind}), 4, 4)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(textured_square({"type": kind}), 4, 4)
     assert (buffer["albedo"] == 1).all()
     np.testing.assert_allclose(buffer["roughness"], 0.1 if kind == "roughdielectric" else 0)
 
@@ -94,8 +89,7 @@ def test_textures_are_read_where_they_are_seen():
         return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest"}
 
     bsdf = {"type": "roughconductor", "alpha": bitmap(ramp), "specular_reflectance": bitmap(colour)}
-    stage = Stage(textured_square(bsdf), 4, 4)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(textured_square(bsdf), 4, 4)
     np.testing.assert_allclose(buffer["roughness"], ramp[::-1], rtol=1e-5)
     np.testing.assert_allclose(buffer["albedo"], colour[::-1], rtol=1e-5)
 
@@ -115,7 +109,6 @@ def test_every_shape_has_its_own_material():
         mesh = base.shapes[0].mesh.copy()
         mesh.vertices[:, 0] = (mesh.vertices[:, 0] + 0.5 + i) / len(kinds) - 0.5
         shapes.append(Shape(f"shape-{9 - i}", mesh, bsdf))
-    stage = Stage(Scene(tuple(shapes), base.camera), 4, 4)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(Scene(tuple(shapes), base.camera), 4, 4)
     np.testing.assert_allclose(buffer["roughness"][0, :, 0], [1, 0, 0.25, 1])
     np.testing.assert_allclose(buffer["albedo"][0, :, 0], [0.1, 0.3, 0.5 + (0.49 / 2.49) ** 2, 0.9], rtol=2e-3)

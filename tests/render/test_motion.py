@@ -38,16 +38,9 @@ def carry(points: np.ndarray, mesh_id: np.ndarray, source: View, target: View) -
 def test_rays_are_those_of_mitsubas_perspective_camera():
     eye, target, fov = [0.3, -0.2, 2.0], [0.1, 0.4, -1.0], 55.0
     height, width = 24, 40
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": fov,
-            "fov_axis": "x",
-            "near_clip": 1e-3,
-            "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": width, "height": height},
-        }
-    )
+    lens = {"type": "perspective", "fov": fov, "fov_axis": "x", "near_clip": 1e-3}
+    film = {"type": "hdrfilm", "width": width, "height": height}
+    sensor = mi.load_dict({**lens, "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 1, 0]), "film": film})
     view = View(intrinsics(fov, height, width), look_at(np.array(eye), np.array(target)), np.zeros((0, 4, 4)))
     film = mi.Point2f(np.float32(pixel_centres(height, width).reshape(-1, 2) / [width, height]).T)
     theirs, _ = sensor.sample_ray(0, 0, film, 0)
@@ -145,11 +138,7 @@ def test_dual_motion_equals_motion_exactly_where_visible(stage):
 
 def test_background_moves_with_its_direction():
     """A camera that turns by half its field of view about the vertical axis moves the sky's centre to the border."""
-    fov = 40.0
-    size = 100
-    K = intrinsics(fov, size, size)
-    eye = np.zeros(3)
-    a = np.radians(fov / 2)
+    K, eye, a = intrinsics(40.0, 100, 100), np.zeros(3), np.radians(20)
     ahead = View(K, look_at(eye, np.array([0.0, 0, -1])), np.zeros((1, 4, 4)))
     turned = View(K, look_at(eye + 5, eye + 5 + np.array([np.sin(a), 0, -np.cos(a)])), np.zeros((1, 4, 4)))
     centre = np.array([[50.0, 50.0]])

@@ -38,13 +38,11 @@ def test_every_point_of_the_halton_cycle_is_unbiased(stage, cycles):
 def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
     stage.pose(POSED_FRAME)
     ray = stage.rays(stage.view(POSED_FRAME))
-    halton = PathTracer(stage, halton=True)
-    owen = PathTracer(stage)
+    halton, owen = PathTracer(stage, halton=True), PathTracer(stage)
     truth = np.add(*owen.radiance(ray, 999, 2048))
     cycles = [np.mean([np.add(*halton.radiance(ray, s, 1, first=f)) for f in range(CYCLE)], axis=0) for s in range(4)]
-    independent = [
-        np.mean([np.add(*owen.radiance(ray, 1000 * s + f, 1)) for f in range(CYCLE)], axis=0) for s in range(4)
-    ]
+    seeds = [range(1000 * s, 1000 * s + CYCLE) for s in range(4)]
+    independent = [np.mean([np.add(*owen.radiance(ray, seed, 1)) for seed in each], axis=0) for each in seeds]
     errors = [np.mean((np.stack(images) - truth) ** 2) for images in (cycles, independent)]
     assert errors[0] < 0.8 * errors[1]
 

@@ -15,18 +15,18 @@ from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
 
 
-def realisations(stage: Stage, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Direct and indirect radiance (N, H, W, 3) of one sample a pixel, with seeds 0 to N - 1."""
+def realisations(stage: Stage, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Emission (H, W, 3), direct and indirect radiance (N, H, W, 3) of one sample a pixel, with seeds 0 to N - 1."""
+    stage.pose(POSED_FRAME)
+    emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
     ray = stage.rays(stage.view(POSED_FRAME))
     tracer = PathTracer(stage)
     images = [tracer.radiance(ray, seed, spp=1) for seed in range(count)]
-    return np.stack([direct for direct, _ in images]), np.stack([indirect for _, indirect in images])
+    return emission, np.stack([direct for direct, _ in images]), np.stack([indirect for _, indirect in images])
 
 
 def test_one_spp_images_average_to_the_stock_integrator(stage):
-    stage.pose(POSED_FRAME)
-    direct, indirect = realisations(stage, 600)
-    emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
+    emission, direct, indirect = realisations(stage, 600)
     np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
     assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(30)]))
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
@@ -44,9 +44,7 @@ def test_reference_averages_to_the_stock_integrator(stage):
 
 def test_a_scene_may_ask_for_more_bounces():
     stage = Stage(replace(build_scene("cornell_box", 3, 24), max_depth=5), 64, 64)
-    stage.pose(POSED_FRAME)
-    direct, indirect = realisations(stage, 250)
-    emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
+    emission, direct, indirect = realisations(stage, 250)
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 5, 16, s) for s in range(30)]))
 
 
@@ -59,9 +57,7 @@ def test_metal_plastic_and_sky_average_to_the_stock_integrator():
     scene = repaint(build_scene("cornell_box", 3, 24), lambda shape: paint.get(shape.name, shape.bsdf))
     sky = np.linspace(0.5, 2, 4 * 8 * 3).reshape(4, 8, 3)
     stage = Stage(replace(scene, sky=sky, max_depth=6), 64, 64)
-    stage.pose(POSED_FRAME)
-    direct, indirect = realisations(stage, 600)
-    emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
+    emission, direct, indirect = realisations(stage, 600)
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 6, 16, s) for s in range(60)]))
 
 

@@ -14,7 +14,7 @@ from scenes.bsdf import Bsdf
 from scenes.camera import directions, pixel_centres
 from scenes.registry import build_scene
 from tests.helpers.mirrors import SILVER, panel, placed
-from tests.helpers.rendering import POSED_FRAME, assert_same_mean, rgb, stock_radiance
+from tests.helpers.rendering import assert_same_mean, first_gbuffer, rgb, stock_radiance
 from tests.render.test_path import realisations
 
 SIZE = 33  # px
@@ -94,8 +94,7 @@ def test_a_lamp_is_as_free_of_noise_as_one_seen_directly(shapes, share):
 
 
 def test_mirrors_tint_light():
-    stage = Stage(scene_of(pane(0, GOLD), lamp(6)), SIZE, SIZE)
-    emission = render_gbuffer(stage, stage.view(0))["emission"]
+    emission = first_gbuffer(scene_of(pane(0, GOLD), lamp(6)), SIZE, SIZE)["emission"]
     np.testing.assert_allclose(emission, np.broadcast_to(LAMP * [0.9, 0.6, 0.3], emission.shape), rtol=1e-5)
 
 
@@ -120,15 +119,13 @@ def shining_box(**changes: object) -> Stage:
     glass = {"type": "dielectric", "specular_transmittance": rgb(0.9, 0.7, 0.5)}
     shapes = tuple(replace(shape, bsdf=paint.get(shape.name, shape.bsdf)) for shape in box.shapes)
     ball = Shape("ball", placed(ball, [0.4, -0.2, 0.6]), glass, smooth=True)
-    stage = Stage(replace(box, shapes=(*shapes, ball), **changes), 64, 64)
-    stage.pose(POSED_FRAME)
-    return stage
+    return Stage(replace(box, shapes=(*shapes, ball), **changes), 64, 64)
 
 
 @pytest.mark.parametrize("max_depth", [4, pytest.param(12, marks=pytest.mark.slow)])
 def test_the_mean_is_that_of_the_stock_integrator(max_depth):
     stage = shining_box(max_depth=max_depth)
-    emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
-    direct, indirect = realisations(stage, 300)
-    images = emission + direct + indirect
-    assert_same_mean(images, np.stack([stock_radiance(stage, max_depth, 16, s) for s in range(40)]))
+    emission, direct, indirect = realisations(stage, 300)
+    assert_same_mean(
+        emission + direct + indirect, np.stack([stock_radiance(stage, max_depth, 16, s) for s in range(40)])
+    )

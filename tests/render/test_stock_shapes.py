@@ -1,5 +1,7 @@
 """Shapes, maps and lights as scene files describe them: what is visible of them, and how they move and change."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,11 +12,9 @@ from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Scene, StockLight, StockShape, Track
 from scenes.camera import move, pixel_centres, unproject
-from tests.helpers.rendering import assert_same_mean, posed_surfaces, rgb, stock_radiance
+from tests.helpers.rendering import assert_same_mean, first_gbuffer, posed_surfaces, rgb, stock_radiance
 
 SIZE = 24
-
-
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}
 SKY = StockLight("sky", {"type": "constant", "radiance": rgb(1, 1, 1)})
 CAMERA = Camera(Track.constant([0.5, 1.0, 6.0]), Track.constant([0.0, 0.0, 0.0]), Track.constant(50.0))
@@ -24,10 +24,6 @@ def placed(x: float, y: float = 0.0, z: float = 0.0, scale: float = 1.0) -> np.n
     matrix = np.diag([scale, scale, scale, 1.0])
     matrix[:3, 3] = [x, y, z]
     return matrix
-
-
-def mitsuba_square(bsdf: dict) -> StockShape:
-    return StockShape("square", {"type": "rectangle"}, bsdf)
 
 
 GROUP = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.5, "bsdf": WHITE}}
@@ -45,7 +41,7 @@ KINDS = {
 def kinds(motion: FreeMotion | None = None) -> Scene:
     shapes = [StockShape(name, described, None if "inst" in name else WHITE) for name, described in KINDS.items()]
     if motion:
-        shapes = [StockShape(shape.name, shape.geometry, shape.bsdf, motion=motion) for shape in shapes]
+        shapes = [replace(shape, motion=motion) for shape in shapes]
     return Scene((), CAMERA, stock=tuple(shapes), lights=(SKY,))
 
 
@@ -92,9 +88,8 @@ def test_radiance_is_that_of_mitsuba_with_all_kinds_of_lights():
         StockLight("sky", {"type": "constant", "radiance": rgb(0.2, 0.3, 0.4)}),
     )
     checks = {"type": "checkerboard", "color0": rgb(0.2, 0.2, 0.2), "color1": rgb(0.9, 0.6, 0.3)}
-    lamp = StockShape(
-        "lamp", {"type": "disk", "to_world": placed(0, 0, -1, 3)}, WHITE, {"type": "area", "radiance": checks}
-    )
+    disk = {"type": "disk", "to_world": placed(0, 0, -1, 3)}
+    lamp = StockShape("lamp", disk, WHITE, {"type": "area", "radiance": checks})
     holes = {"type": "mask", "opacity": 0.5, "nested": WHITE}
     veil = StockShape("veil", {"type": "rectangle", "to_world": placed(0, -1, 1.5, 0.7)}, holes)
     stage = Stage(Scene((), CAMERA, 4, stock=(*kinds().stock, lamp, veil), lights=lights), SIZE, SIZE)
@@ -142,10 +137,9 @@ def test_normals_are_those_that_a_mirror_with_the_same_map_has(kind, bsdf_side, 
     if behind and not bsdf_side:
         pytest.skip("a mirror has no back")
     bsdf = {**bsdf_side, "bsdf": bsdf} if bsdf_side else bsdf
-    camera = Camera(
-        Track.constant([0.2, 0.1, -4.0 if behind else 4.0]), Track.constant([0.0, 0, 0]), Track.constant(25.0)
-    )
-    stage = Stage(Scene((), camera, stock=(mitsuba_square(bsdf),)), 20, 20)
+    eye = Track.constant([0.2, 0.1, -4.0 if behind else 4.0])
+    camera = Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(25.0))
+    stage = Stage(Scene((), camera, stock=(StockShape("square", {"type": "rectangle"}, bsdf),)), 20, 20)
     view = stage.view(0)
     normal = render_gbuffer(stage, view)["normal"].reshape(-1, 3)
     ray = stage.rays(view)
@@ -161,16 +155,12 @@ def test_normals_are_those_that_a_mirror_with_the_same_map_has(kind, bsdf_side, 
 def test_holes_of_masks_are_seen_through():
     """What is behind is in the G-buffer, at its own depth; where the mask is opaque it hides it."""
     opacity = {"type": "bitmap", "raw": True, "filter_type": "nearest", "data": np.float32([[[0.0], [1.0]]])}
-    veil = StockShape(
-        "veil",
-        {"type": "rectangle", "to_world": placed(0, 0, 1)},
-        {"type": "mask", "opacity": opacity, "nested": WHITE},
-    )
+    holes = {"type": "mask", "opacity": opacity, "nested": WHITE}
+    veil = StockShape("veil", {"type": "rectangle", "to_world": placed(0, 0, 1)}, holes)
     green = {"type": "diffuse", "reflectance": rgb(0.1, 0.7, 0.1)}
     wall = StockShape("wall", {"type": "rectangle", "to_world": placed(0, 0, 0, 4)}, green)
     camera = Camera(Track.constant([0.0, 0, 5.0]), Track.constant([0.0, 0, 0]), Track.constant(20.0))
-    stage = Stage(Scene((), camera, stock=(veil, wall), lights=(SKY,)), 8, 8)
-    buffer = render_gbuffer(stage, stage.view(0))
+    buffer = first_gbuffer(Scene((), camera, stock=(veil, wall), lights=(SKY,)), 8, 8)
     assert (buffer["mesh_id"][:, :4] == 2).all() and (buffer["mesh_id"][:, 4:] == 1).all()
     np.testing.assert_allclose(buffer["depth"][:, :4], 5, rtol=1e-5)
     np.testing.assert_allclose(buffer["depth"][:, 4:], 4, rtol=1e-5)
@@ -183,16 +173,13 @@ def test_the_size_of_a_scene_changes_nothing_but_its_depth(factor):
 
     def of_size(size: float) -> tuple[dict, np.ndarray]:
         grown = np.diag([size] * 3 + [1.0])
-        shapes = [
-            StockShape(name, d | {"to_world": grown @ d.get("to_world", np.eye(4))}, None if "inst" in name else WHITE)
-            for name, d in KINDS.items()
-        ]
+        places = {name: {"to_world": grown @ kind.get("to_world", np.eye(4))} for name, kind in KINDS.items()}
+        shapes = [replace(shape, geometry=shape.geometry | places[shape.name]) for shape in kinds().stock]
         point = {"type": "point", "position": [0.0, 2.0 * size, 2.0 * size], "intensity": rgb(*[5 * size**2] * 3)}
         camera = Camera(Track.constant(CAMERA.eye.at(0) * size), CAMERA.target, CAMERA.x_fov)
         stage = Stage(Scene((), camera, stock=tuple(shapes), lights=(StockLight("point", point), SKY)), SIZE, SIZE)
-        return render_gbuffer(stage, stage.view(0)), np.add(
-            *PathTracer(stage).radiance(stage.rays(stage.view(0)), 1, 64)
-        )
+        view = stage.view(0)
+        return render_gbuffer(stage, view), np.add(*PathTracer(stage).radiance(stage.rays(view), 1, 64))
 
     plain, shown = of_size(1.0)
     scaled, shown_scaled = of_size(factor)

@@ -17,16 +17,10 @@ from tests.helpers.scene_files import old_xml, write
 from tests.test_cli import fails
 
 SPLITS = """
-[splits.train]
-clips = 1
-realisations = 1
-reference_spp = 4
-[splits.val]
-clips = 0
-[splits.test]
-clips = 2
-reference_spp = 4
-most_spp = 4
+[splits]
+train = { clips = 1, realisations = 1, reference_spp = 4 }
+val = { clips = 0 }
+test = { clips = 2, reference_spp = 4, most_spp = 4 }
 """
 CONTENT = old_xml('<shape type="cube" id="lost"><bsdf type="phong"/></shape>', '<emitter type="collimated"/>')
 
@@ -93,10 +87,8 @@ def test_a_changed_file_is_another_scene(made, tmp_path, capsys, changed):
         file.write("\n")
     with pytest.raises(BadInput, match="render it again"):
         scene_of(clip, dataset)
-    refused = fails(
-        capsys, "dataset", "--scene", str(copy / "my.toml"), "--data", str(copy / "data"), "--reads", "wskp6"
-    )
-    assert "another source" in refused
+    words = ("--scene", str(copy / "my.toml"), "--data", str(copy / "data"), "--reads", "wskp6")
+    assert "another source" in fails(capsys, "dataset", *words)
 
 
 def test_refusals_leave_nothing_behind(tmp_path, capsys):
@@ -111,9 +103,8 @@ def test_refusals_leave_nothing_behind(tmp_path, capsys):
     (tmp_path / "empty.ply").write_bytes(b"")
     mesh = '<shape type="ply"><string name="filename" value="empty.ply"/></shape>'
     assert "empty.ply" in refused(str(write(tmp_path, old_xml(mesh), SPLITS)))
-    assert "no split has any clips" in refused(
-        str(write(tmp_path, CONTENT, "[splits]\ntrain.clips=0\nval.clips=0\ntest.clips=0"))
-    )
+    no_clips = "[splits]\ntrain.clips=0\nval.clips=0\ntest.clips=0"
+    assert "no split has any clips" in refused(str(write(tmp_path, CONTENT, no_clips)))
     assert not (tmp_path / "data").exists()
 
 

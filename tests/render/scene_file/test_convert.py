@@ -43,9 +43,8 @@ def test_a_material_of_many_shapes_is_loaded_once(tmp_path, monkeypatch):
 def test_files_lie_in_the_folder_or_where_paths_say(tmp_path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "in.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
-    found = converted(
-        tmp_path, xml('<path value="sub"/><shape type="obj"><string name="filename" value="in.obj"/></shape>')
-    )
+    mesh = '<shape type="obj"><string name="filename" value="in.obj"/></shape>'
+    found = converted(tmp_path, xml('<path value="sub"/>', mesh))
     assert found.shapes[1].name == "in" and found.shapes[1].geometry["filename"] == str(tmp_path / "sub" / "in.obj")
     assert found.notes == []
     for name in ("../x.obj", "/etc/hostname", "sub/../../x.obj"):

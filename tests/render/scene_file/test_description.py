@@ -18,29 +18,18 @@ file = "a.xml"
 resolution = [8, 4]
 frames = 5
 bounces = 2
-[[camera]]
-time = 0
-position = [0, 0, 5]
-target = [0, 0, 0]
-[[camera]]
-time = 1.0
-position = [1, 0, 5]
-target = [0, 0, 0]
-up = [0, 0, 1]
-fov = 50
+camera = [
+    { time = 0, position = [0, 0, 5], target = [0, 0, 0] },
+    { time = 1.0, position = [1, 0, 5], target = [0, 0, 0], up = [0, 0, 1], fov = 50 },
+]
 [[motion]]
 shape = "ball"
 keyframes = [{ time = 0 }, { time = 1, position = [1, 2, 3], rotation = [0, 90, 0] }]
 [[light]]
 light = "lamp"
 keyframes = [{ time = 0, gain = 1 }, { time = 1, gain = 0.5 }]
-[splits.test]
-clips = 2
-camera = "keyframes"
-realisations = 1
-reference_spp = 64
-floor = 30
-most_spp = 128
+[splits]
+test = { clips = 2, camera = "keyframes", realisations = 1, reference_spp = 64, floor = 30, most_spp = 128 }
 """
 
 
@@ -62,11 +51,8 @@ def test_the_example_of_the_docs(tmp_path):
     """It is valid, and the values that it gives as defaults are the defaults."""
     (example,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL)
     parsed = described(tmp_path, example)
-    assert (
-        [key.time for key in parsed.camera] == [0, 1]
-        and parsed.motion[0].shape == "ball"
-        and parsed.light[0].light == "lamp"
-    )
+    assert [key.time for key in parsed.camera] == [0, 1]
+    assert parsed.motion[0].shape == "ball" and parsed.light[0].light == "lamp"
     plain = described(tmp_path, "file = 'a.xml'")
     assert (parsed.resolution, parsed.frames) == (plain.resolution, plain.frames)
     for split, wanted in parsed.splits.items():
@@ -170,9 +156,8 @@ def test_motion_is_rigid_and_turns_about_its_pivot():
 
 
 def test_a_camera_of_one_frame_and_one_key_takes_the_rest_from_the_file():
-    file = Camera(
-        Track.constant([0.0, 0, 1]), Track.constant([0.0, 0, 0]), Track.constant(33.0), Track.constant([0.0, 0, 1])
-    )
+    above = Track.constant([0.0, 0, 1])
+    file = Camera(above, Track.constant([0.0, 0, 0]), Track.constant(33.0), up=above)
     camera = camera_of([CameraKey(0.5, (1, 2, 3), (0, 0, 0))], file, 1)
     np.testing.assert_array_equal(camera.eye.at(0), [1, 2, 3])
     assert camera.x_fov.at(0) == 33

@@ -46,8 +46,7 @@ def stage_of(made: Scene) -> Stage:
 def distance_to_box(points: np.ndarray, centre, half) -> np.ndarray:
     """From points (N, 3) to the surface of a box, from outside or from inside."""
     q = np.abs(points - np.array(centre)) - np.array(half)
-    outside = np.linalg.norm(np.maximum(q, 0), axis=1)
-    return np.where((q < 0).all(axis=1), -q.max(axis=1), outside)
+    return np.where((q < 0).all(axis=1), -q.max(axis=1), np.linalg.norm(np.maximum(q, 0), axis=1))
 
 
 def fine(camera: Camera) -> np.ndarray:

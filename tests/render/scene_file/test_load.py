@@ -11,7 +11,7 @@ from render.scene_file.load import OwnScene
 from render.stage import Stage
 from scenes.camera import pixel_centres
 from tests.helpers.rendering import posed_surfaces
-from tests.helpers.scene_files import own, painted, xml
+from tests.helpers.scene_files import own, painted, refusal, xml
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 PLY += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -28,14 +28,6 @@ DAMAGED = {
     "empty.serialized": b"",
     "junk.serialized": bytes(range(256)),
 }
-
-
-def refusal(folder, content, **arguments) -> str:
-    with pytest.raises(BadInput) as error:
-        own(folder, content, **arguments)
-    text = str(error.value)
-    assert "\n" not in text and ".cpp" not in text and "Traceback" not in text
-    return text
 
 
 @pytest.mark.parametrize("grouped", [False, True])
@@ -103,10 +95,7 @@ def test_a_camera_that_cannot_see(tmp_path, key):
 
 def test_keyframes_move_and_brighten(tmp_path):
     toml = """bounces = 1
-    [[camera]]
-    time = 0
-    position = [0, 0, 5]
-    target = [0, 0, 0]
+    camera = [{ time = 0, position = [0, 0, 5], target = [0, 0, 0] }]
     [[motion]]
     shape = "ball"
     keyframes = [{ time = 0 }, { time = 1, position = [0.5, 0, 0] }]

@@ -173,10 +173,8 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
     with pytest.raises(BadInput, match="leaves the scene's folder"):
         path = gltf(folder, lambda content: content.update(images=[{"uri": "../tex.png"}]), baseColorTexture=picture())
         load_mesh_file(path, 1.0)
-    ply = (
-        "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\nproperty float x\nproperty float y\n"
-    )
-    ply += "property float z\nproperty float s\nproperty float t\nelement face 1\n"
+    ply = "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\n"
+    ply += "".join(f"property float {name}\n" for name in "xyzst") + "element face 1\n"
     ply += "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
     (folder / "scene.ply").write_text(ply)
     with pytest.raises(BadInput, match="leaves the scene's folder"):

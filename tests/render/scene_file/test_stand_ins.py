@@ -138,12 +138,6 @@ def test_films_and_samplers_are_the_renderers_own(tmp_path, make):
     assert own(tmp_path, make().replace("</sensor>", film)).notes == []
 
 
-def test_hair_is_no_shape_today(tmp_path):
-    (tmp_path / "h.hair").write_text("0 0 0\n1 1 1\n")
-    scene = own(tmp_path, old_xml(shape("hair", '<string name="filename" value="h.hair"/>')))
-    assert any("no shape 'hair'" in note for note in scene.notes) and len(scene.scene.stock) == 1
-
-
 def test_files_of_pictures(tmp_path):
     """A texture, a bump map, a shining picture and a sky, each of a file."""
     values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)

@@ -4,21 +4,11 @@ import pytest
 
 from errors import BadInput
 from render.scene_file.xml import MAX_INCLUDE_DEPTH, MAX_INCLUDES, ParsedFile, linear_colour
-from tests.helpers.scene_files import old_xml, xml
+from tests.helpers.scene_files import old_xml, refusal, xml
 
 
 def kinds(state) -> list[str]:
     return [node.props.plugin_name() for node in state.nodes]
-
-
-def refusal(folder, content: str | bytes, name: str = "scene.xml") -> str:
-    """The one line that refuses a file."""
-    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(BadInput) as error:
-        ParsedFile(folder / name)
-    text = str(error.value)
-    assert "\n" not in text and ".cpp" not in text and len(text) < 600
-    return text
 
 
 def included(name: str) -> str:
