@@ -75,8 +75,7 @@ def test_cameras_of_headers(from_zero):
     assert_same(view_of_header({"worldToNDC": ndc}, HEIGHT, WIDTH), view, 1e-4)
     assert view_of_header({}, HEIGHT, WIDTH) is None
     assert view_of_header({"worldToNDC": np.zeros((4, 4))}, HEIGHT, WIDTH) is None
-    stretched = ndc * [[0.5, 1, 1, 1]]
-    assert view_of_header({"worldToNDC": stretched}, HEIGHT, WIDTH) is None  # oblong pixels
+    assert view_of_header({"worldToNDC": ndc * [[0.5, 1, 1, 1]]}, HEIGHT, WIDTH) is None  # oblong pixels
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])

@@ -46,11 +46,8 @@ def test_common_names_are_recognised(quantity, layer, prefix):
 
 def test_the_best_name_comes_first():
     names = channels("Composite.Combined.RGBA", "ViewLayer.Combined.RGBA", "ViewLayer.Noisy Image.RGBA")
-    assert [layer.name for layer in candidates("colour", names)] == [
-        "ViewLayer.Noisy Image",
-        "ViewLayer.Combined",
-        "Composite.Combined",
-    ]
+    best_first = ["ViewLayer.Noisy Image", "ViewLayer.Combined", "Composite.Combined"]
+    assert [layer.name for layer in candidates("colour", names)] == best_first
     assert candidates("motion", channels("Vector.XYZW"))[0].channels == tuple(channels("Vector.XYZW"))
     assert candidates("normal", channels("N.XYZ", "Ns.XYZ"))[0].name == "Ns"
 

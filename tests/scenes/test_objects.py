@@ -13,12 +13,8 @@ from scenes.objects.thing import Thing
 from tests.helpers.scenes import SEEDS
 
 STANDING = {**FURNITURE, **DECOR}
-HANGING = {
-    "picture": make_picture,
-    "pendant": make_pendant,
-    "blind": lambda rng: make_blind(rng, 1.2, 1.4),
-    "curtain": lambda rng: make_curtain(rng, 1.1, 2.3),
-}
+HANGING = {"picture": make_picture, "pendant": make_pendant}
+HANGING |= {"blind": lambda rng: make_blind(rng, 1.2, 1.4), "curtain": lambda rng: make_curtain(rng, 1.1, 2.3)}
 THIN = ("leaf", "shade", "print", "fabric")  # sheets rather than bodies, in some things
 
 
@@ -55,9 +51,7 @@ def shading_agreement(mesh):
 @pytest.mark.parametrize("name", [*STANDING, *HANGING])
 def test_every_thing(name, seed):
     maker = {**STANDING, **HANGING}[name]
-    thing = build(maker, seed)
-    same = build(maker, seed)
-    other = build(maker, seed + 1)
+    thing, same, other = (build(maker, each) for each in (seed, seed, seed + 1))
     assert thing.name == name and np.array_equal(vertices(thing), vertices(same))
     assert vertices(thing).shape != vertices(other).shape or not np.allclose(vertices(thing), vertices(other))
     slots = [part.slot for part in thing.parts]
@@ -88,8 +82,7 @@ def test_stands_centred_and_leaves_its_supports_free(name, seed):
     else:
         assert 0.3 < (high - low).max() < 3
     for support in thing.supports:
-        at_low = np.array(support.low)
-        at_high = np.array(support.high)
+        at_low, at_high = np.array(support.low), np.array(support.high)
         assert (at_low < at_high).all() and support.clearance > 0.1
         assert (at_low >= low[[0, 2]]).all() and (at_high <= high[[0, 2]]).all()
         assert 0 < support.height <= high[1] + 1e-9

@@ -21,9 +21,7 @@ def placed(scene, name, frame):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_same_seed_same_scene(name):
-    a = build_scene(name, 5, FRAMES).view(7.5, 64, 64)
-    b = build_scene(name, 5, FRAMES).view(7.5, 64, 64)
-    other = build_scene(name, 6, FRAMES).view(7.5, 64, 64)
+    a, b, other = (build_scene(name, seed, FRAMES).view(7.5, 64, 64) for seed in (5, 5, 6))
     assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
     assert not np.array_equal(a.camera_to_world, other.camera_to_world)
 
@@ -34,8 +32,7 @@ def test_same_seed_same_scene(name):
 def test_nothing_touches(name, seed, frames):
     scene = build_scene(name, seed, frames)
     for frame in np.linspace(0, frames - 1, 9):
-        short = placed(scene, "short-block", frame)
-        tall = placed(scene, "tall-block", frame)
+        short, tall = (placed(scene, name, frame) for name in ("short-block", "tall-block"))
         for block in (short, tall):
             assert (np.abs(block) <= 1 + 1e-9).all() and (np.abs(block[:, [0, 2]]) < 0.99).all()
         if name == "cornell_box_moving":
@@ -49,8 +46,7 @@ def test_moving_box_moves_rigidly_and_its_light_changes():
     scene = build_scene("cornell_box_moving", 1, FRAMES)
     assert scene.moves() and not build_scene("cornell_box", 1, FRAMES).moves()
     for name in ("short-block", "tall-block", "light"):
-        a = placed(scene, name, 0)
-        b = placed(scene, name, 13)
+        a, b = (placed(scene, name, frame) for frame in (0, 13))
         assert np.abs(a - b).max() > 0.01
         distances = [np.linalg.norm(v[:, None] - v[None], axis=-1) for v in (a, b)]
         np.testing.assert_allclose(*distances, atol=1e-12)

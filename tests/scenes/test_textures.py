@@ -17,9 +17,7 @@ def within(values, low, high):
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS)
 def test_texture(seed):
-    a = texture(np.random.default_rng(seed))
-    b = texture(np.random.default_rng(seed))
-    other = texture(np.random.default_rng(seed + 1))
+    a, b, other = (texture(np.random.default_rng(each)) for each in (seed, seed, seed + 1))
     assert a.shape == (TEXTURE_SIZE, TEXTURE_SIZE, 3) and a.dtype == np.float32
     assert within(a, MIN_REFLECTANCE, MAX_REFLECTANCE)
     assert np.array_equal(a, b) and not np.array_equal(a, other)
@@ -28,8 +26,7 @@ def test_texture(seed):
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS, low=st.floats(0, 0.5), span=st.floats(0.01, 0.5))
 def test_gray_texture_spans_its_range(seed, low, span):
-    a = gray_texture(np.random.default_rng(seed), low, low + span)
-    b = gray_texture(np.random.default_rng(seed), low, low + span)
+    a, b = (gray_texture(np.random.default_rng(seed), low, low + span) for _ in range(2))
     assert a.shape == (TEXTURE_SIZE, TEXTURE_SIZE, 1) and a.dtype == np.float32 and np.array_equal(a, b)
     has_one_tone = a.min() == a.max()  # few patterns do, such as that of seed 86
     assert a.min() == pytest.approx(low, abs=1e-6)
@@ -55,8 +52,7 @@ def test_patterns_stay_in_the_palette_and_show_something(pattern, seed):
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_patterns_repeat_seamlessly(pattern):
     """Neighbours across the border differ about as much as elsewhere at most, over many drawings."""
-    inside = []
-    across = []
+    inside, across = [], []
     for seed in range(20):
         tone = pattern(np.random.default_rng(seed)).tone
         for field in (tone, tone.T):
