@@ -135,7 +135,8 @@ def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[s
     dr.eval(channels, si.t)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     if stage.specular.lobes:
-        emission = specular_light(stage.mitsuba_scene, stage.lights, stage.specular, ray, stage.max_events(regularise))
+        events = stage.max_events(regularise)
+        emission = specular_light(stage.mitsuba_scene, stage.lights, stage.specular, ray, events, stage.freezes)
         arrays["emission"] = emission.reshape(stage.height, stage.width, 3)
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.materials.has_mirrors:

@@ -153,9 +153,7 @@ class PathTracer:
         self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        # Dr.Jit 1.5 cannot freeze the rest: Halton points, regularised paths, textured area lights, and scenes without
-        # shapes while another scene is loaded.
-        self.freezes = bool(stage.shapes) and not halton and not regularise and not stage.has_textured_lights
+        self.freezes = stage.freezes and not halton and not regularise  # which Dr.Jit 1.5 cannot freeze either
 
     def samples(
         self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0

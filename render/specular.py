@@ -14,6 +14,7 @@ from render.backend import dr, mi
 from render.lights import Lights
 from render.loading import columns, upload
 from render.materials import BsdfParameters, bsdfs_of, registry_index
+from render.palette import palette
 
 MAX_EVENTS = 8  # in a chain: through a vitrine of solid panes, and a bottle in it
 
@@ -55,18 +56,19 @@ class Chains(NamedTuple):
     rays: NDArray[np.float32]  # (N, 9): origin and direction of the last ray, and throughput
 
 
-def advance(
-    chains: Chains, scene: mi.Scene, lights: Lights, specular: SpecularSurfaces
-) -> tuple[NDArray[np.float32], Chains]:
-    """(radiance (N, 3) from the ends of the chains, chains with one event more: one for each delta lobe there)."""
-    components = [*map(upload, chains.rays.T)]
-    origin, direction, throughput = mi.Point3f(components[:3]), mi.Vector3f(components[3:6]), mi.Color3f(components[6:])
+Branch = tuple[mi.Bool, list[mi.Float]]  # where a lobe continues chains; origin, direction and throughput then
+
+
+def branches_at_end(
+    scene: mi.Scene, lights: Lights, specular: SpecularSurfaces, rays: list[mi.Float], lobes: list[int]
+) -> tuple[mi.Color3f, list[Branch]]:
+    """(radiance from where `rays` end, a branch for each of the delta lobes there)."""
+    origin, direction, throughput = mi.Point3f(rays[:3]), mi.Vector3f(rays[3:6]), mi.Color3f(rays[6:])
     si = scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False)
-    radiance = throughput * lights.at(si).eval(si)
     active = si.is_valid()
     active &= specular.at(si.bsdf(), active)
-    branches = []
-    for lobe in specular.lobes:
+    branches: list[Branch] = []
+    for lobe in lobes:
         context = mi.BSDFContext()
         context.component = lobe
         sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
@@ -74,23 +76,39 @@ def advance(
         follows = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) & dr.any(weight > 0)
         onward = si.spawn_ray(si.to_world(sample.wo))
         branches.append((follows, [*onward.o, *onward.d, *weight]))
-    dr.eval(radiance, branches)  # in one kernel
+    return throughput * lights.at(si).eval(si), branches
+
+
+def advance(chains: Chains, branches: list[Branch]) -> Chains:
+    """The chains with one event more: one for each delta lobe at their ends."""
     pixels = [chains.pixel[:0], *(chains.pixel[np.array(follows)] for follows, _ in branches)]
     rays = [chains.rays[:0], *(columns(ray)[np.array(follows)] for follows, ray in branches)]
-    return columns(radiance), Chains(np.concatenate(pixels), np.concatenate(rays))
+    return Chains(np.concatenate(pixels), np.concatenate(rays))
 
 
 def specular_light(
-    scene: mi.Scene, lights: Lights, specular: SpecularSurfaces, ray: mi.Ray3f, max_events: int
+    scene: mi.Scene,
+    lights: Lights,
+    specular: SpecularSurfaces,
+    ray: mi.Ray3f,
+    max_events: int,
+    freezes: bool = False,
 ) -> NDArray[np.float32]:
-    """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events."""
+    """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events.
+
+    freezes: whether Dr.Jit can freeze the scene's light transport (see PathTracer).
+    """
     count = dr.width(ray.d)
     values = [*ray.o, *ray.d, *mi.Color3f(1)]
     chains = Chains(np.arange(count), np.stack([np.broadcast_to(np.array(value), count) for value in values], axis=-1))
     total = np.zeros((count, 3))
+    # Tracing the program in Python takes longer than running it; all events share one recording.
+    follow = dr.freeze(branches_at_end, state_fn=lambda *_, **__: palette()) if freezes else branches_at_end
     for _ in range(max_events + 1):
-        pixel = chains.pixel
-        if len(pixel):
-            radiance, chains = advance(chains, scene, lights, specular)
-            np.add.at(total, pixel, radiance)  # in the order of chains; Dr.Jit would add in any order
+        if len(chains.pixel):
+            rays = [*map(upload, chains.rays.T)]
+            radiance, branches = follow(scene, lights, specular, rays, specular.lobes)
+            dr.eval(radiance, branches)  # in one kernel
+            np.add.at(total, chains.pixel, columns(radiance))  # in the order of chains; Dr.Jit would add in any order
+            chains = advance(chains, branches)
     return total.astype(np.float32)

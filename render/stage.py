@@ -85,6 +85,8 @@ class Stage:
         self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
         self.has_instances = bool(loader.grouped)
         self.has_textured_lights = any(has_texture(shape.emitter) for shape in scene.stock)
+        # Dr.Jit 1.5 cannot freeze textured area lights, and scenes without shapes while another scene is loaded.
+        self.freezes = bool(self.shapes) and not self.has_textured_lights
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.pose(0)
