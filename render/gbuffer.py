@@ -132,12 +132,14 @@ def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[s
     axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
     direct = mirrored = MirroredHit(si, ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Color3f(1), axes)
     channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
-    dr.eval(channels, si.t)
+    shines = stage.specular.at(si.bsdf(), si.is_valid())
+    dr.eval(channels, si.t, shines)
     arrays = {name: stage.image(value) for name, value in channels.items()}
-    if stage.specular.lobes:
+    if np.array(shines).any():
         events = stage.max_events(regularise)
-        emission = specular_light(stage.mitsuba_scene, stage.lights, stage.specular, ray, events, stage.freezes)
-        arrays["emission"] = emission.reshape(stage.height, stage.width, 3)
+        scene, lights, specular = stage.mitsuba_scene, stage.lights, stage.specular
+        light = specular_light(scene, lights, specular, ray, events, np.array(shines), stage.freezes)
+        arrays["emission"] = np.where(stage.image(shines), light.reshape(arrays["emission"].shape), arrays["emission"])
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
     if stage.materials.has_mirrors:
         focal = upload(np.abs(view.K[:1, 0]))

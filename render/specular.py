@@ -92,15 +92,18 @@ def specular_light(
     specular: SpecularSurfaces,
     ray: mi.Ray3f,
     max_events: int,
+    shines: NDArray[np.bool_] | None = None,
     freezes: bool = False,
 ) -> NDArray[np.float32]:
     """Radiance (N, 3) of lights and sky along `ray`, directly visible and after up to `max_events` specular events.
 
+    shines: (N,), the rays to follow; by default all. It is 0 for the others.
     freezes: whether Dr.Jit can freeze the scene's light transport (see PathTracer).
     """
     count = dr.width(ray.d)
-    values = [*ray.o, *ray.d, *mi.Color3f(1)]
-    chains = Chains(np.arange(count), np.stack([np.broadcast_to(np.array(value), count) for value in values], axis=-1))
+    values = [np.broadcast_to(np.array(value), count) for value in (*ray.o, *ray.d, *mi.Color3f(1))]
+    pixel = np.arange(count) if shines is None else np.flatnonzero(shines)
+    chains = Chains(pixel, np.stack(values, axis=-1)[pixel])
     total = np.zeros((count, 3))
     # Tracing the program in Python takes longer than running it; all events share one recording.
     follow = dr.freeze(branches_at_end, state_fn=lambda *_, **__: palette()) if freezes else branches_at_end
