@@ -37,13 +37,16 @@ def layer_names(name: str) -> list[str]:
 
 
 def write_planes(path: Path, planes: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:
-    """Write EXR channels (H, W) by name atomically, ZIP-compressed, with further `attributes` in the header.
-
-    Raises BadInput where the disk is full or the folder cannot be written.
-    """
+    """Write EXR channels (H, W) by name as `write_file`, ZIP-compressed, with further `attributes` in the header."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+    with OpenEXR.File(header, planes) as file:
+        write_file(path, file)
+
+
+def write_file(path: Path, file: OpenEXR.File) -> None:
+    """Write atomically. Raises BadInput where the disk is full or the folder cannot be written."""
     try:
-        with replacing(path) as temporary, OpenEXR.File(header, planes) as file:
+        with replacing(path) as temporary:
             file.write(str(temporary))
     except RuntimeError as error:  # what OpenEXR raises for a full or unwritable disk
         raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None

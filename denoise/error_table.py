@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from errors import BadInput
@@ -34,13 +35,6 @@ class FrameError:
             None if until is None else np.ceil(estimate.samples_for(until)).item(),
         )
 
-    @staticmethod
-    def parse(row: dict[str, str]) -> "FrameError":
-        """Raises ValueError, KeyError or TypeError for what is no row."""
-        until, samples = (float(row[name]) if row[name] else None for name in ("until", "samples"))
-        spp, relative_error, at_most = (float(row[name]) for name in ("spp", "relative_error", "at_most"))
-        return FrameError(int(row["frame"]), spp, relative_error, at_most, until, samples)
-
 
 class ErrorTable:
     """The rows of a folder's frames, written after each. Raises BadInput where the file there is damaged."""
@@ -51,8 +45,9 @@ class ErrorTable:
         if self.path.exists():
             try:
                 with self.path.open(newline="") as file:
-                    rows = [FrameError.parse(row) for row in csv.DictReader(file)]
-            except (TypeError, ValueError, KeyError, csv.Error):
+                    cells = [{name: cell or None for name, cell in row.items()} for row in csv.DictReader(file)]
+                rows = msgspec.convert(cells, list[FrameError], strict=False)
+            except (msgspec.ValidationError, ValueError, csv.Error):
                 raise BadInput(f"{self.path} is damaged: delete it and run the command again") from None
             self.rows = {row.frame: row for row in rows}
 

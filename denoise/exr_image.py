@@ -10,9 +10,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from datasets.exr import write_file
 from datasets.writer import FLOAT16_MAX
 from errors import BadInput
-from files import replacing
 
 
 @contextmanager
@@ -95,8 +95,4 @@ class ExrImage:
     def write(self, path: Path, note: str) -> None:
         """Write everything atomically, with `note` as the attribute `denoised`. Raises BadInput where that fails."""
         self.file.parts[0].header["denoised"] = note
-        try:
-            with replacing(path) as temporary:
-                self.file.write(str(temporary))
-        except RuntimeError as error:  # what OpenEXR raises for a full or unwritable disk
-            raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None
+        write_file(path, self.file)

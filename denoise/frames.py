@@ -18,7 +18,7 @@ from datasets.frame import Frame, to_tensor
 from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import ForeignFrame, Image
-from denoise.geometry import depth_change, facet_normals, facing_pose, rays_of
+from denoise.geometry import depth_change, facet_normals, facing_pose
 from denoise.motion_convention import MotionConvention
 from errors import BadInput
 from scenes.camera import View, motion_vectors, pixel_centres, unproject
@@ -223,7 +223,9 @@ def depth_of(foreign: ForeignFrame, views: FrameViews | None) -> Image:
     elif "distance" in foreign.arrays:
         depth = foreign.arrays["distance"][..., 0]
         if views:
-            depth = depth / np.linalg.norm(rays_of(views.world, *foreign.size), axis=-1)
+            K = views.world.K
+            in_camera = (pixel_centres(*foreign.size) - K[:2, 2]) / np.diag(K)[:2]  # rays, of length 1 along the axis
+            depth = depth / np.linalg.norm(np.concatenate([in_camera, np.ones((*foreign.size, 1))], axis=-1), axis=-1)
     elif "position" in foreign.arrays and foreign.surface.any():
         depth = np.linalg.norm(np.where(foreign.surface[..., None], foreign.arrays["position"], 0), axis=-1)
     else:
@@ -239,12 +241,15 @@ class OwnFrameBuilder:
         self.reads = reads
         self.view: View | None = None  # of the frame before
 
-    def build(self, image: ExrImage) -> Frame:
-        """The next Frame. A channel that was not exported is missing in it."""
+    def build(self, image: ExrImage) -> tuple[Frame, int]:
+        """The next Frame, and how many pixels were not finite. A channel that was not exported is missing in it."""
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
         view = View._make(np.array(facts[key]) for key in View._fields)
         arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
         visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
         before = self.view if self.view is not None else view
         self.view = view
-        return frame_of(visible, self.reads, view, before, str(image.path), float(facts["noisy_spp"]))
+        frame = frame_of(visible, self.reads, view, before, str(image.path), float(facts["noisy_spp"]))
+        tensors = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # sample buffers are images too
+        bad = [~torch.isfinite(tensor).all(dim=1) for tensor in tensors]
+        return frame, int(torch.stack(bad).any(dim=0).sum())

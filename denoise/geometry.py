@@ -1,17 +1,11 @@
-"""Rays, directions and normals of a frame whose renderer does not give them."""
+"""Directions and normals of a frame whose renderer does not give them."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Array, View, look_at, pixel_centres
+from scenes.camera import Array, View, look_at
 
 Image = NDArray[np.float32]
-
-
-def rays_of(view: View, height: int, width: int) -> Array:
-    """Directions (H, W, 3) through all pixels, of length 1 along the viewing axis."""
-    pixels = pixel_centres(height, width)
-    return np.concatenate([(pixels - view.K[:2, 2]) / np.diag(view.K)[:2], np.ones((height, width, 1))], axis=-1)
 
 
 def facing_pose(normal: Image | None, surface: NDArray[np.bool_]) -> Array:

@@ -263,10 +263,7 @@ class SequenceDenoiser:
 
             def read_own(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
                 image = ExrImage(files.passes[COLOUR])
-                frame = own.build(image)
-                tensors = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # sample buffers are images too
-                bad = [~torch.isfinite(tensor).all(dim=1) for tensor in tensors]
-                return image, frame, int(torch.stack(bad).any(dim=0).sum())
+                return image, *own.build(image)
 
             return read_own
         source = str(self.shots[0][0].passes[COLOUR])

@@ -109,19 +109,17 @@ def outcomes_of(ray: Any, jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
     try:
         while waiting:
             [done], waiting = ray.wait(waiting)
-            yield outcome_of(ray, done, tasks[done])
+            job = tasks[done]
+            try:
+                outcome = ray.get(done)._replace(path=job.path)
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from error
+            except ray.exceptions.RayError as error:  # the worker died, or its machine
+                reason = f"{MAX_WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}"
+                outcome = ClipOutcome(job.path, "failed", reason)
+            yield outcome
     finally:
         for unfinished in waiting:
             ray.cancel(unfinished)  # interrupts the worker, which removes its unfinished clip
         if waiting:
             ray.wait(waiting, num_returns=len(waiting), timeout=CLEAN_UP_SECONDS)
-
-
-def outcome_of(ray: Any, reference: Any, job: RenderJob) -> ClipOutcome:
-    """The outcome of a finished task. Raises the worker's exception."""
-    try:
-        return ray.get(reference)._replace(path=job.path)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from error
-    except ray.exceptions.RayError as error:  # the worker died, or its machine
-        return ClipOutcome(job.path, "failed", f"{MAX_WORKERS_PER_CLIP} workers died: {str(error).splitlines()[0]}")

@@ -76,19 +76,6 @@ DATA_PROFILES = {
 }
 
 
-def rooms_profile(rooms: int, spp: int) -> DataProfile:
-    """Small rooms to train on, with references of `spp` samples a pixel, and a few to validate and test."""
-    return DataProfile(
-        size=(12, 96, 96),
-        rooms={"train": rooms, "val": 3, "test": 4},
-        quality={
-            "train": SamplingQuality(realisations=8, reference_spp=spp),
-            "val": SamplingQuality(realisations=8, reference_spp=64),
-            "test": TEST_OF_SMALL_ROOMS,
-        },
-    )
-
-
 # Defaults of a user's own scene.
 OWN_CLIPS = {"train": 4, "val": 1, "test": 1}
 OWN_QUALITY = {
@@ -135,11 +122,14 @@ def profile_of(name: str) -> DataProfile:
     """
     if name.endswith(".toml"):
         return own_profile(Path(name))
-    rooms = re.fullmatch(r"rooms-(\d+)x(\d+)", name)
-    if rooms and (int(rooms[1]) < 1 or int(rooms[2]) < 2):
-        raise BadInput(f"profile '{name}': at least 1 room, and 2 spp or more for the two buffers of a reference")
-    if rooms:
-        return rooms_profile(int(rooms[1]), int(rooms[2]))
+    if match := re.fullmatch(r"rooms-(\d+)x(\d+)", name):
+        rooms, spp = int(match[1]), int(match[2])
+        if rooms < 1 or spp < 2:
+            raise BadInput(f"profile '{name}': at least 1 room, and 2 spp or more for the two buffers of a reference")
+        # Small rooms to train on, and a few to validate and test.
+        qualities = [SamplingQuality(8, spp), SamplingQuality(8, reference_spp=64), TEST_OF_SMALL_ROOMS]
+        counts = {"train": rooms, "val": 3, "test": 4}
+        return DataProfile((12, 96, 96), dict(zip(SPLITS, qualities, strict=True)), rooms=counts)
     if name not in DATA_PROFILES:
         raise BadInput(
             f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}; a scene of your own is a .toml"

@@ -1,10 +1,10 @@
 """The TOML description of a user's own scene: its file, camera flight, motion and what to render."""
 
-import math
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -90,8 +90,10 @@ def read_description(path: Path) -> Description:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
-    if not all_finite(msgspec.to_builtins(described)):
-        raise BadInput(f"{path}: a number is infinite or not a number")
+    try:
+        json.dumps(msgspec.to_builtins(described), allow_nan=False)
+    except ValueError:
+        raise BadInput(f"{path}: a number is infinite or not a number") from None
     unknown = set(described.splits) - set(SPLITS)
     if unknown:
         raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
@@ -107,12 +109,6 @@ def read_description(path: Path) -> Description:
     if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
         raise BadInput(f"{path}: a split's camera uses keyframes, but there are none: add [[camera]] tables")
     return described
-
-
-def all_finite(value: Any) -> bool:
-    if isinstance(value, dict | list | tuple):
-        return all(map(all_finite, value.values() if isinstance(value, dict) else value))
-    return not isinstance(value, float) or math.isfinite(value)
 
 
 def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:

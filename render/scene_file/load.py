@@ -61,7 +61,6 @@ def camera_framing(low: Array, high: Array) -> Camera:
 
 DEFAULT_CAMERA = camera_framing(np.zeros(3), np.ones(3))  # until the extent of the scene is known
 
-
 PROBED_PIXELS = 2000
 PROBE_SPP = 32
 PROBED_DEPTHS = (5, 9, 17)
@@ -108,7 +107,6 @@ class OwnScene:
         self.described = read_description(path)
         self.width, self.height = self.described.resolution
         self.file = path.resolve().parent / self.described.file
-        self.has_camera = True
         scene, self.notes = self.from_xml() if self.file.suffix.lower() == ".xml" else self.from_meshes()
         depth = scene.max_depth if self.described.bounces is None else self.described.bounces + 1
         self.scene = replace(scene, max_depth=depth)
@@ -120,7 +118,7 @@ class OwnScene:
         except BadInput as error:
             raise BadInput(f"{self.file}: {error}") from None
         self.notes += self.stage.notes
-        if not self.has_camera:
+        if scene.camera is DEFAULT_CAMERA:
             self.notes.append("there is no camera: one that frames the whole scene instead")
             space = Space(self.stage)
             self.scene = replace(self.scene, camera=camera_framing(space.low, space.high))
@@ -129,7 +127,6 @@ class OwnScene:
     def from_xml(self) -> tuple[Scene, list[str]]:
         found = Converter(self.file).convert()
         camera, notes = DEFAULT_CAMERA, [*found.notes]
-        self.has_camera = found.sensor is not None
         if found.sensor:
             try:
                 camera, more = camera_of_sensor(found.sensor, self.height, self.width)
@@ -141,7 +138,6 @@ class OwnScene:
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
         found = load_mesh_file(self.file, self.width / self.height)
-        self.has_camera = found.camera is not None
         return Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky), found.notes
 
     def check_names(self) -> None:
@@ -154,7 +150,9 @@ class OwnScene:
         wanted += [("light", change.light, lights) for change in self.described.light]
         for kind, name, names in wanted:
             if name not in names:
-                raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listing(names)}")
+                more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+                listed = f"there are {', '.join(sorted(names)[:20])}{more}" if names else "there are none"
+                raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listed}")
 
     def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
         """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes."""
@@ -202,12 +200,6 @@ def centre_of(shape: mi.Shape) -> Array:
     """The centre (3,) of a shape's bounding box, about which it rotates, in Mitsuba's units."""
     box = shape.bbox()
     return (np.array(box.min, np.float64) + np.array(box.max, np.float64)).ravel() / 2
-
-
-def listing(names: set[str]) -> str:
-    shown = sorted(names)
-    more = f" and {len(shown) - 20} more" if len(shown) > 20 else ""
-    return f"there are {', '.join(shown[:20])}{more}" if shown else "there are none"
 
 
 @lru_cache(maxsize=1)

@@ -59,33 +59,28 @@ class InsideResolver(FilePathResolver):
             raise
 
 
-class Problems(logging.Handler):
-    """Collects trimesh's messages on what it could not read."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.messages: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Called by trimesh for each message."""
-        message = record.getMessage()
-        if record.levelno >= logging.WARNING or re.match("unable to|failed to|skipping|face|specified", message):
-            self.messages.append(f"trimesh: {message[:200]}")
-
-
 @contextmanager
-def collected_problems() -> Iterator[Problems]:
-    """Within the context trimesh's messages are collected, and not printed."""
+def collected_problems() -> Iterator[list[str]]:
+    """Within the context trimesh prints nothing, and its messages on what it could not read are collected."""
     log = logging.getLogger("trimesh")
     level, propagate = log.level, log.propagate
-    problems = Problems()
-    log.addHandler(problems)
+    problems: list[str] = []
+
+    def collect(record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno >= logging.WARNING or re.match("unable to|failed to|skipping|face|specified", message):
+            problems.append(f"trimesh: {message[:200]}")
+        return False
+
+    handler = logging.Handler()
+    handler.addFilter(collect)
+    log.addHandler(handler)
     log.setLevel(logging.DEBUG)
     log.propagate = False
     try:
         yield problems
     finally:
-        log.removeHandler(problems)
+        log.removeHandler(handler)
         log.setLevel(level)
         log.propagate = propagate
 
@@ -127,11 +122,10 @@ def pbr_bsdf(material: PBRMaterial) -> Bsdf:
     factor, image = colour_factor(material.baseColorFactor), material.baseColorTexture
     colour = rgb(factor.tolist()) if image is None else texture(linear_image(image) * factor)
     bsdf: Bsdf = {"type": "principled", "base_color": colour, "roughness": roughness, "metallic": metallic}
-    bsdf = {"type": "twosided", "bsdf": bsdf | {"specular": 0.5}}
+    bsdf |= {"specular": 0.5}
     if material.normalTexture is not None:
-        bump = {"type": "normalmap", "normalmap": texture(unit_values(material.normalTexture)), "bsdf": bsdf["bsdf"]}
-        bsdf = {"type": "twosided", "bsdf": bump}
-    return bsdf
+        bsdf = {"type": "normalmap", "normalmap": texture(unit_values(material.normalTexture)), "bsdf": bsdf}
+    return {"type": "twosided", "bsdf": bsdf}
 
 
 # Keywords of an OBJ's materials: the property that is left out, and the value that stands for none.
@@ -205,7 +199,7 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
         missing = f": {resolver.missing[0]} is missing" if resolver.missing else f" is empty or damaged ({damage})"
         raise BadInput(f"{path}{missing}")
     notes = [f"the file {name} is missing: its content is left out" for name in dict.fromkeys(resolver.missing)]
-    notes += [*dict.fromkeys(problems.messages), *notes_of_gltf(path)]
+    notes += [*dict.fromkeys(problems), *notes_of_gltf(path)]
     if not can_draw():
         notes.append("textures are left out: reading them needs `pip install 'onespp[report]'`")
     return scene, notes

@@ -115,9 +115,8 @@ def with_properties(words: str, **properties: Any) -> Callable[[Properties], Sta
 
 
 def old_sky(described: Properties) -> StandIn:
-    return {"type": "sunsky", "sky_scale": 1.0, "sun_scale": 0.0} | renamed(
-        described, scale="sky_scale"
-    ), "the sky of sunsky"
+    sky = {"type": "sunsky", "sky_scale": 1.0, "sun_scale": 0.0}
+    return sky | renamed(described, scale="sky_scale"), "the sky of sunsky"
 
 
 def old_sun(described: Properties) -> StandIn:
@@ -199,10 +198,6 @@ def tabulated(wavelengths: Any, values: Any) -> StandIn:
     return {"type": "spectrum", "value": table}, "the spectrum is rendered as red, green and blue"
 
 
-def irregular(described: Properties) -> StandIn:
-    return tabulated(numbers(described.get("wavelengths")), numbers(described.get("values")))
-
-
 def regular(described: Properties) -> StandIn:
     values = numbers(described.get("values"))
     first, last = (number_of(described, f"wavelength_{end}", nm) for end, nm in (("min", 360), ("max", 830)))
@@ -219,15 +214,13 @@ def black_body(described: Properties) -> StandIn:
     return tabulated(nm, radiance * number_of(described, "scale", 1))
 
 
-DISTRIBUTIONS = ("beckmann", "ggx")
 FILTERS = ("bilinear", "nearest")
-WRAP_MODES = ("repeat", "mirror", "clamp")
 
 
 def valid_microfacets(described: Properties) -> StandIn | None:
     """Before version 3 there were the distributions "phong" and "as", with the width of Beckmann's for an alpha."""
     distribution = described.get("distribution", "beckmann")
-    if distribution in DISTRIBUTIONS:
+    if distribution in ("beckmann", "ggx"):
         return valid_metal(described)
     valid = described | {"distribution": "beckmann"}
     return (valid_metal(valid) or (valid, ""))[0], f"Beckmann's distribution instead of '{distribution}'"
@@ -246,7 +239,7 @@ def valid_bitmap(described: Properties) -> StandIn | None:
     if "filename" not in described:
         return GREY, "grey, because its file is not named"
     wraps = {str(described[name]) for name in ("wrap_mode", "wrap_mode_u", "wrap_mode_v") if name in described}
-    wrap = next(iter(sorted(wraps & {*WRAP_MODES})), "clamp") if wraps else "repeat"
+    wrap = next(iter(sorted(wraps & {"repeat", "mirror", "clamp"})), "clamp") if wraps else "repeat"
     gamma = described.get("gamma", -1)
     words = []
     if wraps - {wrap}:
@@ -288,7 +281,7 @@ REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     "instance": lambda described: None if nested(described) else (None, "an instance of nothing is left out"),
     # Mitsuba cannot trace a moving sun symbolically, as our path tracer does.
     "timed_sunsky": with_properties("sunsky, whose sun does not move", type="sunsky"),
-    "irregular": irregular,
+    "irregular": lambda described: tabulated(numbers(described.get("wavelengths")), numbers(described.get("values"))),
     "regular": regular,
     "blackbody": black_body,
 }

@@ -97,24 +97,19 @@ class IncludeReader:
         for parent in [*root.iter()]:
             for child in [*parent]:
                 name = child.get("value" if child.tag == "path" else "filename")
-                if child.tag in ("path", "include", "spectrum") and name is not None:
-                    self.follow(root, parent, child, self.named(name, file), depth)
+                if child.tag not in ("path", "include", "spectrum") or name is None:
+                    continue
+                if "$" in name:
+                    raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
+                named = inside(self.path.parent, name, file)
+                if child.tag == "path":
+                    self.searched.append(named)
+                elif child.tag == "include":
+                    part = self.read(named, depth + 1)
+                    if part.get("version") == root.get("version"):
+                        place = [*parent].index(child)
+                        parent[place : place + 1] = [*part]
         return root
-
-    def named(self, name: str, file: Path) -> Path:
-        if "$" in name:
-            raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
-        return inside(self.path.parent, name, file)
-
-    def follow(self, root: Element, parent: Element, child: Element, named: Path, depth: int) -> None:
-        """Note the folder of a <path>; put the content of an <include> in its place."""
-        if child.tag == "path":
-            self.searched.append(named)
-        elif child.tag == "include":
-            part = self.read(named, depth + 1)
-            if part.get("version") == root.get("version"):
-                place = [*parent].index(child)
-                parent[place : place + 1] = [*part]
 
 
 @contextmanager
