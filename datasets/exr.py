@@ -16,7 +16,6 @@ from errors import BadInput
 from files import replacing
 from scenes.camera import inverse_pose
 
-BUFFER_SUFFIXES = ("_a", "_b")  # of the two layers of a channel that has two sample buffers
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
 
 
@@ -33,7 +32,7 @@ def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 def layer_names(name: str) -> list[str]:
     """The layers of a channel: its own, or one for each of its two buffers."""
-    return [name + suffix for suffix in BUFFER_SUFFIXES] if CHANNELS[name].has_buffers else [name]
+    return [f"{name}_a", f"{name}_b"] if CHANNELS[name].has_buffers else [name]
 
 
 def write_planes(path: Path, planes: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> None:

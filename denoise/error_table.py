@@ -26,14 +26,9 @@ class FrameError:
 
     @staticmethod
     def of(frame: int, estimate: ErrorEstimate, until: float | None) -> "FrameError":
-        return FrameError(
-            frame,
-            float(estimate.frame.samples.mean()),
-            estimate.relative_error(),
-            estimate.max_relative_error(),
-            until,
-            None if until is None else np.ceil(estimate.samples_for(until)).item(),
-        )
+        spp = float(estimate.frame.samples.mean())
+        samples = None if until is None else np.ceil(estimate.samples_for(until)).item()
+        return FrameError(frame, spp, estimate.relative_error(), estimate.max_relative_error(), until, samples)
 
 
 class ErrorTable:

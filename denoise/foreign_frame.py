@@ -44,10 +44,8 @@ def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrIm
     colour = images[COLOUR]
     for image in images.values():
         if (image.height, image.width) != (colour.height, colour.width):
-            raise BadInput(
-                f"{image.path} is {image.width}x{image.height} and {colour.path} {colour.width}x{colour.height}: "
-                "the passes of a frame must have the same size"
-            )
+            sizes = f"{image.path} is {image.width}x{image.height} and {colour.path} {colour.width}x{colour.height}"
+            raise BadInput(f"{sizes}: the passes of a frame must have the same size")
     return images
 
 

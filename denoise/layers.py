@@ -90,10 +90,8 @@ def parse_layers(options: Sequence[str]) -> dict[str, str]:
     for text in options:
         quantity, equals, layer = text.partition("=")
         if not equals or not layer or quantity not in QUANTITIES:
-            raise BadInput(
-                f"'{text}' does not name a layer: write QUANTITY=LAYER, where QUANTITY is one of "
-                f"{', '.join(QUANTITIES)}"
-            )
+            form = f"QUANTITY=LAYER, where QUANTITY is one of {', '.join(QUANTITIES)}"
+            raise BadInput(f"'{text}' does not name a layer: write {form}")
         layers[quantity] = layer
     return layers
 

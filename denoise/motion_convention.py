@@ -42,10 +42,9 @@ class MotionConvention:
         for convention in conventions(components=4):
             if str(convention) == text:
                 return convention
-        raise BadInput(
-            f"'{text}' is no convention of motion vectors: write PAIR,SIGNx,SIGNy,UNIT such as {MotionConvention()}, "
-            f"with PAIR XY or ZW, SIGN + or -, UNIT {', '.join(UNITS)}"
-        )
+        parts = f"PAIR XY or ZW, SIGN + or -, UNIT {', '.join(UNITS)}"
+        form = f"PAIR,SIGNx,SIGNy,UNIT such as {MotionConvention()}, with {parts}"
+        raise BadInput(f"'{text}' is no convention of motion vectors: write {form}")
 
     def pixels(self, motion: Image) -> Image:
         """Motion (H, W, 2) in our convention of foreign `motion` (H, W, 2 or 4); what is not finite becomes 0."""
@@ -144,10 +143,8 @@ class ConventionDetector:
         best = min(twins, key=lambda index: (self.candidates[index].pair != "XY", self.errors[index]))
         convention = self.candidates[best]
         scores = [errors[best] / unmoved, errors[rival] / unmoved]
-        tried = (
-            f"warp error {scores[0]:.2f} of that without motion, {scores[1]:.2f} for the runner-up "
-            f"{self.candidates[rival]}"
-        )
+        runner_up = f"{scores[1]:.2f} for the runner-up {self.candidates[rival]}"
+        tried = f"warp error {scores[0]:.2f} of that without motion, {runner_up}"
         if scores[0] > CLEAR:
             return Detection(convention, False, f"no convention warps well, best {convention} ({tried})")
         certain = bool(scores[0] < CLEAR * scores[1])

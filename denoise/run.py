@@ -220,9 +220,8 @@ class SequenceDenoiser:
             if start < len(shot) and (needs_state or index >= start):
                 image, frame, nonfinite = read(files)
                 if frame.size != self.size:
-                    raise BadInput(
-                        f"{image.path} is {image.width}x{image.height}, unlike the first frame: name one sequence"
-                    )
+                    size = f"{image.width}x{image.height}"
+                    raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
                 output, state = self.step(files, image, frame.to(self.denoiser.device), state, index >= start)
                 if index >= start:
                     self.write(files, image, image_of(output))

@@ -61,9 +61,8 @@ def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = Non
     for name, files in passes.items():
         missing = [number for number in chosen if number not in files]
         if missing:
-            raise BadInput(
-                f"'{' '.join(patterns[name])}' ({name}) lacks frame {missing[0]}: render it, or use --frames"
-            )
+            lacking = f"'{' '.join(patterns[name])}' ({name}) lacks frame {missing[0]}"
+            raise BadInput(f"{lacking}: render it, or use --frames")
     return [FrameFiles(number, {name: files[number] for name, files in passes.items()}) for number in chosen]
 
 

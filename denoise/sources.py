@@ -78,10 +78,8 @@ def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> So
             best, *others = layers
             quantities[quantity] = Source(COLOUR, best, tuple(layer.name or "R,G,B" for layer in others))
     if COLOUR not in quantities:
-        raise BadInput(
-            f"{image.path} has no layer with a name of radiance; it has {list_layers(channels)}: "
-            "name it by --layers colour=LAYER"
-        )
+        unknown = f"{image.path} has no layer with a name of radiance; it has {list_layers(channels)}"
+        raise BadInput(f"{unknown}: name it by --layers colour=LAYER")
     layer = quantities[COLOUR].layer
     prefix = f"{layer.name}." if layer.name else ""
     alpha = next((name for name in (f"{prefix}A", f"{prefix}a") if name in channels), None)

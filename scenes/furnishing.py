@@ -64,19 +64,16 @@ def movers(layout: Layout, count: int) -> None:
         if layout.moving >= goal:
             return
         group = laden(rng, one_of(rng, makers)(rng))
-        half = layout.size[[0, 2]] / 2 - 0.2
-        x, z = rng.uniform(-half, half)
-        layout.try_add(group, random_motion(layout, x, z))
+        layout.try_add(group, random_motion(layout, *layout.floor_position(0.2)))
 
 
 def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
     """Add up to `count` things anywhere on the floor."""
     rng = layout.rng
-    half = layout.size[[0, 2]] / 2 - 0.15
     for _ in range(count):
         group = laden(rng, one_of(rng, makers)(rng))
         for _ in range(4):
-            x, z = rng.uniform(-half, half)
+            x, z = layout.floor_position(0.15)
             if layout.try_add(group, still((x, GAP, z), rng.uniform(-np.pi, np.pi))):
                 break
 
@@ -84,8 +81,7 @@ def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
 def dining(layout: Layout) -> None:
     rng = layout.rng
     group = laden(rng, make_table(rng))
-    half = np.maximum(layout.size[[0, 2]] / 2 - 1.0, 0.1)
-    x, z = rng.uniform(-half, half)
+    x, z = layout.floor_position(1.0)
     if not layout.try_add(group, still((x, GAP, z), rng.choice([0, np.pi / 2]))):
         return
     low, high = layout.boxes[-1]

@@ -58,11 +58,11 @@ def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
     return placed
 
 
-def laden(rng: Rng, thing: Thing, share: float = 0.8) -> Group:
-    """The thing with small ones on each of its supports with probability `share`."""
+def laden(rng: Rng, thing: Thing) -> Group:
+    """The thing with small ones on most of its supports."""
     members = [(thing, np.eye(4))]
     for support in thing.supports:
-        if rng.random() < share:
+        if rng.random() < 0.8:
             members += scatter(rng, support, int(rng.integers(1, 6)))
     return Group(tuple(members))
 
@@ -92,6 +92,12 @@ class Layout:
     def last_frame(self) -> int:
         """Where tracks end; at least 1, for clips of one frame."""
         return max(self.frames - 1, 1)
+
+    def floor_position(self, margin: float) -> tuple[float, float]:
+        """A random place (x, z) at least `margin` from the walls."""
+        half = np.maximum(self.size[[0, 2]] / 2 - margin, 0.01)
+        x, z = self.rng.uniform(-half, half)
+        return float(x), float(z)
 
     def swept(self, bounds: Array, motion: RigidMotion) -> Array:
         """The bounding box (2, 3) of `bounds` (2, 3) during the whole clip."""

@@ -45,15 +45,8 @@ def rectangle(width: float, depth: float, *matrices: Array) -> trimesh.Trimesh:
     return mesh
 
 
-def floor_position(layout: Layout, margin: float) -> tuple[float, float]:
-    """A random place (x, z) at least `margin` from the walls."""
-    half = np.maximum(layout.size[[0, 2]] / 2 - margin, 0.01)
-    x, z = layout.rng.uniform(-half, half)
-    return float(x), float(z)
-
-
 def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Lamp]:
-    x, z = floor_position(layout, max(width, depth) / 2 + 0.05)
+    x, z = layout.floor_position(max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
     if not layout.fits(box):
@@ -77,7 +70,7 @@ def downlight(layout: Layout) -> list[Lamp]:
     rng = layout.rng
     radius = log_uniform(rng, 0.05, 0.15)
     tall = radius * rng.uniform(0.7, 2.0)
-    x, z = floor_position(layout, 0.5)
+    x, z = layout.floor_position(0.5)
     y = layout.size[1] - tall - 0.01
     box = np.array([[x - radius, y - GAP, z - radius], [x + radius, y + tall, z + radius]])
     if not layout.fits(box):
@@ -99,7 +92,7 @@ def bulb(thing: Thing, radius: float, motion: RigidMotion) -> Lamp:
 def hanging(layout: Layout) -> list[Lamp]:
     """A pendant with a bulb in its shade; a closed shade emits light itself instead."""
     thing = make_pendant(layout.rng)
-    x, z = floor_position(layout, 0.5)
+    x, z = layout.floor_position(0.5)
     motion = still((x, layout.size[1] - thing.bounds[1, 1] - GAP, z), 0.0)
     shade = next(part for part in thing.parts if part.slot == "shade")
     closed = trimesh.Trimesh(shade.mesh.vertices, shade.mesh.faces).is_watertight
@@ -116,7 +109,7 @@ def hanging(layout: Layout) -> list[Lamp]:
 def standing_lamp(layout: Layout) -> list[Lamp]:
     """A floor lamp whose bulb is hidden in its shade."""
     thing = make_floor_lamp(layout.rng)
-    motion = still(np.insert(floor_position(layout, 0.4), 1, GAP), float(layout.rng.uniform(-np.pi, np.pi)))
+    motion = still(np.insert(layout.floor_position(0.4), 1, GAP), float(layout.rng.uniform(-np.pi, np.pi)))
     if not layout.try_add(Group.of(thing), motion):
         return []
     return [bulb(thing, log_uniform(layout.rng, 0.02, 0.06), motion)]
@@ -126,7 +119,7 @@ def orb(layout: Layout) -> list[Lamp]:
     """A glowing ball in the air, in half of the cases moving."""
     rng = layout.rng
     radius = log_uniform(rng, 0.06, 0.3)
-    x, z = floor_position(layout, 0.4)
+    x, z = layout.floor_position(0.4)
     y = rng.uniform(0.3, layout.size[1] - 0.5)
     drift = rng.uniform(-0.4, 0.4, 3) * (rng.random() < 0.5)
     start = np.array([x, y, z])

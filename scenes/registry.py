@@ -29,7 +29,6 @@ def build_scene(name: str, seed: int, frames: int) -> Scene:
         rng = np.random.default_rng(2 * n if n >= 0 else -2 * n - 1)
         return room(rng, frames) if number[1] == "room" else closeup(rng, frames)
     if name not in SCENES:
-        raise BadInput(
-            f"unknown scene '{name}'; the scenes are {', '.join(SCENES)}, room-N and closeup-N with any integer N"
-        )
+        names = f"{', '.join(SCENES)}, room-N and closeup-N with any integer N"
+        raise BadInput(f"unknown scene '{name}'; the scenes are {names}")
     return SCENES[name](np.random.default_rng(seed), frames)

@@ -67,13 +67,6 @@ def add_windows(layout: Layout, count: int) -> None:
             layout.hang(make_curtain(rng, cover, height + 0.2), wall, x + cover / 2, y - 0.1, 0.12)
 
 
-def remove_walls(layout: Layout, count: int) -> None:
-    for wall in map(int, layout.rng.permutation(4)[:count]):
-        span = wall_width(wall, layout.size)
-        layout.missing_walls.add(wall)
-        layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
-
-
 def partition(layout: Layout) -> None:
     """Add a wall that divides the room up to a gap."""
     rng = layout.rng
@@ -107,23 +100,15 @@ def shell(layout: Layout) -> list[Shape]:
     return shapes
 
 
-def lamps_of(layout: Layout, style: Style) -> list[lighting.Lamp]:
-    """Lamps, placed before most of the furniture."""
-    rng = layout.rng
-    lamps: list[lighting.Lamp] = []
-    count = int(rng.integers(*style.lamps))
-    for _ in range(8 * count):
-        if len(lamps) >= count:
-            break
-        lamps += one_of(rng, style.fixtures)(layout)
-    return lamps
-
-
 def holes(layout: Layout, style: Style) -> None:
     """Missing walls, windows or a partition, as the style requires."""
     rng = layout.rng
     if style.missing_walls[1] > 1:
-        remove_walls(layout, int(rng.integers(*style.missing_walls)))
+        count = int(rng.integers(*style.missing_walls))
+        for wall in map(int, rng.permutation(4)[:count]):
+            span = wall_width(wall, layout.size)
+            layout.missing_walls.add(wall)
+            layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
     elif style.day or rng.random() < NIGHT:
         add_windows(layout, int(rng.integers(1, 4)))
     elif rng.random() < 0.15:
@@ -149,7 +134,11 @@ def room(rng: Rng, frames: int) -> Scene:
     eye = flight_path(layout)
     way = len(layout.boxes)
     against_walls(layout, int(rng.integers(2, 8)))
-    lamps = lamps_of(layout, style)
+    lamps: list[lighting.Lamp] = []
+    count = int(rng.integers(*style.lamps))
+    for _ in range(8 * count):
+        if len(lamps) < count:
+            lamps += one_of(rng, style.fixtures)(layout)
     furnish(layout)
     if style.day and environment is None:
         openings = [(wall, opening) for wall, holes in layout.openings.items() for opening in holes]

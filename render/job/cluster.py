@@ -64,9 +64,8 @@ def connect(ray: Any) -> None:
             socket.create_connection((host, int(port)), timeout=5).close()  # Ray itself would try for minutes
         ray.init(include_dashboard=False, log_to_driver=False, logging_level="error")
     except (OSError, RuntimeError, ValueError) as error:
-        raise BadInput(
-            f"no Ray cluster answers ({error}): check RAY_ADDRESS and RAY_AUTH_MODE, or end a broken one by `ray stop`"
-        ) from None
+        remedy = "check RAY_ADDRESS and RAY_AUTH_MODE, or end a broken one by `ray stop`"
+        raise BadInput(f"no Ray cluster answers ({error}): {remedy}") from None
 
 
 def reserved_resources() -> dict[str, Any]:

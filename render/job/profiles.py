@@ -131,7 +131,6 @@ def profile_of(name: str) -> DataProfile:
         counts = {"train": rooms, "val": 3, "test": 4}
         return DataProfile((12, 96, 96), dict(zip(SPLITS, qualities, strict=True)), rooms=counts)
     if name not in DATA_PROFILES:
-        raise BadInput(
-            f"unknown profile '{name}'; the profiles are {', '.join(DATA_PROFILES)}; a scene of your own is a .toml"
-        )
+        names = ", ".join(DATA_PROFILES)
+        raise BadInput(f"unknown profile '{name}'; the profiles are {names}; a scene of your own is a .toml")
     return DATA_PROFILES[name]

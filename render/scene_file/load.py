@@ -90,9 +90,8 @@ def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
         return []
     enough = next(depth for depth, value in lights.items() if value >= 0.9 * max(lights.values()))
     share = 100 * own / max(lights.values())
-    few = (
-        f"with {scene.max_depth - 1} bounces only {share:.0f} % of the light of {PROBED_DEPTHS[-1] - 1} bounces arrives"
-    )
+    most = PROBED_DEPTHS[-1] - 1
+    few = f"with {scene.max_depth - 1} bounces only {share:.0f} % of the light of {most} bounces arrives"
     return [f"{few}, perhaps because lamps shine through glass: set `bounces = {enough - 1}` in the TOML"]
 
 
