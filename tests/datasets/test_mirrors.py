@@ -92,7 +92,7 @@ def test_exported_frames_look_the_same(clip, tmp_path):
     for index in range(FRAMES):
         path = tmp_path / f"{index}.exr"
         write_exr(path, clip, index)
-        frame = builder.build(ExrImage(path))
+        frame, _ = builder.build(ExrImage(path))
         expected = read_frame(clip, index, VISIBLE)
         assert frame.channels.keys() == expected.channels.keys()
         for name, tensor in expected.channels.items():
