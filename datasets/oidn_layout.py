@@ -33,15 +33,13 @@ def export_dataset(root: Path, out: Path) -> int:
     splits = [split for split, names in dataset.facts["splits"].items() if names]
     clips = [(split, clip) for split in splits for clip in dataset.clips(split)]
     claim_folder(out, dataset)
-    images = 0
     for split, clip in tqdm(clips, "exr", unit="clip"):
         folder = out / SPLIT_FOLDERS[split]
         folder.mkdir(exist_ok=True)
         for frame in range(clip.frames):
             for realisation in range(clip.realisations):
                 write_group(folder, clip, frame, realisation)
-        images += clip.frames * clip.realisations
-    return images
+    return sum(clip.frames * clip.realisations for _, clip in clips)
 
 
 def claim_folder(out: Path, dataset: Dataset) -> None:

@@ -68,24 +68,20 @@ class RawChannel:
             assert self.first_pixel is not None
             entry = {"value": self.to_storage(self.first_pixel, dtype).tolist()}
         else:
-            entry = self.write_array(dtype)
+            shape = (self.frames, *self.frame_shape)
+            path = self.path.with_suffix(".npy")
+            with path.open("w+b") as file:
+                np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+                file.seek(0)
+                checksum = zlib.crc32(file.read())
+                for frame in range(self.frames):
+                    data = self.to_storage(self.read(frame), dtype).tobytes()
+                    checksum = zlib.crc32(data, checksum)
+                    file.write(data)
+            entry = {"file": path.name, "dtype": dtype, "shape": list(shape), "unit": self.channel.unit}
+            entry["crc32"] = f"{checksum:08x}"
         self.path.unlink()
         return entry
-
-    def write_array(self, dtype: str) -> dict[str, Any]:
-        """Write all frames to a file. Returns the entry of clip.json."""
-        shape = (self.frames, *self.frame_shape)
-        path = self.path.with_suffix(".npy")
-        with path.open("w+b") as file:
-            np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
-            file.seek(0)
-            checksum = zlib.crc32(file.read())
-            for frame in range(self.frames):
-                data = self.to_storage(self.read(frame), dtype).tobytes()
-                checksum = zlib.crc32(data, checksum)
-                file.write(data)
-        facts = {"file": path.name, "dtype": dtype, "shape": list(shape), "unit": self.channel.unit}
-        return {**facts, "crc32": f"{checksum:08x}"}
 
     def to_storage(self, array: NDArray[Any], dtype: str) -> NDArray[Any]:
         """The array as `dtype`, clamped to the range of float16 where that has to stay finite."""
@@ -139,18 +135,15 @@ class ClipWriter:
             floors.append(noise_of_mean(a, b))
         return float(np.mean(floors))
 
-    def drop_mirrored(self) -> None:
-        """Drop the mirrored channels where no mirror is in view: what a mirror shows is always farther away."""
-        mirrored = self.channels.get(MIRRORED["depth"])
-        if mirrored is not None and cmp(mirrored.path, self.channels["depth"].path, shallow=False):
-            for name in MIRRORED.values() & self.channels.keys():
-                self.channels.pop(name).path.unlink()
-
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
         """Complete the clip. `facts` join clip.json; `derived` names channels that readers derive, and from what."""
         for raw in self.channels.values():
             raw.file.close()
-        self.drop_mirrored()
+        mirrored = self.channels.get(MIRRORED["depth"])
+        # What a mirror shows is always farther away: where all depths are equal, no mirror is in view.
+        if mirrored is not None and cmp(mirrored.path, self.channels["depth"].path, shallow=False):
+            for name in MIRRORED.values() & self.channels.keys():
+                self.channels.pop(name).path.unlink()
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape

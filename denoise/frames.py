@@ -107,7 +107,10 @@ class FrameBuilder:
             if not self.had_camera:
                 tqdm.write(f"{foreign.source} has no camera, unlike the frames before it: history begins anew")
         depth = depth_of(foreign, views)
-        given = self.given_motion(foreign)
+        given: Image | None = None  # the renderer's motion (H, W, 2) in our convention; 0 in the first frame
+        if self.conventions.motion is not None:
+            given = self.conventions.motion.pixels(foreign.arrays["motion"])
+            given = given if self.view is not None else np.zeros_like(given)
         view = views.world if views else self.parallel_view(foreign, depth, given)
         before = self.view if self.view is not None else view
         motion = given
@@ -129,13 +132,6 @@ class FrameBuilder:
         previous = before if self.conventions.has_history else NOWHERE
         spp = self.spp * (2 if "half" in foreign.arrays else 1)
         return frame_of(channels, self.reads, view, previous, self.source, spp)
-
-    def given_motion(self, foreign: ForeignFrame) -> Image | None:
-        """The renderer's motion (H, W, 2) in our convention; 0 in the first frame, None where there is none."""
-        if self.conventions.motion is None:
-            return None
-        motion = self.conventions.motion.pixels(foreign.arrays["motion"])
-        return motion if self.view is not None else np.zeros_like(motion)
 
     def given_normal(self, foreign: ForeignFrame) -> Image | None:
         """The renderer's normals (H, W, 3) in [-1, 1]; None where there are none."""

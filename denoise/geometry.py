@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from denoise.foreign_frame import Image
 from scenes.camera import Array, View, look_at
-
-Image = NDArray[np.float32]
 
 
 def facing_pose(normal: Image | None, surface: NDArray[np.bool_]) -> Array:

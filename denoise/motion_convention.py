@@ -7,10 +7,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from denoise.foreign_frame import Image
 from errors import BadInput
 from scenes.camera import FAR_OUTSIDE
-
-Image = NDArray[np.float32]
 
 PAIR_COMPONENTS = {"XY": slice(0, 2), "ZW": slice(2, 4)}  # Blender's Vector has two: one to each neighbouring frame
 SIGNS = {"+": 1.0, "-": -1.0}

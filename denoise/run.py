@@ -1,7 +1,7 @@
 """`onespp denoise`: frames of any renderer through a denoiser, one after another, and the results on disk."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -213,12 +213,12 @@ class SequenceDenoiser:
     def play_shot(self, shot: Sequence[FrameFiles], start: int, progress: Any) -> Iterator[int]:
         """The frames of a shot, of which those before `start` are finished."""
         state: State | None = None
-        read = self.frame_reader()
+        builder = self.builder()
         has_history = self.sources.is_ours or self.analysis.conventions.has_history
         for index, files in enumerate(shot):
             needs_state = has_history and (index == 0 or type(state) is not State)
             if start < len(shot) and (needs_state or index >= start):
-                image, frame, nonfinite = read(files)
+                image, frame, nonfinite = self.read(files, builder)
                 if frame.size != self.size:
                     size = f"{image.width}x{image.height}"
                     raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
@@ -255,24 +255,20 @@ class SequenceDenoiser:
         first = ExrImage(self.shots[0][0].passes[COLOUR], header_only=True)
         return first.height, first.width
 
-    def frame_reader(self) -> Callable[[FrameFiles], tuple[ExrImage, Frame, int]]:
-        """A function from a frame's files to the image to write, the Frame, and how many pixels were not finite."""
+    def builder(self) -> FrameBuilder | OwnFrameBuilder:
+        """What makes the Frames of a shot."""
         if self.sources.is_ours:
-            own = OwnFrameBuilder(self.denoiser.reads)
-
-            def read_own(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-                image = ExrImage(files.passes[COLOUR])
-                return image, *own.build(image)
-
-            return read_own
+            return OwnFrameBuilder(self.denoiser.reads)
         source = str(self.shots[0][0].passes[COLOUR])
-        builder = FrameBuilder(self.analysis.conventions, self.denoiser.reads, source, self.job.spp)
+        return FrameBuilder(self.analysis.conventions, self.denoiser.reads, source, self.job.spp)
 
-        def read_foreign(files: FrameFiles) -> tuple[ExrImage, Frame, int]:
-            foreign, image = read_foreign_frame(files, self.sources)
-            return image, builder.build(foreign), foreign.nonfinite
-
-        return read_foreign
+    def read(self, files: FrameFiles, builder: FrameBuilder | OwnFrameBuilder) -> tuple[ExrImage, Frame, int]:
+        """The image to write, the next Frame of a shot, and how many pixels were not finite."""
+        if isinstance(builder, OwnFrameBuilder):
+            image = ExrImage(files.passes[COLOUR])
+            return image, *builder.build(image)
+        foreign, image = read_foreign_frame(files, self.sources)
+        return image, builder.build(foreign), foreign.nonfinite
 
     def write(self, files: FrameFiles, image: ExrImage, radiance: NDArray[np.float32]) -> None:
         image.replace(self.sources.target, radiance, DTYPES[self.job.stored_as])

@@ -36,17 +36,12 @@ def periodic_noise(rng: Rng, smoothness: float, stretch: float = 1.0) -> Array:
     return field / field.std()
 
 
-def two_tones(rng: Rng) -> tuple[int, int]:
-    a, b = rng.choice(PALETTE_SIZE, 2, replace=False)
-    return int(a), int(b)
-
-
 def checks(rng: Rng) -> Pattern:
     """A chequerboard, a gingham or a patchwork."""
     columns, rows = 2 * rng.integers(1, 9, 2)
     i = (X * columns).astype(int)
     j = (Y * rows).astype(int)
-    a, b = two_tones(rng)
+    a, b = rng.choice(PALETTE_SIZE, 2, replace=False)
     kind = rng.integers(3)
     if kind == 0:
         return Pattern(np.where((i + j) % 2 == 0, a, b), UNSHADED)
@@ -133,7 +128,7 @@ def weave(rng: Rng) -> Pattern:
     j = (Y * threads).astype(int)
     over = (i + j) % twill == 0
     place = np.where(over, X, Y) * threads % 1
-    a, b = two_tones(rng)
+    a, b = rng.choice(PALETTE_SIZE, 2, replace=False)
     uneven = 1 + rng.uniform(0, 0.2) * np.where(over, periodic_noise(rng, 1, 0.1), periodic_noise(rng, 1, 10))
     return Pattern(np.where(over, a, b), (0.6 + 0.4 * np.sin(np.pi * place)) * uneven)
 

@@ -17,7 +17,7 @@ from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
 from render.job.pilots import choose_rooms
-from render.job.plan import NO_PILOTS, check_seed, plan
+from render.job.plan import NO_PILOTS, plan
 from render.job.profiles import profile_of
 
 Item = TypeVar("Item")
@@ -67,7 +67,8 @@ def generate(
 
     Raises BadInput at the end, naming the first clip that failed, and OSError (such as a full disk) at once.
     """
-    check_seed(seed)
+    if seed < 0:
+        raise BadInput(f"the seed {seed} is negative: use 0 or more")
     check_folder(root)
     facts = root / "dataset.json"
     if facts.exists():  # its rooms are chosen; write_or_check_plan compares the profile

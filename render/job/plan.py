@@ -10,7 +10,6 @@ import numpy as np
 
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS, ClipKind
-from errors import BadInput
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.profiles import DataProfile, profile_of, source_of
@@ -44,11 +43,6 @@ def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp 
     return boxes + rooms_of(profile, split, seed, needed_spp) + closeups + profile.special.get(split, [])
 
 
-def check_seed(seed: int) -> None:
-    if seed < 0:
-        raise BadInput(f"the seed {seed} is negative: use 0 or more")
-
-
 def plan(
     profile: str,
     seed: int,
@@ -59,9 +53,8 @@ def plan(
     """The content of dataset.json.
 
     Clips for training and validation get the essential channels and those in `reads`; test clips get all for metrics,
-    but sample buffers only if `reads` names them. Raises BadInput for an unknown profile or a negative seed.
+    but sample buffers only if `reads` names them. Raises BadInput for an unknown profile.
     """
-    check_seed(seed)
     described = profile_of(profile)
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are sampled together

@@ -225,4 +225,4 @@ def test_other_seed_or_profile_needs_another_folder(tiny):
     with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
         plan("huge", 0)
     with pytest.raises(BadInput, match="negative"):
-        plan("tiny", -1)
+        generate(tiny, "tiny", -1)
