@@ -96,8 +96,7 @@ def write_clip(
     derived = {name: "camera" for name in channels if CHANNELS[name].is_camera_motion and not scene.moves()}
     with ClipWriter(folder) as writer:
         writer.timing = dict(seconds_before or {})
-        progress = tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame")
-        for arrays, seconds in progress:
+        for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame"):
             writer.add(arrays, seconds)
         facts = {
             "noisy_spp": sampling.noisy_spp,

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -19,8 +19,6 @@ from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
 from render.job.pilots import choose_rooms
 from render.job.plan import NO_PILOTS, plan
 from render.job.profiles import profile_of
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -38,8 +36,8 @@ class Share:
             return Share(int(match[1]), int(match[2]))
         raise BadInput(f"'{text}' is not a share: write K/N with K from 1 to N, such as 2/8")
 
-    def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        return items[self.index - 1 :: self.count]
+    def of(self, clips: Sequence[Path]) -> Sequence[Path]:
+        return clips[self.index - 1 :: self.count]
 
 
 WHOLE_DATASET = Share(1, 1)

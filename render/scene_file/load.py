@@ -160,9 +160,6 @@ class OwnScene:
             check_camera(camera, frames, self.path)
         else:
             camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
-        return replace(self.animated(frames), camera=camera)
-
-    def animated(self, frames: int) -> Scene:
         scene = self.scene
         by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
         motions = {
@@ -174,6 +171,7 @@ class OwnScene:
         stock = [replace(shape, motion=motions.get(shape.name, shape.motion)) for shape in scene.stock]
         return replace(
             scene,
+            camera=camera,
             shapes=tuple(brightened(shape, gains.get(shape.name)) for shape in shapes),
             stock=tuple(replace(shape, gain=gains.get(shape.name, shape.gain)) for shape in stock),
             lights=tuple(replace(light, gain=gains.get(light.name, light.gain)) for light in scene.lights),
