@@ -9,21 +9,28 @@ from torch.nn import functional as F
 from models.compiled.fusion import WINDOWS
 
 
-def unfold_kernel(image: Tensor, logits: Tensor, window: int) -> Tensor:
-    """Eq. 3 and 4 of Fan et al. 2021 as written: a kernel map by unfolding, softmax, weighted sum.
-
-    `image` (B, C, H, W), `logits` (B, 1, H, W), a `window` of so many pixels a side; returns (B, C, H, W).
-    """
+def taps(image: Tensor, window: int) -> Tensor:
+    """The windows of an image (B, C, H, W), of so many pixels a side, as (B, C, k k, H, W); 0 outside."""
     batch, channels, height, width = image.shape
-    margin = window // 2
-    entries = F.pad(logits, (margin,) * 4, value=-torch.inf)
-    weights = torch.softmax(F.unfold(entries, window), dim=1)  # (B, k k, H W)
-    values = F.unfold(F.pad(image, (margin,) * 4), window).view(batch, channels, window**2, -1)
-    return (values * weights[:, None]).sum(dim=2).view(batch, channels, height, width)
+    return F.unfold(image, window, padding=window // 2).view(batch, channels, -1, height, width)
 
 
-def unfold_fuse(image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS) -> Tensor:
-    """Eq. 5: what models.networks.fusion.fuse computes, in the straightforward way; any dtype."""
+def unfold_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:
+    """A kernel a pixel: softmax of `logits` (B, k k, H, W) over the taps on the `surface`, weighted sum; 0 without any.
+
+    `image` (B, C, H, W), `surface` (B, 1, H, W), by default the whole image; returns (B, C, H, W).
+    """
+    window = round(logits.shape[1] ** 0.5)
+    there = taps(torch.ones_like(image[:, :1]) if surface is None else surface.to(image), window)[:, 0] > 0
+    weights = torch.softmax(torch.where(there, logits, torch.finfo(logits.dtype).min), dim=1) * there
+    return (taps(image, window) * weights[:, None]).sum(dim=2)
+
+
+def unfold_fuse(
+    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
+) -> Tensor:
+    """Eq. 3 to 5: what models.networks.fusion.fuse computes, in the straightforward way; any dtype."""
     shares = torch.softmax(mixture, dim=1)
-    parts = [shares[:, [i]] * unfold_kernel(image, importance[:, [i]], k) for i, k in enumerate(windows)]
+    kernels = [taps(importance[:, [i]], k)[:, 0] for i, k in enumerate(windows)]
+    parts = [shares[:, [i]] * unfold_kernels(image, kernel, surface) for i, kernel in enumerate(kernels)]
     return torch.stack(parts).sum(dim=0)

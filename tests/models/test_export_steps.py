@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn import functional as F
 
 from datasets.cameras import Cameras
 from datasets.clip import Dataset
@@ -35,7 +34,7 @@ from models.weights import save_weights
 from provenance import file_digest
 from tests.helpers.exports import check_page
 from tests.helpers.frames import flat_frame, run
-from tests.helpers.unfold import unfold_kernel
+from tests.helpers.unfold import unfold_fuse
 
 SIZES = ((64, 96), (77, 131))
 FRAMES = 10
@@ -182,15 +181,14 @@ def test_neighbour_sums_equal_the_filters(height, width, step, seed):
 @given(
     height=st.integers(1, 9),
     width=st.integers(1, 9),
-    dx=st.integers(-48, 48).map(lambda n: n / 16),
-    dy=st.integers(-48, 48).map(lambda n: n / 16),
+    motion=st.tuples(st.integers(-48, 48), st.integers(-48, 48)),
     seed=st.integers(0, 9999),
 )
-def test_reprojection_equals_that_of_the_history(height, width, dx, dy, seed):
+def test_reprojection_equals_that_of_the_history(height, width, motion, seed):
     """On walls of a few meshes, where many pixels have no valid tap among 2 x 2, or none at all."""
     torch.manual_seed(seed)
     meshes = [torch.randint(0, 4, (1, 1, height, width)) for _ in range(2)]
-    frame = flat_frame(height, width, (dx, dy), mesh_id=meshes[0])
+    frame = flat_frame(height, width, (motion[0] / 16, motion[1] / 16), mesh_id=meshes[0])
     surfaces = replace(GBuffer.of(frame), mesh_id=meshes[1].float())
     history = torch.rand(1, 4, height, width)
     expected, has_history = reproject(frame, history, surfaces)
@@ -206,7 +204,7 @@ def test_reprojection_equals_that_of_the_history(height, width, dx, dy, seed):
 
 @pytest.mark.parametrize("spread", [1.0, 30.0, 1e4])
 def test_windows_are_exact_for_any_logits(spread):
-    """Against unfolding and softmax in float64, with logits of -1e9 for background."""
+    """Against unfolding and softmax in float64; a window without any surface adds 0."""
     torch.manual_seed(0)
     image = 10 * torch.rand(1, 3, 23, 31) ** 4
     importance = spread * torch.randn(1, len(WINDOWS), 23, 31)
@@ -214,11 +212,7 @@ def test_windows_are_exact_for_any_logits(spread):
     surface = (torch.rand(1, 1, 23, 31) > 0.3).float()
     with torch.no_grad():
         output = BoxWindows(WINDOWS)(image, importance, mixture, surface)
-    masked = torch.where(surface > 0, importance, -1e9).double()
-    parts = [unfold_kernel(image.double(), masked[:, [i]], k) for i, k in enumerate(WINDOWS)]
-    counts = [F.max_pool2d(surface, k, 1, k // 2) for k in WINDOWS]  # a window without any surface adds 0
-    shares = torch.softmax(mixture.double(), dim=1)
-    expected = sum(shares[:, [i]] * part * count for i, (part, count) in enumerate(zip(parts, counts, strict=True)))
+    expected = unfold_fuse(image.double(), importance.double(), mixture.double(), surface=surface)
     torch.testing.assert_close(output.double(), expected, rtol=1e-5, atol=1e-6)
 
 

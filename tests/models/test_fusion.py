@@ -9,34 +9,32 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn import functional as F
 
 from models import compiled
 from models.compiled.fusion import WINDOWS
-from models.networks.fusion import SharedKernel, box_sum, fuse, windowed_sums
+from models.networks.fusion import SharedKernel, fuse
 from tests.helpers.unfold import unfold_fuse
 
 
-def both_ways(image, importance, mixture, windows=WINDOWS):
+def both_ways(image, importance, mixture, surface=None):
     with torch.no_grad():
-        fast = fuse(image, importance, mixture, windows)
+        fast = fuse(image, importance, mixture, WINDOWS, surface)
         with compiled.disabled():
-            return fast, fuse(image, importance, mixture, windows)
-
-
-SCALES = st.sampled_from([0.0, 1.0, 30.0, 100.0, 1e4])
+            return fast, fuse(image, importance, mixture, WINDOWS, surface)
 
 
 @settings(max_examples=40, deadline=None)
 @given(
     height=st.integers(1, 70),
     width=st.integers(1, 23),
-    scale=SCALES,
+    scale=st.sampled_from([0.0, 1.0, 30.0, 100.0, 1e4]),
     shape=st.sampled_from(["noise", "ramp", "step", "spike"]),
     offset=st.sampled_from([0.0, 1e4, -1e4]),
+    share=st.sampled_from([None, 0.0, 0.02, 0.5, 0.98]),
     seed=st.integers(0, 9999),
 )
-def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offset, seed):
+def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offset, share, seed):
+    """With background as well, whatever its logits are."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:height, 0:width]
     patterns = {
@@ -48,10 +46,12 @@ def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offs
     importance = torch.from_numpy(np.float32(patterns[shape] * scale + offset))[None]
     mixture = torch.from_numpy(np.float32(rng.normal(0, scale, (1, 6, height, width))))
     image = torch.from_numpy(np.float32(10 ** rng.uniform(-7, 6.8, (1, 3, height, width))))
-    expected = unfold_fuse(image.double(), importance.double(), mixture.double()).numpy()
-    for result in both_ways(image, importance, mixture):
-        np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5)
-        assert (result.amin() >= image.amin() * (1 - 1e-5)) and (result.amax() <= image.amax() * (1 + 1e-5))
+    surface = None if share is None else torch.from_numpy(np.float32(rng.random((1, 1, height, width)) < share))
+    if surface is not None:
+        importance += 1e4 * (1 - surface) * (torch.from_numpy(rng.random((1, 1, height, width))) < 0.1)
+    expected = unfold_fuse(image.double(), importance.double(), mixture.double(), surface=surface).numpy()
+    for result in both_ways(image, importance, mixture, surface):
+        np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5, atol=1e-25)
 
 
 def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
@@ -66,12 +66,6 @@ def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
         torch.testing.assert_close(result.double(), expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("window", [1, 3, 5, 7, 13])
-def test_box_sums(window):
-    x = torch.arange(40.0).reshape(2, 20)
-    np.testing.assert_allclose(box_sum(x, window, -1), F.avg_pool1d(x, window, 1) * window, rtol=1e-6)
-
-
 @pytest.mark.parametrize("scale", [1.0, 300.0])
 @pytest.mark.parametrize("window", [3, 5])
 def test_gradients_are_finite_differences(window, scale):
@@ -84,26 +78,21 @@ def test_gradients_are_finite_differences(window, scale):
     assert torch.autograd.gradcheck(lambda r, i: SharedKernel.apply(r, i, window), (image, logits))
 
 
+@pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("scale", [1.0, 1e3])
-def test_gradients_equal_plain_autograd_of_the_naive_version(scale):
+def test_gradients_equal_plain_autograd_of_the_naive_version(scale, background):
+    """Also with windows that show no surface."""
     torch.manual_seed(2)
+    surface = (torch.rand(2, 1, 17, 12) < 0.5).float() * (torch.arange(12) < 7) if background else None
     inputs = [torch.rand(2, 3, 17, 12), scale * torch.randn(2, 6, 17, 12), torch.randn(2, 6, 17, 12)]
     mine = [t.clone().requires_grad_() for t in inputs]
     exact = [t.double().requires_grad_() for t in inputs]
     target = torch.rand(2, 3, 17, 12)
-    (fuse(*mine) * target).sum().backward()
-    (unfold_fuse(*exact) * target.double()).sum().backward()
+    (fuse(*mine, surface=surface) * target).sum().backward()
+    (unfold_fuse(*exact, surface=surface) * target.double()).sum().backward()
     for a, b in zip(mine, exact, strict=True):
         torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-4, atol=1e-5)
         assert torch.isfinite(a.grad).all()
-
-
-def test_relative_sums_are_sums():
-    logits = torch.tensor([[[[0.0, 500.0, -500.0]]]])
-    values = torch.tensor([[[[2.0, 3.0, 5.0]]]])
-    top, total = windowed_sums(logits, values, 3)
-    np.testing.assert_array_equal(top[0, 0, 0], [500, 500, 500])
-    np.testing.assert_allclose(total[0, 0, 0], [3, 3, 3], rtol=1e-6)
 
 
 def test_a_poisoned_pixel_stays_within_its_windows():
