@@ -177,14 +177,6 @@ def test_shadows_do_not_leak_to_where_filters_are_wide():
     torch.testing.assert_close(output[..., 21:], light[..., 21:])
 
 
-def test_indirect_light_alone_is_filtered_as_in_the_total():
-    frame = synthetic_frame(3, 30, 40)
-    dark = replace(frame, channels=frame.channels | {"direct": torch.zeros_like(frame.direct)})
-    (indirect,) = run(AAF(signal="indirect"), [frame])
-    (total,) = run(AAF(), [dark])
-    torch.testing.assert_close(indirect + frame.emission, total)
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     hits=st.tuples(*[st.sampled_from([0.0, 1e-30, 1e-7, 1.0, 65504.0, 3e38])] * 4),

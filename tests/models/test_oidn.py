@@ -133,9 +133,3 @@ def test_missing_or_broken_oidn_is_a_clear_error(monkeypatch):
         with pytest.raises(BadInput, match=r"pip install 'onespp\[oidn\]'"):
             registry.create(name)(flat_frame(4, 4), None)
     assert registry.channels_read(["oidn"])
-
-
-def test_it_chooses_its_own_precision():
-    assert registry.create("oidn").parameter_count() == 0
-    with pytest.raises(BadInput, match="chooses its own precision"):
-        registry.create("oidn").prepare(torch.bfloat16)

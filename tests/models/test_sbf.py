@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.filters.neighbours import mesh_variance
-from models.filters.sbf import BANK, SBF, best_filtered, filter_with_risk, guides
-from tests.helpers.frames import flat_frame, run
+from models.filters.sbf import BANK, best_filtered, filter_with_risk, guides
+from tests.helpers.frames import flat_frame
 
 pytestmark = pytest.mark.usefixtures("implementation")
 
@@ -142,15 +142,3 @@ def test_features_are_in_units_of_the_paper_s_deviations():
     )
     squares = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
     torch.testing.assert_close(2 * squares, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))
-
-
-@settings(max_examples=20, deadline=None)
-@given(level=st.sampled_from([0.0, 1e-30, 1e-7, 6e4, 1e35, 3e38]), firefly=st.sampled_from([0.0, 1e-7, 6e4, 3e38]))
-def test_extremes_stay_within_the_range_of_the_input(level, firefly):
-    frame = flat_frame(7, 9, irradiance=torch.full((1, 3, 7, 9), level))
-    frame.direct[0, :, 3, 4] = firefly
-    frame.channels["albedo"] = torch.full((1, 3, 7, 9), 0.5)
-    (output,) = run(SBF(), [frame])
-    assert torch.isfinite(output).all()
-    low, high = sorted((level, firefly))
-    assert output.min() >= min(low, 1e16 / 2) * (1 - 1e-5) and output.max() <= high * (1 + 1e-5)

@@ -30,19 +30,17 @@ NAMES = [
     if not registry.prototype(name).unavailable()
 ]
 FILTERS = ("eaw", "svgf", "asvgf", "trmv", "bmfr", "aaf", "sbf")  # those without a network that run in real time
-THREADS = torch.get_num_threads()
+pytestmark = pytest.mark.usefixtures("one_thread")
 ALL = tuple(registry.channels_read())
 
 
 @pytest.fixture(scope="module")
 def denoisers():
-    torch.set_num_threads(1)  # on images this small further threads only wait
     torch.manual_seed(0)
     made = {name: registry.create(name) for name in NAMES}
     for denoiser in made.values():
         denoiser.prepare()
-    yield made
-    torch.set_num_threads(THREADS)
+    return made
 
 
 # --- Frames at the extremes -------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """SVGF and EAW step by step against slow versions in float64 that follow the papers' formulas pixel by pixel."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -191,21 +190,6 @@ def test_variance_is_temporal_from_four_frames_on_and_spatial_before(size, seed)
         np.testing.assert_allclose(variance[s], expected, rtol=1e-4, atol=1e-5)
 
 
-@both_implementations
-def test_variance_of_a_flickering_wall():
-    """Alternately 0 and 2: the temporal variance approaches 1; a constant has none, in space or time."""
-    frames = [wall(2.0 * (n % 2), 1e4) for n in range(40)]
-    state = None
-    for n, frame in enumerate(frames):
-        _, state = SVGF()(frame, state)
-        direct = state.pictures()["variance direct"]
-        indirect = state.pictures()["variance indirect"]
-        assert indirect.max() < 1e-6 * 1e8
-        assert direct.min() > 0.5 if n >= 8 else direct.min() >= 0
-    assert direct.max() < 1.01
-    assert (state.pictures()["history length"] == 40).all()
-
-
 # --- Edge-stopping functions (§4.4) -----------------------------------------------------------------------------------
 
 
@@ -266,29 +250,6 @@ def test_normals_weigh_by_the_128th_power_of_their_cosine(degrees):
     assert weight(packed(depth, normal, mesh), (0, 0), 0, 1) == pytest.approx(max(0, math.cos(angle)) ** 128, rel=1e-3)
 
 
-@both_implementations
-def test_luminance_weighs_by_the_local_standard_deviation():
-    """Two pixels on a wall: by hand."""
-    geometry = packed(*plane(1, 2))
-    colour = torch.tensor([[1.0, 3.0], [1.0, 1.0], [1.0, 2.0]]).view(1, 1, 3, 1, 2)
-    variance = torch.tensor([0.04, 0.01]).view(1, 1, 1, 1, 2)
-    difference = 0.2126 * 2 + 0.0722 * 1
-    sigma = [math.sqrt((2 * 0.04 + 0.01) / 3), math.sqrt((2 * 0.01 + 0.04) / 3)]
-    out, spread = level(colour, variance, geometry, 1)
-    centre = 9 / 64
-    side = 3 / 32
-    for x in range(2):
-        w = side * math.exp(-difference / (4 * sigma[x]))
-        red = (centre * colour[0, 0, 0, 0, x] + w * colour[0, 0, 0, 0, 1 - x]) / (centre + w)
-        assert out[0, 0, 0, 0, x].item() == pytest.approx(red.item(), rel=1e-5)
-        v = (centre**2 * variance[..., x] + w**2 * variance[..., 1 - x]) / (centre + w) ** 2
-        assert spread[..., x].item() == pytest.approx(v.item(), rel=1e-5)
-    # Without variance, different colours do not mix.
-    out, spread = level(colour, torch.zeros_like(variance), geometry, 1)
-    torch.testing.assert_close(out, colour)
-    assert (spread == 0).all()
-
-
 # --- The à-trous transform (§4.3) -------------------------------------------------------------------------------------
 
 
@@ -306,15 +267,6 @@ def test_a_level_is_the_paper_s(size, step, seed):
         expected = naive_level(colour[s].astype(float), variance[s].astype(float), depth, normal, mesh, step)
         np.testing.assert_allclose(out[0, s].numpy(), expected[0], rtol=1e-4)
         np.testing.assert_allclose(spread[0, s, 0].numpy(), expected[1], rtol=1e-4)
-
-
-def test_uniform_noise_on_a_wall_loses_variance_by_the_sum_of_squares():
-    """Far from the border and with all weights 1, a level multiplies the variance by (Σ h²)²."""
-    geometry = packed(*plane(65, 65))
-    colour = torch.ones(1, 1, 3, 65, 65)
-    variance = torch.full((1, 1, 1, 65, 65), 0.5)
-    _, spread = level(colour, variance, geometry, 4)
-    assert spread[..., 32, 32].item() == pytest.approx(0.5 * (H @ H) ** 2, rel=1e-4)
 
 
 @both_implementations
@@ -343,63 +295,20 @@ def test_five_levels_and_the_first_is_the_history(monkeypatch):
     assert steps == (1, 2, 4, 8, 16)
     assert state.history.colour is first
     torch.testing.assert_close(output, frame.emission + last.sum(dim=1) * frame.albedo.clamp(min=0.01))
+    assert [*state.pictures()] == ["history length", "variance direct", "variance indirect"]
 
 
 # --- The whole --------------------------------------------------------------------------------------------------------
 
 
-def test_indirect_alone_is_what_total_makes_of_it():
-    frames = [synthetic_frame(index, 24, 32) for index in range(5)]
-    alone = SVGF(signal="indirect")
-    total = SVGF()
-    a, state = play(alone, frames)
-    assert list(state.pictures()) == ["history length", "variance indirect"]
-    dark = [replace(f, channels=f.channels | {"direct": 0 * f.direct, "emission": 0 * f.direct}) for f in frames]
-    for x, y in zip(a, run(total, dark), strict=True):
-        torch.testing.assert_close(x, y)
-
-
-@EXAMPLES
-@given(size=SIZES, seed=st.integers(0, 9999), level=st.sampled_from([1e-7, 1.0, 6.5e4]))
-@pytest.mark.parametrize("denoiser", [SVGF, EAW])
-@both_implementations
-def test_the_output_stays_in_the_range_of_the_input(denoiser, size, seed, level):
-    rng = np.random.default_rng(seed)
-    depth, normal, mesh = surfaces(rng, *size)
-    low = np.inf
-    high = -np.inf
-    state = None
-    made = denoiser(signal="indirect")
-    for _ in range(5):
-        frame = flat_frame(*size, mesh_id=to_torch(mesh.astype(float)))
-        light = level * to_torch(rng.choice([0.2, 0.9, 1.0], (3, *size)) * rng.random((3, *size)))
-        frame.channels.update(indirect=light, depth=to_torch(depth), normal=to_torch(normal))
-        visible = light[0, :, mesh > 0]
-        if visible.numel():
-            low = min(low, visible.min().item())
-            high = max(high, visible.max().item())
-        output, state = made(frame, state)
-        shown = output[0, :, mesh > 0]
-        assert (shown >= low * (1 - 1e-5)).all() and (shown <= high * (1 + 1e-5)).all()
-
-
 @pytest.mark.parametrize("denoiser, share", [(SVGF, 0.3), (EAW, 0.3), (BMFR, 0.02)])
-def test_noise_on_a_wall_is_gone_and_the_sky_does_not_leak(denoiser, share):
-    """Of the error after accumulation alone; irradiance stored for the sky reaches neither wall nor output."""
+def test_noise_on_a_wall_is_gone(denoiser, share):
+    """Of the error after accumulation alone."""
     generator = torch.Generator().manual_seed(0)
-    mesh = torch.ones(1, 1, 48, 48)
-    mesh[..., 30:] = 0
-    frames = []
-    for _ in range(8):
-        light = (torch.rand(1, 1, 48, 48, generator=generator) < 0.25).float().repeat(1, 3, 1, 1) * 4
-        light[..., 30:] = 100
-        frame = flat_frame(48, 48, irradiance=light, mesh_id=mesh)
-        frame.channels.update(depth=frame.depth * mesh, normal=frame.normal * mesh)
-        frames.append(frame)
-    filtered, accumulated = (run(d, frames)[-1] for d in (denoiser(), Accumulated()))
-    assert (filtered[..., 30:] == 0).all()
-    errors = [(image[..., :30] - 1).square().mean() for image in (filtered, accumulated)]
-    assert errors[0] < share * errors[1]
+    lights = [4.0 * (torch.rand(1, 1, 48, 30, generator=generator) < 0.25).repeat(1, 3, 1, 1) for _ in range(8)]
+    frames = [flat_frame(48, 30, irradiance=light) for light in lights]
+    filtered, accumulated = ((run(d, frames)[-1] - 1).square().mean() for d in (denoiser(), Accumulated()))
+    assert filtered < share * accumulated
 
 
 # --- EAW --------------------------------------------------------------------------------------------------------------
