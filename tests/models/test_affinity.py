@@ -96,13 +96,3 @@ def test_stays_within_its_neighbourhood_whatever_the_weights(
     assert (filtered >= 0).all()
     assert (filtered <= image.amax() * (1 + 1e-5)).all()
     assert (filtered[(surface == 0).expand_as(filtered)] == 0).all()
-
-
-def test_a_firefly_off_surfaces_has_no_weight() -> None:
-    image, features, sharpness, own, importance, _ = random_inputs(3, 9, 9)
-    surface = torch.ones(2, 1, 9, 9)
-    surface[..., 4, 4] = 0
-    dark = affinity_level(image, features, sharpness, own, importance, surface, 1)
-    image[..., 4, 4] = 65504
-    lit = affinity_level(image, features, sharpness, own, importance, surface, 1)
-    assert torch.equal(dark, lit)

@@ -175,15 +175,6 @@ def test_background_takes_part_in_no_regression(size, seed):
 
 
 @pytest.mark.usefixtures("implementation")
-def test_a_single_pixel_in_the_sky_keeps_its_light():
-    rng = np.random.default_rng(2)
-    light, normal, depth, axes = scene(rng, 40, 40, share=0)
-    depth[11, 13] = 4
-    fitted = regress(light, normal, depth, axes, bmfr.feature_noise(0), (0, 0))
-    np.testing.assert_allclose(fitted[:, 11, 13], light[:, 11, 13], rtol=1e-5)
-
-
-@pytest.mark.usefixtures("implementation")
 def test_a_few_pixels_of_a_block_stay_in_range():
     """Fewer than there are features: noise alone does not let them be fitted one by one, nor leap out of range."""
     rng = np.random.default_rng(3)

@@ -46,7 +46,7 @@ def by_definition(image, guide, surface, spacing: int):
     return (sliced * counted).T.reshape(image.shape)
 
 
-@pytest.mark.parametrize("way", ["compiled", "PyTorch"])
+@pytest.mark.usefixtures("implementation")
 @settings(deadline=None)
 @given(
     size=st.tuples(st.integers(1, 40), st.integers(1, 20)),
@@ -54,13 +54,9 @@ def by_definition(image, guide, surface, spacing: int):
     share=st.sampled_from([0.0, 0.1, 0.9]),
     seed=st.integers(0, 999),
 )
-def test_splat_and_slice_are_the_definition(way, size, spacing, share, seed):
+def test_splat_and_slice_are_the_definition(size, spacing, share, seed):
     image, guide, surface = random_inputs(seed, *size, share)
-    if way == "compiled":
-        filtered = grid_mean(image, guide, spacing, surface)
-    else:
-        with compiled.disabled():
-            filtered = grid_mean(image, guide, spacing, surface)
+    filtered = grid_mean(image, guide, spacing, surface)
     arrays = (tensor.double().numpy() for tensor in (image, guide[:, 0], surface[:, 0]))
     for item, inputs in enumerate(zip(*arrays, strict=True)):
         np.testing.assert_allclose(filtered[item], by_definition(*inputs, spacing), rtol=1e-4, atol=1e-5)
@@ -140,20 +136,14 @@ def test_the_network_has_two_layers():
         torch.testing.assert_close(denoiser.network(x), second(torch.where(hidden > 0, hidden, 0.2 * hidden)))
 
 
-def sharpened(*shares: float) -> Tensor:
-    """What the network says for guides that vary and shares that do not, for an image of 13 x 22."""
-    guides = torch.randn(1, 3, 13, 22, generator=torch.Generator().manual_seed(0))
-    logits = torch.logit(torch.tensor(shares), eps=1e-9).view(1, 2, 1, 1).expand(1, 2, 13, 22)
-    return torch.cat([guides, logits], dim=1)
-
-
 @pytest.mark.parametrize("shares", [(0.3, 0.5), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (0.9, 0.8)])
 def test_the_third_picture_has_what_weights_leave(shares):
     """Which may be less than nothing: the result is cut off at 0."""
     image, _, surface = (tensor[:1] for tensor in random_inputs(5, 13, 22))
-    predicted = sharpened(*shares)
-    output, mixture = registry.create("nbgd").reconstruct(image, predicted, surface)
-    guides = torch.sigmoid(predicted[:, :3])
+    guides = torch.randn(1, 3, 13, 22, generator=torch.Generator().manual_seed(0))
+    logits = torch.logit(torch.tensor(shares), eps=1e-9).view(1, 2, 1, 1).expand(1, 2, 13, 22)
+    output, mixture = registry.create("nbgd").reconstruct(image, torch.cat([guides, logits], dim=1), surface)
+    guides = torch.sigmoid(guides)
     pictures = [grid_mean(image, guides[:, [i]], spacing, surface) for i, spacing in enumerate((4, 8, 16))]
     weights = (*shares, 1 - sum(shares))
     expected = sum(weight * picture for weight, picture in zip(weights, pictures, strict=True))

@@ -163,12 +163,6 @@ def test_images_larger_than_windows():
     np.testing.assert_allclose(to_numpy(fitted), image, rtol=1e-3, atol=1e-3)
 
 
-def test_features_without_variation_leave_a_fit_of_position():
-    noise = 1 + torch.randn(1, 3, 30, 30, generator=torch.Generator().manual_seed(0))
-    same = patch_distances(torch.ones_like(noise), torch.ones_like(noise), torch.ones(1, 1, 30, 30), 3)
-    assert (regress(noise, torch.ones(1, 7, 30, 30), same, 1.0) - 1).square().mean() < 0.02
-
-
 # --- Buffers A and B --------------------------------------------------------------------------------------------------
 
 

@@ -41,24 +41,25 @@ def copy(frame: Frame, **channels: Tensor) -> Frame:
 # --- Operators --------------------------------------------------------------------------------------------------------
 
 
+def fetched(image: np.ndarray, v: float, u: float) -> np.ndarray:
+    """The image (C, H, W) bilinearly at row v and column u; taps outside are the nearest ones inside."""
+    top, left = int(np.floor(v)), int(np.floor(u))
+    rows, columns = (
+        np.clip([first, first + 1], 0, size - 1) for first, size in zip((top, left), image.shape[1:], strict=True)
+    )
+    return image[:, rows][:, :, columns] @ [left + 1 - u, u - left] @ [top + 1 - v, v - top]
+
+
 def naive_warp(image: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C, H, W) fetched bilinearly at p + motion(p), pixel by pixel; taps outside are the nearest ones inside."""
+    """(C, H, W) fetched at p + motion(p), pixel by pixel."""
     _, height, width = image.shape
     out = np.zeros_like(image)
     inside = np.zeros((height, width), bool)
-    for y in range(height):
-        for x in range(width):
-            u = x + motion[0, y, x]
-            v = y + motion[1, y, x]
-            inside[y, x] = -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
-            left = int(np.floor(u))
-            top = int(np.floor(v))
-            for j in (0, 1):
-                for i in (0, 1):
-                    weight = (u - left if i else left + 1 - u) * (v - top if j else top + 1 - v)
-                    row = min(max(top + j, 0), height - 1)
-                    column = min(max(left + i, 0), width - 1)
-                    out[:, y, x] += weight * image[:, row, column]
+    for y, x in np.ndindex(height, width):
+        u = x + motion[0, y, x]
+        v = y + motion[1, y, x]
+        inside[y, x] = -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
+        out[:, y, x] = fetched(image, v, u)
     return out, inside
 
 
@@ -76,19 +77,8 @@ def test_warp_equals_the_naive_version(size):
 def naive_upsampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Twice the size, bilinear between pixel centres, the border continued; cut to (C, H, W)."""
     out = np.zeros((len(image), height, width))
-    for y in range(height):
-        for x in range(width):
-            v = (y + 0.5) / 2 - 0.5
-            u = (x + 0.5) / 2 - 0.5
-            for j in (0, 1):
-                for i in (0, 1):
-                    top = int(np.floor(v))
-                    left = int(np.floor(u))
-                    weight = (v - top if j else top + 1 - v) * (u - left if i else left + 1 - u)
-                    row, column = (
-                        min(max(a, 0), n - 1) for a, n in zip((top + j, left + i), image.shape[1:], strict=True)
-                    )
-                    out[:, y, x] += weight * image[:, row, column]
+    for y, x in np.ndindex(height, width):
+        out[:, y, x] = fetched(image, (y + 0.5) / 2 - 0.5, (x + 0.5) / 2 - 0.5)
     return out
 
 
@@ -97,9 +87,8 @@ def naive_combine(
 ) -> np.ndarray:
     """Eq. 4 as the paper writes it, D by its `pool`."""
     pooled = np.zeros_like(coarse)
-    for y in range(pooled.shape[1]):
-        for x in range(pooled.shape[2]):
-            pooled[:, y, x] = pool(fine[:, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2], axis=(1, 2))
+    for y, x in np.ndindex(pooled.shape[1:]):
+        pooled[:, y, x] = pool(fine[:, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2], axis=(1, 2))
     size = fine.shape[1:]
     return fine - naive_upsampled(alpha * pooled, *size) + naive_upsampled(alpha * coarse, *size)
 
@@ -138,10 +127,9 @@ def test_the_pyramid_is_unbiased(size, monkeypatch):
     reconstruct_image(noisy, ones, predictions(height, width, (0.0, 0.0, 0.0)))
     for image, block in zip(captured, (4, 2, 1), strict=False):
         assert image.shape[2:] == (-(-height // block), -(-width // block))
-        for y in range(height // block):
-            for x in range(width // block):
-                part = noisy[0, :, y * block : (y + 1) * block, x * block : (x + 1) * block]
-                torch.testing.assert_close(image[0, :, y, x], part.mean(dim=(1, 2)))
+        for y, x in np.ndindex(height // block, width // block):
+            part = noisy[0, :, y * block : (y + 1) * block, x * block : (x + 1) * block]
+            torch.testing.assert_close(image[0, :, y, x], part.mean(dim=(1, 2)))
         assert image.min() >= noisy.min() - 1e-6 and image.max() <= noisy.max() + 1e-6
     monkeypatch.undo()
     flat, _ = reconstruct_image(ones, ones, predictions(height, width, (1.0, -1.0, 2.0)))

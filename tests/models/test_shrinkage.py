@@ -150,17 +150,6 @@ def test_a_few_black_samples_do_not_count_as_the_truth():
         assert torch.allclose(output, COLOUR) == kept and (output.max() < 0.05) != kept
 
 
-def test_equal_buffers_have_no_noise():
-    image = torch.rand(1, 3, *SIZE) + 0.1
-    frame = replace(with_buffers(image, image), spp=torch.full((1, 1, 1, 1), 1e9))
-    torch.testing.assert_close(shrunk_to(torch.ones_like(image), frame), image)
-
-
-def test_black_buffers_of_a_black_image_are_black():
-    black = torch.zeros(1, 3, *SIZE)
-    assert (shrunk_to(black, with_buffers(black, black)) == 0).all()
-
-
 def test_a_firefly_in_one_buffer_is_suppressed():
     a, b = noisy_buffers(COLOUR.expand(1, 3, *SIZE), 0.3)
     clean = COLOUR.expand(1, 3, *SIZE)
