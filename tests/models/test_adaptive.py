@@ -18,7 +18,7 @@ from models.wrappers.adaptive import (
     spread_fireflies,
 )
 from models.wrappers.wrapper import unwrapped
-from tests.helpers.frames import chain, flat_frame, play, run
+from tests.helpers.frames import chain, flat_frame, play
 
 SIZE = 48
 
@@ -110,12 +110,18 @@ def test_clamping_loses_no_energy_at_the_edges_of_surfaces():
     assert abs(mean[:, :40].mean() - 1) < 0.01
 
 
-def test_a_firefly_is_spread_over_its_neighbourhood():
+def spread_firefly(mesh_id: torch.Tensor) -> torch.Tensor:
+    """What becomes of a firefly of 1000 in the light of 1 that meshes 1 and 2 get; their normals differ."""
     light = torch.ones(1, 3, SIZE, SIZE)
     light[..., 20, 20] = 1000
-    frame = flat_frame(SIZE, SIZE, irradiance=light)
+    frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
+    frame.channels["normal"] = torch.where(mesh_id > 1, frame.normal.roll(1, dims=1), frame.normal)
     near = SurfaceNeighbourhoods(frame)
-    result = spread_fireflies(light, firefly_limit(torch.ones(1, 1, SIZE, SIZE), near), near)
+    return spread_fireflies(light, firefly_limit(torch.ones(1, 1, SIZE, SIZE), near), near)
+
+
+def test_a_firefly_is_spread_over_its_neighbourhood():
+    result = spread_firefly(torch.ones(1, 1, SIZE, SIZE))
     rest = 1000 - FIREFLY_RATIO
     assert result[0, 0, 20, 20] == pytest.approx(FIREFLY_RATIO + rest / 441, rel=1e-3)  # 7 x 7 strata of 9 pixels
     assert result[0, 0, 25, 14] == pytest.approx(1 + rest / 441, rel=1e-3)
@@ -125,42 +131,24 @@ def test_a_firefly_is_spread_over_its_neighbourhood():
 def test_no_light_crosses_to_another_mesh():
     mesh_id = torch.ones(1, 1, SIZE, SIZE)
     mesh_id[..., 23:] = 2  # within a stratum, whose middle is of mesh 1
-    light = torch.ones(1, 3, SIZE, SIZE)
-    light[..., 20, 20] = 1000
-    frame = flat_frame(SIZE, SIZE, mesh_id=mesh_id, irradiance=light)
-    frame.channels["normal"][:, :, :, 23:] = torch.tensor([1.0, 0.0, 0.0])[None, :, None, None]
-    near = SurfaceNeighbourhoods(frame)
-    result = spread_fireflies(light, firefly_limit(torch.ones(1, 1, SIZE, SIZE), near), near)
+    result = spread_firefly(mesh_id)
     assert (result[..., 23:] == 1).all() and result[0, 0, 20, 22] > 2
 
 
-@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.4, -0.3)])
-def test_uniform_light_is_accumulated_as_without_adaptation(motion):
-    frames = chain([flat_frame(SIZE, SIZE, motion) for _ in range(7)])
-    (outputs, state), (plain, expected) = (play(kind(), frames) for kind in (create_adaptive, Accumulated))
-    for a, b in zip(outputs, plain, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
-    assert torch.equal(state.history.length, expected.history.length)
+def both_ways(lights: list[torch.Tensor], motion: tuple[float, float] = (0.0, 0.0)):
+    """The outputs and the last state of accumulation with adaptation, and those without."""
+    frames = chain([flat_frame(SIZE, SIZE, motion, irradiance=light) for light in lights])
+    return play(registry.create("accumulated+adaptive"), frames), play(Accumulated(), frames)
 
 
-def create_adaptive():
-    return registry.create("accumulated+adaptive")
-
-
-def test_the_weight_of_the_newest_frame_is_that_of_plain_accumulation():
-    """Noise too small to be clamped and too independent to be significant: the same average."""
+@pytest.mark.parametrize("motion, most", [((0.0, 0.0), 0.9), ((0.4, -0.3), 0.8)])
+def test_the_weight_of_the_newest_frame_is_that_of_plain_accumulation(motion, most):
+    """Noise too small to be clamped and too independent to be significant: the same average in most pixels."""
     generator = torch.Generator().manual_seed(0)
-    frames = [
-        flat_frame(SIZE, SIZE, irradiance=grey(1 + 0.1 * torch.randn(1, 1, SIZE, SIZE, generator=generator)))
-        for _ in range(4)
-    ]
-    history = adaptive_history = None
-    for frame in frames:
-        history = accumulate(frame, frame.direct, history)
-        adaptive_history = accumulate_adaptively(frame, frame.direct, adaptive_history)
-    same = (adaptive_history.irradiance - history.irradiance).abs().amax(dim=1) < 1e-5
-    assert same.float().mean() > 0.9
-    assert torch.equal(adaptive_history.length, history.length)
+    lights = [grey(1 + 0.1 * torch.randn(1, 1, SIZE, SIZE, generator=generator)) for _ in range(4)]
+    (outputs, state), (plain, expected) = both_ways(lights, motion)
+    assert ((outputs[-1] - plain[-1]).abs().amax(dim=1) < 1e-5).float().mean() > most
+    assert torch.equal(state.history.length, expected.history.length)
 
 
 @pytest.mark.parametrize("factor", [0.3, 2.5])
@@ -168,13 +156,12 @@ def test_history_follows_a_light_that_jumps(factor):
     """In one frame, without more noise."""
     generator = torch.Generator().manual_seed(0)
     lights = [noisy_light(generator) for _ in range(20)] + [noisy_light(generator, factor) for _ in range(2)]
-    frames = [flat_frame(SIZE, SIZE, irradiance=light) for light in lights]
-    adaptive = run(create_adaptive(), frames)[-2:]
-    plain = run(Accumulated(), frames)[-2:]
-    assert abs(plain[0].mean() - factor) > 0.7 * abs(1 - factor)
-    for output in adaptive:
+    (adaptive, _), (plain, _) = both_ways(lights)
+    lagging = plain[-2]
+    assert abs(lagging.mean() - factor) > 0.7 * abs(1 - factor)
+    for output in adaptive[-2:]:
         assert abs(output.mean() / factor - 1) < 0.1
-        assert output.std() / output.mean() < plain[0].std() / plain[0].mean() * 1.1
+        assert output.std() / output.mean() < lagging.std() / lagging.mean() * 1.1
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (1e-3, 1.0), (1.0, 20.0), (20.0, 1.0)])
@@ -182,16 +169,13 @@ def test_history_does_not_overshoot_light_that_is_switched(before, after):
     """Limits from near darkness are far too low: light clamped at them does not measure the change."""
     generator = torch.Generator().manual_seed(0)
     lights = [noisy_light(generator, level) for level in [before] * 8 + [after] * 10]
-    frames = [flat_frame(SIZE, SIZE, irradiance=light) for light in lights]
-    means = [float(output.mean()) for output in run(create_adaptive(), frames)[10:]]
-    assert all(abs(mean / after - 1) < 0.15 for mean in means)
-    assert abs(float(run(Accumulated(), frames)[10].mean()) / after - 1) > 0.4
+    (adaptive, _), (plain, _) = both_ways(lights)
+    assert all(abs(output.mean() / after - 1) < 0.15 for output in adaptive[10:])
+    assert abs(plain[10].mean() / after - 1) > 0.4
 
 
 def test_a_gain_is_bounded():
-    light = [torch.full((1, 3, SIZE, SIZE), level) for level in (1.0, 100.0)]
-    frames = [flat_frame(SIZE, SIZE, irradiance=level) for level in light]
-    output = run(create_adaptive(), frames)[1]
+    ((_, output), _), _ = both_ways([torch.full((1, 3, SIZE, SIZE), level) for level in (1.0, 100.0)])
     torch.testing.assert_close(output, torch.full_like(output, (MAX_GAIN + 100) / 2))
 
 
