@@ -34,10 +34,6 @@ def frames(tiny) -> list[Frame]:
     return [read_frame(clip, index, NTD(signal="total").reads) for index in range(2, 5)]
 
 
-def copy(frame: Frame, **channels: Tensor) -> Frame:
-    return replace(frame, channels=frame.channels | channels)
-
-
 # --- Operators --------------------------------------------------------------------------------------------------------
 
 
@@ -186,7 +182,7 @@ def test_averaging_keeps_the_light_and_maxima_darken(kind, kept):
     """Fresh networks, of kernels and shares near even, on sparse noise as of one sample a pixel."""
     torch.manual_seed(0)
     light = 8 * (torch.rand(1, 3, 64, 64) < 1 / 8).float()
-    frame = copy(flat_frame(64, 64), direct=torch.zeros_like(light), indirect=light)
+    frame = flat_frame(64, 64).with_channels({"direct": torch.zeros_like(light), "indirect": light})
     brightness = run(kind().eval(), [frame])[0].mean() / light.mean()
     assert kept[0] < brightness < kept[1]
 
@@ -224,7 +220,7 @@ def test_what_it_reads(ntd):
 
 
 def test_the_previous_output_is_warped_by_the_dual_vectors(ntd, frames):
-    now = copy(frames[1], dual_motion=frames[1].dual_motion + 7.3, motion=frames[1].motion + 7.3)
+    now = frames[1].with_channels({"dual_motion": frames[1].dual_motion + 7.3, "motion": frames[1].motion + 7.3})
     _, state = play(ntd, [frames[0], now])
     _, before = play(ntd, frames[:1])
     warped, inside = naive_warp(before.irradiance[0].double().numpy(), now.dual_motion[0].double().numpy())
@@ -240,7 +236,7 @@ def test_the_previous_output_is_warped_by_the_dual_vectors(ntd, frames):
 def test_equal_vectors_make_it_the_ablation_with_traditional_ones(ntd, frames):
     traditional = NTDTraditional().eval()
     traditional.load_state_dict(ntd.state_dict())
-    same = [copy(frame, dual_motion=frame.motion) for frame in frames]
+    same = [frame.with_channels({"dual_motion": frame.motion}) for frame in frames]
     for a, b in zip(run(ntd, same), run(traditional, frames), strict=True):
         assert torch.equal(a, b)
     assert not torch.equal(run(ntd, frames)[1], run(traditional, frames)[1])
@@ -255,8 +251,8 @@ def test_the_first_frame_s_noise_is_its_previous_output(ntd, frames):
 def test_where_vectors_leave_the_image_it_starts_anew(ntd, frames):
     """After a cut to a camera far away nothing of the old shot is left."""
     far = torch.full_like(frames[1].motion, 1e5)
-    cut = copy(frames[1], motion=far, dual_motion=far)
-    bright = copy(frames[0], indirect=frames[0].indirect * 1.5 + 1)
+    cut = frames[1].with_channels({"motion": far, "dual_motion": far})
+    bright = frames[0].with_channels({"indirect": frames[0].indirect * 1.5 + 1})
     states = [play(ntd, [first, cut])[1] for first in (frames[0], bright)]
     assert torch.equal(*(state.warped for state in states))
     assert torch.equal(states[0].warped, cut.indirect / cut.divisor)
@@ -267,9 +263,9 @@ def test_outputs_of_both_signals(ntd, frames):
     total = NTD(signal="total").eval()
     total.load_state_dict(ntd.state_dict())
     for frame in frames:
-        both = copy(frame, direct=torch.zeros_like(frame.direct))
+        both = frame.with_channels({"direct": torch.zeros_like(frame.direct)})
         torch.testing.assert_close(run(total, [both])[0], run(ntd, [frame])[0] + frame.emission)
-        dark = copy(frame, direct=frame.indirect, indirect=torch.zeros_like(frame.indirect))
+        dark = frame.with_channels({"direct": frame.indirect, "indirect": torch.zeros_like(frame.indirect)})
         assert torch.equal(run(total, [dark])[0], run(total, [both])[0])
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from models import compiled
-from models.networks.pixel_kernels import ApplyKernels, apply_kernels
+from models.networks.pixel_kernels import apply_kernels
 from tests.helpers.unfold import unfold_kernels
 
 
@@ -56,12 +56,6 @@ def test_logits_as_a_network_leaves_them(dtype, memory):
     for logits in (head[:, :25], head[:, 25:50]):
         for filtered in both_ways(image, logits):
             torch.testing.assert_close(filtered.double(), expected(image, logits), rtol=2e-6, atol=2e-6)
-
-
-def test_gradients():
-    image, logits = inputs(3, 4, 5)
-    image, logits = (x.double().requires_grad_() for x in (image, logits))
-    assert torch.autograd.gradcheck(ApplyKernels.apply, (image, logits))
 
 
 @pytest.mark.parametrize("background", [False, True])
