@@ -51,7 +51,8 @@ def test_fusion_is_exact_for_any_finite_logits(height, width, scale, shape, offs
         importance += 1e4 * (1 - surface) * (torch.from_numpy(rng.random((1, 1, height, width))) < 0.1)
     expected = unfold_fuse(image.double(), importance.double(), mixture.double(), surface=surface).numpy()
     for result in both_ways(image, importance, mixture, surface):
-        np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5, atol=1e-25)
+        # Where windows show no surface, what is left may have any share: atol is the rounding of the darkest pixel.
+        np.testing.assert_allclose(result.numpy(), expected, rtol=2e-5, atol=2e-12)
 
 
 def test_a_wide_range_in_one_corner_does_not_touch_the_rest():
