@@ -24,8 +24,8 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,sketch,release,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, small rooms, the release (days), "
+        metavar="{tiny,quick,sketch,release,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, small rooms, the release (days), scenes of glass, "
         "or N small rooms with references of S spp",
     ),
 ]
@@ -139,6 +139,7 @@ def evaluate(
     processes: Annotated[int, arg(metavar="N", help="evaluate at most this many clips in parallel")] = os.cpu_count()
     or 1,
     device: Device = "cpu",
+    first_hits: Annotated[bool, arg(help="describe mirrors and glass by themselves, not by what they show")] = False,
 ) -> None:
     """Evaluate denoisers on the test clips, by default all that can run: table, images, results.json.
 
@@ -147,7 +148,7 @@ def evaluate(
     """
     from eval.harness import evaluate as evaluate_on
 
-    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes, device)
+    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes, device, first_hits)
 
 
 def report(

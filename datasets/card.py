@@ -34,7 +34,8 @@ independent sample buffers, and what the primary rays hit (albedo, normals, dept
 
 {channels}
 
-Clips in which mirrors are visible also have `mirrored_albedo` and so on: the same channels of what the mirrors show.
+Clips in which mirrors or smooth glass are visible also have `mirrored_albedo` and so on, the same channels of what
+these show; clips with glass also `second_albedo` and so on, of its second layer.
 
 Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or derived
 from others: `clip.json` of each clip.

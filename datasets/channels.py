@@ -9,7 +9,8 @@ Kind = Literal[
     "reference",  # the same with many samples, also in two buffers
     "emission",  # radiance without noise
     "surface",  # what a primary ray hits
-    "mirrored",  # a surface channel or motion, of what mirrors show; stored where a mirror is in view
+    "mirrored",  # a surface channel or motion, of what mirrors and glass show; stored where one is in view
+    "second",  # of the second layer of glass; stored where smooth glass is in view
     "motion",  # vectors to the frame before
     "gradient",  # how light has changed since the frame before
     "hit",  # means over those of the noisy samples that hit something; 0 where none did
@@ -24,7 +25,7 @@ class Channel:
     dtype: str  # as stored; float32 instead, if it `widens`, where float16 would lose precision
     unit: str
     letters: str = ""  # of its components in EXR layers
-    of: str | None = None  # the channel that this is another form of, for buffers, references and mirrored channels
+    of: str | None = None  # the channel that this is another form of: a buffer, reference, mirrored or second one
     widens: bool = False
     essential: bool = False  # whether it is rendered whatever denoisers read
     step: str | None = None  # the optional step of rendering that makes it
@@ -43,7 +44,7 @@ class Channel:
     @property
     def is_reflected(self) -> bool:
         """Whether it is radiance that surfaces reflect."""
-        return self.kind in ("noisy", "buffers", "reference")
+        return self.kind in ("noisy", "buffers", "reference") or (self.kind == "second" and self.unit == RADIANCE)
 
     @property
     def is_temporal(self) -> bool:
@@ -59,6 +60,7 @@ RADIANCE = "W sr^-1 m^-2"
 LENGTH = "world units"
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)  # of linear red, green and blue (ITU-R BT.709)
 STRATUM = 3  # px, the side of the squares of which each has one sample of the channel gradient
+BACKGROUND = {"albedo": 1.0, "roughness": 1.0}  # of pixels that show no surface; other surface channels are 0
 ALBEDO_FLOOR = 0.01  # demodulation divides by the albedo, but by no less than this
 
 IMAGES = ("F", "H", "W")
@@ -95,11 +97,15 @@ CHANNELS: dict[str, Channel] = {
     "camera_to_world": Channel("camera", ("F", 4, 4), "<f8", LENGTH, essential=True),
     "object_to_world": Channel("camera", ("F", "M", 4, 4), "<f8", LENGTH, essential=True),
 }
+# By the names of prefixes: layers that mirrors and glass show. A second one has light of its own.
 CHANNELS |= {
-    f"mirrored_{name}": replace(channel, kind="mirrored", of=name, essential=False, is_camera_motion=False)
+    f"{kind}_{name}": replace(channel, kind=kind, of=name, essential=False, is_camera_motion=False)
+    for kind in ("mirrored", "second")
     for name, channel in CHANNELS.items()
-    if channel.kind == "surface" or name == "motion"
+    if channel.kind == "surface" or name == "motion" or (kind, name) == ("second", "indirect")
 }
+CHANNELS["glass_reflectance"] = Channel("second", (*IMAGES, 1), "<f2", "1", "Y")
+CHANNELS["second_samples"] = Channel("second", (*REALISATIONS, 1), "<f2", "1", "Y")
 
 
 def channels_of(*kinds: Kind) -> tuple[str, ...]:
@@ -109,7 +115,7 @@ def channels_of(*kinds: Kind) -> tuple[str, ...]:
 
 def forms_of(kind: Kind) -> dict[str, str]:
     """The channels of one kind by the channel that each is another form of."""
-    return {str(CHANNELS[name].of): name for name in channels_of(kind)}
+    return {of: name for name in channels_of(kind) if (of := CHANNELS[name].of)}
 
 
 NOISY_CHANNELS = channels_of("noisy")
@@ -118,5 +124,7 @@ HIT_CHANNELS = channels_of("hit")
 MOTION_CHANNELS = channels_of("motion")
 SAMPLE_BUFFERS = forms_of("buffers")
 MIRRORED = forms_of("mirrored")
+SECOND = forms_of("second")
+SECOND_LAYER = channels_of("second")
 OPTIONAL_STEPS = tuple(dict.fromkeys(channel.step for channel in CHANNELS.values() if channel.step))  # of rendering
-USUAL_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].kind not in ("buffers", "mirrored"))
+USUAL_CHANNELS = tuple(name for name in CHANNELS if CHANNELS[name].kind not in ("buffers", "mirrored", "second"))

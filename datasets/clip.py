@@ -3,7 +3,7 @@
 import re
 import resource
 import zlib
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
@@ -12,12 +12,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, NOISY_CHANNELS
+from datasets.channels import CHANNELS, MIRRORED, NOISY_CHANNELS, SECOND, SECOND_LAYER
 from errors import BadInput
 from files import read_json
 from scenes.camera import View, motion_vectors, pixel_centres
 
 SCHEMA = 1
+NEEDED_FOR_LAYERS = ("indirect", "emission", "albedo", "mesh_id")  # to denoise glass in two layers
 SPLITS = ("train", "val", "test")
 FACTS_OF_A_CLIP = ("frames", "height", "width", "exposure", "channels", "floor_mse", "nonfinite", "clamped", "complete")
 
@@ -62,11 +63,25 @@ def visible_channel(name: str, stored: Container[str], read: Callable[[str], NDA
     return np.where(in_mirror, 0 if CHANNELS[name].kind == "gradient" else read(MIRRORED["motion"]), own)
 
 
+def second_layer_of(names: Iterable[str], stored: Container[str]) -> list[str]:
+    """The channels that come with the named ones where a second layer of glass is `stored`: its own, and a few more."""
+    if "indirect" not in names or "glass_reflectance" not in stored:
+        return []
+    needed = {*names, *NEEDED_FOR_LAYERS}
+    return [
+        name
+        for name, channel in CHANNELS.items()
+        if name in needed or (name in SECOND_LAYER and (channel.of is None or channel.of in needed))
+    ]
+
+
 class Clip:
     """One clip on disk, read on demand. Raises BadInput, naming the file, where it is missing or damaged."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, first_hits: bool = False):
+        """first_hits: whether mirrors and glass are described as surfaces of their own, not by what they show."""
         self.path = path
+        self.first_hits = first_hits
         self.facts = read_json(path / "clip.json", FACTS_OF_A_CLIP)
         self.frames: int = self.facts["frames"]
         self.height: int = self.facts["height"]
@@ -80,7 +95,13 @@ class Clip:
     @property
     def fingerprint(self) -> str:
         """The checksum (crc32, 8 hex digits) of clip.json, which contains those of all channels."""
-        return f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
+        checksum = f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
+        return f"{checksum}-first-hits" if self.first_hits else checksum
+
+    @property
+    def layers(self) -> Container[str]:
+        """The channels that say what mirrors and glass show."""
+        return {} if self.first_hits else self.channels
 
     @property
     def realisations(self) -> int:
@@ -134,7 +155,16 @@ class Clip:
         self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
     ) -> NDArray[Any]:
         """As `read`, but in mirrors of what these show: the input of denoisers. See `visible_channel`."""
-        return visible_channel(channel, self.channels, lambda name: self.read(name, frame, window, realisation))
+        return visible_channel(channel, self.layers, lambda name: self.read(name, frame, window, realisation))
+
+    def read_blended(self, channel: str, frame: int) -> NDArray[Any]:
+        """As `read_visible`, but of smooth glass the mean of both layers by probability, which OIDN asks for."""
+        image = self.read_visible(channel, frame)
+        if "glass_reflectance" not in self.layers:
+            return image
+        reflectance = self.read("glass_reflectance", frame).astype(np.float32)
+        second = self.read(SECOND[channel], frame).astype(np.float32)
+        return image + np.minimum(reflectance, 1 - reflectance) * (second - image)
 
     def view(self, frame: int) -> View:
         """The camera and the poses of all meshes in one frame."""
@@ -187,7 +217,7 @@ class Dataset:
         """The folders of all clips of `splits`, rendered or not, in a fixed order."""
         return [self.path / split / clip for split in splits for clip in self.facts["splits"][split]]
 
-    def clips(self, split: str) -> list[Clip]:
+    def clips(self, split: str, first_hits: bool = False) -> list[Clip]:
         """All clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
         paths = self.planned([split])
         missing = [path for path in paths if not is_clip(path)]
@@ -199,7 +229,7 @@ class Dataset:
         if not paths:
             raise BadInput(f"{self.path} has no clips to {split} with")
         allow_open_files(len(paths) * len(CHANNELS))
-        return [Clip(path) for path in paths]
+        return [Clip(path, first_hits) for path in paths]
 
 
 def constant_channels(clips: Sequence[Clip]) -> dict[str, list[float]]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datasets.cameras import Cameras
-from datasets.channels import ALBEDO_FLOOR, CHANNELS, SAMPLE_BUFFERS
-from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow
+from datasets.channels import ALBEDO_FLOOR, CHANNELS, SAMPLE_BUFFERS, Kind
+from datasets.clip import WHOLE_IMAGE, Clip, ImageWindow, second_layer_of
 from errors import BadInput
 
 Signal = Literal["total", "indirect"]
@@ -92,6 +92,16 @@ class Frame:
     def with_channels(self, channels: Mapping[str, Tensor]) -> "Frame":
         return replace(self, channels=self.channels | dict(channels))
 
+    def without(self, *kinds: Kind) -> "Frame":
+        """The frame without the channels of some kinds."""
+        kept = {name: tensor for name, tensor in self.channels.items() if CHANNELS[name].kind not in kinds}
+        return replace(self, channels=kept)
+
+    @property
+    def has_layers(self) -> bool:
+        """Whether smooth glass is in view, whose second layer is described."""
+        return "glass_reflectance" in self.channels
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """(B, H, W)."""
@@ -158,13 +168,12 @@ class Frame:
 
     def buffer(self, which: int) -> "Frame":
         """The frame with the samples of buffer 0 (A) or 1 (B) alone."""
-        others = {name: tensor for name, tensor in self.channels.items() if CHANNELS[name].kind != "buffers"}
         noisy = {
             name: self.channels[buffers][:, which]
             for name, buffers in SAMPLE_BUFFERS.items()
             if {name, buffers} <= self.channels.keys()
         }
-        return replace(self, channels=others | noisy, spp=self.samples / 2)
+        return replace(self.without("buffers", "second").with_channels(noisy), spp=self.samples / 2)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Frame":
         return replace(self, channels={name: function(tensor) for name, tensor in self.channels.items()})
@@ -240,10 +249,12 @@ def read_frame(
     realisation: int = 0,
     previous: int | None = None,
     window: ImageWindow = WHOLE_IMAGE,
+    in_layers: bool = True,
 ) -> Frame:
     """Frame `index` (B = 1) of a clip, with the named channels of one noise realisation, cut to `window`.
 
-    In mirrors they are of what these show (clip.visible_channel). Sample buffers are left out where the clip has none.
+    In mirrors and glass they are of what these show (clip.visible_channel). Where the clip has a second layer, its
+    forms of these channels come with them, unless not `in_layers`. Sample buffers are left out where it has none.
 
     `previous` is the frame that is played before this one, by default the one before it in the clip. For another one
     (in reversed playback, or while the camera stands still), motion vectors are computed.
@@ -255,7 +266,10 @@ def read_frame(
     if previous is None:
         previous = stored_previous
     tensors = {}
-    for name in channels:
+    names = dict.fromkeys(channels)
+    if in_layers and previous == stored_previous:
+        names |= dict.fromkeys(second_layer_of(names, clip.layers))
+    for name in names:
         channel = CHANNELS[name]
         if not channel.is_image or (channel.kind == "buffers" and name not in clip.channels):
             continue

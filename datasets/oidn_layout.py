@@ -61,10 +61,11 @@ def write_group(folder: Path, clip: Clip, frame: int, realisation: int) -> None:
     noisy = f"{group}_{clip.facts['noisy_spp']:04d}spp"
     images: dict[str, Callable[[], NDArray[np.generic]]] = {
         f"{noisy}.hdr": lambda: clip.noisy(frame, realisation),
-        f"{noisy}.alb": lambda: clip.read_visible("albedo", frame),
-        f"{noisy}.nrm": lambda: clip.read_visible("normal", frame),
         f"{group}_reference.hdr": lambda: clip.reference(frame).mean(axis=0),  # as text it comes after all numbers
     }
+    for name in (noisy, f"{group}_reference"):  # the toolkit's option --clean_aux takes those of the reference
+        images[f"{name}.alb"] = lambda: clip.read_blended("albedo", frame)
+        images[f"{name}.nrm"] = lambda: clip.read_blended("normal", frame)
     for name, read in images.items():
         path = folder / f"{name}.exr"
         if not path.exists():

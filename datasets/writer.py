@@ -2,6 +2,7 @@
 
 import shutil
 import zlib
+from collections.abc import Iterable
 from contextlib import suppress
 from filecmp import cmp
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, REFERENCE_CHANNELS
+from datasets.channels import CHANNELS, MIRRORED, REFERENCE_CHANNELS, SECOND_LAYER
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean
 from files import write_json
 
@@ -135,15 +136,27 @@ class ClipWriter:
             floors.append(noise_of_mean(a, b))
         return float(np.mean(floors))
 
+    def drop_layers(self) -> None:
+        """Drop what mirrors and glass show where none is in view.
+
+        What a mirror shows is always farther away, and glass that splits samples has a reflectance.
+        """
+        shown = self.channels.get(MIRRORED["depth"])
+        if shown is not None and cmp(shown.path, self.channels["depth"].path, shallow=False):
+            self.drop(MIRRORED.values())
+        reflectance = self.channels.get("glass_reflectance")
+        if reflectance is not None and reflectance.constant and not reflectance.first_pixel:
+            self.drop(SECOND_LAYER)
+
+    def drop(self, names: Iterable[str]) -> None:
+        for name in self.channels.keys() & set(names):
+            self.channels.pop(name).path.unlink()
+
     def finish(self, facts: dict[str, Any], derived: dict[str, str]) -> None:
         """Complete the clip. `facts` join clip.json; `derived` names channels that readers derive, and from what."""
         for raw in self.channels.values():
             raw.file.close()
-        mirrored = self.channels.get(MIRRORED["depth"])
-        # What a mirror shows is always farther away: where all depths are equal, no mirror is in view.
-        if mirrored is not None and cmp(mirrored.path, self.channels["depth"].path, shallow=False):
-            for name in MIRRORED.values() & self.channels.keys():
-                self.channels.pop(name).path.unlink()
+        self.drop_layers()
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from tqdm import tqdm
 
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS
-from datasets.clip import visible_channel
+from datasets.clip import second_layer_of, visible_channel
 from datasets.exr import FACTS_ATTRIBUTE, channels_in
 from datasets.frame import Frame, to_tensor
 from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
@@ -172,7 +173,7 @@ class FrameBuilder:
 
 
 def frame_of(
-    channels: dict[str, Any], reads: tuple[str, ...], view: View, previous: View, source: str, spp: float
+    channels: dict[str, Any], reads: Sequence[str], view: View, previous: View, source: str, spp: float
 ) -> Frame:
     """A Frame with those of the `channels`, arrays (H, W, C) or (2, H, W, C), that a denoiser `reads`."""
     return Frame(
@@ -242,10 +243,11 @@ class OwnFrameBuilder:
         facts: dict[str, Any] = json.loads(image.header[FACTS_ATTRIBUTE])
         view = View._make(np.array(facts[key]) for key in View._fields)
         arrays = channels_in({name: channel.pixels for name, channel in image.channels.items()})
-        visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in self.reads if name in arrays}
+        names = list(dict.fromkeys([*self.reads, *second_layer_of(self.reads, arrays)]))
+        visible = {name: visible_channel(name, arrays, arrays.__getitem__) for name in names if name in arrays}
         before = self.view if self.view is not None else view
         self.view = view
-        frame = frame_of(visible, self.reads, view, before, str(image.path), float(facts["noisy_spp"]))
+        frame = frame_of(visible, names, view, before, str(image.path), float(facts["noisy_spp"]))
         tensors = [tensor.flatten(1, -3) for tensor in frame.channels.values()]  # sample buffers are images too
         bad = [~torch.isfinite(tensor).all(dim=1) for tensor in tensors]
         return frame, int(torch.stack(bad).any(dim=0).sum())

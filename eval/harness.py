@@ -96,13 +96,14 @@ class ClipJob(NamedTuple):
     """A clip to evaluate in a worker process."""
 
     path: Path
+    first_hits: bool
     specs: list[DenoiserSpec]
     runs: Path
     threads: int
 
     def work(self) -> None:
         torch.set_num_threads(self.threads)
-        evaluate_clip(Clip(self.path), named_denoisers(self.specs), self.runs, quiet=True)
+        evaluate_clip(Clip(self.path, self.first_hits), named_denoisers(self.specs), self.runs, quiet=True)
 
 
 def start_worker() -> None:
@@ -124,7 +125,7 @@ def compile_kernels(spec: DenoiserSpec) -> None:
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
     """Evaluate clips in parallel, after compiling kernels in parallel: else each process would compile all of them."""
     threads = max(1, torch.get_num_threads() // processes)
-    jobs = [ClipJob(clip.path, specs, runs, threads) for clip in clips]
+    jobs = [ClipJob(clip.path, clip.first_hits, specs, runs, threads) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
         for _ in tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"):
             pass
@@ -166,15 +167,16 @@ def evaluate(
     names: Sequence[str] = (),
     processes: int = 1,
     device: str = "cpu",
+    first_hits: bool = False,
     smallest_share: int = SMALLEST_SHARE,
 ) -> dict[str, Any]:
     """Evaluate on the test clips of data sets; writes results.json, frames.csv and a PNG per clip and signal.
 
     These go to RUNS/eval; names of PNGs of indirect light end in `-indirect`. Earlier results of the same clips,
-    weights and code are reused. Returns the content of results.json. Raises BadInput where two data sets have clips
-    of one name.
+    weights and code are reused. `first_hits` describes mirrors and glass by their own surfaces. Returns the content of
+    results.json. Raises BadInput where two data sets have clips of one name.
     """
-    clips = [clip for path in data for clip in Dataset(path).clips("test")]
+    clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
     if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
         raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
     specs = evaluated(names, runs, budget, device)

@@ -9,15 +9,17 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from tabulate import tabulate
 
 from errors import BadInput
 from eval.bench.denoisers import BASELINE
+from eval.means import means
 from eval.metrics import METRICS, Values
 from eval.report.table_rows import TableRow, clip_rows, mean_rows
-from eval.results import NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
+from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
 from eval.text_table import PRINTED
 from eval.tradeoff.trades import Trade, psnr_front
@@ -27,6 +29,7 @@ from provenance import ROOT, device_in_words
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
+FIRST_STEADY_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
 SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
 
 
@@ -82,6 +85,22 @@ def extract_stress(runs: Path) -> dict[str, Any]:
     return {"device": content["device"], "rows": rows}
 
 
+def steady_clips(runs: Path) -> list[dict[str, Any]]:
+    """Metrics of all denoisers, and their noise floors, from FIRST_STEADY_FRAME of each clip on."""
+    rows = []
+    for clip in read_results(runs)[1]:
+        values = {result.denoiser: result.frames[FIRST_STEADY_FRAME:] for result in (*clip.results, clip.reference)}
+        rows.append({"scene": clip.scene, "clip": clip.clip, "results": {n: kept(means(f)) for n, f in values.items()}})
+    return rows
+
+
+def extract_glass(runs: Path) -> dict[str, Any]:
+    """Results on the profile `glass`, with what glass shows as guides and with first hits."""
+    content, _ = read_results(runs / "glass")
+    folders = {"what it shows": runs / "glass", "first hits": runs / "glass" / "first-hits"}
+    return {"device": content["device"], "clips": {guides: steady_clips(path) for guides, path in folders.items()}}
+
+
 def extract_times(runs: Path) -> dict[str, Any]:
     """Seconds that `make` and `make test` took, which they leave in RUNS, on this machine."""
     files = {name: runs / f"{name}.seconds" for name in ("make", "test")}
@@ -96,6 +115,7 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
     "trade": ("onespp trade", extract_trade),
     "stress": ("onespp stress --long", extract_stress),
     "times": ("make", extract_times),
+    "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),
 }
 
 
@@ -230,6 +250,25 @@ def front() -> str:
     return table(lines)
 
 
+def glass() -> str:
+    """PSNR of denoisers on scenes of glass, the mean of their clips, with either kind of guides; and temporal error."""
+    lines: dict[tuple[str, str], dict[str, str]] = {}
+    for guides, clips in measured("glass")["clips"].items():
+        scenes = list(dict.fromkeys(clip["scene"].split("-")[1] for clip in clips))
+        for denoiser in clips[0]["results"]:
+
+            def mean(metric: str, scene: str, clips: list[Any] = clips, name: str = denoiser) -> float:
+                return fmean(c["results"][name][metric] for c in clips if scene in c["scene"])
+
+            floor = denoiser == NOISE_FLOOR
+            line = {"denoiser": FLOOR if floor else f"`{denoiser}`", "guides": "" if floor else guides}
+            line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
+            line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
+            lines[denoiser, line["guides"]] = line
+    order = list(dict.fromkeys(denoiser for denoiser, _ in lines))
+    return table([line for _, line in sorted(lines.items(), key=lambda item: order.index(item[0][0]))])
+
+
 def stress() -> str:
     """Whether each denoiser keeps the requirements of the stress bench."""
     lines = [
@@ -258,7 +297,7 @@ def minutes(what: str) -> str:
 
 GENERATORS: dict[str, Callable[..., str]] = {
     each.__name__: each
-    for each in (clip, quality, value, shipped, times, ratio, samples, front, stress, device, minutes)
+    for each in (clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, minutes)
 }
 
 

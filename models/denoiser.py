@@ -8,8 +8,10 @@ from typing import ClassVar, TypeVar, cast
 import torch
 from torch import Tensor, nn
 
+from datasets.channels import SECOND
 from datasets.frame import Frame, Moment, Signal
 from errors import BadInput
+from models.layers import blended, composed, main_layer, second_layer, second_share
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,17 @@ class State:
     def pictures(self) -> dict[str, Tensor]:
         """Images for debugging, by name with units: (B, 1 or 3, H, W)."""
         return {}
+
+
+@dataclass(frozen=True)
+class LayeredState(State):
+    """The states of both layers of glass."""
+
+    main: State
+    second: State
+
+    def pictures(self) -> dict[str, Tensor]:
+        return self.main.pictures()
 
 
 # Why filters without a network compute in float32 only.
@@ -61,6 +74,7 @@ class Denoiser(nn.Module):
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
         convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
         separates_lights: whether it filters direct and indirect light apart.
+        blends_layers: whether it takes glass in one layer, with guides blended from both, instead of twice.
         has_kernels: whether compiled kernels do a part of its work.
         baseline_for: the signals whose denoisers are compared with it, in evaluations, cards and trade-offs.
         evaluated_with: wrappers with which `onespp eval` runs it beside the denoiser itself.
@@ -78,6 +92,7 @@ class Denoiser(nn.Module):
     offline: bool = False
     convex: bool = False
     separates_lights: bool = False
+    blends_layers: bool = False
     has_kernels: bool = True
     baseline_for: tuple[Signal, ...] = ()
     evaluated_with: tuple[str, ...] = ()
@@ -99,7 +114,21 @@ class Denoiser(nn.Module):
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """`forward`, with NaN and infinities replaced by 0. Raises BadInput where one of `constants` varies."""
         self.check_constants(frame)
-        return cast(tuple[Tensor, State], super().__call__(frame.finite(), state))
+        return self.run(frame.finite(), state)
+
+    def run(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        """`forward`, for each layer of glass apart."""
+        if not frame.has_layers or self.blends_layers:
+            one_layer = blended(frame) if frame.has_layers else frame
+            return cast(tuple[Tensor, State], super().__call__(one_layer, state))
+        before = matching_state(state, LayeredState, frame)
+        share = second_share(frame)
+        main, main_state = super().__call__(main_layer(frame, share), before.main if before else None)
+        second = second_layer(frame, share)
+        light, second_state = super().__call__(second, before.second if before else None)
+        emission = frame.emission if self.signal == "total" else torch.zeros_like(main)
+        output = composed(main, light / second.divisor, share, frame.channel(SECOND["albedo"]), emission)
+        return output, LayeredState(frame.moment, main_state, second_state)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """Radiance (B, 3, H, W) of `signal`, non-negative, and the state for the next frame.

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS
+from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS, SECOND, SECOND_LAYER
 from render.backend import mi
 from render.first_bounce import hit_channels
-from render.gbuffer import render_gbuffer
+from render.gbuffer import light_of_second_layer, render_gbuffer
 from render.gradient import GradientSamples
+from render.look_through import chains_through_glass, traced_motion
 from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
@@ -83,36 +84,41 @@ class FrameInProgress:
 
 
 def noise_free_frames(
-    stage: Stage, frames: int, regularise: bool, wants_dual: bool, timer: StepTimer
+    stage: Stage, frames: int, regularise: bool, wants_dual: bool, in_layers: bool, timer: StepTimer
 ) -> Iterator[FrameInProgress]:
     """Yield every frame with its G-buffer and motion vectors.
 
-    Dual motion vectors need rays through the scene of the previous frame, so the G-buffer is rendered a frame ahead.
+    Dual motion vectors and those through glass need rays through the scene of the previous frame, so the G-buffer is
+    rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
     view = stage.view(0)
-    arrays = render_gbuffer(stage, view, regularise)
-    arrays["motion"] = arrays["dual_motion"] = np.zeros_like(centres)
-    if stage.materials.has_mirrors:
-        arrays[MIRRORED["motion"]] = arrays["motion"]
+    arrays = render_gbuffer(stage, view, regularise, in_layers)
+    for name in ("motion", "dual_motion", *(forms["motion"] for forms in layers_of(stage, in_layers))):
+        arrays[name] = np.zeros_like(centres)
     frame = FrameInProgress(0, view, view, arrays)
     timer.lap("gbuffer")
     for index in range(1, frames):
         stage.pose(index)
         view = stage.view(index)
-        arrays = render_gbuffer(stage, view, regularise)
+        arrays = render_gbuffer(stage, view, regularise, in_layers)
+        shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
+        chains = [chains_through_glass(stage, view, rarer) for rarer in (False, True)] if shows_glass else []
         timer.lap("gbuffer")
         surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
         arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
-        if stage.materials.has_mirrors:
-            shown = arrays[MIRRORED["depth"]][..., 0].astype(np.float64), arrays[MIRRORED["mesh_id"]][..., 0]
-            arrays[MIRRORED["motion"]] = motion_vectors(centres, *shown, view, frame.view)
+        for forms in layers_of(stage, in_layers):
+            shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
+            arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
         timer.lap("motion")
         stage.pose(index - 1)
         timer.lap("gbuffer")
         if wants_dual:
             arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
             timer.lap("dual_motion")
+        for forms, chain in zip(layers_of(stage, in_layers), chains, strict=False):
+            arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
+        timer.lap("motion")
         yield frame
         timer.start()
         frame = FrameInProgress(index, view, frame.view, arrays)
@@ -121,11 +127,17 @@ def noise_free_frames(
     yield frame
 
 
+def layers_of(stage: Stage, in_layers: bool) -> list[dict[str, str]]:
+    """The names of the channels of what mirrors and glass show, layer by layer."""
+    return [MIRRORED] * stage.looks_through + [SECOND] * (in_layers and stage.glass is not None)
+
+
 class SampledChannels:
     """Renders the channels of a clip that need random samples; its methods take the frames in order."""
 
-    def __init__(self, stage: Stage, sampling: Sampling, seed: int, in_buffers: bool):
+    def __init__(self, stage: Stage, sampling: Sampling, seed: int, in_buffers: bool, in_layers: bool):
         self.stage = stage
+        self.in_layers = in_layers
         self.sampling = sampling
         self.seed = seed
         self.in_buffers = in_buffers and sampling.noisy_spp % 2 == 0
@@ -149,10 +161,16 @@ class SampledChannels:
             ]
             for i in range(self.sampling.realisations)
         ]
-        drawn = np.array([[self.noisy_tracer.radiance(self.ray, *draw) for draw in draws] for draws in self.draws])
-        direct, indirect = np.moveaxis(drawn, 2, 0)  # (realisations, buffers, H, W, 3)
+        trace = self.noisy_tracer.split_radiance if self.in_layers else self.noisy_tracer.radiance
+        drawn = [[trace(self.ray, *draw) for draw in draws] for draws in self.draws]
+        direct, indirect, *of_glass = (
+            np.array([[images[i] for images in buffers] for buffers in drawn]) for i in range(len(drawn[0][0]))
+        )  # (realisations, buffers, H, W, C)
         self.first_sample = direct[0, 0], indirect[0, 0]
         arrays = {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
+        if of_glass:
+            means = (image.mean(axis=1) for image in (direct + indirect, *of_glass))
+            arrays |= light_of_second_layer(frame.arrays["glass_reflectance"], *means)
         buffers = {SAMPLE_BUFFERS["direct"]: direct, SAMPLE_BUFFERS["indirect"]: indirect}
         return arrays | buffers if self.in_buffers else arrays
 
@@ -203,19 +221,22 @@ def render_clip(
 ) -> Iterator[tuple[Arrays, dict[str, float]]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
-    `channels` are those to render, with their mirrored forms in a scene with mirrors; by default all but sample
-    buffers. Sample buffers need an even number of noisy samples a pixel, and change which samples are drawn.
+    `channels` are those to render, with what mirrors and glass show in a scene with these, in two layers if they name
+    any of SECOND_LAYER; by default all but sample buffers. Sample buffers need an even number of noisy samples a pixel,
+    and change which samples are drawn.
 
     Deterministic in its arguments for one Mitsuba variant and processor.
     """
     stage = Stage(scene, height, width)
     timer = StepTimer()
     wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
-    wanted |= {MIRRORED[name] for name in wanted & MIRRORED.keys()}
+    in_layers = stage.glass is not None and not wanted.isdisjoint(SECOND_LAYER)
+    wanted |= {forms[name] for forms in layers_of(stage, in_layers) for name in wanted & forms.keys()}
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
     makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
-    sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted)
-    for frame in noise_free_frames(stage, frames, sampling.options.regularise, "dual_motion" not in skipped, timer):
+    sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers)
+    wants_dual = "dual_motion" not in skipped
+    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, in_layers, timer):
         for step, maker in makers.items():
             frame.arrays |= maker(sampled, frame)
             timer.lap(step)

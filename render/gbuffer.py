@@ -1,68 +1,17 @@
-"""Primary visibility without noise, directly and behind mirrors: geometry, materials and emission.
+"""Primary visibility without noise, directly and by way of mirrors and glass: geometry, materials and emission."""
 
-A mirror image is described as if it stood behind the mirror: it has edges, textures and motion like any other surface,
-so that denoisers need no special case for it.
-"""
-
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.channels import MIRRORED
+from datasets.channels import BACKGROUND, MIRRORED, SECOND
 from render.backend import dr, mi
-from render.loading import columns, upload
+from render.loading import columns
+from render.look_through import Sight, look_through
 from render.specular import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
-
-MAX_MIRRORS = 4  # along a ray
-# Of what a surface reflects, in pixels: where it is blurred more, its own guides serve denoisers better.
-MAX_BLUR = 0.75
-
-
-@dataclass
-class MirroredHit:
-    """What rays hit behind all mirrors that show it sharply, or the last mirror where that shows only sky."""
-
-    si: mi.SurfaceInteraction3f
-    ray: mi.Ray3f  # the last one
-    beyond: mi.Float  # path length after the first mirror in Mitsuba's units; 0 without one
-    spread: mi.Float  # by which rays diverge, in radians: twice the GGX alpha of each mirror
-    blur: mi.Float  # how far they have diverged, in Mitsuba's units
-    tint: mi.Color3f  # the product of all mirrors' albedos
-    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]  # the world's, reflected by the mirrors from first to last
-
-    def in_mirrors(self, normal: mi.Vector3f) -> mi.Vector3f:
-        """The mirror image of a world direction (3,)."""
-        return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
-
-
-def reflected(stage: Stage, hit: MirroredHit, eye_distance: mi.Float, focal: mi.Float) -> MirroredHit:
-    """The hits of the rays that mirrors reflect; unchanged elsewhere, and where a ray misses or the picture is blurred.
-
-    `eye_distance` is the length of primary rays, `focal` the focal length in pixels.
-    """
-    here = hit.si
-    is_mirror, albedo, alpha = stage.materials.mirror_at(here)
-    normal = stage.normals.evaluate(here, is_mirror)
-
-    def flipped(direction: mi.Vector3f) -> mi.Vector3f:
-        return direction - 2 * dr.dot(direction, normal) * normal
-
-    onward = stage.past_cutouts(here.spawn_ray(flipped(hit.ray.d)))
-    there = stage.mitsuba_scene.ray_intersect(onward, mi.RayFlags.All, coherent=False, active=is_mirror)
-    step = dr.norm(there.p - here.p)
-    beyond = hit.beyond + step
-    spread = hit.spread + 2 * alpha
-    blur = hit.blur + spread * step
-    is_sharp = blur * focal < MAX_BLUR * (eye_distance + beyond)
-    x, y, z = map(flipped, hit.axes)
-    shown = MirroredHit(there, onward, beyond, spread, blur, hit.tint * albedo, (x, y, z))
-    result: MirroredHit = dr.select(is_mirror & there.is_valid() & is_sharp, shown, hit)
-    dr.eval(result)
-    return result
 
 
 def depth_along_axis(
@@ -99,23 +48,37 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
     return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 
-def surface_channels(stage: Stage, hit: MirroredHit) -> dict[str, dr.AnyArray]:
-    valid = hit.si.is_valid()
-    normal = stage.normals.evaluate(hit.si, valid)
-    normal = hit.in_mirrors(dr.select(dr.dot(normal, hit.ray.d) > 0, -normal, normal))
-    albedo, roughness = stage.materials.evaluate(hit.si, valid)
+def surface_channels(stage: Stage, sight: Sight) -> dict[str, dr.AnyArray]:
+    valid = sight.si.is_valid()
+    normal = stage.normals.evaluate(sight.si, valid)
+    normal = sight.turned_back(dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal))
+    albedo, roughness = stage.materials.evaluate(sight.si, valid)
     return {
         "normal": dr.select(valid, normal, mi.Vector3f(0)),
-        "albedo": hit.tint * albedo,
+        "albedo": sight.tint * albedo,
         "roughness": roughness,
-        "mesh_id": stage.mesh_id(hit.si),
+        "mesh_id": stage.mesh_id(sight.si),
     }
 
 
-def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[str, NDArray[Any]]:
+def layer_channels(
+    stage: Stage, view: View, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, sight: Sight, forms: dict[str, str]
+) -> dict[str, NDArray[Any]]:
+    """What mirrors and glass at the ends `si` of primary rays show, by the names of its channels in `forms`."""
+    channels = surface_channels(stage, sight)
+    dr.eval(channels, sight.beyond, sight.reflectance)
+    depth = depth_along_axis(stage, si, ray, view, sight.beyond)
+    arrays = {forms[name]: stage.image(value) for name, value in channels.items()}
+    return arrays | {forms["depth"]: depth.reshape(stage.height, stage.width, 1)}
+
+
+def render_gbuffer(
+    stage: Stage, view: View, regularise: bool = False, in_layers: bool = True
+) -> dict[str, NDArray[Any]]:
     """The noise-free channels (H, W, C) of the channel table, with the stage posed for `view`'s frame.
 
-    `regularise` is that of the path tracer whose samples complete them.
+    `regularise` is that of the path tracer whose samples complete them, `in_layers` whether to describe the second
+    layer of glass.
 
     albedo: diffuse reflectance + specular reflectance at normal incidence, in [0, 1]; 1 for background.
     normal: the shading normal in world space, of unit length, toward the viewer; 0 for background.
@@ -124,33 +87,79 @@ def render_gbuffer(stage: Stage, view: View, regularise: bool = False) -> dict[s
     depth: along the viewing axis, in world units; 0 for background.
     mesh_id: index of the shape + 1; 0 for background.
 
-    In a scene with mirrors all but emission also in mirrored form: surfaces visible in a mirror, as if they stood
-    behind it. Their albedo is multiplied by the mirrors', their depth follows from the length of the whole path.
+    In a scene with mirrors or smooth glass all but emission also in mirrored form: what these show, as if it stood
+    behind them; for glass by its more frequent branch. Albedo is multiplied by that of the mirrors, depth follows from
+    the length of the whole path. In a scene with glass also of the rarer branch.
+
+    glass_reflectance: the probability of reflection where samples split; 0 without glass.
     """
     ray = stage.rays(view)
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-    direct = mirrored = MirroredHit(si, ray, mi.Float(0), mi.Float(0), mi.Float(0), mi.Color3f(1), axes)
-    channels = {**surface_channels(stage, direct), "emission": stage.lights.at(si).eval(si)}
+    channels = {**surface_channels(stage, Sight.along(ray, si)), "emission": stage.lights.at(si).eval(si)}
     shines = stage.specular.at(si.bsdf(), si.is_valid())
     dr.eval(channels, si.t, shines)
     arrays = {name: stage.image(value) for name, value in channels.items()}
+    events = stage.max_events(regularise)
     if np.array(shines).any():
-        events = stage.max_events(regularise)
         scene, lights, specular = stage.mitsuba_scene, stage.lights, stage.specular
         light = specular_light(scene, lights, specular, ray, events, np.array(shines), stage.freezes)
         arrays["emission"] = np.where(stage.image(shines), light.reshape(arrays["emission"].shape), arrays["emission"])
     arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
-    if stage.materials.has_mirrors:
-        focal = upload(np.abs(view.K[:1, 0]))
-        for _ in range(MAX_MIRRORS):
-            before = mirrored.beyond
-            mirrored = reflected(stage, mirrored, si.t, focal)
-            if dr.all(mirrored.beyond == before):
-                break
-        shown = {MIRRORED[name]: value for name, value in surface_channels(stage, mirrored).items()}
-        dr.eval(shown, mirrored.beyond)
-        arrays |= {name: stage.image(value) for name, value in shown.items()}
-        depth = depth_along_axis(stage, si, ray, view, mirrored.beyond)
-        arrays[MIRRORED["depth"]] = depth.reshape(stage.height, stage.width, 1)
+    if stage.looks_through:
+        arrays |= layers(stage, view, si, ray, arrays, events, np.array(shines).any(), in_layers)
     return arrays
+
+
+def layers(
+    stage: Stage,
+    view: View,
+    si: Any,
+    ray: mi.Ray3f,
+    own: dict[str, NDArray[Any]],
+    max_splits: int,
+    shines: bool,
+    in_layers: bool,
+) -> dict[str, NDArray[Any]]:
+    """What mirrors and glass at the ends `si` of primary rays show, if there are any: whether any `shines`.
+
+    `own` are the channels of what the primary rays hit, with which all begins.
+    """
+    arrays = {MIRRORED[name]: own[name] for name in MIRRORED.keys() & own.keys()}
+    reflectance = np.zeros_like(own["depth"])
+    if shines or stage.materials.has_mirrors:
+        sight = look_through(stage, view, ray, si, max_splits=max_splits)
+        arrays = layer_channels(stage, view, si, ray, sight, MIRRORED)
+        reflectance = stage.image(sight.reflectance)
+    if stage.glass is None or not in_layers:
+        return arrays
+    second = {
+        SECOND[name]: np.full_like(array, BACKGROUND.get(name, 0)) for name, array in own.items() if name in SECOND
+    }
+    splits = splits_at(reflectance)
+    if splits.any():
+        sight = look_through(stage, view, ray, si, rarer_first=True, max_splits=max_splits)
+        shown = layer_channels(stage, view, si, ray, sight, SECOND)
+        second = {name: np.where(splits, shown[name], background) for name, background in second.items()}
+    return {**arrays, **second, "glass_reflectance": reflectance}
+
+
+def splits_at(reflectance: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether samples take both branches at glass of a reflectance (H, W, 1)."""
+    return (reflectance > 0) & (reflectance < 1)
+
+
+def light_of_second_layer(
+    reflectance: NDArray[np.float32], light: Array, reflected: Array, reflections: Array
+) -> dict[str, Array]:
+    """The channels second_indirect and second_samples (..., H, W, C): the light of samples that take the rarer branch.
+
+    `reflectance` is the channel glass_reflectance, `light` all radiance of the samples, `reflected` that by way of a
+    reflection, `reflections` the share of such samples.
+    """
+    splits = splits_at(reflectance)
+    is_reflection = reflectance <= 0.5
+    other = (light - reflected).clip(min=0)
+    return {
+        SECOND["indirect"]: np.where(splits, np.where(is_reflection, reflected, other), 0),
+        "second_samples": np.where(splits, np.where(is_reflection, reflections, 1 - reflections), 0),
+    }

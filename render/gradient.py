@@ -77,7 +77,7 @@ class GradientSamples(NamedTuple):
         visible = is_same_surface(point, self.mesh_id, place, trace_visible(stage, now, place), now)
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
         pixel = mi.UInt32(aligned(self.pixel.astype(np.uint32)))
-        direct, indirect = tracer.samples(stage.rays(now, place), pixel, *self.draw)
+        direct, indirect, *_ = tracer.samples(stage.rays(now, place), pixel, *self.draw)
         shaded = sample_luminance(columns(direct) + columns(indirect))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)
         column, row = place[visible & inside].astype(int).T

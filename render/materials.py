@@ -7,7 +7,7 @@ normal incidence: one albedo and one roughness for the whole surface.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -265,13 +265,19 @@ class MaterialTable:
         self.saturates = any(internal)
         # Rows that are no mixtures refer to themselves.
         self.unweighted = constant(0)
-        columns = [self.mixtures.get(row, (self.unweighted, row, row, False)) for row in range(len(self.materials))]
-        weight, first, second, sided = zip(*columns, strict=True)
+        mixtures = [self.mixtures.get(row, (self.unweighted, row, row, False)) for row in range(len(self.materials))]
+        weight, first, second, sided = zip(*mixtures, strict=True)
         self.weight = mi.TexturePtr([*weight])
         self.first, self.second, self.sided = mi.UInt32([*first]), mi.UInt32([*second]), mi.Bool([*sided])
+        self.columns = [self.base, self.roughness, self.metallic, self.scale, self.f0, self.squared, self.row]
+        self.columns += [self.internal, self.weight, self.first, self.second, self.sided]
         # As data: unevaluated arrays would be compiled into kernels as literals, with the number of rows.
-        dr.make_opaque(self.base, self.roughness, self.metallic, self.scale, self.f0, self.squared, self.row)
-        dr.make_opaque(self.internal, self.weight, self.first, self.second, self.sided)
+        dr.make_opaque(self.columns)
+
+    def state(self) -> list[Any]:
+        """All that kernels read of it."""
+        textures = [[each.base, each.roughness, each.metallic] for each in self.materials]
+        return [textures, [mixture[0] for mixture in self.mixtures.values()], self.unweighted, *self.columns]
 
     def add(self, tree: Material | Mixture) -> int:
         """Append a material, and those of a mixture. Returns its row."""

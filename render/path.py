@@ -15,7 +15,7 @@ from render.lights import Lights
 from render.palette import palette
 from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
-from render.specular import SpecularSurfaces
+from render.specular import BsdfSet, SpecularSurfaces
 from render.stage import Stage
 
 AnySampler = Sampler | HaltonSampler
@@ -38,11 +38,12 @@ def bounce(
     specular: SpecularSurfaces,
     chain: mi.Bool,
     sampler: AnySampler,
-) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool]:
-    """(radiance, si, throughput, active, chain): direct light reflected at `si`, and the path's next vertex.
+) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool, mi.UInt32]:
+    """(radiance, si, throughput, active, chain, lobe): direct light reflected at `si`, and the path's next vertex.
 
     Emitter and BSDF sampling are combined. But a path's `last` ray is not traced from a diffuse surface, where emitter
     sampling alone is the better choice. Light at the end of a `chain` of specular events is left out: it is emission.
+    `lobe` are the flags of the BSDF's lobe that the path takes.
     """
     u_emitter = sampler.next_2d()
     u_lobe = sampler.next_1d()
@@ -70,7 +71,7 @@ def bounce(
     emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
     mis = mis_weight(sample.pdf, emitter_pdf)
     radiance += dr.select(active & ~chain, throughput * emitter.eval(following, active) * mis, 0)
-    return radiance, following, throughput, active & following.is_valid(), chain
+    return radiance, following, throughput, active & following.is_valid(), chain, sample.sampled_type
 
 
 def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Float) -> tuple[mi.Color3f, mi.Bool]:
@@ -93,8 +94,12 @@ def sample_mean(
     blurred: BlurredTable | None,
     specular: SpecularSurfaces,
     max_events: mi.UInt32,
-) -> tuple[mi.Color3f, mi.Color3f]:
+    glass: BsdfSet | None,
+) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
+
+    Also the part of that radiance by paths that the first smooth `glass` on a chain of specular events reflects, and
+    the share of such paths in the samples; 0 without glass.
 
     Each ray draws the random numbers of its `pixel` (row-major). `seed`, `first` (the index of the first sample), `spp`
     and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended continues with its
@@ -110,15 +115,26 @@ def sample_mean(
     throughput = mi.Color3f(1)
     depth = mi.UInt32(1)
     chain = mi.Bool(True)
+    whole = mi.Bool(True)  # whether no glass has split the path
+    mirrored = mi.Bool(False)  # whether glass has reflected it
+    reflected = mi.Color3f(0)
+    reflections = mi.UInt32(0)
     index = mi.UInt32(0)
     while primary.is_valid() & (index < spp):
         sampler = draw(key, first + index, depth)
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
         chain &= depth <= max_events
         last = depth + 1 == max_depth
-        radiance, si, throughput, active, chain = bounce(
+        splits = mi.Bool(False) if glass is None else chain & whole & glass.at(bsdf, chain)
+        radiance, si, throughput, active, chain, lobe = bounce(
             scene, lights, si, bsdf, throughput, last, specular, chain, sampler
         )
+        mirrors = splits & mi.has_flag(lobe, mi.BSDFFlags.DeltaReflection)
+        # Conditional expressions: without glass, nothing is added to the loop.
+        reflections += 0 if glass is None else dr.select(mirrors, 1, 0)
+        mirrored |= mirrors
+        whole &= ~splits
+        reflected += 0 if glass is None else dr.select(mirrored, radiance, 0)
         direct += dr.select(depth == 1, radiance, 0)
         indirect += dr.select(depth == 1, 0, radiance)
         throughput, active = survive(throughput, depth, active, sampler.next_1d())
@@ -128,9 +144,11 @@ def sample_mean(
         throughput = dr.select(ended, 1, throughput)
         depth = dr.select(ended, 1, depth)
         chain |= ended
+        whole |= ended
+        mirrored &= ~ended
         index += dr.select(ended, 1, 0)
     count = mi.Color3f(spp)
-    return direct / count, indirect / count
+    return direct / count, indirect / count, reflected / count, mi.Float(reflections) / mi.Float(spp)
 
 
 class SampleRange(NamedTuple):
@@ -156,9 +174,12 @@ class PathTracer:
         self.freezes = stage.freezes and not halton and not regularise  # which Dr.Jit 1.5 cannot freeze either
 
     def samples(
-        self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        """(direct, indirect) radiance along primary rays, each with the random numbers of its `pixel` (row-major)."""
+        self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0, splits: bool = False
+    ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
+        """(direct, indirect, reflected, share of reflections) along primary rays: see `sample_mean`.
+
+        Each has the random numbers of its `pixel` (row-major). The last two are 0 unless glass `splits` paths.
+        """
         stage = self.stage
         if self.frozen_pose != stage.poses:
             # Tracing the program in Python takes longer than running it at 1 spp, so it is frozen and replayed with the
@@ -167,7 +188,7 @@ class PathTracer:
             frozen = dr.freeze(sample_mean, state_fn=lambda *_, **__: palette())
             self.sample_mean = frozen if self.freezes else sample_mean
             self.frozen_pose = stage.poses
-        direct, indirect = self.sample_mean(
+        means = self.sample_mean(
             stage.mitsuba_scene,
             stage.lights,
             ray,
@@ -180,16 +201,21 @@ class PathTracer:
             blurred=self.blurred,
             specular=stage.specular,
             max_events=dr.opaque(mi.UInt32, stage.max_events(self.blurred is not None)),
+            glass=stage.glass if splits else None,
         )
-        dr.eval(direct, indirect)
-        return direct, indirect
+        dr.eval(means)
+        return means
 
     def radiance(
         self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(direct, indirect) radiance (H, W, 3), without emission, along the primary rays of all pixels."""
-        direct, indirect = self.samples(ray, self.every_pixel, seed, spp, first)
+        direct, indirect, *_ = self.samples(ray, self.every_pixel, seed, spp, first)
         return self.stage.image(direct), self.stage.image(indirect)
+
+    def split_radiance(self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0) -> list[NDArray[np.float32]]:
+        """Also the part of it that glass reflects first, and the share of such samples (H, W, 1)."""
+        return [self.stage.image(mean) for mean in self.samples(ray, self.every_pixel, seed, spp, first, splits=True)]
 
 
 def finite_or_zero(image: NDArray[np.floating]) -> FloatImage:
@@ -203,7 +229,7 @@ class PosedFrame:
         stage.pose(frame)
         self.stage = stage
         self.view = stage.view(frame)
-        self.emission = render_gbuffer(stage, self.view, regularise)["emission"].astype(np.float64)
+        self.emission = render_gbuffer(stage, self.view, regularise, in_layers=False)["emission"].astype(np.float64)
         self.ray = stage.rays(self.view)
         self.tracer = PathTracer(stage, regularise=regularise)
 

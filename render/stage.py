@@ -13,7 +13,7 @@ from render.materials import MaterialTable, bsdfs_of, registry_index, registry_t
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
-from render.specular import MAX_EVENTS, SpecularSurfaces
+from render.specular import MAX_EVENTS, SpecularSurfaces, smooth_glass
 from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
@@ -79,6 +79,8 @@ class Stage:
         visible = [*self.shapes, *loader.grouped]
         self.materials = MaterialTable(visible)
         self.specular = SpecularSurfaces(visible)
+        self.glass = smooth_glass(visible)
+        self.looks_through = self.materials.has_mirrors or self.glass is not None
         self.normals = ShadingNormals(visible)
         # Masks have null transmission; so has thin glass.
         self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(visible).values())
@@ -89,6 +91,8 @@ class Stage:
         self.freezes = bool(self.shapes) and not self.has_textured_lights
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
+        self.event_pose = -1  # that for which `event` has been recorded, see render.look_through
+        self.event: Any = None
         self.pose(0)
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:

@@ -13,7 +13,7 @@ METALS = ("Al", "Ag", "Au", "Cu", "Cr")  # Mitsuba's names
 GLASS = 1.5  # index of refraction; Mitsuba compiles it into kernels, so that rooms share one
 SHEETS = ("leaf", "shade", "fabric", "print")  # thin, two-sided
 NEVER_GLOSSY = (*SHEETS, "stem", "paper", "cushion", "blanket", "soil", "wax")
-ALWAYS_GLOSSY = ("metal", "glass")
+ALWAYS_GLOSSY = ("metal", "glass", "clear", "mirror")
 WHITENED = {"wall": 0.5, "floor": 0.1, "dark wall": 0.0}  # see desaturated
 
 
@@ -63,11 +63,14 @@ FINISHES: dict[str, Callable[[Rng, Bsdf], Bsdf]] = {
         if rng.random() < 0.2
         else {"type": "dielectric", "int_ior": GLASS}
     ),
+    "clear": lambda rng, base: {"type": "dielectric", "int_ior": GLASS},
 }
 # Weights of the finishes of a slot that is not plainly diffuse.
 GLOSSY_FINISHES = {
     "metal": {"rough metal": 10, "mirror": 1, "principled": 4},
     "glass": {"glass": 1},
+    "clear": {"clear": 1},
+    "mirror": {"mirror": 1},
     "body": {"rough plastic": 12, "plastic": 4, "principled": 12, "rough metal": 10, "mirror": 1, "glass": 1},
     "ceramic": {"plastic": 2, "rough plastic": 3, "principled": 1},
     "slat": {"rough metal": 1, "rough plastic": 1},

@@ -7,9 +7,10 @@ import numpy as np
 from scenes.animation import RigidMotion, Track, still
 from scenes.draws import one_of
 from scenes.layout import GAP, Group, Layout, laden
-from scenes.objects.catalogue import DECOR, FURNITURE
+from scenes.objects.catalogue import DECOR, FURNITURE, GLAZING
 from scenes.objects.fittings import make_picture
 from scenes.objects.furniture import make_table
+from scenes.objects.glazing import make_glazed_mirror
 from scenes.objects.seating import make_chair
 from scenes.objects.thing import Maker
 from scenes.shell import wall_pose, wall_width
@@ -93,16 +94,26 @@ def dining(layout: Layout) -> None:
         layout.try_add(Group.of(chair), still(place, side * np.pi / 2 + np.pi))
 
 
-def pictures(layout: Layout, count: int) -> None:
-    """Add up to `count` pictures to walls without openings."""
+def hang_on_walls(layout: Layout, maker: Maker, count: int) -> None:
+    """Add up to `count` pictures, or other things to hang, to walls without openings."""
     rng = layout.rng
     for _ in range(count):
         wall = int(rng.integers(4))
-        picture = make_picture(rng)
+        picture = maker(rng)
         half = wall_width(wall, layout.size) / 2 + picture.bounds[0, 0]
         top = layout.size[1] - picture.bounds[1, 1] - 0.1
         if half > 0 and top > 0.8 and wall not in layout.openings:
             layout.hang(picture, wall, rng.uniform(-half, half), rng.uniform(0.8, top), 0.004)
+
+
+def glaze(layout: Layout) -> None:
+    """Add clear glass to a third of the rooms, by draws of its own: the others are as they were without it."""
+    rng = layout.rng
+    (layout.rng,) = own = rng.spawn(1)
+    if own[0].random() < 1 / 3:
+        scattered(layout, [*GLAZING.values()], int(own[0].integers(1, 4)))
+        hang_on_walls(layout, make_glazed_mirror, int(own[0].integers(0, 3)))
+    layout.rng = rng
 
 
 def furnish(layout: Layout) -> None:
@@ -112,8 +123,9 @@ def furnish(layout: Layout) -> None:
     if rng.random() < 0.6:
         dining(layout)
     scattered(layout, list(FURNITURE.values()), int(rng.integers(2, 8)))
-    pictures(layout, int(rng.integers(0, 6)))
+    hang_on_walls(layout, make_picture, int(rng.integers(0, 6)))
     decor = list(DECOR.values())
     scattered(layout, decor, int(rng.integers(0, 8)))
     while layout.things < MIN_THINGS:
         scattered(layout, decor, MIN_THINGS - layout.things)
+    glaze(layout)

@@ -8,12 +8,14 @@ from errors import BadInput
 from scenes.animation import Scene
 from scenes.cornell import cornell_box, cornell_box_moving
 from scenes.extremes import EXTREME_SCENES, SceneBuilder
+from scenes.glass import GLASS_SCENES
 from scenes.rooms import closeup, room
 
 SCENES: dict[str, SceneBuilder] = {
     "cornell_box": cornell_box,
     "cornell_box_moving": cornell_box_moving,
     **EXTREME_SCENES,
+    **GLASS_SCENES,
 }
 
 

@@ -59,7 +59,7 @@ def write_accumulated(clip: Clip, network: FilteringNetwork[A], folder: Path) ->
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         for index, realisation in np.ndindex(shape[:2]):
-            frame = read_frame(clip, index, network.reads, realisation)
+            frame = read_frame(clip, index, network.reads, realisation, in_layers=False)
             after = network.accumulate(frame, states[realisation])
             states[realisation] = after
             file.write(after.history.irradiance[0].permute(1, 2, 0).numpy().tobytes())

@@ -85,4 +85,4 @@ class AccumulatedCrops(TorchDataset[Crops]):
         window = random_window(clip, self.crop, rng)
         irradiance = to_tensor(self.irradiance[item][position, realisation][window])
         log_scale = torch.from_numpy(self.scales[item][position, realisation])[None]
-        return Crops(read_frame(clip, position, self.channels, window=window), irradiance, log_scale)
+        return Crops(read_frame(clip, position, self.channels, window=window, in_layers=False), irradiance, log_scale)

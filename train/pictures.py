@@ -28,7 +28,7 @@ def sample_picture(denoiser: Denoiser, clip: Clip, device: torch.device) -> Tens
     state: State | None = None
     last = min(SAMPLE_FRAME, clip.frames - 1)
     for index in range(last + 1):
-        frame = read_frame(clip, index, denoiser.reads)
+        frame = read_frame(clip, index, denoiser.reads, in_layers=False)
         output, state = denoiser(frame.to(device), state)
     reference = to_tensor(clip.reference(last, denoiser.signal), has_buffers=True)[0].mean(dim=0, keepdim=True)
     images = (frame.radiance(denoiser.signal), finite(output).float().cpu(), reference)

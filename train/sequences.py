@@ -52,7 +52,7 @@ class WholeFrames:
         key = (str(clip.path), index, realisation)
         if key not in self.measured:
             light = ("indirect",) if self.signal == "indirect" else NOISY_CHANNELS
-            frame = read_frame(clip, index, (*light, "albedo", "depth"), realisation)
+            frame = read_frame(clip, index, (*light, "albedo", "depth"), realisation, in_layers=False)
             radiance = frame.irradiance(self.signal).clamp(min=0) * frame.divisor
             self.measured[key] = log_luminance_and_depth(radiance, frame.depth)
         return self.measured[key]
@@ -105,9 +105,13 @@ class TrainingSequences(TorchDataset[list[Frame]]):
         frames = []
         for time, position in enumerate(playback):
             first, *others = draw.realisations(time)
-            frame = read_frame(clip, position, self.channels, first, playback[max(time - 1, 0)], window)
+            frame = read_frame(
+                clip, position, self.channels, first, playback[max(time - 1, 0)], window, in_layers=False
+            )
             if others:
-                more = [read_frame(clip, position, self.sampled, other, window=window) for other in others]
+                more = [
+                    read_frame(clip, position, self.sampled, other, window=window, in_layers=False) for other in others
+                ]
                 frame = averaged([frame, *more])
             if self.whole_frames is not None:
                 frame = replace(frame, whole=self.whole_frames(clip, position, first))

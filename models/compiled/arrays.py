@@ -20,5 +20,6 @@ Matrix: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.bool_]  # (H, W)
 Doubles: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int32]
+Indices: TypeAlias = NDArray[np.int64]
 Index: TypeAlias = int | np.int64
 Scalar: TypeAlias = float | np.float32

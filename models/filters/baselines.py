@@ -17,6 +17,7 @@ class Noisy(Denoiser):
     refuses = CLASSICAL
     convex = True
     has_kernels = False
+    blends_layers = True
     baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

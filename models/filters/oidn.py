@@ -84,6 +84,7 @@ class OIDN(Denoiser):
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
     has_kernels = False
+    blends_layers = True
     baseline_for: tuple[Signal, ...] = ("total",)
 
     quality: OIDNQuality = "high"

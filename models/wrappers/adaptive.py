@@ -157,4 +157,4 @@ class Adaptive(Wrapper):
         inner.accumulation = accumulate_adaptively
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        return self.inner.forward(frame, state)
+        return self.inner.run(frame, state)

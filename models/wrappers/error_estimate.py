@@ -136,7 +136,7 @@ def denoise_with_error(denoiser: JamesStein, frame: Frame, state: State | None) 
     """The output of NAME+js for a frame, its state, and its error. Raises BadInput without sample buffers."""
     if not frame.has_buffers:
         raise BadInput(f"{frame.source} has no two sample buffers: its error cannot be estimated")
-    frame = frame.finite()
+    frame = frame.finite().without("second")  # whose light has no sample buffers
     inner, signal = denoiser.inner, denoiser.signal
     output, after = inner(frame, state)
     filtered = shrinkage.denoised_irradiance(output, frame, signal)

@@ -126,7 +126,7 @@ class JamesStein(Wrapper):
         return super().reads_with((*reads, *(SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        output, after = self.inner.forward(frame, state)
+        output, after = self.inner.run(frame, state)
         if not frame.has_buffers:
             return output, after
         denoised = denoised_irradiance(output, frame, self.signal)

@@ -89,7 +89,7 @@ class TAA(Wrapper):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         previous = matching_state(state, TAAState, frame)
-        output, inner = self.inner.forward(frame, previous.inner if previous else None)
+        output, inner = self.inner.run(frame, previous.inner if previous else None)
         scale = running_scale(output, frame.depth, previous.scale if previous else None)
         if previous:
             exposure = scale.exposure()

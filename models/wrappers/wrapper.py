@@ -4,8 +4,10 @@ from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
-from models.denoiser import Denoiser
+from datasets.frame import Frame
+from models.denoiser import Denoiser, State
 
 
 class Wrapper(Denoiser):
@@ -28,6 +30,9 @@ class Wrapper(Denoiser):
 
     def unavailable(self) -> str | None:
         return self.inner.unavailable()
+
+    def run(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        return self.forward(frame, state)  # the inner denoiser is run layer by layer
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         self.inner.prepare(precision)

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from tqdm import tqdm
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, SECOND_LAYER
 from datasets.clip import ClipKind, is_clip
 from datasets.writer import ClipWriter
 from files import locked
@@ -75,7 +75,8 @@ def render_to_folder(
         clock.lap("pilot")
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     sampling = Sampling(quality.realisations, noisy_spp, spp, options)
-    write_clip(folder, scene, profile.size, sampling, seed, channels, clock.read())
+    layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), clock.read())
 
 
 def write_clip(

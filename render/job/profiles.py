@@ -9,6 +9,7 @@ from typing import NamedTuple
 from datasets.clip import SPLITS
 from errors import BadInput
 from render.scene_file.description import SplitRequest, read_description
+from scenes.glass import SETTINGS
 
 
 class SamplingQuality(NamedTuple):
@@ -72,6 +73,14 @@ DATA_PROFILES = {
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
+    ),
+    # Six scenes of glass: at rest, with a camera that moves, and with things that move.
+    "glass": DataProfile(
+        size=(12, 144, 256),
+        quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048)),
+        special={
+            "test": [clip for name in SETTINGS for clip in (f"{name}/still", f"{name}/000", f"{name}-moving/000")]
+        },
     ),
 }
 

@@ -80,7 +80,7 @@ def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
     def light(depth: int) -> float:
         """Mean radiance of surfaces, each pixel's at most 1: fireflies would hide how much most of them get."""
         stage.scene = replace(scene, max_depth=depth)
-        direct, indirect = tracer.samples(rays, mi.UInt32(pixel.astype(np.uint32)), 0, PROBE_SPP)
+        direct, indirect, *_ = tracer.samples(rays, mi.UInt32(pixel.astype(np.uint32)), 0, PROBE_SPP)
         return float(np.minimum(columns(direct + indirect), 1).mean(axis=1) @ shows_no_lamp)
 
     own = light(scene.max_depth)

@@ -1,6 +1,6 @@
 """Makers of all things that stand on the floor, and of all that stand on those. Rooms draw from them in this order."""
 
-from scenes.objects import decor, fittings, furniture, plants, seating
+from scenes.objects import decor, fittings, furniture, glazing, plants, seating
 from scenes.objects.thing import Maker
 
 
@@ -44,3 +44,5 @@ DECOR = by_name(
     decor.make_basket,
     fittings.make_photo,
 )
+
+GLAZING = by_name(glazing.make_showcase, glazing.make_pane)

@@ -19,8 +19,9 @@ SurfacesBySlot = dict[str, list[Surface]]
 class ThingPart:
     """One mesh of a thing, with texture coordinates and unit outward vertex normals.
 
-    Its slot suggests a material: wood, front (doors, lids, panels), metal, stone, ceramic, glass, wax, body (anything),
-    fabric, cushion, blanket, shade, slat, leaf, stem, soil, paper, cover-1 to cover-3, frame, or print (uv in 0..1).
+    Its slot suggests a material: wood, front (doors, lids, panels), metal, stone, ceramic, glass, clear (smooth glass),
+    mirror, wax, body (anything), fabric, cushion, blanket, shade, slat, leaf, stem, soil, paper, cover-1 to cover-3,
+    frame, or print (uv in 0..1).
     """
 
     mesh: trimesh.Trimesh

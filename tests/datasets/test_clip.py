@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from datasets.channels import CHANNELS
+from datasets.channels import CHANNELS, channels_of
 from datasets.clip import Clip, Dataset
 from datasets.frame import ChannelTensor, Frame
 from datasets.info import find_problems, problems_of_clip
@@ -46,7 +46,8 @@ def test_stored_arrays_are_what_was_rendered(tiny):
 
 def test_frames_have_an_attribute_for_every_image_channel():
     attributes = {name for name, value in vars(Frame).items() if isinstance(value, ChannelTensor)}
-    assert attributes == {name for name, channel in CHANNELS.items() if channel.is_image and channel.kind != "mirrored"}
+    of_layers = set(channels_of("mirrored", "second"))
+    assert attributes == {name for name, channel in CHANNELS.items() if channel.is_image} - of_layers
 
 
 def test_derived_motion_equals_rendered_motion(tiny):

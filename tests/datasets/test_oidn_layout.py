@@ -60,7 +60,7 @@ def test_every_realisation_of_every_frame_is_an_input_with_its_reference(exporte
             for realisation in range(clip.realisations)
         }
         assert groups.keys() == expected
-        assert len(list((out / folder).iterdir())) == 4 * len(groups)
+        assert len(list((out / folder).iterdir())) == 6 * len(groups)
         for group, images in groups.items():
             assert images == ([f"{group}_0001spp"], f"{group}_reference")
         total += len(groups)
@@ -78,6 +78,7 @@ def test_pixels_are_those_of_the_data_set_bit_for_bit(exported):
     np.testing.assert_allclose(read(folder, target, "hdr"), sum(lights).mean(axis=0), rtol=1e-6)
     for feature, channel in (("alb", "albedo"), ("nrm", "normal")):
         image = read(folder, noisy, feature)
+        np.testing.assert_array_equal(image, read(folder, target, feature))
         assert image.dtype == np.float16 and image.tobytes() == np.ascontiguousarray(clip.read(channel, 5)).tobytes()
     assert read(folder, noisy, "hdr").dtype == read(folder, target, "hdr").dtype == np.float32
 

@@ -9,7 +9,8 @@ import trimesh
 
 from provenance import ROOT
 from render.clip import Sampling, render_clip
-from render.gbuffer import MAX_BLUR, render_gbuffer
+from render.gbuffer import render_gbuffer
+from render.look_through import MAX_BLUR
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.camera import pixel_centres, unproject

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scenes.meshes import blob, circle, disc, gem, hollow, lathe, leaf, silhouette, slab, solid, superellipsoid, tube
-from scenes.objects.catalogue import DECOR, FURNITURE
+from scenes.objects.catalogue import DECOR, FURNITURE, GLAZING
 from scenes.objects.fittings import make_blind, make_curtain, make_pendant, make_picture
 from scenes.objects.thing import Thing
 from tests.helpers.scenes import SEEDS
 
-STANDING = {**FURNITURE, **DECOR}
+STANDING = {**FURNITURE, **DECOR, **GLAZING}
 HANGING = {"picture": make_picture, "pendant": make_pendant}
 HANGING |= {"blind": lambda rng: make_blind(rng, 1.2, 1.4), "curtain": lambda rng: make_curtain(rng, 1.1, 2.3)}
 THIN = ("leaf", "shade", "print", "fabric")  # sheets rather than bodies, in some things

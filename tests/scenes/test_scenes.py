@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from errors import BadInput
 from scenes.animation import Track
 from scenes.camera import intrinsics, inverse_pose, look_at
+from scenes.glass import GLASS_SCENES
 from scenes.registry import SCENES, build_scene
 from tests.helpers.scenes import FRAMES, SEEDS
 
@@ -19,7 +20,7 @@ def placed(scene, name, frame):
     return shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", sorted(SCENES.keys() - GLASS_SCENES.keys()))  # glass has no random flights
 def test_same_seed_same_scene(name):
     a, b, other = (build_scene(name, seed, FRAMES).view(7.5, 64, 64) for seed in (5, 5, 6))
     assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))

@@ -69,7 +69,7 @@ def test_accumulating_is_done_once_and_whole(clips, cache, tmp_path, monkeypatch
     monkeypatch.setattr(accumulation, "read_frame", lambda *_: pytest.fail("accumulated again"))
     accumulate_clip(clips[0], wskp, cache)
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(accumulation, "read_frame", interrupted)

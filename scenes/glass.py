@@ -1,0 +1,251 @@
+"""Scenes of glass: a pane, vessels on a table, a solid sphere, a frosted door, coated metal and a vitrine. Metres.
+
+Each by itself with a camera that moves, and as NAME-moving with a camera at rest and things that move.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scenes.animation import AT_REST, Camera, RigidMotion, Scene, Shape, Track, still
+from scenes.bsdf import Bsdf, bitmap, diffuse_bsdf, rgb
+from scenes.camera import Array
+from scenes.draws import Rng
+from scenes.finish import GLASS
+from scenes.meshes import Surface, hollow, lathe, silhouette, slab, solid, superellipsoid, tube
+from scenes.sky import sky
+from scenes.textures import Pattern, bond, texture
+
+CLEAR_GLASS: Bsdf = {"type": "dielectric", "int_ior": GLASS}
+WATER: Bsdf = {"type": "dielectric", "int_ior": 1.33}
+FROSTED: Bsdf = {"type": "roughdielectric", "int_ior": GLASS, "alpha": 0.2}
+SILVER: Bsdf = {"type": "conductor", "material": "Ag"}
+GLASS_DEPTH = 10  # path edges: through a vitrine and back
+
+
+def painted(*colour: float) -> Bsdf:
+    return diffuse_bsdf(rgb(colour))
+
+
+def thing(name: str, surface: Surface, bsdf: Bsdf, motion: RigidMotion = AT_REST) -> Shape:
+    return Shape(name, surface.mesh(), bsdf, motion=motion, smooth=surface.smooth)
+
+
+def lamp(name: str, surface: Surface, radiance: Sequence[float]) -> Shape:
+    return Shape(name, surface.mesh(), painted(0.5, 0.5, 0.5), radiance=Track.constant(radiance))
+
+
+def room(rng: Rng, width: float, height: float, depth: float, front: bool = True) -> list[Shape]:
+    """Floor, ceiling and walls about the y axis; without its front (towards -z) if that is open."""
+    wall = 0.1
+    sides = [
+        thing("floor", slab(width, wall, depth).at(0, -wall), diffuse_bsdf(bitmap(texture(rng), 0.7))),
+        thing("ceiling", slab(width, wall, depth).at(0, height), painted(0.8, 0.8, 0.8)),
+        thing("left", slab(wall, height, depth).at(-(width + wall) / 2), diffuse_bsdf(bitmap(texture(rng), 0.5))),
+        thing("right", slab(wall, height, depth).at((width + wall) / 2), diffuse_bsdf(bitmap(texture(rng), 0.5))),
+        thing("behind", slab(width, height, wall).at(z=(depth + wall) / 2), diffuse_bsdf(bitmap(texture(rng), 0.5))),
+    ]
+    return (
+        [*sides, thing("front", slab(width, height, wall).at(z=-(depth + wall) / 2), painted(0.7, 0.7, 0.65))]
+        if front
+        else sides
+    )
+
+
+def slide(frames: int, start: ArrayLike, step: ArrayLike, turn: float = 0.0) -> RigidMotion:
+    """From `start` (3,) on by `step` (3,) a frame, turning by `turn` radians a frame."""
+    last = max(frames - 1, 1)
+    ends = np.stack([np.asarray(start, float), np.asarray(start, float) + last * np.asarray(step, float)])
+    return RigidMotion(Track(ends, 0, last), Track(np.array([0.0, turn * last]), 0, last))
+
+
+class Setting(NamedTuple):
+    """A scene for a camera that moves between two places, and what moves in it instead, by name."""
+
+    shapes: list[Shape]
+    eyes: tuple[Sequence[float], Sequence[float]]
+    target: Sequence[float]
+    x_fov: float
+    motions: dict[str, RigidMotion]
+    sky: Array | None = None
+
+
+def pane(rng: Rng, frames: int) -> Setting:
+    """A window at dusk: a street behind it, and the lit room reflected in it."""
+    brick, joint = bond(6, 16, 0.5 * (np.arange(16) % 2))
+    bricks = Pattern(rng.uniform(0, 1, 96)[brick], np.where(joint < 0.006, 1.3, 1.0))
+    facade = np.clip(
+        np.array([0.35, 0.16, 0.1]) * (0.6 + 0.6 * bricks.tone[..., None]) * bricks.shade[..., None], 0.02, 0.9
+    )
+    wall = [
+        thing("sill", slab(4, 0.8, 0.1), painted(0.75, 0.72, 0.65)),
+        thing("lintel", slab(4, 0.4, 0.1).at(0, 2.2), painted(0.75, 0.72, 0.65)),
+        *(
+            thing(f"post {side}", slab(0.6, 1.4, 0.1).at(1.7 * side, 0.8), painted(0.75, 0.72, 0.65))
+            for side in (-1, 1)
+        ),
+    ]
+    street = [
+        thing("road", slab(30, 0.1, 12).at(0, -0.5, -6.5), painted(0.2, 0.2, 0.22)),
+        thing("kerb", slab(30, 0.15, 1.5).at(0, -0.4, -8), diffuse_bsdf(bitmap(texture(rng), 0.5))),
+        thing("facade", slab(30, 8, 0.3).at(0, -0.4, -9), diffuse_bsdf(bitmap(facade.astype(np.float32), 0.4))),
+        *(lamp(f"window {i}", slab(0.9, 1.2, 0.1).at(2.2 * i - 4.4, 1.3, -8.85), (0.8, 0.6, 0.3)) for i in (0, 2, 3)),
+        thing(
+            "car",
+            superellipsoid(2.6, 1.1, 1.2, 5, 3).at(0, -0.35),
+            painted(0.7, 0.06, 0.04),
+            still((0.4, 0, -5), 0),
+        ),
+    ]
+    inside = [replace(shape, motion=still((0, 0, 2), 0)) for shape in room(rng, 4, 2.6, 4, front=False)]
+    ball = thing("ball", superellipsoid(0.5, 0.5, 0.5, 2, 4), painted(0.1, 0.5, 0.2), still((-0.5, 0.9, 1.0), 0))
+    shapes = [*wall, thing("pane", slab(2.8, 1.4, 0.01).at(0, 0.8), CLEAR_GLASS), *street, *inside, ball]
+    shapes += [lamp("lamp", slab(2.4, 0.04, 1.4).at(0.6, 2.5, 2.6), (2, 1.8, 1.5))]
+    motions = {
+        "car": slide(frames, (-1.2, 0, -5), (0.12, 0, 0)),
+        "ball": slide(frames, (-0.5, 0.9, 1.0), (0.03, 0, 0.01)),
+    }
+    return Setting(shapes, ((0.4, 1.5, 2.6), (0.7, 1.55, 2.4)), (0.0, 1.35, 0), 62, motions, 0.3 * sky(rng, sun=None))
+
+
+def table(rng: Rng, frames: int) -> Setting:
+    """A bottle and a glass of water with a straw on a patterned table."""
+    radii = np.array([0.95, 1, 1, 0.95, 0.4, 0.36, 0.38]) * 0.045
+    bottle = lathe(hollow(silhouette(radii, 0.3, 40), 0.003, 0.01), 64)
+    tumbler = lathe(hollow(silhouette([0.032, 0.036, 0.038], 0.12, 16), 0.002, 0.008), 64)
+    water = lathe(solid(silhouette([0.0297, 0.0322, 0.0342], 0.07, 16)), 64)
+    shapes = [
+        *room(rng, 3, 2.4, 3),
+        thing("table", slab(1.2, 0.04, 0.8).at(0, 0.7), diffuse_bsdf(bitmap(texture(rng), 2.5))),
+        thing("bottle", bottle.at(-0.09, 0.741), CLEAR_GLASS),
+        thing("glass", tumbler.at(0.07, 0.741, 0.05), CLEAR_GLASS),
+        thing("water", water.at(0.07, 0.7495, 0.05), WATER),
+        thing("straw", tube([(0.062, 0.765, 0.05), (0.095, 0.93, 0.04)], 0.003), painted(0.8, 0.1, 0.1)),
+        thing("box", slab(0.12, 0.18, 0.12).at(0.02, 0.74, -0.22), painted(0.1, 0.25, 0.6)),
+        thing(
+            "can", lathe(solid(silhouette([0.04, 0.04], 0.13, 4)), 48).at(0.2, 0.74, -0.15), painted(0.75, 0.55, 0.1)
+        ),
+        lamp("softbox", slab(2.2, 0.04, 2.2).at(0.2, 2.3, 0.2), (2.4, 2.4, 2.2)),
+    ]
+    motions = {"box": slide(frames, (-0.12, 0, 0), (0.012, 0, 0), 0.02)}
+    return Setting(shapes, ((0.0, 1.02, 0.62), (0.1, 1.0, 0.6)), (0.0, 0.82, 0), 45, motions)
+
+
+def sphere(rng: Rng, frames: int) -> Setting:
+    """A solid ball of glass before blocks."""
+    shapes = [
+        *room(rng, 4, 2.6, 4),
+        thing("ball", superellipsoid(0.7, 0.7, 0.7, 2, 5).at(0, 0.002), CLEAR_GLASS),
+        thing("cube", slab(0.35, 0.35, 0.35).at(-0.45, 0, -0.8), painted(0.7, 0.1, 0.08)),
+        thing("tower", slab(0.3, 0.9, 0.3).at(0.5, 0, -0.9), diffuse_bsdf(bitmap(texture(rng), 1.5))),
+        thing("cone", lathe(solid([(0.2, 0), (0.01, 0.5)]), 48).at(0.05, 0, -1.1), painted(0.1, 0.3, 0.7)),
+        lamp("softbox", slab(2.4, 0.04, 2.4).at(0.5, 2.5, 0.5), (2.6, 2.4, 2.2)),
+    ]
+    motions = {"cone": slide(frames, (-0.4, 0, 0), (0.04, 0, 0))}
+    return Setting(shapes, ((0.0, 0.75, 1.7), (0.2, 0.7, 1.65)), (0, 0.38, 0), 50, motions)
+
+
+def door(rng: Rng, frames: int) -> Setting:
+    """A door of frosted glass beside a clear pane, and a lit room behind both."""
+    frame = painted(0.5, 0.5, 0.52)
+    shapes = [
+        *room(rng, 4, 2.5, 5),
+        *(thing(f"post {i}", slab(0.08, 2.3, 0.08).at(x), frame) for i, x in enumerate((-1.0, 0.0, 1.0))),
+        thing("beam", slab(4, 0.2, 0.1).at(0, 2.3), frame),
+        *(thing(f"wall {side}", slab(0.96, 2.3, 0.08).at(1.52 * side), painted(0.7, 0.68, 0.6)) for side in (-1, 1)),
+        thing("door", slab(0.9, 2.28, 0.012).at(-0.5, 0.01), FROSTED),
+        thing("clear", slab(0.9, 2.28, 0.012).at(0.5, 0.01), CLEAR_GLASS),
+        thing("chest", slab(0.5, 0.8, 0.4).at(-0.4, 0, -0.6), painted(0.65, 0.2, 0.05)),
+        thing("plinth", slab(0.3, 1.1, 0.3).at(0.6, 0, -1.2), diffuse_bsdf(bitmap(texture(rng), 1.5))),
+        thing("ball", superellipsoid(0.45, 0.45, 0.45, 2, 4).at(0.5, 0, -0.5), painted(0.05, 0.35, 0.6)),
+        lamp("lamp behind", slab(2.4, 0.04, 1.8).at(0, 2.45, -1.3), (1.7, 1.6, 1.3)),
+        lamp("lamp", slab(1.6, 0.04, 1.6).at(0.5, 2.45, 1.3), (0.7, 0.7, 0.7)),
+    ]
+    motions = {"ball": slide(frames, (-1.0, 0, 0), (0.08, 0, 0))}
+    return Setting(shapes, ((0.2, 1.35, 1.9), (-0.05, 1.35, 1.9)), (0.0, 1.0, -0.3), 62, motions)
+
+
+def coat(rng: Rng, frames: int) -> Setting:
+    """Metal under a clear coat."""
+    outline = silhouette(np.array([0.9, 1.0, 0.85, 0.45, 0.4, 0.55]) * 0.3, 0.8, 40) + np.array([0, 0.003])
+    copper: Bsdf = {"type": "roughconductor", "material": "Cu", "alpha": 0.2}
+    shapes = [
+        *room(rng, 4, 2.6, 4),
+        thing("vase", lathe(solid(outline - np.array([0.004, 0])), 96), copper),
+        thing(
+            "coat",
+            lathe(solid(np.stack([outline[0] - [0, 0.002], *outline, outline[-1] + [0, 0.004]])), 96),
+            CLEAR_GLASS,
+        ),
+        thing(
+            "plate", slab(0.6, 0.5, 0.03).at(-0.65, 0, -0.3), {"type": "roughconductor", "material": "Al", "alpha": 0.2}
+        ),
+        thing("plate's coat", slab(0.612, 0.512, 0.042).at(-0.65, -0.006, -0.3), CLEAR_GLASS),
+        thing("cube", slab(0.3, 0.3, 0.3).at(0.55, 0, 0.3), painted(0.7, 0.1, 0.08)),
+        thing("tower", slab(0.25, 1.0, 0.25).at(0.6, 0, -0.6), diffuse_bsdf(bitmap(texture(rng), 1.5))),
+        lamp("softbox", slab(2.0, 0.04, 2.0).at(0.7, 2.5, 0.7), (3, 2.8, 2.4)),
+    ]
+    motions = {"cube": slide(frames, (-0.15, 0, 0.2), (0.025, 0, 0), 0.03)}
+    return Setting(shapes, ((-0.1, 0.85, 1.6), (0.15, 0.85, 1.6)), (0, 0.4, 0), 52, motions)
+
+
+def vitrine(rng: Rng, frames: int) -> Setting:
+    """A glass case with a mirror at its back, figures and a lamp in it."""
+    edge = 0.02
+    walls = {
+        "left": (edge, 0.7, 0.5, -0.5, 0.0),
+        "right": (edge, 0.7, 0.5, 0.5, 0.0),
+        "front glass": (0.98, 0.7, 0.008, 0.0, 0.25),
+    }
+    shapes = [
+        *room(rng, 4, 2.6, 4),
+        thing("plinth", slab(1.1, 0.8, 0.6), diffuse_bsdf(bitmap(texture(rng), 1.2))),
+        *(thing(f"{name} pane", slab(w, h, d).at(x, 0.802, z), CLEAR_GLASS) for name, (w, h, d, x, z) in walls.items()),
+        thing("lid", slab(1.06, 0.03, 0.56).at(0, 1.504), painted(0.3, 0.2, 0.1)),
+        thing("mirror", slab(0.96, 0.68, 0.01).at(0, 0.803, -0.24), SILVER),
+        thing("ball", superellipsoid(0.2, 0.2, 0.2, 2, 4).at(-0.25, 0.801), painted(0.7, 0.1, 0.05)),
+        thing(
+            "figure",
+            lathe(solid(silhouette([0.07, 0.03, 0.08, 0.05, 0.02], 0.4, 30)), 48).at(0.05, 0.801),
+            painted(0.7, 0.6, 0.1),
+        ),
+        thing("cube", slab(0.15, 0.15, 0.15).at(0.3, 0.801, 0.03), painted(0.1, 0.2, 0.65)),
+        lamp("strip", slab(0.9, 0.02, 0.4).at(0, 1.482, 0.0), (2.2, 2, 1.7)),
+        lamp("lamp", slab(2.2, 0.04, 2.2).at(-0.4, 2.5, 0.6), (0.7, 0.66, 0.6)),
+    ]
+    motions = {"cube": slide(frames, (-0.1, 0, 0.0), (0.008, 0, 0), 0.04)}
+    return Setting(shapes, ((0.25, 1.3, 1.3), (0.05, 1.3, 1.35)), (0, 1.12, 0), 50, motions)
+
+
+SETTINGS: dict[str, Callable[[Rng, int], Setting]] = {
+    "glass-pane": pane,
+    "glass-table": table,
+    "glass-sphere": sphere,
+    "glass-door": door,
+    "glass-coat": coat,
+    "glass-vitrine": vitrine,
+}
+TEXTURE_SEED = 7  # they look alike in all clips
+
+
+def scene_of(setting: Setting, camera_moves: bool, frames: int) -> Scene:
+    eyes = np.array(setting.eyes if camera_moves else setting.eyes[:1])
+    camera = Camera(Track(eyes, 0, max(frames - 1, 1)), Track.constant(setting.target), Track.constant(setting.x_fov))
+    motions = {} if camera_moves else setting.motions
+    shapes = [replace(shape, motion=motions.get(shape.name, shape.motion)) for shape in setting.shapes]
+    return Scene(tuple(shapes), camera, GLASS_DEPTH, setting.sky)
+
+
+def builder(name: str, camera_moves: bool) -> Callable[[Rng, int], Scene]:
+    def build(rng: Rng, frames: int) -> Scene:
+        return scene_of(SETTINGS[name](np.random.default_rng(TEXTURE_SEED), frames), camera_moves, frames)
+
+    return build
+
+
+GLASS_SCENES = {name: builder(name, True) for name in SETTINGS} | {
+    f"{name}-moving": builder(name, False) for name in SETTINGS
+}
