@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
-from weakref import proxy
+from weakref import finalize, proxy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +153,7 @@ def event_of(stage: Stage) -> Callable[..., Sight]:
         own = proxy(stage)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
         stage.event = dr.freeze(lambda *arguments: one_further(own, *arguments), state_fn=lambda *_, **__: state)
         stage.event_pose = stage.poses
+        finalize(stage, stage.event.clear)  # else its recordings would keep the scene
     return stage.event
 
 

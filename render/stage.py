@@ -1,5 +1,6 @@
 """An animated scene in Mitsuba, posed for one frame at a time without recompiling kernels."""
 
+import gc
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +49,7 @@ class Stage:
     """
 
     def __init__(self, scene: Scene, height: int, width: int):
+        gc.collect()  # recordings keep earlier scenes, which every virtual call would trace too
         self.scene = scene = replace(scene, shapes=tuple(map(with_placed_textures, scene.shapes)))
         self.height = height
         self.width = width
