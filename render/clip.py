@@ -12,8 +12,8 @@ from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS
 from render.backend import mi
 from render.first_bounce import hit_channels
 from render.gbuffer import light_of_second_layer, render_gbuffer
+from render.glass_motion import chains_through_glass, traced_motion
 from render.gradient import GradientSamples
-from render.look_through import chains_through_glass, traced_motion
 from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
 from render.path import PathTracer, SampleRange
 from render.stage import Stage

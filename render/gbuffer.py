@@ -8,21 +8,18 @@ from numpy.typing import NDArray
 from datasets.channels import BACKGROUND, MIRRORED, SECOND
 from render.backend import dr, mi
 from render.loading import columns
-from render.look_through import Sight, look_through
-from render.specular import specular_light
+from render.look_through import Shown, Sight, look_through, surface_channels
+from render.specular_light import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
 
 
-def depth_along_axis(
-    stage: Stage, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, view: View, beyond: mi.Float | None = None
-) -> NDArray[np.float32]:
+def depth_along_axis(stage: Stage, length: mi.Float, ray: mi.Ray3f, view: View) -> NDArray[np.float32]:
     """Depth (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored.
 
-    `beyond` is the length of the path, in Mitsuba's units, after its reflection by a mirror at `si`.
+    `length` is that of the path in Mitsuba's units, 0 where nothing is hit.
     """
-    length = si.t if beyond is None else si.t + beyond
-    distance = np.array(dr.select(si.is_valid(), length, 0), dtype=np.float64) * stage.unit
+    distance = np.array(length, dtype=np.float64) * stage.unit
     depth = distance * (columns(ray.d).astype(np.float64) @ view.camera_to_world[:3, 2])
     if stage.has_cutouts:  # rays begin behind those that they have passed
         begins = columns(ray.o).astype(np.float64) * stage.unit - view.camera_to_world[:3, 3]
@@ -42,33 +39,26 @@ def trace_visible(stage: Stage, view: View, pixels: Array) -> VisibleSurface:
     ray = stage.rays(view, pixels.reshape(-1, 2))
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
     mesh_id = stage.mesh_id(si)
-    dr.eval(si.t, si.n, mesh_id)
-    depth = depth_along_axis(stage, si, ray, view).astype(np.float64)
+    length = dr.select(si.is_valid(), si.t, 0)
+    dr.eval(length, si.n, mesh_id)
+    depth = depth_along_axis(stage, length, ray, view).astype(np.float64)
     normal = columns(si.n).astype(np.float64)
     return VisibleSurface(depth.reshape(shape), np.array(mesh_id).reshape(shape), normal.reshape(*shape, 3))
 
 
-def surface_channels(stage: Stage, sight: Sight) -> dict[str, dr.AnyArray]:
-    valid = sight.si.is_valid()
-    normal = stage.normals.evaluate(sight.si, valid)
-    normal = sight.turned_back(dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal))
-    albedo, roughness = stage.materials.evaluate(sight.si, valid)
-    return {
-        "normal": dr.select(valid, normal, mi.Vector3f(0)),
-        "albedo": sight.tint * albedo,
-        "roughness": roughness,
-        "mesh_id": stage.mesh_id(sight.si),
-    }
+def own_surface(stage: Stage, ray: mi.Ray3f) -> tuple[dict[str, dr.AnyArray], mi.Float, mi.Bool]:
+    """(channels of what primary rays hit, their length or 0, whether it reflects or transmits perfectly specularly)."""
+    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    channels = {**surface_channels(stage, Sight.along(ray, si)), "emission": stage.lights.at(si).eval(si)}
+    return channels, dr.select(si.is_valid(), si.t, 0), stage.specular.at(si.bsdf(), si.is_valid())
 
 
 def layer_channels(
-    stage: Stage, view: View, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, sight: Sight, forms: dict[str, str]
+    stage: Stage, view: View, ray: mi.Ray3f, shown: Shown, forms: dict[str, str]
 ) -> dict[str, NDArray[Any]]:
-    """What mirrors and glass at the ends `si` of primary rays show, by the names of its channels in `forms`."""
-    channels = surface_channels(stage, sight)
-    dr.eval(channels, sight.beyond, sight.reflectance)
-    depth = depth_along_axis(stage, si, ray, view, sight.beyond)
-    arrays = {forms[name]: stage.image(value) for name, value in channels.items()}
+    """What mirrors and glass show along primary rays, by the names of its channels in `forms`."""
+    depth = depth_along_axis(stage, shown.length, ray, view)
+    arrays = {forms[name]: stage.image(value) for name, value in shown.channels.items()}
     return arrays | {forms["depth"]: depth.reshape(stage.height, stage.width, 1)}
 
 
@@ -94,42 +84,38 @@ def render_gbuffer(
     glass_reflectance: the probability of reflection where samples split; 0 without glass.
     """
     ray = stage.rays(view)
-    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    channels = {**surface_channels(stage, Sight.along(ray, si)), "emission": stage.lights.at(si).eval(si)}
-    shines = stage.specular.at(si.bsdf(), si.is_valid())
-    dr.eval(channels, si.t, shines)
+    channels, length, shines = stage.replay(own_surface, ray)
     arrays = {name: stage.image(value) for name, value in channels.items()}
     events = stage.max_events(regularise)
-    if np.array(shines).any():
-        scene, lights, specular = stage.mitsuba_scene, stage.lights, stage.specular
-        light = specular_light(scene, lights, specular, ray, events, np.array(shines), stage.freezes)
-        arrays["emission"] = np.where(stage.image(shines), light.reshape(arrays["emission"].shape), arrays["emission"])
-    arrays["depth"] = depth_along_axis(stage, si, ray, view).reshape(stage.height, stage.width, 1)
+    shiny = np.array(shines)
+    if shiny.any():
+        light = specular_light(stage, ray, events, shiny).reshape(arrays["emission"].shape)
+        arrays["emission"] = np.where(stage.image(shines), light, arrays["emission"])
+    arrays["depth"] = depth_along_axis(stage, length, ray, view).reshape(stage.height, stage.width, 1)
     if stage.looks_through:
-        arrays |= layers(stage, view, si, ray, arrays, events, np.array(shines).any(), in_layers)
+        arrays |= layers(stage, view, ray, arrays, events, shiny.any(), in_layers)
     return arrays
 
 
 def layers(
     stage: Stage,
     view: View,
-    si: Any,
     ray: mi.Ray3f,
     own: dict[str, NDArray[Any]],
     max_splits: int,
     shines: bool,
     in_layers: bool,
 ) -> dict[str, NDArray[Any]]:
-    """What mirrors and glass at the ends `si` of primary rays show, if there are any: whether any `shines`.
+    """What mirrors and glass show along primary rays, if there are any: whether any `shines`.
 
     `own` are the channels of what the primary rays hit, with which all begins.
     """
     arrays = {MIRRORED[name]: own[name] for name in MIRRORED.keys() & own.keys()}
     reflectance = np.zeros_like(own["depth"])
     if shines or stage.materials.has_mirrors:
-        sight = look_through(stage, view, ray, si, max_splits=max_splits)
-        arrays = layer_channels(stage, view, si, ray, sight, MIRRORED)
-        reflectance = stage.image(sight.reflectance)
+        shown = look_through(stage, view, ray, max_splits=max_splits)
+        arrays = layer_channels(stage, view, ray, shown, MIRRORED)
+        reflectance = stage.image(shown.reflectance)
     if stage.glass is None or not in_layers:
         return arrays
     second = {
@@ -137,9 +123,9 @@ def layers(
     }
     splits = splits_at(reflectance)
     if splits.any():
-        sight = look_through(stage, view, ray, si, rarer_first=True, max_splits=max_splits)
-        shown = layer_channels(stage, view, si, ray, sight, SECOND)
-        second = {name: np.where(splits, shown[name], background) for name, background in second.items()}
+        shown = look_through(stage, view, ray, rarer_first=True, max_splits=max_splits)
+        rarer = layer_channels(stage, view, ray, shown, SECOND)
+        second = {name: np.where(splits, rarer[name], background) for name, background in second.items()}
     return {**arrays, **second, "glass_reflectance": reflectance}
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from datasets.channels import LUMINANCE_WEIGHTS, STRATUM
 from render.backend import mi
 from render.gbuffer import trace_visible
-from render.loading import aligned, columns
+from render.loading import columns, copied
 from render.motion import is_same_surface
 from render.path import PathTracer, SampleRange
 from scenes.camera import Array, View, move, project, unproject
@@ -76,7 +76,7 @@ class GradientSamples(NamedTuple):
         place = project(point, self.mesh_id > 0, now)
         visible = is_same_surface(point, self.mesh_id, place, trace_visible(stage, now, place), now)
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
-        pixel = mi.UInt32(aligned(self.pixel.astype(np.uint32)))
+        pixel = copied(mi.UInt32(self.pixel.astype(np.uint32)))
         direct, indirect, *_ = tracer.samples(stage.rays(now, place), pixel, *self.draw)
         shaded = sample_luminance(columns(direct) + columns(indirect))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)

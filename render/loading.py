@@ -14,7 +14,7 @@ from render.backend import dr, mi
 from scenes.animation import Shape, StockLight, StockShape
 from scenes.bsdf import Bsdf
 
-T = TypeVar("T", np.float32, np.uint32)
+ArrayT = TypeVar("ArrayT", bound=dr.AnyArray)
 
 
 PLACE = "_place"  # where a file describes it: a key in descriptions that Mitsuba does not get
@@ -94,21 +94,21 @@ def load_mesh(shape: Shape) -> mi.Mesh:
     return mesh
 
 
-def aligned(values: NDArray[T]) -> NDArray[T]:
-    """`values` (N,), of 4 bytes each, with 64-byte alignment.
+def copied(borrowed: ArrayT) -> ArrayT:
+    """An array made from numpy's, in Dr.Jit's own memory.
 
-    On the CPU Dr.Jit borrows numpy's memory and compiles its alignment into kernels.
+    On the CPU Dr.Jit borrows numpy's memory. It compiles the alignment of such memory into kernels, and recordings of
+    frozen functions (Dr.Jit 1.5) miss that another array has taken its place.
     """
-    spare = 64 // 4
-    buffer = np.empty(len(values) + spare, values.dtype)
-    start = -(buffer.ctypes.data // 4) % spare
-    buffer[start : start + len(values)] = values
-    return buffer[start : start + len(values)]
+    own: ArrayT = dr.select(dr.opaque(mi.Bool, True), borrowed, 0)
+    dr.eval(own)
+    dr.sync_thread()  # numpy may free its memory now
+    return own
 
 
 def upload(values: NDArray[np.floating]) -> mi.Float:
     """`values` (N,) as data for kernels; Python numbers would be compiled in."""
-    return mi.Float(aligned(values.astype(np.float32)))
+    return copied(mi.Float(values.astype(np.float32)))
 
 
 def columns(vector: Iterable[dr.AnyArray]) -> NDArray[Any]:

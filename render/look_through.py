@@ -6,30 +6,21 @@ description (after the path-space decomposition of Zimmer et al. 2015): one by t
 at the first glass on the way, one by the other. Behind it both take the more frequent one.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
-from weakref import finalize, proxy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from render.backend import dr, mi
-from render.loading import columns, upload
-from render.palette import palette
+from render.loading import upload
 from render.specular import BsdfSet
 from render.stage import Stage
-from scenes.camera import FAR_OUTSIDE, Array, View, move, pixel_centres
+from scenes.camera import View
 
 MAX_MIRRORS = 4  # along a ray
 LONGEST_CHAIN = 12  # in scenes with glass
 # Of what a surface reflects, in pixels: where it is blurred more, its own guides serve denoisers better.
 MAX_BLUR = 0.75
-NEWTON_STEPS = 6
-PROBE = 0.25  # px between the rays from which derivatives are estimated
-MAX_STEP = 8.0  # px
-EXACT, FOUND_WITHIN = 0.02, 0.5  # px
 ALMOST_ONE = 1 - 2.0**-24  # as a random number: it chooses transmission wherever there is any
 
 
@@ -144,107 +135,57 @@ def one_further(
     return result
 
 
-def event_of(stage: Stage) -> Callable[..., Sight]:
-    """`one_further` on a stage in its pose, recorded where Dr.Jit can: tracing it takes longer than running it."""
-    if not stage.freezes or stage.has_cutouts:
-        return partial(one_further, stage)
-    if stage.event_pose != stage.poses:
-        state = (palette(), stage.mitsuba_scene, stage.materials.state(), stage.specular, stage.glass)
-        own = proxy(stage)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
-        stage.event = dr.freeze(lambda *arguments: one_further(own, *arguments), state_fn=lambda *_, **__: state)
-        stage.event_pose = stage.poses
-        finalize(stage, stage.event.clear)  # else its recordings would keep the scene
-    return stage.event
-
-
-def look_through(
-    stage: Stage, view: View, ray: mi.Ray3f, si: Any, rarer_first: bool = False, max_splits: int = 1
+def chain_end(
+    stage: Stage, ray: mi.Ray3f, si: Any, focal: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32
 ) -> Sight:
-    """What mirrors and glass at the ends `si` of primary rays show.
+    """What mirrors and glass at the ends `si` of primary rays show: the loop over events runs in the kernel."""
+    longest = MAX_MIRRORS if stage.glass is None else LONGEST_CHAIN
+
+    def step(number: mi.UInt32, sight: Sight) -> tuple[mi.UInt32, Sight]:
+        return number + 1, one_further(stage, sight, si.t, focal, rarer_first, number < max_splits)
+
+    start = mi.UInt32(0), Sight.along(ray, si)
+    return dr.while_loop(start, lambda number, sight: (number < longest) & sight.goes_on, step)[1]
+
+
+def surface_channels(stage: Stage, sight: Sight) -> dict[str, dr.AnyArray]:
+    """The channels of a surface as the eye sees it, but for depth, by name."""
+    valid = sight.si.is_valid()
+    normal = stage.normals.evaluate(sight.si, valid)
+    normal = sight.turned_back(dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal))
+    albedo, roughness = stage.materials.evaluate(sight.si, valid)
+    return {
+        "normal": dr.select(valid, normal, mi.Vector3f(0)),
+        "albedo": sight.tint * albedo,
+        "roughness": roughness,
+        "mesh_id": stage.mesh_id(sight.si),
+    }
+
+
+@dataclass
+class Shown:
+    """What primary rays show behind mirrors and glass."""
+
+    channels: dict[str, dr.AnyArray]  # but for depth
+    length: mi.Float  # apparent, of the whole path in Mitsuba's units; 0 where the primary ray hits nothing
+    point: mi.Point3f  # where the path ends
+    through_glass: mi.Bool
+    reflectance: mi.Float  # as in Sight
+
+
+def shown(stage: Stage, ray: mi.Ray3f, focal: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32) -> Shown:
+    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    sight = chain_end(stage, ray, si, focal, rarer_first, max_splits)
+    length = dr.select(si.is_valid(), si.t + sight.beyond, 0)
+    through_glass = sight.glass & (sight.beyond > 0)
+    return Shown(surface_channels(stage, sight), length, sight.si.p, through_glass, sight.reflectance)
+
+
+def look_through(stage: Stage, view: View, ray: mi.Ray3f, rarer_first: bool = False, max_splits: int = 1) -> Shown:
+    """What primary rays of `view` show behind mirrors and glass, with the stage posed for its frame.
 
     Rays split at the first glass, if it is among the first `max_splits` events. rarer_first: follow the rarer branch
     there.
     """
-    sight = Sight.along(ray, si)
     focal = upload(np.abs(view.K[:1, 0]))
-    follow = event_of(stage)
-    dr.make_opaque(sight, si.t)  # as after an event: literals would need a recording of their own
-    for number in range(MAX_MIRRORS if stage.glass is None else LONGEST_CHAIN):
-        flags = dr.opaque(mi.Bool, rarer_first), dr.opaque(mi.Bool, number < max_splits)
-        sight = follow(sight, si.t, focal, *flags)
-        dr.eval(sight)
-        if not dr.any(sight.goes_on):
-            break
-    return sight
-
-
-class TracedChains(NamedTuple):
-    """The chains of specular events through `pixels` (N, 2), by the rarer branch at the first glass or the other."""
-
-    pixels: Array
-    rarer_first: bool
-    ends: Array  # (N, 3), world
-    mesh_id: NDArray[np.integer]  # (N,), at the end
-    through_glass: NDArray[np.bool_]  # (N,)
-
-
-class NewtonStep(NamedTuple):
-    step: Array  # (N, 2), px
-    off: Array  # (N,), about how many pixels the start is off; infinite on another mesh
-
-
-def chains_at(stage: Stage, view: View, pixels: Array, rarer_first: bool) -> TracedChains:
-    """The chains through `pixels` (N, 2), for a stage posed for `view`'s frame."""
-    ray = stage.rays(view, pixels)
-    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    sight = look_through(stage, view, ray, si, rarer_first)
-    mesh_id = stage.mesh_id(sight.si)
-    through_glass = sight.glass & (sight.beyond > 0)
-    dr.eval(sight.si.p, mesh_id, through_glass)
-    ends = columns(sight.si.p).astype(np.float64) * stage.unit
-    return TracedChains(pixels, rarer_first, ends, np.array(mesh_id), np.array(through_glass))
-
-
-def chains_through_glass(stage: Stage, view: View, rarer_first: bool) -> TracedChains:
-    """Those through all pixel centres."""
-    return chains_at(stage, view, pixel_centres(stage.height, stage.width).reshape(-1, 2), rarer_first)
-
-
-def newton_step(
-    stage: Stage, view: View, place: Array, rarer_first: bool, target: Array, mesh_id: NDArray[np.integer]
-) -> NewtonStep:
-    """From pixels `place` (N, 2) towards those whose chains end at `target` (N, 3), on the meshes `mesh_id` (N,)."""
-    probes = np.stack([place, place + np.array([PROBE, 0]), place + np.array([0, PROBE])])
-    there = chains_at(stage, view, probes.reshape(-1, 2), rarer_first)
-    ends = there.ends.reshape(3, -1, 3)
-    across, down = (ends[1:] - ends[0]) / PROBE  # world units a pixel
-    error = target - ends[0]
-    xx, xy, yy = ((a * b).sum(axis=-1) for a, b in ((across, across), (across, down), (down, down)))
-    x, y = ((a * error).sum(axis=-1) for a in (across, down))
-    step = np.stack([yy * x - xy * y, xx * y - xy * x], axis=-1) / np.maximum(xx * yy - xy**2, 1e-30)[:, None]
-    same = (there.mesh_id.reshape(3, -1) == mesh_id).all(axis=0)
-    pixels_off = np.linalg.norm(error, axis=-1) / np.sqrt(np.maximum(np.maximum(xx, yy), 1e-30))
-    return NewtonStep(step.clip(-MAX_STEP, MAX_STEP), np.where(same, pixels_off, np.inf))
-
-
-def traced_motion(stage: Stage, chains: TracedChains, motion: Array, now: View, previous: View) -> Array:
-    """`motion` (H, W, 2), in pixels, with that of what glass shows traced, for a stage posed for the previous frame.
-
-    What glass shows is where the same branch led to the same surface point then. From the pixel that the virtual point
-    behind the glass moves to, Newton's method on the traced map finds it. Where it does not, motion is FAR_OUTSIDE.
-    """
-    traced = motion.reshape(-1, 2).copy()
-    (active,) = np.nonzero(chains.through_glass)
-    place = chains.pixels + traced
-    traced[active] = FAR_OUTSIDE
-    target = move(chains.ends, chains.mesh_id, now, previous)
-    for _ in range(NEWTON_STEPS):
-        if len(active):
-            step, off = newton_step(
-                stage, previous, place[active], chains.rarer_first, target[active], chains.mesh_id[active]
-            )
-            found = active[off < FOUND_WITHIN]
-            place[active] += np.where((off < EXACT)[:, None], 0, step)
-            traced[found] = (place - chains.pixels)[found]
-            active = active[(off >= EXACT) & np.isfinite(off)]
-    return traced.reshape(motion.shape)
+    return stage.replay(shown, ray, focal, dr.opaque(mi.Bool, rarer_first), dr.opaque(mi.UInt32, max_splits))

@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
-from render.lights import Lights
-from render.palette import palette
 from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
-from render.specular import BsdfSet, SpecularSurfaces
 from render.stage import Stage
 
 AnySampler = Sampler | HaltonSampler
@@ -29,13 +26,11 @@ def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
 
 
 def bounce(
-    scene: mi.Scene,
-    lights: Lights,
+    stage: Stage,
     si: mi.SurfaceInteraction3f,
     bsdf: mi.BSDFPtr,
     throughput: mi.Color3f,
     last: mi.Bool,
-    specular: SpecularSurfaces,
     chain: mi.Bool,
     sampler: AnySampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool, mi.UInt32]:
@@ -45,6 +40,7 @@ def bounce(
     sampling alone is the better choice. Light at the end of a `chain` of specular events is left out: it is emission.
     `lobe` are the flags of the BSDF's lobe that the path takes.
     """
+    scene, lights = stage.mitsuba_scene, stage.lights
     u_emitter = sampler.next_2d()
     u_lobe = sampler.next_1d()
     u_direction = sampler.next_2d()
@@ -67,7 +63,7 @@ def bounce(
     towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in the index of the sky
     towards.emitter = emitter
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    chain &= delta & specular.at(bsdf, chain)
+    chain &= delta & stage.specular.at(bsdf, chain)
     emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
     mis = mis_weight(sample.pdf, emitter_pdf)
     radiance += dr.select(active & ~chain, throughput * emitter.eval(following, active) * mis, 0)
@@ -82,31 +78,30 @@ def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Flo
 
 @dr.syntax
 def sample_mean(
-    scene: mi.Scene,
-    lights: Lights,
+    stage: Stage,
     ray: mi.Ray3f,
     pixel: mi.UInt32,
     seed: mi.UInt32,
     first: mi.UInt32,
     spp: mi.UInt32,
     max_depth: mi.UInt32,
+    max_events: mi.UInt32,
     draw: type[AnySampler],
     blurred: BlurredTable | None,
-    specular: SpecularSurfaces,
-    max_events: mi.UInt32,
-    glass: BsdfSet | None,
+    splits_paths: bool,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
     """Mean direct and indirect radiance of `spp` samples a ray, summed lane by lane in a fixed order.
 
-    Also the part of that radiance by paths that the first smooth `glass` on a chain of specular events reflects, and
-    the share of such paths in the samples; 0 without glass.
+    Also the part of that radiance by paths that the first smooth glass on a chain of specular events reflects, and the
+    share of such paths in the samples; 0 unless glass `splits_paths`.
 
     Each ray draws the random numbers of its `pixel` (row-major). `seed`, `first` (the index of the first sample), `spp`
     and `max_depth` are opaque, so one kernel serves all their values. A lane whose path has ended continues with its
     next sample at once. `draw` is the sampler; `blurred` regularises (see PathTracer). Light at the end of chains of up
     to `max_events` specular events is left out.
     """
-    primary = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    glass = stage.glass if splits_paths else None
+    primary = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     # Hash the pixel before combining it with the seed: a sum would make images of some seeds shifted copies.
     key = hash32(hash32(pixel) ^ seed)
     direct = mi.Color3f(0)
@@ -126,9 +121,7 @@ def sample_mean(
         chain &= depth <= max_events
         last = depth + 1 == max_depth
         splits = mi.Bool(False) if glass is None else chain & whole & glass.at(bsdf, chain)
-        radiance, si, throughput, active, chain, lobe = bounce(
-            scene, lights, si, bsdf, throughput, last, specular, chain, sampler
-        )
+        radiance, si, throughput, active, chain, lobe = bounce(stage, si, bsdf, throughput, last, chain, sampler)
         mirrors = splits & mi.has_flag(lobe, mi.BSDFFlags.DeltaReflection)
         # Conditional expressions: without glass, nothing is added to the loop.
         reflections += 0 if glass is None else dr.select(mirrors, 1, 0)
@@ -168,7 +161,6 @@ class PathTracer:
         self.stage = stage
         self.every_pixel = dr.arange(mi.UInt32, stage.height * stage.width)
         dr.make_opaque(self.every_pixel)
-        self.frozen_pose = -1  # stage.poses when `sample_mean` was frozen
         self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
         self.freezes = stage.freezes and not halton and not regularise  # which Dr.Jit 1.5 cannot freeze either
@@ -180,29 +172,12 @@ class PathTracer:
 
         Each has the random numbers of its `pixel` (row-major). The last two are 0 unless glass `splits` paths.
         """
-        stage = self.stage
-        if self.frozen_pose != stage.poses:
-            # Tracing the program in Python takes longer than running it at 1 spp, so it is frozen and replayed with the
-            # palette, whose objects kernels may call, as state. Frozen functions miss some changes of meshes (Dr.Jit
-            # 1.5), so each is used for one pose only.
-            frozen = dr.freeze(sample_mean, state_fn=lambda *_, **__: palette())
-            self.sample_mean = frozen if self.freezes else sample_mean
-            self.frozen_pose = stage.poses
-        means = self.sample_mean(
-            stage.mitsuba_scene,
-            stage.lights,
-            ray,
-            pixel,
-            seed=dr.opaque(mi.UInt32, seed),
-            first=dr.opaque(mi.UInt32, first),
-            spp=dr.opaque(mi.UInt32, spp),
-            max_depth=dr.opaque(mi.UInt32, stage.scene.max_depth),
-            draw=self.draw,
-            blurred=self.blurred,
-            specular=stage.specular,
-            max_events=dr.opaque(mi.UInt32, stage.max_events(self.blurred is not None)),
-            glass=stage.glass if splits else None,
-        )
+        max_events = self.stage.max_events(self.blurred is not None)
+        numbers = (seed, first, spp, self.stage.scene.max_depth, max_events)
+        data = [dr.opaque(mi.UInt32, number) for number in numbers]
+        if self.freezes:
+            return self.stage.replay(sample_mean, ray, pixel, *data, self.draw, None, splits)
+        means = sample_mean(self.stage, ray, pixel, *data, self.draw, self.blurred, splits)  # type: ignore[call-arg]
         dr.eval(means)
         return means
 

@@ -26,11 +26,16 @@ def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Change
         matrix = shape.motion.matrix(frame)
         vertices = (shape.mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]) / unit
         changes[f"{shape.name}.vertex_positions"] = np.float32(vertices).ravel()
-        if shape.smooth:  # positions alone would recompute the authored normals
+        if shape.smooth:
             changes[f"{shape.name}.vertex_normals"] = np.float32(shape.mesh.vertex_normals @ matrix[:3, :3].T).ravel()
     if shape.radiance is not None:
         changes[f"{shape.name}.emitter.radiance.value"] = shape.radiance.at(frame).astype(np.float32)
     return changes
+
+
+def normals_of(name: str) -> str:
+    """The parameter that changes with `name`: Mitsuba recomputes the authored normals of moved vertices otherwise."""
+    return name.replace(".vertex_positions", ".vertex_normals")
 
 
 class StockParameters:

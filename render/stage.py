@@ -1,8 +1,10 @@
 """An animated scene in Mitsuba, posed for one frame at a time without recompiling kernels."""
 
 import gc
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
+from weakref import finalize, proxy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +14,16 @@ from render.lights import Lights
 from render.loading import StockLoader, extent_of, load_mesh, upload, with_placed_textures
 from render.materials import MaterialTable, bsdfs_of, registry_index, registry_table
 from render.palette import palette
-from render.posing import Changes, StockParameters, as_parameter, mesh_changes
+from render.posing import Changes, StockParameters, as_parameter, mesh_changes, normals_of
 from render.shading_normals import ShadingNormals
-from render.specular import MAX_EVENTS, SpecularSurfaces, smooth_glass
+from render.specular import SpecularSurfaces, smooth_glass
 from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
+T = TypeVar("T")
+
 MAX_CUTOUTS = 32  # that a primary ray passes
+MAX_EVENTS = 8  # in a chain of specular events: through a vitrine of solid panes, and a bottle in it
 CUTOUT = 0.999  # least transmission of a cut-out
 
 
@@ -93,9 +98,27 @@ class Stage:
         self.freezes = bool(self.shapes) and not self.has_textured_lights
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
-        self.event_pose = -1  # that for which `event` has been recorded, see render.look_through
-        self.event: Any = None
+        self.recordings: dict[Callable[..., Any], Callable[..., Any]] = {}
         self.pose(0)
+
+    def replay(self, function: Callable[..., T], *arguments: Any) -> T:
+        """`function(self, *arguments)`, evaluated; recorded by Dr.Jit, since tracing it takes longer than running it.
+
+        What changes between calls, other than the pose, must be among the arguments: arrays as data, or hashable.
+        """
+        if self.freezes and function not in self.recordings:
+            own = proxy(self)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
+            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state())
+            finalize(self, frozen.clear)  # else recordings would keep the scene
+            self.recordings[function] = frozen
+        result = self.recordings[function](*arguments) if self.freezes else function(self, *arguments)
+        dr.eval(result)
+        return result
+
+    def state(self) -> list[Any]:
+        """All that kernels read of it, and the palette, whose objects they may call."""
+        tables = [self.materials.state(), self.specular, self.glass, self.mesh_id_of_shape]
+        return [palette(), self.mitsuba_scene, self.lights, *tables]
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """The mesh id at a surface interaction: the shape's index + 1, or 0 for none."""
@@ -113,11 +136,9 @@ class Stage:
             changes |= mesh_changes(shape, frame, self.unit, moves=first or shape.motion.varies())
         for stock in self.stock:
             changes |= stock.changes(frame)
-        changes = {
-            name: value
-            for name, value in changes.items()
-            if name not in self.posed or not np.array_equal(value, self.posed[name])
-        }
+        changed = {name for name, value in changes.items() if not np.array_equal(value, self.posed.get(name, np.nan))}
+        changed |= {normals_of(name) for name in changed} & changes.keys()
+        changes = {name: changes[name] for name in changes if name in changed}
         for name, value in changes.items():
             self.parameters[name] = as_parameter(value, self.parameters[name])
         if changes:
@@ -150,19 +171,21 @@ class Stage:
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
         origin = mi.Point3f(*map(upload, view.camera_to_world[:3, 3:] / self.unit))
         ray = mi.Ray3f(origin, mi.Vector3f(*map(upload, towards.T)))
+        ray = self.past_cutouts(ray)
         dr.eval(ray)
-        return self.past_cutouts(ray)
+        return ray
 
     def past_cutouts(self, ray: mi.Ray3f) -> mi.Ray3f:
         """The rays from behind the cut-outs that they hit first, up to MAX_CUTOUTS."""
         if not self.has_cutouts:
             return ray
-        for _ in range(MAX_CUTOUTS):
+
+        def step(number: mi.UInt32, ray: mi.Ray3f, cutout: mi.Bool) -> tuple[mi.UInt32, mi.Ray3f, mi.Bool]:
             si = self.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
             hit = si.is_valid()
             cutout = hit & (dr.min(si.bsdf().eval_null_transmission(si, hit)) > CUTOUT)
-            if not dr.any(cutout):
-                break
             ray.o = dr.select(cutout, si.spawn_ray(ray.d).o, ray.o)
-            dr.eval(ray)
-        return ray
+            return number + 1, ray, cutout
+
+        start = mi.UInt32(0), mi.Ray3f(ray), mi.Bool(True)
+        return dr.while_loop(start, lambda number, _, cutout: cutout & (number < MAX_CUTOUTS), step)[1]

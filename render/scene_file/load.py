@@ -15,8 +15,8 @@ from render.scene_file.convert import Converter
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
 from render.scene_file.mesh_file import load_mesh_file
-from render.specular import MAX_EVENTS, specular_light
-from render.stage import Stage
+from render.specular_light import specular_light
+from render.stage import MAX_EVENTS, Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
 from scenes.camera import Array, look_at, pixel_centres
 
@@ -74,7 +74,7 @@ def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
     pixel = np.arange(0, count, max(1, count // PROBED_PIXELS))
     centres = pixel_centres(stage.height, stage.width).reshape(-1, 2)
     rays = stage.rays(scene.view(0, stage.height, stage.width), centres[pixel])
-    shows_no_lamp = ~specular_light(stage.mitsuba_scene, stage.lights, stage.specular, rays, MAX_EVENTS).any(axis=1)
+    shows_no_lamp = ~specular_light(stage, rays, MAX_EVENTS).any(axis=1)
     tracer = PathTracer(stage)
 
     def light(depth: int) -> float:

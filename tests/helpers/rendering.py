@@ -48,7 +48,8 @@ def stock_radiance(stage: Stage, max_depth: int, spp: int, seed: int) -> NDArray
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     ray = stage.rays(stage.view(POSED_FRAME))
     pixel = dr.arange(mi.UInt32, count * spp) // spp
-    ray = mi.RayDifferential3f(mi.Ray3f(ray.o, dr.gather(mi.Vector3f, ray.d, pixel)))
+    ray.o = ray.o + dr.zeros(mi.Point3f, count)  # one eye for all, or a point behind cut-outs for each
+    ray = mi.RayDifferential3f(dr.gather(mi.Ray3f, ray, pixel))
     colour, _, _ = integrator.sample(stage.mitsuba_scene, sampler, ray)
     return np.array(colour).T.reshape(stage.height, stage.width, spp, 3).mean(axis=2)
 

@@ -54,6 +54,18 @@ def test_smooth_mesh_keeps_and_turns_its_vertex_normals():
         assert np.abs(buffer["normal"] - expected)[hit].max() < 5e-3  # facets are off by up to 0.03
 
 
+def test_a_mesh_that_moves_without_turning_keeps_its_authored_normals(square):
+    """Mitsuba would recompute them from the moved vertices."""
+    plain, tilted = square.shapes[0].mesh, [0.6, 0, 0.8]
+    mesh = trimesh.Trimesh(plain.vertices, plain.faces, vertex_normals=np.tile(tilted, (4, 1)), process=False)
+    motion = RigidMotion(Track(np.array([[0.0, 0, 0], [0.1, 0, 0]])), Track.constant(0.0))
+    shape = replace(square.shapes[0], mesh=mesh, motion=motion, smooth=True)
+    stage = Stage(replace(square, shapes=(shape,)), 16, 16)
+    for frame in (0, 1):
+        stage.pose(frame)
+        np.testing.assert_allclose(render_gbuffer(stage, stage.view(frame))["normal"][8, 8], tilted, atol=1e-6)
+
+
 def test_colours_lie_on_their_walls(stage):
     stage.pose(0)
     buffer = render_gbuffer(stage, stage.view(0))

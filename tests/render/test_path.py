@@ -25,6 +25,15 @@ def realisations(stage: Stage, count: int) -> tuple[np.ndarray, np.ndarray, np.n
     return emission, np.stack([direct for direct, _ in images]), np.stack([indirect for _, indirect in images])
 
 
+def everything(stage: Stage, frame: int) -> dict[str, np.ndarray]:
+    """The G-buffer and sampled light of a frame, by channel and seed."""
+    stage.pose(frame)
+    view = stage.view(frame)
+    ray = stage.rays(view)
+    light = {f"light {seed}": np.stack(PathTracer(stage).radiance(ray, seed, 4)) for seed in (1, 2)}
+    return render_gbuffer(stage, view) | light
+
+
 def test_one_spp_images_average_to_the_stock_integrator(stage):
     emission, direct, indirect = realisations(stage, 600)
     np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
@@ -61,19 +70,18 @@ def test_metal_plastic_and_sky_average_to_the_stock_integrator():
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 6, 16, s) for s in range(60)]))
 
 
-def test_a_replayed_kernel_follows_the_scene(moving):
-    """After other frames were rendered, a frame has the bytes that it has when it is the first one."""
-    tracer = PathTracer(moving)
-    images = {}
-    for frame in (4, 20, 4):
-        moving.pose(frame)
-        ray = moving.rays(moving.view(frame))
-        images[frame] = np.stack([tracer.radiance(ray, seed, 4) for seed in (1, 2)])
-    for frame in (20, 4):
-        moving.pose(frame)
-        ray = moving.rays(moving.view(frame))
-        fresh = np.stack([PathTracer(moving).radiance(ray, seed, 4) for seed in (1, 2)])
-        assert images[frame].tobytes() == fresh.tobytes()
+@pytest.mark.parametrize(
+    ("scene", "frames"), [("cornell_box_moving", (4, 20, 4, 12)), ("glass-vitrine-moving", (0, 2, 1, 3))]
+)
+def test_recordings_follow_the_scene(scene, frames):
+    """Every pose has the bytes that it has without recordings, whichever poses came before."""
+    stages = [Stage(build_scene(scene, 5, 24), 32, 32) for _ in range(2)]
+    stages[1].freezes = False
+    for frame in frames:
+        recorded, fresh = (everything(stage, frame) for stage in stages)
+        assert recorded.keys() == fresh.keys()
+        for name, image in recorded.items():
+            assert image.tobytes() == fresh[name].tobytes(), (frame, name)
 
 
 def test_a_scene_without_shapes_is_rendered_beside_another(moving):
