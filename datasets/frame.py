@@ -198,6 +198,11 @@ class Frame:
         """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, see `complete`."""
         return self.complete(irradiance * self.divisor, signal)
 
+    def demodulate(self, radiance: Tensor, signal: Signal) -> Tensor:
+        """Irradiance (B, 3, H, W) of denoised radiance: without emission, over `divisor`."""
+        reflected = radiance - self.emission if signal == "total" else radiance
+        return (reflected / self.divisor).clamp(min=0)
+
     def complete(self, reflected: Tensor, signal: Signal) -> Tensor:
         """Radiance (B, 3, H, W) of what was denoised: background reflects nothing; "total" has noise-free emission."""
         surface = self.surface

@@ -79,7 +79,9 @@ def weights_of(name: DenoiserName, runs: Path) -> Path | None:
 def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
     """All denoisers, then those with wrappers; networks with shipped weights and with those trained in `budget`."""
     plain = [DenoiserName(base) for base in DENOISERS]
-    wrapped = [replace(name, wrappers=(wrapper,)) for name in plain for wrapper in prototype(name).evaluated_with]
+    wrapped = [
+        replace(name, wrappers=tuple(suffix.split("+"))) for name in plain for suffix in prototype(name).evaluated_with
+    ]
     for name in (*plain, *wrapped):
         yield name
         trained = replace(name, budget=budget)

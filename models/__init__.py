@@ -3,6 +3,6 @@
 - `denoiser.py` is the interface, `names.py` parses names, `registry.py` lists denoisers and wrappers, `spec.py`
   describes one way to run one, `weights.py` reads and writes networks.
 - `history/`: reprojection, temporal accumulation, running exposure and depth scale. `filters/`: denoisers without a
-  network, and OIDN. `networks/`: those with one. `wrappers/`: +adaptive, +taa, +js. `compiled/`: the kernels of all.
-  `export/`: one graph per frame for inference engines.
+  network, and OIDN. `networks/`: those with one. `wrappers/`: +accumulated, +adaptive, +taa, +js. `compiled/`: the
+  kernels of all. `export/`: one graph per frame for inference engines.
 """

@@ -68,16 +68,17 @@ class Denoiser(nn.Module):
 
     Attributes:
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
-        signal: what it returns; "total" denoises direct + indirect and adds emission back untouched.
+        signal: what it returns: "total" or "indirect" light.
         refuses: precisions that it does not compute in, with the reason.
         is_network: whether it needs trained weights.
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
         convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
         separates_lights: whether it filters direct and indirect light apart.
+        filters_emission: whether emission is a part of what it filters, which it otherwise adds back untouched.
         blends_layers: whether it takes glass in one layer, with guides blended from both, instead of twice.
         has_kernels: whether compiled kernels do a part of its work.
         baseline_for: the signals whose denoisers are compared with it, in evaluations, cards and trade-offs.
-        evaluated_with: wrappers with which `onespp eval` runs it beside the denoiser itself.
+        evaluated_with: suffixes with which `onespp eval` runs it beside the denoiser itself.
         dispensable: channels that its network can do without where they do not vary, and its input for a value.
         inputs: the inputs of its network in order, and how many channels each has; channels by their names.
         constants: channels that it does without, see `specialise`, and the value that each has everywhere.
@@ -92,6 +93,7 @@ class Denoiser(nn.Module):
     offline: bool = False
     convex: bool = False
     separates_lights: bool = False
+    filters_emission: bool = False
     blends_layers: bool = False
     has_kernels: bool = True
     baseline_for: tuple[Signal, ...] = ()

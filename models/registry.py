@@ -17,7 +17,7 @@ from models.filters.baselines import Accumulated, Noisy
 from models.filters.bmfr import BMFR
 from models.filters.eaw import EAW
 from models.filters.nfor import NFOR
-from models.filters.oidn import OIDN, OIDNAccumulated, OIDNBalanced, OIDNFast
+from models.filters.oidn import OIDN, OIDNAccumulated, OIDNBalanced, OIDNFast, OIDNIrradiance
 from models.filters.sbf import SBF
 from models.filters.svgf import SVGF
 from models.filters.trmv import TRMV
@@ -27,6 +27,7 @@ from models.networks.ntd import NTD, NTDMean, NTDTraditional
 from models.networks.one import One
 from models.networks.rae import RAE
 from models.networks.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
+from models.wrappers.accumulated import AccumulatedAfter
 from models.wrappers.adaptive import Adaptive
 from models.wrappers.shrinkage import JamesStein
 from models.wrappers.taa import TAA
@@ -46,6 +47,7 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "oidn": OIDN,
     "oidn-balanced": OIDNBalanced,
     "oidn-fast": OIDNFast,
+    "oidn-irradiance": OIDNIrradiance,
     "oidn-accumulated": OIDNAccumulated,
     "rae": RAE,
     "wskp3": WSKP3,
@@ -61,7 +63,12 @@ DENOISERS: dict[str, type[Denoiser]] = {
     "ntd-mean": NTDMean,
     "one": One,
 }
-WRAPPERS: dict[str, type[Wrapper]] = {"adaptive": Adaptive, "taa": TAA, "js": JamesStein}
+WRAPPERS: dict[str, type[Wrapper]] = {
+    "accumulated": AccumulatedAfter,
+    "adaptive": Adaptive,
+    "taa": TAA,
+    "js": JamesStein,
+}
 SHIPPED_FOLDER = Path(__file__).parent / "shipped"  # a file a network, beside its card
 SYNTAX = re.compile(r"([^@+]+)(?:@([^@+]+))?((?:\+[^@+]+)*)")
 
@@ -107,8 +114,8 @@ def parse_name(name: str | DenoiserName) -> DenoiserName:
         parsed = DenoiserName(match[1], match[2], tuple(match[3].split("+")[1:]))
     if parsed.base not in DENOISERS or not WRAPPERS.keys() >= {*parsed.wrappers}:
         raise BadInput(
-            f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with +taa and +js, and "
-            "those that begin with temporal accumulation with +adaptive"
+            f"unknown denoiser '{name}'; the denoisers are {', '.join(DENOISERS)}, each also with "
+            "+accumulated, +taa and +js, and those that accumulate with +adaptive"
         )
     if parsed.budget and not DENOISERS[parsed.base].is_network:
         raise BadInput(f"unknown denoiser '{name}': '{parsed.base}' has no weights, and so no @{parsed.budget}")

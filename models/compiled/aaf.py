@@ -1,5 +1,7 @@
 """models.filters.aaf for the CPU: rows in parallel, every loop along them vectorised."""
 
+import math
+
 import numba
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from models.compiled.lines import add_line, add_product, columns_with_tap, divid
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
 MAX_REACH = 50  # px
 TRUNCATION = 8**0.5  # standard deviations at which Gaussians end
-COSINE_OF_5_DEGREES = 0.99619  # largest angle between the normals of pixels that are filtered together
+COSINE_OF_5_DEGREES = math.cos(math.radians(5))  # of normals that are filtered together, at most
 MAX_GAUSSIAN_EXPONENT = np.float32(TRUNCATION**2 / 2)
 NEAR = np.float32(2 * DIFFUSE_BAND)
 

@@ -71,7 +71,7 @@ def weigh(alpha: Row, length: Row, past_length: Row, change: Row, valid: Row) ->
     """The weight of the newest frame and the new history length, (W), where `change` of the history is dropped."""
     for x in range(alpha.size):
         kept = f32(1) - change[x]
-        alpha[x] = kept * f32(ALPHA) + change[x]
+        alpha[x] = kept * max(f32(ALPHA), f32(1) / (past_length[x] + f32(1))) + change[x]
         length[x] = past_length[x] * kept + f32(1) if valid[x] > 0 else f32(1)
 
 

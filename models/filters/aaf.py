@@ -11,6 +11,8 @@ wide as that allows, in the plane of the surface, applied along rows and then co
   truncated at the exponent -4 and reaches surfaces nearer than z whose normals are within 5°. On a glossy surface of
   Phong exponent m, 3.5 + 0.2 m replaces 2.8.
 
+As in SVGF's evaluation (Schied et al. 2017, §5.1), the light that it filters has been accumulated over frames.
+
 We know the papers by their abstracts, others' accounts and, of the second, the authors' code. We choose:
 
 - s and z are minima over 3 x 3 pixels of the same mesh: those of a single sample are too noisy, and would make filters
@@ -26,6 +28,8 @@ We know the papers by their abstracts, others' accounts and, of the second, the 
 - No filter reaches farther than 50 px, the authors' limit; wider ones are narrowed.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -34,10 +38,10 @@ from datasets.frame import Frame
 from models import compiled
 from models.compiled import aaf as kernels
 from models.compiled.aaf import COSINE_OF_5_DEGREES, DIFFUSE_BAND, MAX_REACH, TRUNCATION
-from models.denoiser import CLASSICAL, Denoiser, State
+from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.filters.atrous import Tap, offset_taps, window_mean
 from models.filters.neighbours import mesh_min
-from models.filters.svgf import irradiances
+from models.filters.svgf import SVGF, Integrated, integrate, irradiances
 from models.history.geometry import frame_rays
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
@@ -111,23 +115,31 @@ def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tens
     return window_mean(image, 1, taps, weight)
 
 
-class AAF(Denoiser):
-    """Filters direct and indirect irradiance separately, frame by frame, each within its own [min, max]."""
+@dataclass(frozen=True)
+class AAFState(State):
+    history: Integrated
 
-    reads = (
-        *("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id"),
-        *("hit_distance", "light_distance", "light_angle"),
-    )
+    def pictures(self) -> dict[str, Tensor]:
+        return {"history length": self.history.length}
+
+
+class AAF(Denoiser):
+    """Filters accumulated direct and indirect irradiance separately, each within its range since the last reset."""
+
+    reads = (*SVGF.reads, "roughness", "hit_distance", "light_distance", "light_angle")
     refuses = CLASSICAL
     convex = True
     separates_lights = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        image = irradiances(frame, self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
+        previous = matching_state(state, AAFState, frame)
+        noisy = irradiances(frame, self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
+        history = integrate(frame, noisy, previous.history if previous else None)
+        image = history.colour
         width = widths(frame)[:, -image.shape[1] :]
         max_width = width.clone()
         max_width[:, -1] = torch.inf  # of indirect light
         geometry = pack_geometry(frame)
         for down in (False, True):
             image = filter_lines(image, width, max_width, geometry, down)
-        return frame.remodulate(image.sum(dim=1), self.signal), State(frame.moment)
+        return frame.remodulate(image.sum(dim=1), self.signal), AAFState(frame.moment, history)

@@ -75,7 +75,7 @@ class RayTracingFilter:
 
 
 class OIDN(Denoiser):
-    """Denoises reflected radiance frame by frame; noise-free emission is added afterwards.
+    """Denoises the beauty, direct + indirect + emission, frame by frame, as its documentation asks.
 
     Runs on as many CPU threads as PyTorch. `quality` is "high" (OIDN's default, for final frames), "balanced" or "fast"
     (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
@@ -84,8 +84,10 @@ class OIDN(Denoiser):
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
     has_kernels = False
+    filters_emission = True
     blends_layers = True
     baseline_for: tuple[Signal, ...] = ("total",)
+    evaluated_with: tuple[str, ...] = ("accumulated", "accumulated+adaptive")
 
     quality: OIDNQuality = "high"
     key: tuple[int, int, int] | None = None  # (H, W, threads) of the filter
@@ -109,21 +111,20 @@ class OIDN(Denoiser):
             self.key = key
         return self.filter
 
-    def denoise(self, frame: Frame, radiance: Tensor) -> Tensor:
-        """The denoised image of reflected `radiance` (B, 3, H, W), with emission for "total"."""
-        inputs = (radiance.clamp(min=0), frame.albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
-        denoised = torch.stack([*map(self.filter_for(*frame.size), *inputs)])
-        return frame.complete(denoised, self.signal)
+    def denoise(self, frame: Frame, radiance: Tensor, albedo: Tensor) -> Tensor:
+        """The denoised image of radiance (B, 3, H, W) with `albedo` (B, 3, H, W) as the auxiliary image."""
+        inputs = (radiance.clamp(min=0), albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
+        return torch.stack([*map(self.filter_for(*frame.size), *inputs)])
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        reflected = frame.indirect if self.signal == "indirect" else frame.direct + frame.indirect
-        return self.denoise(frame, reflected), State(frame.moment)
+        return self.denoise(frame, frame.radiance(self.signal), frame.albedo), State(frame.moment)
 
 
 class OIDNBalanced(OIDN):
     """OIDN in its quality "balanced"."""
 
     baseline_for = ()
+    evaluated_with = ()
     quality = "balanced"
 
 
@@ -131,11 +132,23 @@ class OIDNFast(OIDN):
     """OIDN in its quality "fast"."""
 
     baseline_for = ()
+    evaluated_with = ()
     quality = "fast"
 
 
+class OIDNIrradiance(OIDN):
+    """Denoises irradiance, whose albedo is 1, and multiplies it by the albedo afterwards."""
+
+    filters_emission = False
+    baseline_for = ()
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        denoised = self.denoise(frame, frame.irradiance(self.signal), torch.ones_like(frame.albedo))
+        return frame.remodulate(denoised, self.signal), State(frame.moment)
+
+
 class OIDNAccumulated(Accumulating, OIDN):
-    """Denoises temporally accumulated irradiance, remodulated. The history is not filtered."""
+    """Denoises temporally accumulated radiance. The history is not filtered."""
 
     reads = Accumulated.reads
     has_kernels = True
@@ -144,4 +157,5 @@ class OIDNAccumulated(Accumulating, OIDN):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
-        return self.denoise(frame, history.irradiance * frame.divisor), AccumulatedState(frame.moment, history)
+        radiance = frame.remodulate(history.irradiance, self.signal)
+        return self.denoise(frame, radiance, frame.albedo), AccumulatedState(frame.moment, history)

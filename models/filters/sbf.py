@@ -8,9 +8,10 @@ Where the paper leaves it open, we choose:
 
 - The filters have no range term on colour (σ_r = ∞), as in the authors' code, which reports noisy results with one. So
   they are linear in colours, and dF/dc is the share of the pixel in its own weights.
-- Distances of features are not divided by their variances: ours are free of noise, for which the authors recommend this
-  (Schied et al. 2017, §5.1). Depth is divided by the frame's maximum, as in the authors' code.
-- σ_f are its defaults, 0.8 for normals, 0.25 for albedo, 0.6 for depth; windows end at 2 σ_s.
+- σ_f are the defaults of the authors' code, 0.8 for normals, 0.25 for albedo, 0.6 for depth, times 0.1: it divides
+  squared differences by max(variance, 0.01), and our features have none. Depth is divided by the frame's maximum.
+- Windows end at 2 σ_s.
+- As in SVGF's evaluation (Schied et al. 2017, §5.1), the light has been accumulated over frames.
 - It filters irradiance, with albedo among the features. The paper filters radiance; but with one sample per pixel σ²
   has to be estimated from other pixels, where texture would count as noise.
 - σ² is the variance of each colour over 9 x 9 pixels of the same mesh: that of the pixel as it is, whatever its number
@@ -29,15 +30,16 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from models import compiled
 from models.compiled import sbf as kernels
-from models.denoiser import CLASSICAL, Denoiser, State
+from models.denoiser import CLASSICAL, State, matching_state
+from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.filters.neighbours import mesh_variance
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
 BANK = tuple(2 ** (i / 2) for i in range(7))  # px; σ_s from 1 to 8
 RISK_SIGMA = 8.0  # px
-SBF_SIGMA_NORMAL = 0.8
-SIGMA_ALBEDO = 0.25
-SIGMA_DEPTH = 0.6  # of the frame's maximum
+SBF_SIGMA_NORMAL = 0.08
+SIGMA_ALBEDO = 0.025
+SIGMA_DEPTH = 0.06  # of the frame's maximum
 BACKGROUND_DEPTH = 1e3  # in σ; outside the image it is the negative of this
 GATHERED_ROWS = 16  # filtered at once: all taps along a row are gathered
 
@@ -101,14 +103,15 @@ def best_filtered(colour: Tensor, variance: Tensor, guides: Tensor) -> Tensor:
     return filtered.take_along_dim(smoothed.argmin(dim=2, keepdim=True), dim=1)[:, 0]
 
 
-class SBF(Denoiser):
-    """Filters frame by frame, within the range of its irradiance."""
+class SBF(Accumulating):
+    """Filters accumulated irradiance within its [min, max] since the last reset."""
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id")
+    reads = Accumulated.reads
     refuses = CLASSICAL
     convex = True
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        colour = frame.irradiance(self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
+        history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))
+        colour = history.irradiance.clamp(-MAX_LUMINANCE, MAX_LUMINANCE)
         filtered = best_filtered(colour, mesh_variance(colour, frame.mesh_id), guides(frame))
-        return frame.remodulate(filtered, self.signal), State(frame.moment)
+        return frame.remodulate(filtered, self.signal), AccumulatedState(frame.moment, history)

@@ -2,6 +2,8 @@
 
 Where the paper is silent, we choose:
 
+- While the history is short, samples are averaged evenly, α = max(0.2, 1 / n), and the spatial estimate of variance is
+  multiplied by 4 / n, as in the authors' published code.
 - The history length of a sample includes the sample; "< 4 frames" (§4.2) compares it, rounded, with 4.
 - The temporal variance of single samples enters the first level unscaled, although integration has averaged it.
 - Depths are along the viewing axis (clip-space depth is affine in them). ∇z is, along each axis, the smaller difference
@@ -56,8 +58,9 @@ def integrate_samples(
     past = [previous.colour.flatten(1, 2), previous.moments.flatten(1, 2), previous.length]
     history, has_history = reproject(frame, torch.cat(past, dim=1), previous.gbuffer)
     change = torch.zeros_like(previous.length) if change is None else change
-    alpha = torch.where(has_history, (1 - change) * ALPHA + change, 1)
     colour, moments, length = history.split([image.shape[1] for image in past], dim=1)
+    newest = (1 / (length + 1)).clamp(min=ALPHA)
+    alpha = torch.where(has_history, (1 - change) * newest + change, 1)
     return (
         torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
         torch.lerp(moments.view_as(previous.moments), luminance_moments(noisy), alpha[:, None]),
@@ -135,8 +138,12 @@ def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
     """Variance (B, S, 1, H, W) of luminance: temporal, or spatial while the history is short (§4.2)."""
     mean, square = integrated.moments.split(1, dim=2)
     variance = (square - mean.square()).clamp(min=0)
-    short = integrated.length.round() < MIN_TEMPORAL_LENGTH  # interpolated from whole numbers, not always exactly
-    return spatial_variance(variance, mean, geometry, short) if short.any() else variance
+    length = integrated.length.round()  # interpolated from whole numbers, not always exactly
+    short = length < MIN_TEMPORAL_LENGTH
+    if not short.any():
+        return variance
+    boost = (MIN_TEMPORAL_LENGTH / length.clamp(min=1)).clamp(min=1)
+    return spatial_variance(variance, mean, geometry, short) * boost[:, None]
 
 
 def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Wrappers of denoisers: +adaptive, +taa, +js."""
+"""Wrappers of denoisers: +accumulated, +adaptive, +taa, +js."""

@@ -152,7 +152,9 @@ class Adaptive(Wrapper):
 
     def __init__(self, inner: Denoiser):
         if not isinstance(inner, Accumulating):
-            raise BadInput(f"{type(inner).__name__} does not begin with temporal accumulation: leave out +adaptive")
+            raise BadInput(
+                f"{type(inner).__name__} does not accumulate: leave out +adaptive, or put +accumulated before it"
+            )
         super().__init__(inner)
         inner.accumulation = accumulate_adaptively
 

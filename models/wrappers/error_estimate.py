@@ -139,10 +139,10 @@ def denoise_with_error(denoiser: JamesStein, frame: Frame, state: State | None) 
     frame = frame.finite().without("second")  # whose light has no sample buffers
     inner, signal = denoiser.inner, denoiser.signal
     output, after = inner(frame, state)
-    filtered = shrinkage.denoised_irradiance(output, frame, signal)
+    filtered = frame.demodulate(output, signal)
     rho = shrinkage.shrinkage_weight(frame, filtered, signal)
     buffers = [frame.buffer(which) for which in (0, 1)]
-    passes = [shrinkage.denoised_irradiance(inner(buffer, state)[0], buffer, signal) for buffer in buffers]
+    passes = [buffer.demodulate(inner(buffer, state)[0], signal) for buffer in buffers]
     estimate = estimate_error(frame, filtered, passes, [buffer.irradiance(signal) for buffer in buffers], rho)
     return frame.remodulate(shrinkage.blend(frame, filtered, rho, signal), signal), after, estimate
 

@@ -87,12 +87,6 @@ def mesh_mean_3x3(image: Tensor, mesh_id: Tensor) -> Tensor:
     return sums[:, :-1] / sums[:, -1:]
 
 
-def denoised_irradiance(output: Tensor, frame: Frame, signal: Signal) -> Tensor:
-    """The irradiance (B, 3, H, W) of a denoiser's output radiance."""
-    reflected = output - frame.emission if signal == "total" else output
-    return (reflected / frame.divisor).clamp(min=0)
-
-
 def comparison_unit(luminance: Tensor) -> Tensor:
     """What irradiance is divided by to be compared, from the mean luminance near each pixel, (B, 1, H, W); never 0."""
     offset = MIN_RELATIVE_LUMINANCE * luminance.mean(dim=(1, 2, 3), keepdim=True)
@@ -129,6 +123,6 @@ class JamesStein(Wrapper):
         output, after = self.inner.run(frame, state)
         if not frame.has_buffers:
             return output, after
-        denoised = denoised_irradiance(output, frame, self.signal)
+        denoised = frame.demodulate(output, self.signal)
         rho = shrinkage_weight(frame, denoised, self.signal)
         return frame.remodulate(blend(frame, denoised, rho, self.signal), self.signal), after

@@ -8,6 +8,7 @@ from errors import BadInput
 from models import registry
 from models.filters.baselines import Accumulated
 from models.history.accumulation import accumulate
+from models.wrappers.accumulated import AccumulatedAfter
 from models.wrappers.adaptive import (
     FIREFLY_RATIO,
     MAX_GAIN,
@@ -180,13 +181,14 @@ def test_a_gain_is_bounded():
 
 
 def test_every_accumulating_denoiser_has_the_wrapper():
-    for name in ("accumulated", "eaw", "bmfr", "oidn-accumulated", "wskp6", "kp", "wskp-mr", "mr-kp", "nbgd"):
+    for name in ("accumulated", "eaw", "bmfr", "sbf", "oidn-accumulated", "wskp6", "kp", "wskp-mr", "mr-kp", "nbgd"):
         adaptive = registry.prototype(f"{name}+adaptive")
         assert unwrapped(adaptive).accumulation is accumulate_adaptively
         assert adaptive.reads == registry.prototype(name).reads
         assert registry.prototype(name).accumulation is accumulate
+    assert isinstance(registry.prototype("oidn+accumulated+adaptive").inner, AccumulatedAfter)
     assert registry.parse_name("wskp6+adaptive+taa").base == "wskp6"
     assert "motion" in registry.prototype("eaw+adaptive+taa").reads
     for name in ("noisy+adaptive", "svgf+adaptive", "eaw+taa+adaptive"):
-        with pytest.raises(BadInput, match="temporal accumulation"):
+        with pytest.raises(BadInput, match="does not accumulate"):
             registry.prototype(name)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from models.filters.asvgf import ASVGF, STRATUM, change_of_light, repeat_strata, strata_centres, strata_sums
-from models.filters.svgf import ALPHA, SVGF, SVGFState
+from models.filters.svgf import SVGF, SVGFState
 from tests.helpers.frames import chain, flat_frame, play, run
 
 SIZE = 24
@@ -68,12 +68,12 @@ def test_it_follows_a_light_that_jumps():
 
 
 def test_history_is_discarded_in_proportion():
-    """The integrated colour is (1 - α) C' + α C with α = (1 - λ) 0.2 + λ; the length shrinks by 1 - λ."""
+    """The second colour is (1 - α) C' + α C with α = (1 - λ) / 2 + λ; the length shrinks by 1 - λ."""
     frames = [flat_frame(SIZE, SIZE, irradiance=torch.full((1, 3, SIZE, SIZE), level)) for level in (1.0, 3.0)]
     with_gradient(frames[1], 0.5, 2.0)
     _, state = play(ASVGF(), frames)
     assert isinstance(state, SVGFState)
-    alpha = 0.75 * ALPHA + 0.25
+    alpha = 0.75 / 2 + 0.25
     torch.testing.assert_close(state.history.moments[:, 0, 0], torch.full((1, SIZE, SIZE), (1 - alpha) + 3 * alpha))
     torch.testing.assert_close(state.history.length, torch.full((1, 1, SIZE, SIZE), 1.75))
 

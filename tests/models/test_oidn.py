@@ -10,7 +10,7 @@ from datasets.clip import Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
 from models import registry
-from models.filters.oidn import OIDN, OIDNAccumulated, OIDNFast
+from models.filters.oidn import OIDN, OIDNAccumulated, OIDNFast, OIDNIrradiance
 from models.spec import load
 from tests.helpers.frames import flat_frame, run
 
@@ -68,13 +68,20 @@ def test_brightness_scales(tiny):
     torch.testing.assert_close(1000 * output, thousandfold, rtol=1e-2, atol=1e-2)
 
 
-def test_emission_is_untouched():
-    """Lamps are added after denoising: their light neither bleeds nor becomes noise."""
-    dark = flat_frame(16, 16)
-    lamp = flat_frame(16, 16)
+def test_it_gets_the_beauty_or_irradiance():
+    """A lamp is in the image that is denoised; irradiance has no lamp, and does not depend on texture."""
+    lamp = noisy_wall(16, 16)
     lamp.emission[..., 8:] = 50.0
-    denoiser = OIDN()
-    torch.testing.assert_close(denoiser(lamp, None)[0] - denoiser(dark, None)[0], lamp.emission)
+    inputs = []
+    for kind in (OIDN, OIDNIrradiance):
+        denoiser = kind()
+        denoiser(lamp, None)
+        inputs.append([denoiser.filter.images[name].permute(2, 0, 1)[None] for name in ("color", "albedo")])
+    (beauty, albedo), (irradiance, ones) = inputs
+    torch.testing.assert_close(beauty, lamp.direct + lamp.emission)
+    torch.testing.assert_close(albedo, lamp.albedo)
+    torch.testing.assert_close(irradiance, lamp.direct / lamp.albedo)
+    assert (ones == 1).all()
     assert (OIDN(signal="indirect")(lamp, None)[0] < 0.1).all()  # all light is direct
 
 

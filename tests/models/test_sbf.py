@@ -136,9 +136,9 @@ def test_variance_is_that_of_the_same_mesh():
 def test_features_are_in_units_of_the_paper_s_deviations():
     frame = flat_frame(1, 2)
     frame.channels.update(
-        normal=torch.tensor([[0.0, 0.8], [0, 0], [-1, -1]])[None, :, None],
-        albedo=torch.tensor([[0.5, 0.75], [0.5, 0.5], [0.5, 0.25]])[None, :, None],
-        depth=torch.tensor([[2.0, 5.0]])[None, :, None],
+        normal=torch.tensor([[0.0, 0.08], [0, 0], [-1, -1]])[None, :, None],
+        albedo=torch.tensor([[0.5, 0.525], [0.5, 0.5], [0.5, 0.475]])[None, :, None],
+        depth=torch.tensor([[4.7, 5.0]])[None, :, None],
     )
     squares = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
     torch.testing.assert_close(2 * squares, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))

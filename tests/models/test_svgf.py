@@ -134,16 +134,17 @@ def wall(direct, indirect, **kwargs):
     return frame
 
 
-def test_samples_and_moments_are_integrated_with_alpha_a_fifth():
-    """The first sample is taken as it is; then C' = 0.2 C + 0.8 C', for colour, luminance and its square alike."""
-    values = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0)]
+def test_samples_and_moments_are_means_and_later_integrated_with_alpha_a_fifth():
+    """C' = α C + (1 - α) C' with α = max(1/5, 1/n) for the n-th sample: of colour, luminance and its square alike."""
+    values = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0), (2.0, 2.0), (9.0, 1.0), (0.0, 3.0)]
     history = None
     expected = None
     for n, both in enumerate(values):
         frame = wall(*both)
         history = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
         new = np.array([(v, v, v * v) for v in both])
-        expected = new if expected is None else 0.2 * new + 0.8 * expected
+        alpha = max(0.2, 1 / (n + 1))
+        expected = new if expected is None else alpha * new + (1 - alpha) * expected
         for s in range(2):
             torch.testing.assert_close(history.colour[0, s], torch.full((3, 4, 6), expected[s, 0]))
             torch.testing.assert_close(history.moments[0, s, 0], torch.full((4, 6), expected[s, 1]))
@@ -186,7 +187,8 @@ def test_variance_is_temporal_from_four_frames_on_and_spatial_before(size, seed)
     for s in range(2):
         moments = history.moments[0, s].double().numpy()
         temporal = moments[1] - moments[0] ** 2
-        expected = np.where(lengths < 3.5, naive_spatial_variance(moments, depth, normal, mesh), temporal)
+        spatial = naive_spatial_variance(moments, depth, normal, mesh) * 4 / np.round(lengths)  # of a few samples
+        expected = np.where(lengths < 3.5, spatial, temporal)
         np.testing.assert_allclose(variance[s], expected, rtol=1e-4, atol=1e-5)
 
 
