@@ -170,7 +170,10 @@ def clip(scene: str, *names: str) -> str:
     floor = list(rows)[-1]
     chosen = [rows[name] for name in (*(names or list(rows)[:-1]), floor)]
     titles = {metric: METRICS[metric].title for metric in PRINTED}
-    lines = [{"denoiser": cell(row)} | {title: row.text(metric) for metric, title in titles.items()} for row in chosen]
+    lines = [
+        {"denoiser": cell(row), "made from": row.made_from} | {title: row.text(key) for key, title in titles.items()}
+        for row in chosen
+    ]
     return table(lines)
 
 
@@ -184,7 +187,8 @@ def quality(metric: str, signal: str = "total") -> str:
     rows = {title: rows_of(clip, signal) for clip, title in columns.items()}
     lines = []
     for index, row in enumerate(rows["mean"]):
-        lines.append({"denoiser": cell(row)} | {title: rows[title][index].text(metric) for title in columns})
+        values = {title: rows[title][index].text(metric) for title in columns}
+        lines.append({"denoiser": cell(row), "made from": row.made_from} | values)
     return table(lines)
 
 
@@ -270,18 +274,15 @@ def glass() -> str:
 
 
 def stress() -> str:
-    """Whether each denoiser keeps the requirements of the stress bench."""
+    """The requirements of the stress bench that denoisers break."""
+    rows = measured("stress")["rows"]
     lines = [
-        {
-            "denoiser": f"`{name}`",
-            "cases": row["cases"],
-            "non-finite pixels": row["nonfinite"],
-            "largest range violation": f"{row['violation']:.1g}",
-            "broken": "; ".join(row["broken"]) or "none",
-        }
-        for name, row in measured("stress")["rows"].items()
+        {"denoiser": f"`{name}`", "broken": "; ".join(row["broken"])} for name, row in rows.items() if row["broken"]
     ]
-    return table(lines)
+    cases = sum(row["cases"] for row in rows.values())
+    worst = max(row["violation"] for row in rows.values() if not row["broken"])
+    text = f"{len(rows)} denoisers, {cases} cases; {len(lines) or 'none'} of them break a requirement."
+    return f"{text} The largest violation of a range by the others is {worst:.1g}.\n{table(lines) if lines else ''}"
 
 
 def device(name: str) -> str:

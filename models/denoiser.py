@@ -70,6 +70,7 @@ class Denoiser(nn.Module):
         reads: channels it needs; nothing else is loaded, rendered or stored for it.
         signal: what it returns: "total" or "indirect" light.
         refuses: precisions that it does not compute in, with the reason.
+        made_from: what its implementation follows, for tables: others' papers, their authors' code, accounts of either.
         is_network: whether it needs trained weights.
         offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
         convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
@@ -89,6 +90,7 @@ class Denoiser(nn.Module):
     reads: tuple[str, ...]
     signal: Signal = "total"
     refuses: Mapping[torch.dtype, str] = MappingProxyType({})
+    made_from: str = "paper"
     is_network: bool = False
     offline: bool = False
     convex: bool = False

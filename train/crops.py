@@ -85,4 +85,5 @@ class AccumulatedCrops(TorchDataset[Crops]):
         window = random_window(clip, self.crop, rng)
         irradiance = to_tensor(self.irradiance[item][position, realisation][window])
         log_scale = torch.from_numpy(self.scales[item][position, realisation])[None]
-        return Crops(read_frame(clip, position, self.channels, window=window, in_layers=False), irradiance, log_scale)
+        frame = read_frame(clip, position, self.channels, realisation, window=window, in_layers=False)
+        return Crops(frame, irradiance, log_scale)

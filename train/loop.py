@@ -58,6 +58,8 @@ def train_network(task: Task, save_seconds: float = SAVE_SECONDS) -> Path:
         if fabric.is_global_zero:
             train_to_end(training, save_seconds)
         else:  # take part in every step and in every validation
+            if not training.position.done:
+                training.validate()
             for _ in training.steps():
                 if training.validates:
                     training.validate()
@@ -86,6 +88,7 @@ def take_steps(training: Training, save_seconds: float) -> None:
     """Train to the last step; keep the best weights by validation, write the log, and a checkpoint every so often."""
     position = training.position
     if not position.done:
+        training.keep_best(training.validate())  # the start: nothing trained may be worse
         training.save()  # so that a training killed at once keeps its precision
     label = f"{training.task.name} ({training.precision})"
     saved = time.monotonic()

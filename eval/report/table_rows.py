@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from errors import BadInput
 from eval.means import mean_floor, scores_of
 from eval.metrics import METRICS, Values, within_floor
 from eval.results import FLOOR, ClipResults, by_signal, of_one_spp, results_of
 from eval.text_table import floor_cell, value_cell
+from models.registry import prototype
 
 MEAN = "mean of clips of 1 spp"  # instead of a clip's name
 
@@ -30,6 +32,14 @@ class TableRow:
     @property
     def is_mean(self) -> bool:
         return self.clip == MEAN
+
+    @property
+    def made_from(self) -> str:
+        """What the implementation of its denoiser follows; empty for one that is here no more."""
+        try:
+            return "" if self.is_floor else prototype(self.denoiser).made_from
+        except BadInput:
+            return ""
 
     def text(self, metric: str) -> str:
         value = self.values.get(metric)

@@ -126,6 +126,7 @@ class AAFState(State):
 class AAF(Denoiser):
     """Filters accumulated direct and indirect irradiance separately, each within its range since the last reset."""
 
+    made_from = "abstracts, code"
     reads = (*SVGF.reads, "roughness", "hit_distance", "light_distance", "light_angle")
     refuses = CLASSICAL
     convex = True

@@ -68,6 +68,7 @@ def change_of_light(frame: Frame) -> Tensor:
 class ASVGF(SVGF):
     """SVGF with α = (1 - λ) max(0.2, 1 / n) + λ, for colour and moments alike."""
 
+    made_from = "accounts"
     reads: tuple[str, ...] = (*SVGF.reads, "gradient")
     baseline_for = ()
 

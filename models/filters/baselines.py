@@ -13,6 +13,7 @@ from models.history.accumulation import Accumulation, accumulate
 class Noisy(Denoiser):
     """The noisy frame itself."""
 
+    made_from = "ours"
     reads = ("direct", "indirect", "emission")
     refuses = CLASSICAL
     convex = True

@@ -121,6 +121,7 @@ class BMFRState(AccumulatedState):
 class BMFR(Accumulating):
     """Fits accumulated irradiance in blocks of 32 x 32 pixels, and accumulates the fits."""
 
+    made_from = "code"
     reads = Accumulated.reads
     refuses = CLASSICAL
 

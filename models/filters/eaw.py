@@ -54,6 +54,7 @@ class EAWState(AccumulatedState):
 class EAW(Accumulating):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
+    made_from = "accounts"
     reads = Accumulated.reads
     refuses = CLASSICAL
     convex = True

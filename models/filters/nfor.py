@@ -165,6 +165,7 @@ def features_of(frame: Frame) -> Tensor:
 class NFOR(Denoiser):
     """Filters each frame by itself, in seconds: a yardstick of quality."""
 
+    made_from = "paper, code"
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id")
     refuses = CLASSICAL
     offline = True

@@ -81,6 +81,7 @@ class OIDN(Denoiser):
     (for interactive previews). Raises BadInput when it is prepared, or first used, where pyoidn does not run.
     """
 
+    made_from = "the library"
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth")
     refuses = dict.fromkeys((torch.bfloat16, torch.float16), "OIDN chooses its own precision")
     has_kernels = False
@@ -137,14 +138,14 @@ class OIDNFast(OIDN):
 
 
 class OIDNIrradiance(OIDN):
-    """Denoises irradiance, whose albedo is 1, and multiplies it by the albedo afterwards."""
+    """Denoises irradiance + emission, with an albedo of 1; the albedo is multiplied afterwards, of irradiance alone."""
 
-    filters_emission = False
     baseline_for = ()
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        denoised = self.denoise(frame, frame.irradiance(self.signal), torch.ones_like(frame.albedo))
-        return frame.remodulate(denoised, self.signal), State(frame.moment)
+        emission = frame.emission if self.signal == "total" else 0
+        denoised = self.denoise(frame, frame.irradiance(self.signal) + emission, torch.ones_like(frame.albedo))
+        return frame.remodulate((denoised - emission).clamp(min=0), self.signal), State(frame.moment)
 
 
 class OIDNAccumulated(Accumulating, OIDN):

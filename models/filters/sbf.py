@@ -106,6 +106,7 @@ def best_filtered(colour: Tensor, variance: Tensor, guides: Tensor) -> Tensor:
 class SBF(Accumulating):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
+    made_from = "accounts, code"
     reads = Accumulated.reads
     refuses = CLASSICAL
     convex = True

@@ -208,6 +208,7 @@ def irradiances(frame: Frame, signal: Signal) -> Tensor:
 class SVGF(Denoiser):
     """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset."""
 
+    made_from = "paper, code"
     reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
     convex = True

@@ -68,6 +68,7 @@ class TRMVState(State):
 class TRMV(SVGF):
     """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset."""
 
+    made_from = "abstract, accounts"
     reads: tuple[str, ...] = (*SVGF.reads, "roughness", "dual_motion", "shadow_motion", "reflection_motion")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

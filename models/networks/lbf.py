@@ -7,6 +7,7 @@ kinds and blocks of secondary features, the window of 55 x 55, its terms (Eq. 11
 
 What differs, since frames have 1 spp and noise-free features:
 
+- As in SVGF's evaluation (Schied et al. 2017, §5.1), the light that it filters has been accumulated over frames.
 - Roughness replaces the textures of the second hit. Visibility is whether direct light arrives: the mean over 3 x 3
   pixels of the same mesh, with variance p (1 - p) / 9 and p from 9 x 9.
 - The variance of colours is their spread over 9 x 9 pixels of the same mesh; other features have variance 0 and are not
@@ -19,14 +20,15 @@ What differs, since frames have 1 spp and noise-free features:
 - Background is in no window and in no statistic.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from datasets.frame import Frame, Signal
 from models.compiled.cross_bilateral import FEATURE_GROUPS
-from models.denoiser import Denoiser, State, matching_state
+from models.denoiser import State, matching_state
+from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.filters.neighbours import mesh_means, mesh_variance, taps_3x3
 from models.history.geometry import positions_around_eye, ray_axes
 from models.history.running_scale import RunningScale, running_scale
@@ -78,20 +80,24 @@ def remove_spikes(image: Tensor, surface: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class LBFState(State):
-    """Running exposure and depth scale; for debugging, the filter's sharpness."""
+class LBFState(AccumulatedState):
+    """Accumulated irradiance, running exposure and depth scale; for debugging, the filter's sharpness."""
 
     scale: RunningScale
-    sharpness: Tensor  # (B, 1 + groups, H, W)
+    sharpness: Tensor | None = None  # (B, 1 + groups, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
-        return {"width of the filter (px)": (2 * self.sharpness[:, :1]) ** -0.5}
+        if self.sharpness is None:
+            return super().pictures()
+        return super().pictures() | {"width of the filter (px)": (2 * self.sharpness[:, :1]) ** -0.5}
 
 
-class LBF(Denoiser):
-    """Filters each frame by itself, within the range of its irradiance; takes seconds a frame."""
+class LBF(Accumulating):
+    """Filters accumulated irradiance within its range since the last reset; takes seconds a frame."""
 
-    reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id")
+    made_from = "code"
+    reads = (*Accumulated.reads, "roughness")
+    filter_reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id")
     refuses = dict.fromkeys(
         (torch.bfloat16, torch.float16), "the sums of its filter need float32, and its network is too small to gain"
     )
@@ -112,18 +118,25 @@ class LBF(Denoiser):
         factors = self.network(statistics).movedim(-1, 1).to(features)
         return factors / torch.cat([torch.ones_like(surface), variance.clamp(min=MIN_FEATURE_VARIANCE)], dim=1)
 
-    def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, LBFState]:
-        """Filtered irradiance (B, 3, H, W), before spikes are removed, and the state for the next frame."""
+    def accumulate(self, frame: Frame, state: State | None) -> LBFState:
+        """The state before filtering: accumulated irradiance and running scales."""
         before = matching_state(state, LBFState, frame)
+        history = self.accumulated(frame, before)
+        scale = running_scale(history.irradiance * frame.divisor, frame.depth, before.scale if before else None)
+        return LBFState(frame.moment, history, scale)
+
+    def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, Tensor]:
+        """Filtered irradiance (B, 3, H, W), before spikes are removed, and the filter's sharpness."""
         surface = (frame.depth > 0).to(frame.depth)
-        colour = frame.irradiance(self.signal).clamp(-MAX_LUMINANCE, MAX_LUMINANCE) * surface
-        scale = running_scale(colour * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
+        colour = irradiance.clamp(-MAX_LUMINANCE, MAX_LUMINANCE) * surface
         features, variance = features_of(frame, scale)
         sharpness = self.sharpness(features, variance, surface, frame.samples)
         pixels = Pixels(colour, mesh_variance(colour, frame.mesh_id), features, surface)
-        return cross_bilateral(pixels, sharpness), LBFState(frame.moment, scale, sharpness.detach())
+        return cross_bilateral(pixels, sharpness), sharpness.detach()
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        filtered, after = self.predict(frame, state)
+        after = self.accumulate(frame, state)
+        filtered, sharpness = self.filter(frame, after.history.irradiance, after.scale)
         surface = (frame.depth > 0).to(frame.depth)
-        return frame.remodulate(remove_spikes(filtered, surface), self.signal), after
+        irradiance = remove_spikes(filtered, surface)
+        return frame.remodulate(irradiance, self.signal), replace(after, sharpness=sharpness)

@@ -34,6 +34,8 @@ SPACINGS = (4, 8, 16)  # px, and values of a guide, from cell to cell
 class NBGD(KernelPredictor):
     """Three guides and two mixing weights per pixel; means over the cells of three bilateral grids, mixed."""
 
+    made_from = "code"
+
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         outputs = 2 * len(SPACINGS) - 1

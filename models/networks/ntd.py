@@ -239,4 +239,5 @@ class NTDTraditional(NTD):
 class NTDMean(NTD):
     """NTD with averages, as in Eq. 7 of WSKP (Fan et al. 2021), in place of the maxima of Eq. 4, which darken; ours."""
 
+    made_from = "paper, changed"
     pool = staticmethod(halve)

@@ -200,6 +200,7 @@ def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidde
 class One(Denoiser):
     """Recurrent kernel prediction. Without validated history, the weight of the current frame is 1."""
 
+    made_from = "ours"
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True

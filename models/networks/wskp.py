@@ -259,6 +259,7 @@ class WSKPMR(MultiResolution):
 class MRKP(MultiResolution):
     """The paper's other baseline (§6.1): the network of wskp-mr, and a 5 x 5 kernel per pixel at each resolution."""
 
+    made_from = "ours, after code"
     maps = 25
 
     def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:

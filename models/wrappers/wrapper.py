@@ -20,6 +20,7 @@ class Wrapper(Denoiser):
         self.inner = inner
         self.reads = self.reads_with(inner.reads)
         self.refuses = inner.refuses
+        self.made_from = inner.made_from
         self.is_network = inner.is_network
         self.offline = inner.offline
         self.constants = inner.constants

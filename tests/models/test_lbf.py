@@ -13,7 +13,7 @@ from models.history.running_scale import running_scale
 from models.networks.cross_bilateral import Pixels, cross_bilateral
 from models.networks.lbf import features_of, remove_spikes
 from models.networks.secondary_features import secondary_features
-from tests.helpers.frames import flat_frame, run
+from tests.helpers.frames import flat_frame
 
 both_implementations = pytest.mark.usefixtures("implementation")
 SIZES = st.tuples(st.integers(1, 7), st.integers(1, 7))
@@ -230,8 +230,14 @@ def test_the_network_has_the_authors_shape():
     torch.testing.assert_close(denoiser.network(x), expected)
 
 
-def test_frames_are_filtered_one_by_one():
+def test_accumulated_light_is_filtered():
+    """As that of one frame which has it."""
     lights = torch.rand(2, 1, 3, 10, 10, generator=torch.Generator().manual_seed(0))
-    frames = [flat_frame(10, 10, irradiance=light) for light in lights]
+    frames = [flat_frame(10, 10, irradiance=light) for light in (*lights, lights.mean(dim=0))]
     lbf = registry.create("lbf")
-    torch.testing.assert_close(run(lbf, frames)[1], run(lbf, frames[1:])[0])
+    state = lbf(frames[0], None)[1]
+    history = lbf.accumulate(frames[1], state)
+    torch.testing.assert_close(history.history.irradiance, lights.mean(dim=0))
+    accumulated, _ = lbf.filter(frames[2], history.history.irradiance, history.scale)
+    alone, _ = lbf.filter(frames[2], frames[2].irradiance("total"), history.scale)
+    torch.testing.assert_close(accumulated, alone)

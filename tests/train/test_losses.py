@@ -153,13 +153,11 @@ def test_lbf_loss_by_hand(batch_of, monkeypatch):
     """The relative MSE of exposed radiance, emission included, times half the samples per pixel."""
     batch = batch_of("lbf", 2, crop=16)
     denoiser = create("lbf")
-    (frame,) = batch.frames
-    frame = replace(frame, spp=torch.tensor([1.0, 4.0])[:, None, None, None])
-    _, state = denoiser.predict(frame, None)
+    frame = replace(batch.frame, spp=torch.tensor([1.0, 4.0])[:, None, None, None])
     guess = torch.rand_like(frame.albedo)
-    monkeypatch.setattr(denoiser, "predict", lambda frame, before: (guess, state))
-    value, _ = NetworkLoss(denoiser, LBFLoss())(Batch([frame]))
-    exposure = state.scale.exposure().numpy()
+    monkeypatch.setattr(denoiser, "filter", lambda frame, irradiance, scale: (guess, None))
+    value, _ = NetworkLoss(denoiser, LBFLoss())(Crops(frame, batch.irradiance, batch.log_scale))
+    exposure = batch.scale.exposure().numpy()
     albedo = np.maximum(frame.albedo.numpy(), 0.01)
     output = exposure * (guess.numpy() * albedo + frame.emission.numpy())
     buffers = frame.direct_reference + frame.indirect_reference + frame.emission[:, None]

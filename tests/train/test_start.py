@@ -56,6 +56,16 @@ def test_it_begins_with_the_general_network_bit_for_bit(tiny, tmp_path, general)
         assert begun.keys() == wanted.keys() and all(torch.equal(begun[key], wanted[key]) for key in wanted)
 
 
+@pytest.mark.parametrize("name", ["wskp3", "rae"])
+def test_a_training_that_makes_it_worse_keeps_its_start(tiny, tmp_path, name):
+    task = short(name, tiny, tmp_path)
+    task = replace(task, recipe=replace(task.recipe, rate=1e3, ramp=0))
+    start = Training(task).judged.denoiser.state_dict()
+    weights = train_network(task)
+    assert json.loads(metadata(weights)["recipe"])["step"] == 0
+    assert all(torch.equal(start[key], kept) for key, kept in tensors(weights).items())
+
+
 def test_its_weights_and_checkpoint_name_what_it_began_with(tiny, tmp_path, general):
     task = short("wskp3", tiny, tmp_path / "runs", start=general)
     weights = train_network(task)
