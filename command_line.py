@@ -298,7 +298,7 @@ def trade(
     data: DataOfBudget = None,
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    size: Annotated[str, arg(metavar="WxH", help="of the images that were timed")] = "1280x720",
+    size: Annotated[str | None, arg(metavar="WxH", help="of the images that were timed; by default the clips'")] = None,
     threads: Annotated[int | None, arg(metavar="N", help="that were timed; by default the most")] = None,
     spp: Annotated[tuple[int, ...], arg(metavar="N...", help="samples per pixel, rising")] = DEFAULT_SPP,
 ) -> None:

@@ -124,7 +124,7 @@ class FrameBuilder:
             "normal": self.normals(foreign, depth, view, views),
             "depth": depth[..., None],
             "roughness": foreign.arrays.get("roughness", np.ones((*foreign.size, 1), np.float32)),
-            "mesh_id": foreign.surface[..., None],
+            "mesh_id": mesh_ids(foreign),
             "motion": motion,
             "dual_motion": motion,
         }
@@ -170,6 +170,15 @@ class FrameBuilder:
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         unit = np.where(length > 1e-6, normal / np.maximum(length, 1e-6), toward_viewer)
         return np.where(foreign.surface[..., None], unit, 0).astype(np.float32)
+
+
+def mesh_ids(foreign: ForeignFrame) -> Image:
+    """Ids (H, W, 1) of surfaces, 0 for background: hashes of the renderer's, below 2^24, or 1 for all without any."""
+    if "id" not in foreign.arrays:
+        return foreign.surface[..., None].astype(np.float32)
+    bits = np.ascontiguousarray(foreign.arrays["id"], np.float32).view(np.uint32)
+    hashed = (bits * np.uint32(0x9E3779B1)) >> 8  # Fibonacci hashing: ids may be small integers or random bits
+    return np.where(foreign.surface[..., None], np.maximum(hashed, 1), 0).astype(np.float32)
 
 
 def frame_of(

@@ -29,6 +29,8 @@ class Job:
         nrm: normals in separate files
         mv: motion vectors in separate files
         depth: depth in separate files
+        pos: positions in separate files, in the world
+        ids: ids of objects or meshes in separate files
         layers: name layers yourself, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y
         motion: the motion vectors' convention, such as XY,+x,-y,pixels, in the notation that is printed
         ref: references to compare with
@@ -54,6 +56,8 @@ class Job:
     nrm: Patterns = ()
     mv: Patterns = ()
     depth: Patterns = ()
+    pos: Patterns = ()
+    ids: Patterns = ()
     layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...")] = ()
     motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT")] = None
     ref: Annotated[tuple[str, ...], arg(metavar="PATTERN...", aliases=["-r"])] = ()
@@ -74,7 +78,8 @@ class Job:
         if not colour:
             raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
         passes = {COLOUR: colour, "half": self.half, "albedo": self.alb, "normal": self.nrm, "motion": self.mv}
-        return {name: patterns for name, patterns in (passes | {"depth": self.depth}).items() if patterns}
+        passes |= {"depth": self.depth, "position": self.pos, "id": self.ids}
+        return {name: patterns for name, patterns in passes.items() if patterns}
 
     @property
     def estimates_error(self) -> bool:

@@ -31,6 +31,8 @@ QUANTITIES: dict[str, LayerNames] = {
         ("vector", "motion", "motionvector", "motionvectors", "velocity", "mv", "flow"), ("xyzw", "xy", "uv", "rg")
     ),
     "roughness": LayerNames(("roughness",), SCALAR),  # GGX alpha
+    # Of objects or meshes: any numbers that are equal within one and from frame to frame.
+    "id": LayerNames(("id", "ids", "objectid", "meshid", "instanceid", "indexob"), SCALAR),
 }
 
 

@@ -31,7 +31,7 @@ from eval.results import (
     write_results,
 )
 from eval.selection import evaluated, with_indirect_baselines
-from eval.text_table import results_table
+from eval.text_table import results_table, table_by_age
 from extras import can_draw
 from models.spec import DenoiserSpec
 from process import set_up_process
@@ -191,5 +191,6 @@ def evaluate(
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(device), results, weights)
     save_strips(runs, by_clip(results))
-    print(results_table(list(by_clip(results))))
+    judged = list(by_clip(results))
+    print(f"{results_table(judged)}\n\n{table_by_age(judged)}")
     return content

@@ -26,6 +26,22 @@ def mean_floor(frames: list[Values]) -> Values:
     return floors
 
 
+# A recurrent denoiser has no history in the first frame, some in the fifth, and is steady from the 16th on.
+AGES = {"first frame": slice(0, 1), "fifth": slice(4, 5), "from the 16th on": slice(15, None)}
+
+
+def means_by_age(clips: Sequence[ClipResults], metric: str = "psnr") -> dict[str, dict[str, float | None]]:
+    """A metric of each denoiser by AGES, the mean over clips of one signal; None where no clip is that long."""
+    rows: dict[str, dict[str, float | None]] = {}
+    for denoiser in dict.fromkeys(result.denoiser for clip in clips for result in clip.results):
+        results = [result for clip in clips for result in clip.results if result.denoiser == denoiser]
+        for age, frames in AGES.items():
+            chosen = [means(result.frames[frames])[metric] for result in results if result.frames[frames]]
+            values = [value for value in chosen if value is not None]
+            rows.setdefault(denoiser, {})[age] = fmean(values) if values else None
+    return rows
+
+
 @dataclass(frozen=True)
 class ClipScores:
     """A denoiser's metrics on several clips, and the noise floors of these."""

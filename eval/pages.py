@@ -16,12 +16,12 @@ from tabulate import tabulate
 
 from errors import BadInput
 from eval.bench.denoisers import BASELINE
-from eval.means import means
+from eval.means import means, means_by_age
 from eval.metrics import METRICS, Values
 from eval.report.table_rows import TableRow, clip_rows, mean_rows
-from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
+from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, by_signal, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.text_table import PRINTED
+from eval.text_table import PRINTED, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -55,7 +55,8 @@ def extract_eval(runs: Path) -> dict[str, Any]:
         }
         for clip in of_one_spp(clips)
     ]
-    return {key: content[key] for key in ("device", "versions", "dataset")} | {"clips": rows}
+    facts = {key: content[key] for key in ("device", "versions", "dataset")}
+    return facts | {"clips": rows, "ages": means_by_age(by_signal(of_one_spp(clips))["total"])}
 
 
 def kept(values: Values) -> Values:
@@ -192,6 +193,13 @@ def quality(metric: str, signal: str = "total") -> str:
     return table(lines)
 
 
+def ages(*names: str) -> str:
+    """PSNR of the named denoisers by the age of their history."""
+    rows = measured("eval")["ages"]
+    texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names}
+    return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
+
+
 def value(metric: str, denoiser: str, scene: str = "mean") -> str:
     """One number."""
     return next(row.text(metric) for row in rows_of(scene) if row.denoiser == denoiser)
@@ -298,7 +306,7 @@ def minutes(what: str) -> str:
 
 GENERATORS: dict[str, Callable[..., str]] = {
     each.__name__: each
-    for each in (clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, minutes)
+    for each in (ages, clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, minutes)
 }
 
 

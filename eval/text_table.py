@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from tabulate import tabulate
 
+from eval.means import AGES, means_by_age
 from eval.metrics import METRICS, within_floor
-from eval.results import FLOOR, ClipResults
+from eval.results import FLOOR, ClipResults, by_signal
 
 PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
 NEAR_FLOOR = "≈"
@@ -24,6 +25,16 @@ def floor_cell(metric: str, value: float | None) -> str:
     """A noise floor, marked if it is a standard error."""
     mark = "±" if METRICS[metric].floor_is_error and value is not None else ""
     return mark + value_cell(metric, value)
+
+
+def table_by_age(clips: Sequence[ClipResults]) -> str:
+    """PSNR by the age of the history, the mean over clips, of each signal."""
+    tables = []
+    for signal, ours in by_signal(clips).items():
+        rows = means_by_age(ours)
+        lines = [[name, signal, *(value_cell("psnr", value) for value in row.values())] for name, row in rows.items()]
+        tables.append(tabulate(lines, ["PSNR dB", "signal", *AGES], disable_numparse=True))
+    return "\n\n".join(tables)
 
 
 def results_table(clips: Sequence[ClipResults]) -> str:

@@ -38,19 +38,19 @@ def trade(
     budget: str,
     levels: Sequence[int],
     names: Sequence[str] = (),
-    size: str = "1280x720",
+    size: str | None = None,
     threads: int | None = None,
 ) -> str:
     """Evaluate all candidates on the test clips, with `levels` of samples per pixel.
 
-    Returns tables; writes RUNS/report/trade.json and a figure. Times are those of RUNS/bench at `size` and `threads`.
-    Clips and results are stored in RUNS/trade and reused. Raises BadInput where there are no times or clips, for a bad
-    size or numbers of samples, and as `candidates`.
+    Returns tables; writes RUNS/report/trade.json and a figure. Times are those of RUNS/bench at `size`, by default that
+    of the clips, and `threads`. Clips and results are stored in RUNS/trade and reused. Raises BadInput where there are
+    no times or clips, for a bad size or numbers of samples, and as `candidates`.
     """
     check_levels(levels)
     dataset = Dataset(data)
-    times = Times(runs, parse_size(size), threads, RENDERER)
     clips = clips_of_one_spp(dataset)
+    times = Times(runs, parse_size(size) if size else (clips[0].height, clips[0].width), threads, RENDERER)
     chosen = candidates(names, runs, budget)
     folder = runs / "trade"
 

@@ -164,6 +164,26 @@ def test_names_and_files_make_no_difference(spheres, tmp_path, names):
     assert same(denoised(tmp_path / "in", tmp_path / "out", **passes), expected)
 
 
+def test_positions_and_ids_in_files_of_their_own(spheres, tmp_path):
+    """They give the history of one file with all layers; and ids separate what geometry does not."""
+
+    def with_ids(frame: Frame) -> foreign.Layers:
+        halves = np.arange(frame.size[1])[None, :, None] < frame.size[1] // 2
+        return foreign.pbrt(frame) | {"id.Y": np.broadcast_to(np.where(halves, 3.0, 70000.0), (*frame.size, 1))}
+
+    foreign.write_sequence(tmp_path / "plain", spheres, foreign.pbrt)
+    foreign.write_sequence(tmp_path / "together", spheres, with_ids)
+    foreign.write_sequence(tmp_path / "colour", spheres, lambda f: {"RGB": foreign.beauty(f)})
+    passes = {}
+    for flag, layer in {"alb": "Albedo.RGB", "nrm": "N.XYZ", "pos": "P.XYZ", "ids": "id.Y"}.items():
+        letters = layer.rpartition(".")[2]
+        foreign.write_sequence(tmp_path / flag, spheres, lambda f, _l=layer, _c=letters: {_c: with_ids(f)[_l]})
+        passes[flag] = (str(tmp_path / flag / "*.exr"),)
+    together = denoised(tmp_path / "together", tmp_path / "expected")
+    assert same(denoised(tmp_path / "colour", tmp_path / "out", **passes), together)
+    assert not same(denoised(tmp_path / "plain", tmp_path / "other"), together)
+
+
 def test_layers_of_unknown_names_are_named_by_the_user(spheres, tmp_path):
     foreign.write_sequence(
         tmp_path / "in", spheres, lambda f: {"Foo.RGB": foreign.beauty(f), "Bar.RGB": foreign.image(f, "albedo")}

@@ -12,8 +12,9 @@ import torch
 from datasets.clip import Dataset
 from eval import clip_run, harness
 from eval.harness import evaluate
+from eval.means import means_by_age
 from eval.metrics import METRICS
-from eval.results import FLOOR, folder_of, load_picture, read_results
+from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
 from models.registry import create
 from models.weights import save_weights
 from train.task import run_folder
@@ -164,3 +165,18 @@ def test_parallel_evaluation_gives_the_same_results(once, tiny, tmp_path):
             assert ours.key == theirs.key and ours.frames == [
                 {k: v if v is None else pytest.approx(v, rel=1e-3) for k, v in frame.items()} for frame in theirs.frames
             ]
+
+
+def test_denoisers_are_judged_by_the_age_of_their_history():
+    """The first frame, the fifth, and the mean from the 16th on, of the clips that are so long."""
+
+    def clip(length: int, offset: float) -> ClipResults:
+        frames = [{metric: offset + index for metric in METRICS} for index in range(length)]
+        result = Result(
+            key="", denoiser="one", signal="total", scene="box", clip=str(length), metrics={}, frames=frames
+        )
+        return ClipResults("box", str(length), "total", [result], result)
+
+    ages = means_by_age([clip(20, 100.0), clip(6, 200.0)])["one"]
+    assert list(ages.values()) == [150.0, 154.0, 117.0]
+    assert list(means_by_age([clip(1, 3.0)])["one"].values()) == [3.0, None, None]
