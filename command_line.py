@@ -140,15 +140,21 @@ def evaluate(
     or 1,
     device: Device = "cpu",
     first_hits: Annotated[bool, arg(help="describe mirrors and glass by themselves, not by what they show")] = False,
+    where: Annotated[bool, arg(help="print where the squared error is instead: edges, roughness, scale")] = False,
 ) -> None:
     """Evaluate denoisers on the test clips, by default all that can run: table, images, results.json.
 
     Networks use their shipped weights (`onespp weights`) and, as NETWORK@BUDGET, those trained in this budget. Earlier
     results of the same clips, weights and code are kept.
     """
+    from eval.error_location import where as error_tables
     from eval.harness import evaluate as evaluate_on
 
-    evaluate_on(data or [data_folder(None, budget)], runs, budget, names, processes, device, first_hits)
+    folders = data or [data_folder(None, budget)]
+    if where:
+        print(error_tables(folders, runs, budget, names))
+    else:
+        evaluate_on(folders, runs, budget, names, processes, device, first_hits)
 
 
 def report(

@@ -13,12 +13,14 @@ import flip_evaluator
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
 
 from datasets.tonemap import psnr
 from eval.comparison import Comparison
 from eval.ssim import ssim, ssim_floor
 
 EPSILON = 0.01
+FLICKER_BLOCK = 16  # px
 
 Values = dict[str, float | None]  # by metric; None where undefined
 
@@ -122,6 +124,49 @@ def flicker(c: Comparison) -> float | None:
     return float(c.change.output.abs().mean()) if c.change and c.still else None
 
 
+def energy(c: Comparison) -> float | None:
+    """Mean radiance over that of the reference, less 1: convex filters keep it, others lose a few per cent."""
+    mean = float(c.reference.mean())
+    return float(c.output.mean()) / mean - 1 if mean > 0 else None
+
+
+def energy_error(c: Comparison) -> float | None:
+    """Its standard error for a perfect image with independent pixels."""
+    mean = float((c.exposure * c.reference).mean())
+    return float(c.noise.square().sum().sqrt()) / c.noise.numel() / mean if mean > 0 else None
+
+
+def gradient_product(x: Tensor, y: Tensor) -> float:
+    """The sum of products of the gradients, differences of adjacent pixels, of two images (1, 1, H, W)."""
+    return sum(float((x.diff(dim=dim) * y.diff(dim=dim)).sum()) for dim in (-1, -2))
+
+
+def detail(c: Comparison) -> float | None:
+    """The share of the truth's gradients in displayed luminance that the image has, noise taken off: Σ ∇x ∇r / Σ ∇A ∇B.
+
+    Gradients of noise, in image and reference, are uncorrelated with those of the truth.
+    """
+    output, reference, buffers = c.luminances
+    truth = gradient_product(*buffers.split(1))
+    return gradient_product(output, reference) / truth if truth > 0 else None
+
+
+def block_flicker(c: Comparison) -> float | None:
+    """`temporal_error` of the means of blocks of 16 x 16 pixels: what is seen as blotches that come and go."""
+    return None if c.change is None else block_change(c.change.output - c.change.reference)
+
+
+def block_flicker_floor(c: Comparison) -> float | None:
+    if c.change is None:
+        return None
+    a, b = c.change.buffers.split(1)
+    return block_change(a - b) / 2
+
+
+def block_change(change: Tensor) -> float:
+    return float(F.avg_pool2d(change, FLICKER_BLOCK, ceil_mode=True).abs().mean())
+
+
 def where_disoccluded(c: Comparison, error: Tensor) -> float | None:
     """The mean of `error` (1, 3, H, W) on disoccluded pixels; None without any."""
     if c.disoccluded is None or not c.disoccluded.any():
@@ -158,6 +203,9 @@ METRICS = {
         of=lambda c: where_disoccluded(c, (c.displayed - c.displayed_reference).abs()),
         floor=lambda c: where_disoccluded(c, c.displayed_noise.abs()),
     ),
+    "energy": Metric("energy", "{:+.1%}", of=energy, floor=energy_error, edge=twice, floor_is_error=True),
+    "detail": Metric("detail", "{:.3f}", more_is_better=True, of=detail, floor=None),
+    "block_flicker": Metric("block flicker", "{:.4f}", of=block_flicker, floor=block_flicker_floor),
     "flicker": Metric("flicker", "{:.4f}", of=flicker, floor=None),
     "l1": Metric(
         "L1",

@@ -150,3 +150,47 @@ def test_display_and_luminance():
     x = torch.tensor([0.0, 0.25, 2.0])[None, :, None, None]
     torch.testing.assert_close(display(x, 2.0).flatten(), torch.tensor([0.0, 0.5 ** (1 / 2.2), 1.0]))
     assert image_luminance(torch.ones(1, 3, 1, 1)).item() == pytest.approx(1)
+
+
+def noisy_pair(seed: int, noise: float, size: int = 128) -> tuple[np.ndarray, torch.Tensor]:
+    """A picture (3, H, W) and two buffers of it (2, 3, H, W) with independent noise."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:size, 0:size] / 4
+    truth = np.broadcast_to(0.3 + 0.1 * np.sin(x) * np.cos(1.7 * y), (3, size, size))
+    return truth, torch.from_numpy(truth + noise * rng.normal(size=(2, 3, size, size))).float()
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.95, 1.2])
+def test_energy_is_the_change_of_mean_radiance(gain):
+    truth, buffers = noisy_pair(0, 0.05)
+    values = measure(Comparison(torch.from_numpy(gain * truth[None]), buffers, 2.0))
+    perfect = Comparison(torch.from_numpy(truth[None].copy()), buffers, 2.0)
+    error = METRICS["energy"].floor(perfect)
+    assert error == pytest.approx(0.05 / math.sqrt(2 * buffers[0].numel()) / 0.3, rel=0.05)
+    assert abs(measure(perfect)["energy"]) < 3 * error
+    assert values["energy"] == pytest.approx(gain - 1, abs=3 * error)
+
+
+def test_detail_counts_neither_noise_nor_blur():
+    """1 for the truth and for the truth with noise, however noisy the reference; for a blurred image what it keeps."""
+    truth, buffers = noisy_pair(1, 0.01)
+    noisy = truth + 0.02 * np.random.default_rng(2).normal(size=truth.shape)
+    blurred = 0.3 + 0.6 * (truth - 0.3)
+    for image, expected in ((truth, 1.0), (noisy, 1.0), (blurred, 0.6)):
+        # The tone curve is not linear: within a few per cent where contrast is low.
+        value = measure(Comparison(torch.from_numpy(image[None].copy()), buffers, 1.0))["detail"]
+        assert value == pytest.approx(expected, rel=0.05)
+
+
+def test_blocks_flicker_where_their_means_change():
+    """White noise, which changes every frame, cancels in blocks; a blotch of a block's size does not."""
+    _, buffers = noisy_pair(3, 0.0, 64)
+    flat = torch.full((1, 3, 64, 64), 0.3)
+    blotch, noise = flat.clone(), flat + 0.01 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(0))
+    blotch[..., 16:32, 32:48] *= 1.5
+    before = Comparison(flat, buffers, 1.0).luminances
+    values = [measure(Comparison(image, buffers, 1.0, before=before)) for image in (flat, noise, blotch)]
+    still, white, grown = (value["block_flicker"] for value in values)
+    change = float(display(torch.tensor(0.45), 1.0) - display(torch.tensor(0.3), 1.0))
+    assert still == 0 and white < 0.1 * values[1]["temporal_error"]
+    assert grown == pytest.approx(change / 16, rel=1e-4) == values[2]["temporal_error"]

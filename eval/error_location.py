@@ -1,0 +1,127 @@
+"""`onespp eval --where`: shares of the squared error by place, roughness, brightness and scale.
+
+Errors are those of displayed images. Their square is the product of the differences to both buffers of the reference,
+(x - A)(x - B), whose mean is the squared error without noise of the reference.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tabulate import tabulate
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from datasets.clip import Clip, Dataset
+from datasets.frame import Frame, read_frame, to_tensor
+from datasets.tonemap import display
+from eval.selection import evaluated
+from models.operators import finite, image_luminance
+from models.spec import DenoiserSpec
+
+GUIDES = ("depth", "normal", "mesh_id", "roughness")
+CREASE_COSINE = 0.94  # between normals of adjacent pixels, 20 degrees
+SMOOTH, ROUGH = 0.1, 0.3  # GGX alpha
+DARK, BRIGHT = 0.25, 0.75  # displayed luminance
+SCALES = (1, 4, 16)  # px
+
+Shares = dict[tuple[str, str], Tensor]  # by (question, answer)
+
+
+def beside(differs: Tensor, dim: int) -> Tensor:
+    """The pixels (1, 1, H, W) on either side of adjacent ones that differ, along `dim`."""
+    before, after = ((1, 0), (0, 1)) if dim == -1 else ((0, 0, 1, 0), (0, 0, 0, 1))
+    return F.pad(differs, before) | F.pad(differs, after)
+
+
+def places(frame: Frame, reference: Tensor) -> Shares:
+    """Masks (1, 1, H, W) of a frame's pixels; `reference` (1, 3, H, W) is as displayed."""
+    edge = torch.zeros_like(frame.mesh_id, dtype=torch.bool)
+    crease = torch.zeros_like(edge)
+    for dim in (-1, -2):
+        length = edge.shape[dim] - 1
+        a, b = (frame.normal.narrow(dim, start, length) for start in (0, 1))
+        edge |= beside(frame.mesh_id.diff(dim=dim) != 0, dim)
+        crease |= beside((a * b).sum(dim=1, keepdim=True) < CREASE_COSINE, dim)
+    crease &= ~edge
+    surface = frame.depth > 0
+    alpha, y = frame.roughness, image_luminance(reference)
+    return {
+        ("place", "mesh edges"): edge,
+        ("place", "creases"): crease & surface,
+        ("place", "inside"): ~edge & ~(crease & surface),
+        ("roughness", f"α ≤ {SMOOTH}"): surface & (alpha <= SMOOTH),
+        ("roughness", f"to {ROUGH}"): surface & (alpha > SMOOTH) & (alpha <= ROUGH),
+        ("roughness", "rougher"): surface & (alpha > ROUGH),
+        ("roughness", "background"): ~surface,
+        ("displayed", f"below {DARK}"): y < DARK,
+        ("displayed", f"to {BRIGHT}"): (y >= DARK) & (y < BRIGHT),
+        ("displayed", "brighter"): y >= BRIGHT,
+    }
+
+
+def by_scale(error_a: Tensor, error_b: Tensor) -> Shares:
+    """Sums of the squared error (1, 3, H, W) of details smaller than 4 and 16 pixels, and of the rest."""
+    height, width = (side - side % SCALES[-1] or side for side in error_a.shape[-2:])
+    sums = []
+    for scale in SCALES:
+        block = min(scale, height), min(scale, width)
+        a, b = (F.avg_pool2d(error[..., :height, :width], block) for error in (error_a, error_b))
+        sums.append((a * b).sum() * (block[0] * block[1]))
+    fine, middle, coarse = sums
+    names = (f"below {SCALES[1]} px", f"to {SCALES[2]} px", "larger")
+    return {("scale", name): sum for name, sum in zip(names, (fine - middle, middle - coarse, coarse), strict=True)}
+
+
+def squared_errors(output: Tensor, buffers: Tensor, masks: Shares) -> Shares:
+    """Sums of the squared error of a displayed image (1, 3, H, W), by place and by scale; `buffers` (2, 3, H, W)."""
+    a, b = (output - buffer for buffer in buffers.split(1))
+    product = (a * b).sum(dim=1, keepdim=True)
+    return {key: product[mask].sum() for key, mask in masks.items()} | by_scale(a, b)
+
+
+def add(total: Shares, more: Shares) -> None:
+    for key, value in more.items():
+        total[key] = total.get(key, torch.zeros(())) + value
+
+
+def normalised(sums: Shares) -> Shares:
+    """Sums over the total of their question."""
+    totals = {question: sum(v for key, v in sums.items() if key[0] == question) for question, _ in sums}
+    return {key: value / totals[key[0]] for key, value in sums.items()}
+
+
+@torch.no_grad()
+def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
+    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip."""
+    denoisers = {spec.name: spec.build() for spec in specs}
+    states = dict.fromkeys(denoisers)
+    channels = sorted({*GUIDES, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
+    sums: dict[str, Shares] = {name: {} for name in ("pixels", *denoisers)}
+    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
+        frame = read_frame(clip, index, channels)
+        for name, denoiser in denoisers.items():
+            reference = to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
+            buffers = display(reference, clip.exposure).double()
+            masks = places(frame, buffers.mean(dim=0, keepdim=True))
+            output, states[name] = denoiser(frame, states[name])
+            shown = display(finite(output), clip.exposure).double()
+            add(sums[name], squared_errors(shown, buffers, masks))
+        add(sums["pixels"], {key: mask.sum() for key, mask in masks.items()})
+    return {name: normalised(shares) for name, shares in sums.items()}
+
+
+def table_of(clip: Clip, shares: dict[str, Shares]) -> str:
+    keys = dict.fromkeys(key for each in shares.values() for key in each)
+    lines = [
+        [*key, *(f"{100 * float(each[key]):.0f} %" if key in each else "" for each in shares.values())] for key in keys
+    ]
+    return f"{clip.scene}/{clip.name}\n" + tabulate(lines, ["", "", *shares], disable_numparse=True)
+
+
+def where(data: Sequence[Path], runs: Path, budget: str, names: Sequence[str]) -> str:
+    """A table for each test clip. Raises BadInput as `onespp eval` does."""
+    specs = evaluated(names, runs, budget)
+    clips = [clip for path in data for clip in Dataset(path).clips("test")]
+    return "\n\n".join(table_of(clip, error_shares(clip, specs)) for clip in clips)
