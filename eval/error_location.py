@@ -20,11 +20,11 @@ from eval.selection import evaluated
 from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
 
-GUIDES = ("depth", "normal", "mesh_id", "roughness")
+PLACE_CHANNELS = ("depth", "normal", "mesh_id", "roughness")
 CREASE_COSINE = 0.94  # between normals of adjacent pixels, 20 degrees
-SMOOTH, ROUGH = 0.1, 0.3  # GGX alpha
-DARK, BRIGHT = 0.25, 0.75  # displayed luminance
-SCALES = (1, 4, 16)  # px
+SMOOTH_ALPHA, ROUGH_ALPHA = 0.1, 0.3  # GGX alpha
+DARK_BELOW, BRIGHT_FROM = 0.25, 0.75  # displayed luminance
+ERROR_SCALES = (1, 4, 16)  # px
 
 Shares = dict[tuple[str, str], Tensor]  # by (question, answer)
 
@@ -51,26 +51,26 @@ def places(frame: Frame, reference: Tensor) -> Shares:
         ("place", "mesh edges"): edge,
         ("place", "creases"): crease & surface,
         ("place", "inside"): ~edge & ~(crease & surface),
-        ("roughness", f"α ≤ {SMOOTH}"): surface & (alpha <= SMOOTH),
-        ("roughness", f"to {ROUGH}"): surface & (alpha > SMOOTH) & (alpha <= ROUGH),
-        ("roughness", "rougher"): surface & (alpha > ROUGH),
+        ("roughness", f"α ≤ {SMOOTH_ALPHA}"): surface & (alpha <= SMOOTH_ALPHA),
+        ("roughness", f"to {ROUGH_ALPHA}"): surface & (alpha > SMOOTH_ALPHA) & (alpha <= ROUGH_ALPHA),
+        ("roughness", "rougher"): surface & (alpha > ROUGH_ALPHA),
         ("roughness", "background"): ~surface,
-        ("displayed", f"below {DARK}"): y < DARK,
-        ("displayed", f"to {BRIGHT}"): (y >= DARK) & (y < BRIGHT),
-        ("displayed", "brighter"): y >= BRIGHT,
+        ("displayed", f"below {DARK_BELOW}"): y < DARK_BELOW,
+        ("displayed", f"to {BRIGHT_FROM}"): (y >= DARK_BELOW) & (y < BRIGHT_FROM),
+        ("displayed", "brighter"): y >= BRIGHT_FROM,
     }
 
 
 def by_scale(error_a: Tensor, error_b: Tensor) -> Shares:
     """Sums of the squared error (1, 3, H, W) of details smaller than 4 and 16 pixels, and of the rest."""
-    height, width = (side - side % SCALES[-1] or side for side in error_a.shape[-2:])
+    height, width = (side - side % ERROR_SCALES[-1] or side for side in error_a.shape[-2:])
     sums = []
-    for scale in SCALES:
+    for scale in ERROR_SCALES:
         block = min(scale, height), min(scale, width)
         a, b = (F.avg_pool2d(error[..., :height, :width], block) for error in (error_a, error_b))
         sums.append((a * b).sum() * (block[0] * block[1]))
     fine, middle, coarse = sums
-    names = (f"below {SCALES[1]} px", f"to {SCALES[2]} px", "larger")
+    names = (f"below {ERROR_SCALES[1]} px", f"to {ERROR_SCALES[2]} px", "larger")
     return {("scale", name): sum for name, sum in zip(names, (fine - middle, middle - coarse, coarse), strict=True)}
 
 
@@ -97,7 +97,7 @@ def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]
     """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip."""
     denoisers = {spec.name: spec.build() for spec in specs}
     states = dict.fromkeys(denoisers)
-    channels = sorted({*GUIDES, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
+    channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
     sums: dict[str, Shares] = {name: {} for name in ("pixels", *denoisers)}
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)

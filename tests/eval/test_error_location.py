@@ -16,12 +16,12 @@ def frame_with_edges():
     frame = flat_frame(SIZE, SIZE)
     column, row = torch.arange(SIZE), torch.arange(SIZE)[:, None]
     right = (column >= 32).expand(1, 1, SIZE, SIZE)
-    frame.channels |= {
+    channels = {
         "mesh_id": torch.where(column < 16, 1.0, 2.0).expand(1, 1, SIZE, SIZE),
         "normal": torch.where(right, torch.tensor([1.0, 0, 0])[:, None, None], frame.normal),
         "roughness": torch.where(row < 48, 1.0, 0.05).expand(1, 1, SIZE, SIZE),
     }
-    return frame
+    return frame.with_channels(channels)
 
 
 def shares_of(errors: torch.Tensor, noise: float = 0.0) -> dict[str, float]:
