@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trimesh.visual import TextureVisuals
 
 from errors import BadInput
-from render.backend import dr, mi
+from render.backend import VARIANT, dr, mi
 from scenes.animation import Shape, StockLight, StockShape
 from scenes.bsdf import Bsdf
 
@@ -94,21 +94,24 @@ def load_mesh(shape: Shape) -> mi.Mesh:
     return mesh
 
 
-def copied(borrowed: ArrayT) -> ArrayT:
-    """An array made from numpy's, in Dr.Jit's own memory.
+def uploaded(values: NDArray[Any], kind: type[ArrayT]) -> ArrayT:
+    """`values` (N,) as an array of that kind, in Dr.Jit's own memory.
 
-    On the CPU Dr.Jit borrows numpy's memory. It compiles the alignment of such memory into kernels, and recordings of
-    frozen functions (Dr.Jit 1.5) miss that another array has taken its place.
+    On the CPU Dr.Jit would borrow numpy's memory. It compiles the alignment of such memory into kernels, and recordings
+    of frozen functions (Dr.Jit 1.5) miss that another array has taken its place.
     """
-    own: ArrayT = dr.select(dr.opaque(mi.Bool, True), borrowed, 0)
-    dr.eval(own)
-    dr.sync_thread()  # numpy may free its memory now
+    if VARIANT == "cuda_ad_rgb" or not len(values):
+        return kind(values)
+    own: ArrayT = dr.zeros(kind, len(values))
+    dr.make_opaque(own)
+    dr.sync_thread()
+    np.asarray(own)[:] = values
     return own
 
 
 def upload(values: NDArray[np.floating]) -> mi.Float:
     """`values` (N,) as data for kernels; Python numbers would be compiled in."""
-    return copied(mi.Float(values.astype(np.float32)))
+    return uploaded(values.astype(np.float32), mi.Float)
 
 
 def columns(vector: Iterable[dr.AnyArray]) -> NDArray[Any]:

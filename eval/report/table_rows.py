@@ -35,11 +35,11 @@ class TableRow:
 
     @property
     def made_from(self) -> str:
-        """What the implementation of its denoiser follows; empty for one that is here no more."""
+        """What the implementation of its denoiser follows; "-" for one that is here no more."""
         try:
-            return "" if self.is_floor else prototype(self.denoiser).made_from
+            return "-" if self.is_floor else prototype(self.denoiser).made_from
         except BadInput:
-            return ""
+            return "-"
 
     def text(self, metric: str) -> str:
         value = self.values.get(metric)

@@ -90,12 +90,13 @@ def test_the_page_loads_nothing(page, evaluated):
 def test_the_table_has_every_result_and_floor(page):
     titles, *rows = page.rows
     shown = [metric.title for key, metric in METRICS.items() if key != "flicker"]  # nothing stands still here
-    assert [title.removesuffix(" ↑") for title in titles] == ["clip", "denoiser", "signal", *shown, "non-finite"]
+    facts = ["clip", "denoiser", "made from", "signal"]
+    assert [title.removesuffix(" ↑") for title in titles] == [*facts, *shown, "non-finite"]
     clips = ["mean of clips of 1 spp", "cornell_box/000", "cornell_box_moving/000"]
-    assert [row[0] for row in rows if row[1] == "(noise floor)" and row[2] == "total"] == clips
-    assert {row[2] for row in rows if row[1] == "ntd"} == {"indirect"}
+    assert [row[0] for row in rows if row[1] == "(noise floor)" and row[3] == "total"] == clips
+    assert {(row[2], row[3]) for row in rows if row[1] == "ntd"} == {("paper", "indirect")}
     assert len(rows) == 3 * (len(NAMES) - 1 + 1) + 3 * (3 + 1)
-    assert all(len(row) == 3 + len(shown) + (row[1] != "(noise floor)") for row in rows)
+    assert all(len(row) == 4 + len(shown) + (row[1] != "(noise floor)") for row in rows)
 
 
 def test_the_best_are_marked(page, evaluated):

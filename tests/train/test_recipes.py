@@ -46,7 +46,8 @@ def test_recipes_are_those_of_the_papers(name, expected):
 def test_budgets_scale_the_effort_and_anneal():
     for (name, budget), recipe in RECIPES.items():
         paper = RECIPES[name, "paper"]
-        may_differ = EFFORT | ENDS_WELL | (FOR_NOISY_REFERENCES if budget == "release" else set())
+        displayed = budget == "release" or (name == "lbf" and budget != "paper")  # its own loss makes it worse
+        may_differ = EFFORT | ENDS_WELL | (FOR_NOISY_REFERENCES if displayed else set())
         same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in may_differ}
         assert replace(paper, **same) == recipe, (name, budget)
         assert recipe.epochs <= paper.epochs
