@@ -20,9 +20,9 @@ def mean_floor(frames: list[Values]) -> Values:
     """Noise floors of means over frames with independent noise: the squares of standard errors add up."""
     floors = means(frames)
     for name, metric in METRICS.items():
-        if metric.floor_is_error:
-            errors = [row[name] for row in frames]
-            floors[name] = float(np.linalg.norm(errors) / len(errors))  # type: ignore[arg-type]
+        errors = [error for row in frames if (error := row.get(name)) is not None]
+        if metric.floor_is_error and errors:
+            floors[name] = float(np.linalg.norm(errors) / len(errors))
     return floors
 
 

@@ -141,6 +141,7 @@ class OIDNIrradiance(OIDN):
     """Denoises irradiance + emission, with an albedo of 1; the albedo is multiplied afterwards, of irradiance alone."""
 
     baseline_for = ()
+    evaluated_with = ()
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         emission = frame.emission if self.signal == "total" else 0

@@ -24,7 +24,7 @@ from train.task import run_folder
 
 METRICS = {
     *("mse", "rmse", "l1", "psnr", "ssim", "flip", "mse_unbiased", "smape", "rel_mse"),
-    *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1"),
+    *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1", "energy", "detail", "block_flicker"),
 }
 
 
