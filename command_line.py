@@ -152,7 +152,7 @@ def evaluate(
 
     folders = data or [data_folder(None, budget)]
     if where:
-        print(error_tables(folders, runs, budget, names))
+        print(error_tables(folders, runs, budget, names, device, first_hits))
     else:
         evaluate_on(folders, runs, budget, names, processes, device, first_hits)
 

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.frame import Frame, read_frame, to_tensor
+from datasets.frame import Frame, Signal, read_frame, to_tensor
 from datasets.tonemap import display
 from eval.selection import evaluated
 from models.operators import finite, image_luminance
@@ -92,22 +92,27 @@ def normalised(sums: Shares) -> Shares:
     return {key: value / totals[key[0]] for key, value in sums.items()}
 
 
+def displayed_reference(clip: Clip, index: int, signal: Signal) -> Tensor:
+    """Both buffers (2, 3, H, W) of the reference, as displayed."""
+    return display(to_tensor(clip.reference(index, signal), has_buffers=True)[0], clip.exposure).double()
+
+
 @torch.no_grad()
 def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
     """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip."""
     denoisers = {spec.name: spec.build() for spec in specs}
     states = dict.fromkeys(denoisers)
     channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
+    signals: set[Signal] = {"total", *(denoiser.signal for denoiser in denoisers.values())}
     sums: dict[str, Shares] = {name: {} for name in ("pixels", *denoisers)}
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)
+        buffers = {signal: displayed_reference(clip, index, signal) for signal in signals}
+        masks = places(frame, buffers["total"].mean(dim=0, keepdim=True))
         for name, denoiser in denoisers.items():
-            reference = to_tensor(clip.reference(index, denoiser.signal), has_buffers=True)[0]
-            buffers = display(reference, clip.exposure).double()
-            masks = places(frame, buffers.mean(dim=0, keepdim=True))
-            output, states[name] = denoiser(frame, states[name])
-            shown = display(finite(output), clip.exposure).double()
-            add(sums[name], squared_errors(shown, buffers, masks))
+            output, states[name] = denoiser(frame.to(denoiser.device), states[name])
+            shown = display(finite(output.cpu()), clip.exposure).double()
+            add(sums[name], squared_errors(shown, buffers[denoiser.signal], masks))
         add(sums["pixels"], {key: mask.sum() for key, mask in masks.items()})
     return {name: normalised(shares) for name, shares in sums.items()}
 
@@ -120,8 +125,10 @@ def table_of(clip: Clip, shares: dict[str, Shares]) -> str:
     return f"{clip.scene}/{clip.name}\n" + tabulate(lines, ["", "", *shares], disable_numparse=True)
 
 
-def where(data: Sequence[Path], runs: Path, budget: str, names: Sequence[str]) -> str:
+def where(
+    data: Sequence[Path], runs: Path, budget: str, names: Sequence[str], device: str = "cpu", first_hits: bool = False
+) -> str:
     """A table for each test clip. Raises BadInput as `onespp eval` does."""
-    specs = evaluated(names, runs, budget)
-    clips = [clip for path in data for clip in Dataset(path).clips("test")]
+    specs = evaluated(names, runs, budget, device)
+    clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
     return "\n\n".join(table_of(clip, error_shares(clip, specs)) for clip in clips)

@@ -294,6 +294,11 @@ def device(name: str) -> str:
     return str(measured(name)["device"])
 
 
+def size(name: str) -> str:
+    """The size of the images that were timed for a source."""
+    return str(measured(name)["size"]).replace("x", " × ")
+
+
 def minutes(what: str) -> str:
     """How long a target of make took."""
     seconds = measured("times")[what]
@@ -302,7 +307,22 @@ def minutes(what: str) -> str:
 
 GENERATORS: dict[str, Callable[..., str]] = {
     each.__name__: each
-    for each in (ages, clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, minutes)
+    for each in (
+        ages,
+        clip,
+        quality,
+        value,
+        shipped,
+        times,
+        ratio,
+        samples,
+        front,
+        glass,
+        stress,
+        device,
+        size,
+        minutes,
+    )
 }
 
 

@@ -26,7 +26,15 @@ from tests.helpers.frames import chain, flat_frame, play, run
 
 NAMES = [
     name
-    for name in (*registry.DENOISERS, "noisy+taa", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive", "eaw+js")
+    for name in (
+        *registry.DENOISERS,
+        "noisy+taa",
+        "noisy+accumulated",
+        "wskp3+taa",
+        "eaw+adaptive",
+        "wskp3+adaptive",
+        "eaw+js",
+    )
     if not registry.prototype(name).unavailable()
 ]
 FILTERS = ("eaw", "svgf", "asvgf", "trmv", "bmfr", "aaf", "sbf")  # those without a network that run in real time
