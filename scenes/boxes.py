@@ -5,15 +5,16 @@ import numpy as np
 from scenes.camera import Array
 
 
-def enclosing_box(boxes: Array) -> Array:
-    """The bounding box (2, 3) of `boxes` (N, 2, 3), N > 0."""
-    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+def bounding_box(points: Array) -> Array:
+    """The smallest box (2, 3) around `points` (..., 3), at least one; also around boxes (N, 2, 3)."""
+    points = points.reshape(-1, 3)
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def transformed_box(box: Array, matrix: Array) -> Array:
     """The bounding box (2, 3) of `box` (2, 3) transformed by `matrix` (4, 4)."""
-    transformed = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-    return np.stack([transformed.min(axis=0), transformed.max(axis=0)])
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
+    return bounding_box(corners @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def overlaps(box: Array, boxes: Array) -> bool:

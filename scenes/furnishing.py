@@ -5,26 +5,74 @@ from collections.abc import Sequence
 import numpy as np
 
 from scenes.animation import RigidMotion, Track, still
-from scenes.draws import one_of
-from scenes.layout import GAP, Group, Layout, laden
-from scenes.objects.catalogue import DECOR, FURNITURE, GLAZING
-from scenes.objects.fittings import make_picture
-from scenes.objects.furniture import make_table
-from scenes.objects.glazing import make_glazed_mirror
-from scenes.objects.seating import make_chair
-from scenes.objects.thing import Maker
-from scenes.shell import wall_pose, wall_width
+from scenes.boxes import overlaps, transformed_box
+from scenes.camera import Array
+from scenes.draws import Rng, one_of
+from scenes.layout import GAP, Group, Layout, bounds_of
+from scenes.objects.decor import BODIES, VESSELS, make_basket
+from scenes.objects.fittings import make_floor_lamp, make_glazed_mirror, make_photo, make_picture
+from scenes.objects.furniture import CASES, make_column, make_pane, make_screen, make_showcase, make_table
+from scenes.objects.plants import make_floor_plant, make_small_plant
+from scenes.objects.seating import SEATS, UPHOLSTERED, make_bench, make_chair
+from scenes.objects.thing import Maker, Thing
+from scenes.shell import pose, wall_pose, wall_width
 
+# Rooms draw from these in this order.
+FURNITURE: tuple[Maker, ...] = (
+    make_table,
+    *SEATS,
+    *UPHOLSTERED,
+    *CASES,
+    make_screen,
+    make_floor_plant,
+    make_floor_lamp,
+    make_column,
+)
+DECOR: tuple[Maker, ...] = (*VESSELS, *BODIES, make_small_plant, make_basket, make_photo)
+GLAZING: tuple[Maker, ...] = (make_showcase, make_pane)
+AGAINST_WALLS: tuple[Maker, ...] = (*UPHOLSTERED, *CASES, make_bench, make_screen)
 MIN_THINGS = 15
-AGAINST_WALLS = ("sofa", "armchair", "bed", "shelf", "cabinet", "desk", "bench", "screen")
+
+
+def scatter(rng: Rng, support: Array, most: int) -> Group:
+    """Up to `most` small things with their poses on a support (2, 3), without overlap."""
+    low, high = support[:, [0, 2]]
+    level = support[0, 1] + GAP
+    placed: Group = []
+    taken = np.empty((0, 2, 3))
+    for _ in range(2 * most):
+        if len(placed) == most:
+            break
+        thing = one_of(rng, DECOR)(rng)
+        angle = rng.uniform(-np.pi, np.pi)
+        size = transformed_box(thing.bounds, pose(0, 0, 0, angle))
+        room_low, room_high = low - size[0, [0, 2]], high - size[1, [0, 2]]
+        if (room_low >= room_high).any() or level + size[1, 1] >= support[1, 1]:
+            continue
+        x, z = rng.uniform(room_low, room_high)
+        matrix = pose(x, level, z, angle)
+        box = transformed_box(thing.bounds, matrix)
+        if not overlaps(box, taken):
+            placed.append((thing, matrix))
+            taken = np.concatenate([taken, box[None]])
+    return placed
+
+
+def laden(rng: Rng, thing: Thing) -> Group:
+    """The thing with small ones on most of its supports."""
+    group = [(thing, np.eye(4))]
+    for support in thing.supports:
+        if rng.random() < 0.8:
+            group += scatter(rng, support, int(rng.integers(1, 6)))
+    return group
 
 
 def against_walls(layout: Layout, count: int) -> None:
     """Add up to `count` pieces of furniture with their backs to a wall."""
     rng = layout.rng
-    for name in rng.choice(AGAINST_WALLS, count):
-        group = laden(rng, FURNITURE[str(name)](rng))
-        bounds = group.bounds
+    for maker in rng.choice(AGAINST_WALLS, count):
+        group = laden(rng, maker(rng))
+        bounds = bounds_of(group)
         for _ in range(8):
             wall = int(rng.integers(4))
             free = wall_width(wall, layout.size) / 2 - bounds[1, 0]
@@ -59,13 +107,10 @@ def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
 
 def movers(layout: Layout, count: int) -> None:
     rng = layout.rng
-    makers = [*FURNITURE.values(), *DECOR.values()]
-    goal = layout.moving + count
     for _ in range(12 * count):
-        if layout.moving >= goal:
-            return
-        group = laden(rng, one_of(rng, makers)(rng))
-        layout.try_add(group, random_motion(layout, *layout.floor_position(0.2)))
+        if count > 0:
+            group = laden(rng, one_of(rng, FURNITURE + DECOR)(rng))
+            count -= layout.try_add(group, random_motion(layout, *layout.floor_position(0.2)))
 
 
 def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
@@ -91,7 +136,7 @@ def dining(layout: Layout) -> None:
         outward = np.array([np.sin(side * np.pi / 2), 0, np.cos(side * np.pi / 2)])
         reach = (high - low) / 2 + chair.bounds[1, 2] + rng.uniform(0.03, 0.25)
         place = np.array([(low[0] + high[0]) / 2, GAP, (low[2] + high[2]) / 2]) + outward * reach
-        layout.try_add(Group.of(chair), still(place, side * np.pi / 2 + np.pi))
+        layout.try_add([(chair, np.eye(4))], still(place, side * np.pi / 2 + np.pi))
 
 
 def hang_on_walls(layout: Layout, maker: Maker, count: int) -> None:
@@ -111,7 +156,7 @@ def glaze(layout: Layout) -> None:
     rng = layout.rng
     (layout.rng,) = own = rng.spawn(1)
     if own[0].random() < 1 / 3:
-        scattered(layout, [*GLAZING.values()], int(own[0].integers(1, 4)))
+        scattered(layout, GLAZING, int(own[0].integers(1, 4)))
         hang_on_walls(layout, make_glazed_mirror, int(own[0].integers(0, 3)))
     layout.rng = rng
 
@@ -122,10 +167,9 @@ def furnish(layout: Layout) -> None:
         movers(layout, int(rng.integers(2, 5)))
     if rng.random() < 0.6:
         dining(layout)
-    scattered(layout, list(FURNITURE.values()), int(rng.integers(2, 8)))
+    scattered(layout, FURNITURE, int(rng.integers(2, 8)))
     hang_on_walls(layout, make_picture, int(rng.integers(0, 6)))
-    decor = list(DECOR.values())
-    scattered(layout, decor, int(rng.integers(0, 8)))
-    while layout.things < MIN_THINGS:
-        scattered(layout, decor, MIN_THINGS - layout.things)
+    scattered(layout, DECOR, int(rng.integers(0, 8)))
+    while len(layout.centres) < MIN_THINGS:
+        scattered(layout, DECOR, MIN_THINGS - len(layout.centres))
     glaze(layout)

@@ -5,66 +5,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scenes.animation import RigidMotion, Shape, still
-from scenes.boxes import enclosing_box, overlaps, transformed_box
+from scenes.boxes import bounding_box, overlaps, transformed_box
 from scenes.bsdf import Bsdf
 from scenes.camera import Array
-from scenes.draws import Rng, one_of
+from scenes.draws import Rng
 from scenes.finish import finish
-from scenes.meshes import Surface, join
-from scenes.objects.catalogue import DECOR
-from scenes.objects.thing import Support, Thing
-from scenes.shell import Opening, pose, wall_pose
+from scenes.meshes import Surface
+from scenes.objects.thing import Thing
+from scenes.shell import Opening, wall_pose
 
 MAX_THINGS = 54  # not counting what hangs
 GAP = 0.002  # m, between neighbouring things
 
 
-@dataclass(frozen=True)
-class Group:
-    """A thing and what stands on it, which move together."""
-
-    members: tuple[tuple[Thing, Array], ...]  # thing, its pose (4, 4) in the group
-
-    @property
-    def bounds(self) -> Array:
-        return enclosing_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in self.members]))
-
-    @staticmethod
-    def of(thing: Thing) -> "Group":
-        return Group(((thing, np.eye(4)),))
+# A thing and what stands on it, which move together, with their poses (4, 4) relative to the thing's.
+Group = list[tuple[Thing, Array]]
 
 
-def scatter(rng: Rng, support: Support, most: int) -> list[tuple[Thing, Array]]:
-    """Up to `most` small things with their poses (4, 4) on a support, without overlap."""
-    low, high = np.array(support.low), np.array(support.high)
-    placed: list[tuple[Thing, Array]] = []
-    taken = np.empty((0, 2, 3))
-    makers = list(DECOR.values())
-    for _ in range(2 * most):
-        if len(placed) == most:
-            break
-        thing = one_of(rng, makers)(rng)
-        angle = rng.uniform(-np.pi, np.pi)
-        size = transformed_box(thing.bounds, pose(0, 0, 0, angle))
-        room_low, room_high = low - size[0, [0, 2]], high - size[1, [0, 2]]
-        if (room_low >= room_high).any() or size[1, 1] + GAP >= support.clearance:
-            continue
-        x, z = rng.uniform(room_low, room_high)
-        matrix = pose(x, support.height + GAP, z, angle)
-        box = transformed_box(thing.bounds, matrix)
-        if not overlaps(box, taken):
-            placed.append((thing, matrix))
-            taken = np.concatenate([taken, box[None]])
-    return placed
-
-
-def laden(rng: Rng, thing: Thing) -> Group:
-    """The thing with small ones on most of its supports."""
-    members = [(thing, np.eye(4))]
-    for support in thing.supports:
-        if rng.random() < 0.8:
-            members += scatter(rng, support, int(rng.integers(1, 6)))
-    return Group(tuple(members))
+def bounds_of(group: Group) -> Array:
+    return bounding_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in group]))
 
 
 @dataclass
@@ -78,15 +37,10 @@ class Layout:
     shapes: list[Shape] = field(default_factory=list)
     boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # reserved
     centres: list[Array] = field(default_factory=list)  # (3,) of things
-    moving: int = 0  # groups
     walls: int = 0  # inside the room; the first boxes are theirs
     openings: dict[int, list[Opening]] = field(default_factory=dict)  # of walls 0 to 3
     missing_walls: set[int] = field(default_factory=set)
     backs: list[tuple[RigidMotion, Array]] = field(default_factory=list)  # of furniture before walls: pose, bounds
-
-    @property
-    def things(self) -> int:
-        return len(self.centres)
 
     @property
     def last_frame(self) -> int:
@@ -102,7 +56,7 @@ class Layout:
     def swept(self, bounds: Array, motion: RigidMotion) -> Array:
         """The bounding box (2, 3) of `bounds` (2, 3) during the whole clip."""
         frames = range(self.frames) if motion.varies() else range(1)
-        return enclosing_box(np.stack([transformed_box(bounds, motion.matrix(frame)) for frame in frames]))
+        return bounding_box(np.stack([transformed_box(bounds, motion.matrix(frame)) for frame in frames]))
 
     def fits(self, box: Array) -> bool:
         """Whether `box` (2, 3) lies in the room and overlaps no reserved one."""
@@ -115,37 +69,38 @@ class Layout:
         """Keep later things out of these boxes (2, 3)."""
         self.boxes = np.concatenate([self.boxes, np.stack(boxes)])
 
+    def claim(self, box: Array) -> bool:
+        """Reserve `box` (2, 3) if it fits; whether it did."""
+        fits = self.fits(box)
+        if fits:
+            self.reserve(box)
+        return fits
+
     def try_add(self, group: Group, motion: RigidMotion) -> bool:
-        box = self.swept(group.bounds + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
-        if not self.fits(box) or self.things + len(group.members) > MAX_THINGS:
-            return False
-        self.add(group, motion)
-        return True
+        """Add a group if it fits, with gaps beside it; whether it did."""
+        box = self.swept(bounds_of(group) + np.array([[-GAP], [GAP]]) * [1, 0, 1], motion)
+        fits = self.fits(box) and len(self.centres) + len(group) <= MAX_THINGS
+        if fits:
+            self.add(group, motion)
+        return fits
 
     def add(self, group: Group, motion: RigidMotion) -> None:
-        self.reserve(self.swept(group.bounds, motion))
-        for thing, matrix in group.members:
-            number = self.things
+        self.reserve(self.swept(bounds_of(group), motion))
+        for thing, matrix in group:
+            name = f"{len(self.centres)}-{thing.name}"
             size = float(np.ptp(thing.bounds, axis=0).max())
             self.centres.append(transformed_box(thing.bounds, motion.matrix(0) @ matrix).mean(axis=0))
-            for part in thing.parts:
-                mesh = part.mesh.copy(include_cache=True)  # without it the authored normals are lost
-                mesh.apply_transform(matrix)
-                bsdf = finish(self.rng, part.slot, self.gloss, size)
-                self.shapes.append(Shape(f"{number}-{thing.name}-{part.slot}", mesh, bsdf, None, motion, part.smooth))
-        self.moving += motion.varies()
+            for slot, surface in thing.parts.items():
+                bsdf = finish(self.rng, slot, self.gloss, size)
+                self.shapes.append(Shape(f"{name}-{slot}", surface.mesh(matrix), bsdf, None, motion, surface.smooth))
 
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:
         """Add a thing to a wall if it fits, at (x, y) as visible from inside and `z` in front of it."""
         motion = still((wall_pose(wall, self.size) @ [x, y, z, 1])[:3], wall * np.pi / 2)
-        group = Group.of(thing)
-        if not overlaps(self.swept(group.bounds, motion), self.boxes):
-            self.add(group, motion)
+        if not overlaps(transformed_box(thing.bounds, motion.matrix(0)), self.boxes):
+            self.add([(thing, np.eye(4))], motion)
 
-    def build(self, name: str, surfaces: list[Surface], matrix: Array, bsdf: Bsdf | None = None) -> None:
+    def build(self, name: str, surface: Surface, matrix: Array, bsdf: Bsdf | None = None) -> None:
         """Add a part of the building, transformed by `matrix` (4, 4); of a wall's material by default."""
-        surface = join(surfaces)
-        mesh = surface.mesh()
-        mesh.apply_transform(matrix)
         bsdf = bsdf or finish(self.rng, "wall", 0.0, 1.0)
-        self.shapes.append(Shape(f"{name}-{len(self.shapes)}", mesh, bsdf, smooth=surface.smooth))
+        self.shapes.append(Shape(f"{name}-{len(self.shapes)}", surface.mesh(matrix), bsdf, smooth=surface.smooth))

@@ -1,33 +1,28 @@
 """Lamps for rooms, from plain panels to indirect lighting.
 
-A fixture adds its body to the layout and returns its lamps, none if it does not fit; `shine` decides their radiance.
+A fixture adds its body to the layout and returns its lamp in a list, empty if it does not fit; `shine` decides the
+radiance.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import trimesh
 
 from scenes.animation import AT_REST, KeyframedTrack, RigidMotion, Shape, Track, still
-from scenes.boxes import transformed_box
+from scenes.boxes import bounding_box, transformed_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.colours import light_colour
 from scenes.draws import log_uniform, one_of
-from scenes.layout import GAP, Group, Layout
-from scenes.meshes import lathe, slab, superellipsoid
+from scenes.layout import GAP, Layout
+from scenes.meshes import Surface, join, lathe, slab, superellipsoid
 from scenes.objects.fittings import make_floor_lamp, make_pendant
 from scenes.objects.thing import Thing
 from scenes.shell import Opening, horizontal_rectangle, wall_pose, wall_width
 
 BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
-
-
-@dataclass(frozen=True)
-class Lamp:
-    mesh: trimesh.Trimesh
-    motion: RigidMotion = AT_REST
 
 
 def turn_then_shift(axis: int, angle: float, x: float, y: float, z: float) -> Array:
@@ -37,35 +32,30 @@ def turn_then_shift(axis: int, angle: float, x: float, y: float, z: float) -> Ar
     return matrix
 
 
-def rectangle(width: float, depth: float, *matrices: Array) -> trimesh.Trimesh:
-    """A rectangle in the xz plane that faces up, transformed by each of the `matrices` (4, 4)."""
-    mesh = horizontal_rectangle(width, depth)
-    for matrix in matrices:
-        mesh.apply_transform(matrix)
-    return mesh
+def lamp(surface: Surface, *poses: Array, motion: RigidMotion = AT_REST) -> list[Shape]:
+    """A surface that is to shine, transformed by each of the `poses` (4, 4)."""
+    return [Shape("lamp", surface.mesh(*poses), BLACK, motion=motion)]
 
 
-def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Lamp]:
+def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Shape]:
     x, z = layout.floor_position(max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
-    if not layout.fits(box):
-        return []
-    layout.reserve(box)
-    return [Lamp(rectangle(width, depth, turn_then_shift(0, np.pi, x, y, z)))]
+    panel = lamp(horizontal_rectangle(width, depth), turn_then_shift(0, np.pi, x, y, z))
+    return panel if layout.claim(box) else []
 
 
-def ceiling_panel(layout: Layout) -> list[Lamp]:
+def ceiling_panel(layout: Layout) -> list[Shape]:
     """A panel as small as a spotlight or as large as a table."""
     return panel_below_ceiling(layout, log_uniform(layout.rng, 0.2, 2.5), log_uniform(layout.rng, 0.2, 2.5))
 
 
-def luminous_panel(layout: Layout) -> list[Lamp]:
+def luminous_panel(layout: Layout) -> list[Shape]:
     """A panel of up to half of the ceiling, as in offices and shops."""
     return panel_below_ceiling(layout, *(layout.rng.uniform(0.25, 0.7, 2) * layout.size[[0, 2]]).tolist())
 
 
-def downlight(layout: Layout) -> list[Lamp]:
+def downlight(layout: Layout) -> list[Shape]:
     """A lamp deep in a dark tube under the ceiling: a spot of light."""
     rng = layout.rng
     radius = log_uniform(rng, 0.05, 0.15)
@@ -73,49 +63,45 @@ def downlight(layout: Layout) -> list[Lamp]:
     x, z = layout.floor_position(0.5)
     y = layout.size[1] - tall - 0.01
     box = np.array([[x - radius, y - GAP, z - radius], [x + radius, y + tall, z + radius]])
-    if not layout.fits(box):
+    if not layout.claim(box):
         return []
-    layout.reserve(box)
     tube = lathe([(radius * 0.9, 0), (radius, 0), (radius, tall), (radius * 0.9, tall), (radius * 0.9, 0)], 24)
-    layout.build("tube", [tube], turn_then_shift(1, 0, x, y, z), BLACK)
-    return [Lamp(rectangle(radius, radius, turn_then_shift(0, np.pi, x, y + tall * 0.95, z)))]
+    layout.build("tube", tube, turn_then_shift(1, 0, x, y, z), BLACK)
+    return lamp(horizontal_rectangle(radius, radius), turn_then_shift(0, np.pi, x, y + tall * 0.95, z))
 
 
-def bulb(thing: Thing, radius: float, motion: RigidMotion) -> Lamp:
-    low, high = next(part.mesh.bounds for part in thing.parts if part.slot == "shade")
-    x, y, z = (low + high) / 2
-    ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 1).mesh()
-    ball.apply_transform(turn_then_shift(1, 0, x, y - radius, z))
-    return Lamp(ball, motion)
+def bulb(thing: Thing, radius: float, motion: RigidMotion) -> list[Shape]:
+    """A ball in the middle of a thing's shade."""
+    x, y, z = bounding_box(thing.parts["shade"].points).mean(axis=0)
+    ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 1)
+    return lamp(ball, turn_then_shift(1, 0, x, y - radius, z), motion=motion)
 
 
-def hanging(layout: Layout) -> list[Lamp]:
+def hanging(layout: Layout) -> list[Shape]:
     """A pendant with a bulb in its shade; a closed shade emits light itself instead."""
     thing = make_pendant(layout.rng)
     x, z = layout.floor_position(0.5)
     motion = still((x, layout.size[1] - thing.bounds[1, 1] - GAP, z), 0.0)
-    shade = next(part for part in thing.parts if part.slot == "shade")
-    closed = trimesh.Trimesh(shade.mesh.vertices, shade.mesh.faces).is_watertight
-    lamp = Lamp(shade.mesh, motion) if closed else bulb(thing, log_uniform(layout.rng, 0.04, 0.1), motion)
-    kept = Thing(thing.name, tuple(part for part in thing.parts if part is not shade or not closed))
-    box = transformed_box(thing.bounds, motion.matrix(0))
-    if not layout.fits(box):
+    shade = thing.parts["shade"]
+    closed = trimesh.Trimesh(shade.points, shade.faces).is_watertight
+    light = lamp(shade, motion=motion) if closed else bulb(thing, log_uniform(layout.rng, 0.04, 0.1), motion)
+    kept = Thing(thing.name, {"metal": thing.parts["metal"]}) if closed else thing
+    if not layout.claim(transformed_box(thing.bounds, motion.matrix(0))):
         return []
-    layout.add(Group.of(kept), motion)
-    layout.reserve(box)
-    return [lamp]
+    layout.add([(kept, np.eye(4))], motion)
+    return light
 
 
-def standing_lamp(layout: Layout) -> list[Lamp]:
+def standing_lamp(layout: Layout) -> list[Shape]:
     """A floor lamp whose bulb is hidden in its shade."""
     thing = make_floor_lamp(layout.rng)
     motion = still(np.insert(layout.floor_position(0.4), 1, GAP), float(layout.rng.uniform(-np.pi, np.pi)))
-    if not layout.try_add(Group.of(thing), motion):
+    if not layout.try_add([(thing, np.eye(4))], motion):
         return []
-    return [bulb(thing, log_uniform(layout.rng, 0.02, 0.06), motion)]
+    return bulb(thing, log_uniform(layout.rng, 0.02, 0.06), motion)
 
 
-def orb(layout: Layout) -> list[Lamp]:
+def orb(layout: Layout) -> list[Shape]:
     """A glowing ball in the air, in half of the cases moving."""
     rng = layout.rng
     radius = log_uniform(rng, 0.06, 0.3)
@@ -124,15 +110,12 @@ def orb(layout: Layout) -> list[Lamp]:
     drift = rng.uniform(-0.4, 0.4, 3) * (rng.random() < 0.5)
     start = np.array([x, y, z])
     motion = RigidMotion(Track(np.stack([start, start + drift]), 0, layout.last_frame), Track.constant(0.0))
-    mesh = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 2).mesh()
-    box = layout.swept(np.asarray(mesh.bounds), motion)
-    if not layout.fits(box):
-        return []
-    layout.reserve(box)
-    return [Lamp(mesh, motion)]
+    ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 2)
+    fits = layout.claim(layout.swept(bounding_box(ball.points), motion))
+    return lamp(ball, motion=motion) if fits else []
 
 
-def cove(layout: Layout) -> list[Lamp]:
+def cove(layout: Layout) -> list[Shape]:
     """A strip behind a ledge under the ceiling, visible from the ceiling only."""
     rng = layout.rng
     wall = int(rng.integers(4))
@@ -142,16 +125,15 @@ def cove(layout: Layout) -> list[Lamp]:
     lip = rng.uniform(0.05, 0.12)
     y = layout.size[1] - drop
     frame = wall_pose(wall, layout.size)
-    ledge = [slab(length, 0.03, depth).at(0, y - 0.03, depth / 2), slab(length, lip, 0.02).at(0, y, depth - 0.01)]
+    ledge = join([slab(length, 0.03, depth).at(0, y - 0.03, depth / 2), slab(length, lip, 0.02).at(0, y, depth - 0.01)])
     box = transformed_box(np.array([[-length / 2, y - 0.03, 0.001], [length / 2, y + lip, depth]]), frame)
-    if not layout.fits(box):
+    if not layout.claim(box):
         return []
-    layout.reserve(box)
     layout.build("ledge", ledge, frame)
-    return [Lamp(rectangle(length * 0.95, 0.08, turn_then_shift(1, 0, 0, y + 0.005, depth * 0.4), frame))]
+    return lamp(horizontal_rectangle(length * 0.95, 0.08), turn_then_shift(1, 0, 0, y + 0.005, depth * 0.4), frame)
 
 
-def behind_opening(layout: Layout) -> list[Lamp]:
+def behind_opening(layout: Layout) -> list[Shape]:
     """A panel outside a wall with slits or a small hole."""
     rng = layout.rng
     wall = int(rng.integers(4))
@@ -176,26 +158,26 @@ def behind_opening(layout: Layout) -> list[Lamp]:
     size = rng.uniform(0.5, 1.5)
     away = rng.uniform(0.1, 0.4)
     shift = (x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.5), -away)
-    return [Lamp(rectangle(size, size, turn_then_shift(0, np.pi / 2, *shift), wall_pose(wall, layout.size)))]
+    return lamp(horizontal_rectangle(size, size), turn_then_shift(0, np.pi / 2, *shift), wall_pose(wall, layout.size))
 
 
-def above_furniture(layout: Layout) -> list[Lamp]:
+def above_furniture(layout: Layout) -> list[Shape]:
     """A strip on top of furniture at a wall, near its back, facing up or the wall."""
     if not layout.backs:
         return []
     motion, box = one_of(layout.rng, layout.backs)
     width, height, depth = box[1] - box[0]
     place = turn_then_shift(0, -layout.rng.uniform(0, np.pi / 3), 0, height + 0.08, box[0, 2] + depth / 4)
-    return [Lamp(rectangle(width * 0.7, min(0.08, depth / 3), place), motion)]
+    return lamp(horizontal_rectangle(width * 0.7, min(0.08, depth / 3)), place, motion=motion)
 
 
-def sky_panel(layout: Layout, wall: int, opening: Opening) -> Lamp:
+def sky_panel(layout: Layout, wall: int, opening: Opening) -> list[Shape]:
     """An overcast sky: a bright rectangle behind a window, with its edges hidden."""
-    place = turn_then_shift(0, np.pi / 2, *opening.middle, -0.35)
-    return Lamp(rectangle(opening.width + 0.8, opening.height + 0.8, place, wall_pose(wall, layout.size)))
+    panel = horizontal_rectangle(opening.width + 0.8, opening.height + 0.8)
+    return lamp(panel, turn_then_shift(0, np.pi / 2, *opening.middle, -0.35), wall_pose(wall, layout.size))
 
 
-Fixture = Callable[[Layout], list[Lamp]]
+Fixture = Callable[[Layout], list[Shape]]
 
 OPEN_FIXTURES: tuple[Fixture, ...] = (*[ceiling_panel] * 4, downlight, hanging, orb)
 DAY_FIXTURES: tuple[Fixture, ...] = (luminous_panel, ceiling_panel, hanging, orb, standing_lamp)
@@ -215,14 +197,14 @@ def brightness(layout: Layout) -> Track:
     return Track.constant(1.0)
 
 
-def shine(layout: Layout, lamps: list[Lamp], flux: float) -> list[Shape]:
-    """The lamps as shapes that together emit `flux` (pi times area times radiance), in random shares."""
+def shine(layout: Layout, lamps: list[Shape], flux: float) -> list[Shape]:
+    """The lamps, switched on: together they emit `flux` (pi times area times radiance), in random shares."""
     rng = layout.rng
     shares = rng.lognormal(0, 0.8, len(lamps))
     shapes = []
-    for number, (lamp, share) in enumerate(zip(lamps, shares / shares.sum(), strict=True)):
+    for number, (light, share) in enumerate(zip(lamps, shares / shares.sum(), strict=True)):
         strength = brightness(layout)
-        radiance = light_colour(rng) * share * flux / (np.pi * lamp.mesh.area)
+        radiance = light_colour(rng) * share * flux / (np.pi * light.mesh.area)
         track = replace(strength, keys=np.outer(strength.keys, radiance))
-        shapes.append(Shape(f"lamp-{number}", lamp.mesh, BLACK, track, lamp.motion))
+        shapes.append(replace(light, name=f"lamp-{number}", radiance=track))
     return shapes

@@ -35,9 +35,13 @@ class Surface:
         matrix = axis_rotation(axis, angle)
         return replace(self, points=self.points @ matrix.T, normals=self.normals @ matrix.T)
 
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self, *poses: Array) -> trimesh.Trimesh:
+        """As a mesh, transformed by each of the `poses` (4, 4) in turn."""
         visual = trimesh.visual.TextureVisuals(uv=self.uv)
-        return trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
+        mesh = trimesh.Trimesh(self.points, self.faces, vertex_normals=self.normals, visual=visual, process=False)
+        for pose in poses:
+            mesh.apply_transform(pose)
+        return mesh
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:

@@ -6,8 +6,7 @@ import numpy as np
 
 from errors import BadInput
 from scenes.animation import Scene
-from scenes.cornell import cornell_box, cornell_box_moving
-from scenes.extremes import EXTREME_SCENES, SceneBuilder
+from scenes.cornell import EXTREME_SCENES, SceneBuilder, cornell_box, cornell_box_moving
 from scenes.glass import GLASS_SCENES
 from scenes.rooms import closeup, room
 

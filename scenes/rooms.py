@@ -7,6 +7,7 @@ import numpy as np
 
 from scenes import lighting
 from scenes.animation import Camera, Scene, Shape, Track
+from scenes.boxes import bounding_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.draws import Rng, log_uniform, one_of
@@ -58,7 +59,7 @@ def add_windows(layout: Layout, count: int) -> None:
         y = rng.uniform(0.2, layout.size[1] - height - 0.2)
         hole = Opening((x, y), (x + width, y + height))
         layout.openings[wall] = [hole]
-        layout.build("reveal", [reveal(hole, rng.uniform(0.08, 0.3))], wall_pose(wall, layout.size))
+        layout.build("reveal", reveal(hole, rng.uniform(0.08, 0.3)), wall_pose(wall, layout.size))
         dressing = rng.random()
         if dressing < 0.2:
             layout.hang(make_blind(rng, width - 0.02, height - 0.02), wall, hole.middle[0], y + 0.01, -0.05)
@@ -73,30 +74,28 @@ def partition(layout: Layout) -> None:
     x = layout.size[0] * rng.uniform(-0.2, 0.2)
     gap = rng.uniform(0.8, 1.6)
     wall = slab(0.1, layout.size[1], layout.size[2] - gap).at(x, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
-    layout.build("partition", [wall], np.eye(4))
-    layout.reserve(np.stack([wall.points.min(axis=0), wall.points.max(axis=0)]))
+    layout.build("partition", wall, np.eye(4))
+    layout.reserve(bounding_box(wall.points))
     layout.walls += 1
 
 
 def shell(layout: Layout) -> list[Shape]:
     rng = layout.rng
     width, height, depth = layout.size
-    below = horizontal_rectangle(width + 0.1, depth + 0.1)
-    above = horizontal_rectangle(width + 0.1, depth + 0.1)
-    above.apply_transform(np.array([[1, 0, 0, 0], [0, -1, 0, height], [0, 0, -1, 0], [0, 0, 0, 1.0]]))
+    level = horizontal_rectangle(width + 0.1, depth + 0.1)
     dark = rng.random() < 0.3  # for deep shadows, which are lit by the walls
     slot = "dark wall" if dark else "wall"
     tone = rng.uniform(0.02, 0.2, 3) if dark else rng.uniform(0.4, 0.85, 3)
     roofless = bool(layout.missing_walls) and rng.random() < ROOFLESS
-    shapes = [Shape("floor", below, finish(rng, "floor", layout.gloss, 1.0))]
+    shapes = [Shape("floor", level.mesh(), finish(rng, "floor", layout.gloss, 1.0))]
     if not roofless:
-        shapes.append(Shape("ceiling", above, diffuse_bsdf(rgb(tone.tolist()))))
+        above = np.array([[1, 0, 0, 0], [0, -1, 0, height], [0, 0, -1, 0], [0, 0, 0, 1.0]])
+        shapes.append(Shape("ceiling", level.mesh(above), diffuse_bsdf(rgb(tone.tolist()))))
     paint = finish(rng, slot, layout.gloss / 3, 1.0)
     for wall in sorted(set(range(4)) - layout.missing_walls):
-        mesh = wall_with_openings(wall_width(wall, layout.size) + 0.1, height, layout.openings.get(wall, []))
-        mesh.apply_transform(wall_pose(wall, layout.size))
+        surface = wall_with_openings(wall_width(wall, layout.size) + 0.1, height, layout.openings.get(wall, []))
         own = finish(rng, slot, layout.gloss / 3, 1.0) if rng.random() < 0.25 else paint
-        shapes.append(Shape(f"wall-{wall}", mesh, own))
+        shapes.append(Shape(f"wall-{wall}", surface.mesh(wall_pose(wall, layout.size)), own))
     return shapes
 
 
@@ -134,15 +133,17 @@ def room(rng: Rng, frames: int) -> Scene:
     eye = flight_path(layout)
     way = len(layout.boxes)
     against_walls(layout, int(rng.integers(2, 8)))
-    lamps: list[lighting.Lamp] = []
+    lamps: list[Shape] = []
     count = int(rng.integers(*style.lamps))
     for _ in range(8 * count):
         if len(lamps) < count:
             lamps += one_of(rng, style.fixtures)(layout)
     furnish(layout)
     if style.day and environment is None:
-        openings = [(wall, opening) for wall, holes in layout.openings.items() for opening in holes]
-        lamps = (lamps + [lighting.sky_panel(layout, *opening) for opening in openings])[:MAX_LAMPS]
+        for wall, openings in layout.openings.items():
+            for opening in openings:
+                lamps += lighting.sky_panel(layout, wall, opening)
+        lamps = lamps[:MAX_LAMPS]
     if not lamps and environment is None:
         lamps = lighting.ceiling_panel(layout) or lighting.orb(layout) or lighting.hanging(layout)
     surface = 2 * (size[0] * size[1] + size[1] * size[2] + size[0] * size[2])

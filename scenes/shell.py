@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import trimesh
 
 from scenes.animation import still
 from scenes.camera import Array
@@ -46,7 +45,7 @@ def wall_width(wall: int, size: Array) -> float:
     return float(size[0] if wall % 2 == 0 else size[2])
 
 
-def wall_with_openings(width: float, height: float, openings: list[Opening]) -> trimesh.Trimesh:
+def wall_with_openings(width: float, height: float, openings: list[Opening]) -> Surface:
     """A rectangle in the xy plane on the origin, facing +z, with holes; texture coordinates in metres."""
     xs = np.unique([-width / 2, width / 2, *(e for o in openings for e in (o.low[0], o.high[0]))])
     ys = np.unique([0.0, height, *(e for o in openings for e in (o.low[1], o.high[1]))])
@@ -57,24 +56,20 @@ def wall_with_openings(width: float, height: float, openings: list[Opening]) -> 
             if not any(o.low[0] < x < o.high[0] and o.low[1] < y < o.high[1] for o in openings):
                 points = np.array([[(x0, y0, 0), (x1, y0, 0)], [(x0, y1, 0), (x1, y1, 0)]])
                 cells.append(sheet(points, points[..., :2]))
-    return join(cells).mesh()
+    return join(cells)
 
 
 def reveal(opening: Opening, thickness: float) -> Surface:
     """The four sides of an opening through a wall of that thickness, behind the plane z = 0."""
-    x = opening.middle[0]
     border = 0.02
-    sides = [
-        slab(opening.width + 2 * border, border, thickness).at(x, opening.low[1] - border, -thickness / 2),
-        slab(opening.width + 2 * border, border, thickness).at(x, opening.high[1], -thickness / 2),
-        slab(border, opening.height, thickness).at(opening.low[0] - border / 2, opening.low[1], -thickness / 2),
-        slab(border, opening.height, thickness).at(opening.high[0] + border / 2, opening.low[1], -thickness / 2),
-    ]
-    return join(sides)
+    (left, bottom), (right, top) = opening.low, opening.high
+    level = slab(opening.width + 2 * border, border, thickness)
+    upright = slab(border, opening.height, thickness)
+    sides = [level.at(opening.middle[0], y, -thickness / 2) for y in (bottom - border, top)]
+    return join(sides + [upright.at(x, bottom, -thickness / 2) for x in (left - border / 2, right + border / 2)])
 
 
-def horizontal_rectangle(width: float, depth: float) -> trimesh.Trimesh:
+def horizontal_rectangle(width: float, depth: float) -> Surface:
     """A rectangle in the xz plane, facing up."""
     x, z = width / 2, depth / 2
-    points = np.array([(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)])
-    return flat_shaded(points, np.array([[0, 1, 2], [0, 2, 3]])).mesh()
+    return flat_shaded(np.array([(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)]), np.array([[0, 1, 2], [0, 2, 3]]))

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from scenes.draws import Rng, one_of, uniforms
 from scenes.meshes import Surface, blob, circle, gem, hollow, join, lathe, silhouette, slab, solid, superellipsoid, tube
-from scenes.objects.thing import SurfacesBySlot, Thing, evenly, merged, standing
+from scenes.objects.thing import SurfacesBySlot, Thing, evenly, standing
 
 
 def book(width: float, height: float, depth: float) -> tuple[Surface, Surface]:
@@ -17,20 +17,20 @@ def book(width: float, height: float, depth: float) -> tuple[Surface, Surface]:
 
 
 def make_books(rng: Rng) -> Thing:
-    surfaces: SurfacesBySlot = {}
+    volumes: list[SurfacesBySlot] = []
     level = 0.0
     for _ in range(rng.integers(2, 7)):
         width, height, depth = uniforms(rng, (0.13, 0.22), (0.012, 0.045), (0.18, 0.28))
         angle = rng.normal(0, 0.25)
         cover, pages = (part.turned(angle).at(0, level) for part in book(width, height, depth))
-        surfaces = merged(surfaces, {f"cover-{rng.integers(1, 4)}": [cover], "paper": [pages]})
+        volumes.append({f"cover-{rng.integers(1, 4)}": [cover], "paper": [pages]})
         level += height
-    return standing("books", surfaces)
+    return standing("books", *volumes)
 
 
 def make_book_row(rng: Rng) -> Thing:
     """A row of upright books, spines to the front."""
-    surfaces: SurfacesBySlot = {}
+    volumes: list[SurfacesBySlot] = []
     x = 0.0
     for _ in range(rng.integers(4, 12)):
         width, height, depth = uniforms(rng, (0.13, 0.18), (0.012, 0.045), (0.18, 0.27))
@@ -38,9 +38,9 @@ def make_book_row(rng: Rng) -> Thing:
             part.at(width / 2).turned(np.pi / 2, axis=0).turned(np.pi / 2, axis=1).at(x, depth / 2)
             for part in book(width, height, depth)
         )
-        surfaces = merged(surfaces, {f"cover-{rng.integers(1, 4)}": [cover], "paper": [pages]})
+        volumes.append({f"cover-{rng.integers(1, 4)}": [cover], "paper": [pages]})
         x += height
-    return standing("book_row", surfaces)
+    return standing("book_row", *volumes)
 
 
 def make_box(rng: Rng) -> Thing:
@@ -141,3 +141,7 @@ def make_candle(rng: Rng) -> Thing:
     holder = silhouette(radius * np.array([1, *rng.uniform(0.2, 0.6, 4), 0.8]), height, 24)
     stick = lathe(solid([(wax, 0), (wax * 0.95, rng.uniform(0.06, 0.18))]), 20).at(0, height)
     return standing("candle", {one_of(rng, ("metal", "ceramic", "wood")): [lathe(solid(holder))], "wax": [stick]})
+
+
+VESSELS = (make_vase, make_bowl, make_bottle, make_cup, make_glass)
+BODIES = (make_books, make_book_row, make_box, make_ball, make_ring, make_lump, make_crystal, make_candle)

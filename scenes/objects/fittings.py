@@ -1,4 +1,4 @@
-"""What hangs: pictures (and photos that stand), blinds, curtains, and the bodies of lamps (lights: scenes.lighting)."""
+"""What hangs: pictures (and photos that stand), mirrors, blinds, curtains, and the bodies of lamps."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, lathe, sheet, silhouette, slab, superellipsoid, tube
-from scenes.objects.furniture import rim
-from scenes.objects.thing import SurfacesBySlot, Thing, assembled, merged, shifted, standing
+from scenes.objects.furniture import EDGE, rim
+from scenes.objects.thing import SurfacesBySlot, Thing, assembled, shifted, standing
 
 
 def make_floor_lamp(rng: Rng) -> Thing:
@@ -57,12 +57,22 @@ def make_photo(rng: Rng) -> Thing:
     leaning = {slot: [surface.turned(-lean, axis=0) for surface in surfaces] for slot, surfaces in picture.items()}
     reach = height * 0.7
     prop = tube([(0, reach * math.cos(lean), -reach * math.sin(lean)), (0, 0, -height * 0.4)], 0.004, 6)
-    return standing("photo", merged(leaning, {"metal": [prop]}))
+    return standing("photo", leaning, {"metal": [prop]})
 
 
 def make_picture(rng: Rng) -> Thing:
     """A framed print for a wall: its back at z = 0, facing +z."""
     return assembled("picture", framed(rng, rng.uniform(0.25, 1.2), rng.uniform(0.25, 1.0)))
+
+
+def make_glazed_mirror(rng: Rng) -> Thing:
+    """A framed mirror behind a pane for a wall: its back at z = 0, facing +z."""
+    width, height, gap = uniforms(rng, (0.4, 1.1), (0.5, 1.2), (0.01, 0.03))
+    inside = width - 2 * EDGE - 0.002, height - 2 * EDGE - 0.002
+    frame = [board.at(z=0.02 + gap / 2) for board in rim(width, height, EDGE, 0.04 + gap)]
+    mirror = slab(*inside, 0.004).at(0, EDGE + 0.001, 0.003)
+    pane = slab(*inside, 0.004).at(0, EDGE + 0.001, 0.007 + gap)
+    return assembled("glazed_mirror", {"frame": frame, "mirror": [mirror], "clear": [pane]})
 
 
 def make_blind(rng: Rng, width: float, height: float) -> Thing:

@@ -1,4 +1,4 @@
-"""Parts of furniture, and tables, desks, shelves, cabinets, columns and screens made of them."""
+"""Parts of furniture, and tables, desks, shelves, cabinets, columns, screens, showcases and panes made of them."""
 
 import math
 
@@ -6,7 +6,9 @@ import numpy as np
 
 from scenes.draws import Rng, one_of, uniforms
 from scenes.meshes import Surface, disc, join, lathe, silhouette, slab, solid, tube
-from scenes.objects.thing import SurfacesBySlot, Thing, evenly, merged, shifted, standing, top_support
+from scenes.objects.thing import SurfacesBySlot, Thing, evenly, shifted, standing, top_support
+
+EDGE = 0.03  # m, width of the frames of panes
 
 
 def corners(width: float, depth: float) -> list[tuple[float, float]]:
@@ -96,8 +98,8 @@ def make_table(rng: Rng) -> Thing:
         width, depth = uniforms(rng, (0.5, 1.9), (0.45, 0.95))
         frame = legs(rng, width, depth, height)
         board = slab(width, thickness, depth)
-    surfaces = merged({one_of(rng, ("wood", "wood", "wood", "stone", "glass")): [board.at(0, height)]}, frame)
-    return standing("table", surfaces, [top_support(width, depth, height + thickness)])
+    top = {one_of(rng, ("wood", "wood", "wood", "stone", "glass")): [board.at(0, height)]}
+    return standing("table", top, frame, supports=[top_support(width, depth, height + thickness)])
 
 
 def make_desk(rng: Rng) -> Thing:
@@ -109,8 +111,8 @@ def make_desk(rng: Rng) -> Thing:
     tall = height - 0.08
     drawers = shifted(fronts(rng, block - 0.01, tall - 0.01, 1, rows), x, 0.085, depth / 2 - 0.08)
     body = {"wood": [slab(block, tall, depth - 0.1).at(x, 0.08, -0.03), slab(width, thickness, depth).at(0, height)]}
-    surfaces = merged(body, drawers, legs(rng, width, depth, height))
-    return standing("desk", surfaces, [top_support(width, depth, height + thickness)])
+    free = top_support(width, depth, height + thickness)
+    return standing("desk", body, drawers, legs(rng, width, depth, height), supports=[free])
 
 
 def make_shelf(rng: Rng) -> Thing:
@@ -124,15 +126,15 @@ def make_shelf(rng: Rng) -> Thing:
     wood += [slab(board, height, depth).at(x) for x in (board / 2 - width / 2, width / 2 - board / 2)]
     between = np.linspace(-inner / 2, inner / 2, columns + 1)[1:-1]
     wood += [slab(board, levels[-1] - levels[0], depth).at(x, levels[0]) for x in between]
-    surfaces: SurfacesBySlot = {"wood": wood}
-    if rng.random() < 0.6:
-        surfaces["front"] = [slab(width - 0.01, height - 0.01, 0.008).at(0, 0.005, -depth / 2)]
+    panel = slab(width - 0.01, height - 0.01, 0.008).at(0, 0.005, -depth / 2)
+    back = {"front": [panel]} if rng.random() < 0.6 else {}
     supports = [top_support(width, depth, height)]
     cell = inner / columns
     clearance = levels[1] - levels[0] - board
     for y in levels[:-1]:
-        supports += [top_support(cell, depth, y + board, clearance, 0.03).at(x, 0, 0) for x in evenly(inner, columns)]
-    return standing("shelf", surfaces, supports)
+        free = top_support(cell, depth, y + board, clearance, 0.03)
+        supports += [free + np.array([x, 0, 0]) for x in evenly(inner, columns)]
+    return standing("shelf", {"wood": wood}, back, supports=supports)
 
 
 def make_cabinet(rng: Rng) -> Thing:
@@ -142,8 +144,8 @@ def make_cabinet(rng: Rng) -> Thing:
     body = slab(width, height, depth).at(0, foot)
     doors = shifted(fronts(rng, width - 0.02, height - 0.02, columns, rows), 0, foot + 0.01, depth / 2)
     lid = slab(width + 0.03, 0.02, depth + 0.04).at(0, foot + height, 0.01)
-    surfaces = merged({"wood": [body, lid]}, doors, legs(rng, width, depth, foot + 0.001))
-    return standing("cabinet", surfaces, [top_support(width, depth, foot + height + 0.02)])
+    free = top_support(width, depth, foot + height + 0.02)
+    return standing("cabinet", {"wood": [body, lid]}, doors, legs(rng, width, depth, foot + 0.001), supports=[free])
 
 
 def make_column(rng: Rng) -> Thing:
@@ -155,7 +157,7 @@ def make_column(rng: Rng) -> Thing:
     else:
         body = lathe(solid(silhouette(rng.uniform(0.28, 0.46, 7) * width, height - 0.1, 28))).at(0, 0.05)
     surfaces = {one_of(rng, ("stone", "wood")): [plate, body, plate.at(0, height - 0.05)]}
-    return standing("column", surfaces, [top_support(width, width, height)])
+    return standing("column", surfaces, supports=[top_support(width, width, height)])
 
 
 def make_screen(rng: Rng) -> Thing:
@@ -177,3 +179,31 @@ def make_screen(rng: Rng) -> Thing:
     step = width * math.cos(fold)
     folded = [join(panel).turned(fold * (-1) ** k).at(k * step) for k in range(count)]
     return standing("screen", {one_of(rng, ("wood", "metal")): folded})
+
+
+def make_showcase(rng: Rng) -> Thing:
+    """A plinth with panes at its front and sides, open above, before a board or a mirror."""
+    width, height, depth, tall = uniforms(rng, (0.6, 1.4), (0.5, 0.9), (0.35, 0.55), (0.35, 0.8))
+    thickness = rng.uniform(0.004, 0.012)
+    panes = [slab(width - 0.01, tall, thickness).at(0, height + 0.001, depth / 2 - thickness)]
+    panes += [
+        slab(thickness, tall, depth - 0.08).at(side * (width / 2 - thickness), height + 0.001, -0.01)
+        for side in (-1, 1)
+    ]
+    back = slab(width, tall, 0.02).at(0, height + 0.001, 0.01 - depth / 2)
+    surfaces = {"wood": [slab(width, height, depth)], "clear": panes, one_of(rng, ("front", "mirror")): [back]}
+    inside = top_support(width - 0.06, depth - 0.1, height, margin=0.02)
+    return standing("showcase", surfaces, supports=[inside])
+
+
+def make_pane(rng: Rng) -> Thing:
+    """A pane in a frame that stands by itself, as in offices."""
+    width, height, thickness = uniforms(rng, (0.7, 1.6), (1.2, 2.0), (0.004, 0.012))
+    frame = rim(width, height, EDGE, EDGE)
+    feet = [slab(EDGE, 0.02, 0.4).at(side * width / 3) for side in (-1, 1)]
+    pane = slab(width - 2 * EDGE - 0.002, height - 2 * EDGE - 0.002, thickness).at(0, EDGE + 0.021)
+    surfaces = {"metal": [*(board.at(0, 0.02) for board in frame), *feet], "clear": [pane]}
+    return standing("pane", surfaces)
+
+
+CASES = (make_shelf, make_cabinet, make_desk)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scenes.camera import Array
 from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, hollow, lathe, leaf, silhouette, tube
-from scenes.objects.thing import SurfacesBySlot, Thing, merged, standing
+from scenes.objects.thing import SurfacesBySlot, Thing, standing
 
 
 def arc(rng: Rng, start: ArrayLike, length: float, azimuth: float, droop: float, count: int = 8) -> Array:
@@ -59,7 +59,7 @@ def potted(rng: Rng, name: str, radius: float, height: float) -> Thing:
     soil = disc(float(np.interp(level, outer[:, 1], outer[:, 0])) - wall / 2, 0.02 * deep, 24).at(0, level)
     pot: SurfacesBySlot = {"ceramic": [lathe(hollow(outer, wall, deep * 0.8), 28)], "soil": [soil]}
     grow = tuft if rng.random() < 0.4 else shrub
-    return standing(name, merged(pot, grow(rng, level, height - level)))
+    return standing(name, pot, grow(rng, level, height - level))
 
 
 def make_floor_plant(rng: Rng) -> Thing:

@@ -7,7 +7,7 @@ import numpy as np
 from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, lathe, silhouette, slab, solid, superellipsoid, tube
 from scenes.objects.furniture import corners, legs, pedestal
-from scenes.objects.thing import Support, SurfacesBySlot, Thing, evenly, merged, shifted, standing, top_support
+from scenes.objects.thing import SurfacesBySlot, Thing, evenly, shifted, standing, top_support
 
 
 def seat(rng: Rng, width: float, depth: float) -> tuple[SurfacesBySlot, float]:
@@ -40,13 +40,11 @@ def back(rng: Rng, width: float, height: float) -> SurfacesBySlot:
 def make_chair(rng: Rng) -> Thing:
     width, depth, height = uniforms(rng, (0.4, 0.5), (0.4, 0.5), (0.4, 0.47))
     base, thickness = seat(rng, width, depth)
-    surfaces = merged(
-        legs(rng, width, depth, height),
-        shifted(base, y=height),
-        shifted(back(rng, width, rng.uniform(0.35, 0.6)), y=height + 0.01, z=0.025 - depth / 2),
-    )
-    free = Support((-width / 2 + 0.05, -depth / 2 + 0.08), (width / 2 - 0.05, depth / 2 - 0.05), height + thickness)
-    return standing("chair", surfaces, [free])
+    frame = legs(rng, width, depth, height)
+    rest = shifted(back(rng, width, rng.uniform(0.35, 0.6)), y=height + 0.01, z=0.025 - depth / 2)
+    low = (0.05 - width / 2, height + thickness, 0.08 - depth / 2)
+    free = np.array([low, (width / 2 - 0.05, np.inf, depth / 2 - 0.05)])
+    return standing("chair", frame, shifted(base, y=height), rest, supports=[free])
 
 
 def make_stool(rng: Rng) -> Thing:
@@ -58,8 +56,8 @@ def make_stool(rng: Rng) -> Thing:
     if rng.random() < 0.4:
         thickness = rng.uniform(0.05, 0.1)
         cushion = lathe(solid(silhouette([radius * 0.9, radius, radius, radius * 0.9], thickness, 10)))
-        return standing("stool", merged(frame, board, {"cushion": [cushion.at(0, height + 0.03)]}))
-    return standing("stool", merged(frame, board), [top_support(side, side, height + 0.03)])
+        return standing("stool", frame, board, {"cushion": [cushion.at(0, height + 0.03)]})
+    return standing("stool", frame, board, supports=[top_support(side, side, height + 0.03)])
 
 
 def make_bench(rng: Rng) -> Thing:
@@ -67,8 +65,8 @@ def make_bench(rng: Rng) -> Thing:
     count = int(rng.integers(1, 6))
     thickness = rng.uniform(0.02, 0.045)
     planks = [slab(width, thickness, depth / count - 0.008).at(0, height, z) for z in evenly(depth, count)]
-    surfaces = merged({"wood": planks}, legs(rng, width, depth, height))
-    return standing("bench", surfaces, [top_support(width, depth, height + thickness)])
+    free = top_support(width, depth, height + thickness)
+    return standing("bench", {"wood": planks}, legs(rng, width, depth, height), supports=[free])
 
 
 def upholstered(rng: Rng, name: str, seats: int) -> Thing:
@@ -117,3 +115,7 @@ def make_bed(rng: Rng) -> Thing:
     pillows = [pillow.at(x, level + thickness - 0.02, 0.28 - depth / 2) for x in evenly(width, count)]
     mattress = superellipsoid(width, thickness, depth, 16, 3).at(0, level)
     return standing("bed", {"wood": frame, "fabric": [mattress], "blanket": [blanket], "cushion": pillows})
+
+
+SEATS = (make_chair, make_stool, make_bench)
+UPHOLSTERED = (make_sofa, make_armchair, make_bed)

@@ -1,13 +1,12 @@
-"""Things, their parts and supports, and functions that their makers share."""
+"""Things, and functions that their makers share."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 
-from scenes.boxes import enclosing_box
+from scenes.boxes import bounding_box
 from scenes.camera import Array
 from scenes.draws import Rng
 from scenes.meshes import Surface, join
@@ -16,48 +15,21 @@ SurfacesBySlot = dict[str, list[Surface]]
 
 
 @dataclass(frozen=True)
-class ThingPart:
-    """One mesh of a thing, with texture coordinates and unit outward vertex normals.
-
-    Its slot suggests a material: wood, front (doors, lids, panels), metal, stone, ceramic, glass, clear (smooth glass),
-    mirror, wax, body (anything), fabric, cushion, blanket, shade, slat, leaf, stem, soil, paper, cover-1 to cover-3,
-    frame, or print (uv in 0..1).
-    """
-
-    mesh: trimesh.Trimesh
-    slot: str
-    smooth: bool = False  # shade with the mesh's vertex normals
-
-
-@dataclass(frozen=True)
-class Support:
-    """A horizontal rectangle for smaller things to stand on; metres."""
-
-    low: tuple[float, float]  # x, z
-    high: tuple[float, float]  # x, z
-    height: float  # y
-    clearance: float = math.inf  # free height above
-
-    def at(self, x: float, y: float, z: float) -> "Support":
-        low = (self.low[0] + x, self.low[1] + z)
-        high = (self.high[0] + x, self.high[1] + z)
-        return replace(self, low=low, high=high, height=self.height + y)
-
-
-@dataclass(frozen=True)
 class Thing:
-    """An object in its rest pose, with one part for each slot, its lowest point at y = 0.
+    """An object in its rest pose, its lowest point at y = 0.
 
-    Furniture and decor are centred on the y axis; what hangs is centred on x = 0.
+    Furniture and decor are centred on the y axis; what hangs is centred on x = 0. A slot suggests a material: wood,
+    front (doors, lids, panels), metal, stone, ceramic, glass, clear (smooth glass), mirror, wax, body (anything),
+    fabric, cushion, blanket, shade, slat, leaf, stem, soil, paper, cover-1 to cover-3, frame, or print (uv in 0..1).
     """
 
     name: str
-    parts: tuple[ThingPart, ...]
-    supports: tuple[Support, ...] = ()
+    parts: dict[str, Surface]  # by slot
+    supports: Sequence[Array] = ()  # boxes (2, 3) for smaller things to stand in, infinitely high if open above
 
     @property
     def bounds(self) -> Array:
-        return enclosing_box(np.array([part.mesh.bounds for part in self.parts]))
+        return bounding_box(np.concatenate([surface.points for surface in self.parts.values()]))
 
 
 Maker = Callable[[Rng], Thing]
@@ -67,35 +39,28 @@ def shifted(surfaces: SurfacesBySlot, x: float = 0.0, y: float = 0.0, z: float =
     return {slot: [surface.at(x, y, z) for surface in of_slot] for slot, of_slot in surfaces.items()}
 
 
-def merged(*groups: SurfacesBySlot) -> SurfacesBySlot:
+def assembled(name: str, *groups: SurfacesBySlot) -> Thing:
+    """A thing of the surfaces of all groups as they are."""
     surfaces: SurfacesBySlot = {}
     for group in groups:
         for slot, of_slot in group.items():
             surfaces[slot] = surfaces.get(slot, []) + of_slot
-    return surfaces
+    return Thing(name, {slot: join(of_slot) for slot, of_slot in surfaces.items()})
 
 
-def assembled(name: str, surfaces: SurfacesBySlot) -> Thing:
-    """A thing of surfaces as they are, without empty slots."""
-    joined = {slot: join(of_slot) for slot, of_slot in surfaces.items() if of_slot}
-    return Thing(name, tuple(ThingPart(surface.mesh(), slot, surface.smooth) for slot, surface in joined.items()))
-
-
-def standing(name: str, surfaces: SurfacesBySlot, supports: Sequence[Support] = ()) -> Thing:
+def standing(name: str, *groups: SurfacesBySlot, supports: Sequence[Array] = ()) -> Thing:
     """A thing of surfaces and supports, translated to stand on y = 0, centred on the y axis."""
-    points = np.concatenate([surface.points for of_slot in surfaces.values() for surface in of_slot])
-    low, high = points.min(axis=0), points.max(axis=0)
-    shift = (float(-(low[0] + high[0]) / 2), float(-low[1]), float(-(low[2] + high[2]) / 2))
-    thing = assembled(name, shifted(surfaces, *shift))
-    return replace(thing, supports=tuple(support.at(*shift) for support in supports))
+    thing = assembled(name, *groups)
+    low, high = thing.bounds
+    shift = -np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    parts = {slot: surface.at(*shift) for slot, surface in thing.parts.items()}
+    return Thing(name, parts, [support + shift for support in supports])
 
 
-def top_support(
-    width: float, depth: float, height: float, clearance: float = math.inf, margin: float = 0.01
-) -> Support:
+def top_support(width: float, depth: float, height: float, clearance: float = math.inf, margin: float = 0.01) -> Array:
     """The support on a board `width` x `depth` about the y axis with its top at `height`, less a `margin`."""
     x, z = width / 2 - margin, depth / 2 - margin
-    return Support((-x, -z), (x, z), height, clearance)
+    return np.array([[-x, height, -z], [x, height + clearance, z]])
 
 
 def evenly(width: float, count: int) -> Array:

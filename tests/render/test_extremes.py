@@ -6,7 +6,7 @@ import pytest
 from datasets.clip import Clip
 from datasets.writer import ClipWriter
 from render.clip import Sampling, render_clip
-from scenes.extremes import EXTREME_SCENES, rescaled
+from scenes.cornell import EXTREME_SCENES, rescaled
 from scenes.registry import build_scene
 
 SIZE = 24  # px

@@ -9,7 +9,7 @@ from render.path import PathTracer
 from render.regularise import blurred
 from render.sampler import CYCLE
 from render.stage import Stage
-from scenes.extremes import repaint
+from scenes.cornell import repaint
 from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
 

@@ -10,7 +10,7 @@ from render.gbuffer import render_gbuffer
 from render.path import PathTracer
 from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
-from scenes.extremes import repaint
+from scenes.cornell import repaint
 from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
 

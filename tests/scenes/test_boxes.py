@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scenes.boxes import enclosing_box, first_hit, keeps_clearance, overlaps, transformed_box
+from scenes.boxes import bounding_box, first_hit, keeps_clearance, overlaps, transformed_box
 from scenes.shell import pose
 from tests.helpers.scenes import SEEDS
 
@@ -30,9 +30,9 @@ def test_transformed_box_is_the_smallest_around_a_turned_one(seed):
 
 @settings(deadline=None)
 @given(seed=SEEDS)
-def test_enclosing_box_holds_all_and_overlaps_each(seed):
+def test_bounding_box_holds_all_and_overlaps_each(seed):
     boxes = random_boxes(np.random.default_rng(seed), 5)
-    around = enclosing_box(boxes)
+    around = bounding_box(boxes)
     assert (around[0] <= boxes[:, 0]).all() and (around[1] >= boxes[:, 1]).all()
     assert all(overlaps(box, around[None]) for box in boxes)
     assert not overlaps(around + 1.01 * (around[1] - around[0]), boxes)
