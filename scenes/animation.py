@@ -181,7 +181,7 @@ class Camera:
 
 
 def frozen(value: Any) -> Any:
-    """A Track as in frame 0 for ever; of dataclasses and tuples, the same with all Tracks in them frozen."""
+    """A Track as in frame 0 for ever; dataclasses, such as a Scene, and tuples with all Tracks in them frozen."""
     if isinstance(value, Track):
         return Track.constant(value.at(0))
     if isinstance(value, tuple):
@@ -214,10 +214,6 @@ class Scene:
             camera_to_world=look_at(self.camera.eye.at(frame), self.camera.target.at(frame), self.camera.up.at(frame)),
             object_to_world=np.array([shape.motion.matrix(frame) for shape in self.meshes]).reshape(-1, 4, 4),
         )
-
-    def still(self) -> "Scene":
-        """The scene of frame 0 for ever: nothing moves or changes, the camera included."""
-        return frozen(self)
 
     def moves(self) -> bool:
         return any(shape.motion.varies() for shape in self.meshes)

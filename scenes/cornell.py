@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
+from scenes.animation import Camera, RigidMotion, Scene, Shape, Track, still
 from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.draws import Rng
@@ -37,25 +37,6 @@ def block_mesh(width: float, height: float) -> trimesh.Trimesh:
     return mesh
 
 
-def empty_box() -> list[Shape]:
-    return [
-        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), WHITE),
-        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), WHITE),
-        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), WHITE),
-        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), RED),
-        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), GREEN),
-    ]
-
-
-def light(position: Track, radiance: Track) -> Shape:
-    corners = [(-0.235, 0, -0.19), (0.235, 0, -0.19), (0.235, 0, 0.19), (-0.235, 0, 0.19)]
-    return Shape("light", quad(*corners), WHITE, radiance, RigidMotion(position, Track.constant(0.0)))
-
-
-def block(name: str, width: float, height: float, position: Track, angle: Track) -> Shape:
-    return Shape(name, block_mesh(width, height), WHITE, motion=RigidMotion(position, angle))
-
-
 class Keys:
     """Tracks through random keys at equal intervals, the same in clips of any length; a clip lies in their middle."""
 
@@ -73,19 +54,36 @@ class Keys:
         """Through random points of a box."""
         return self.track(self.rng.uniform(low, high, (self.count, len(low))))
 
+    def flight(self, low: Sequence[float], high: Sequence[float]) -> Camera:
+        """Through random points of a box, looking around the middle of the Cornell box."""
+        target = self.between([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4])
+        return Camera(self.between(low, high), target, Track.constant(75.0))
 
-def fly(keys: Keys, low: Sequence[float], high: Sequence[float]) -> Camera:
-    """A smooth flight through random points of a box that looks around the middle of the Cornell box."""
-    target = keys.between([-0.35, -0.55, -0.8], [0.35, 0.15, -0.4])
-    return Camera(keys.between(low, high), target, Track.constant(75.0))
+
+def filled_box(
+    width: float, short: RigidMotion, tall: RigidMotion, light: RigidMotion, radiance: Track, camera: Camera
+) -> Scene:
+    """The box with two blocks of that `width` and a light, in these places."""
+    lamp = quad((-0.235, 0, -0.19), (0.235, 0, -0.19), (0.235, 0, 0.19), (-0.235, 0, 0.19))
+    shapes = (
+        Shape("floor", quad((-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)), WHITE),
+        Shape("ceiling", quad((-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)), WHITE),
+        Shape("back", quad((-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)), WHITE),
+        Shape("red-wall", quad((-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)), RED),
+        Shape("green-wall", quad((1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)), GREEN),
+        Shape("short-block", block_mesh(width, 0.6), WHITE, motion=short),
+        Shape("tall-block", block_mesh(width, 1.2), WHITE, motion=tall),
+        Shape("light", lamp, WHITE, radiance, light),
+    )
+    return Scene(shapes, camera)
 
 
 def cornell_box(rng: Rng, frames: int) -> Scene:
     """The classic box: two white blocks and a ceiling light; only the camera moves."""
-    short = block("short-block", 0.6, 0.6, Track.constant([0.33, FLOOR_HEIGHT, 0.35]), Track.constant(-0.29))
-    tall = block("tall-block", 0.6, 1.2, Track.constant([-0.33, FLOOR_HEIGHT, -0.28]), Track.constant(0.30))
-    lamp = light(Track.constant([0.0, 0.99, 0.0]), Track.constant(LIGHT_RADIANCE))
-    return Scene((*empty_box(), short, tall, lamp), fly(Keys(rng, frames), [-0.8, -0.4, 0.75], [0.8, 0.7, 0.98]))
+    short = still([0.33, FLOOR_HEIGHT, 0.35], -0.29)
+    tall = still([-0.33, FLOOR_HEIGHT, -0.28], 0.30)
+    camera = Keys(rng, frames).flight([-0.8, -0.4, 0.75], [0.8, 0.7, 0.98])
+    return filled_box(0.6, short, tall, still([0.0, 0.99, 0.0], 0.0), Track.constant(LIGHT_RADIANCE), camera)
 
 
 def cornell_box_moving(rng: Rng, frames: int) -> Scene:
@@ -97,18 +95,16 @@ def cornell_box_moving(rng: Rng, frames: int) -> Scene:
     keys = Keys(rng, frames)
     sides = np.where(np.arange(keys.count) % 2 == 0, -1.0, 1.0) * rng.choice([-1.0, 1.0])
 
-    def lane(z: float, side: Array) -> Track:
+    def lane(z: float, side: Array) -> RigidMotion:
         x = side * rng.uniform(0.25, 0.55, keys.count)
-        return keys.track(np.stack([x, np.full(keys.count, FLOOR_HEIGHT), np.full(keys.count, z)], axis=1))
+        place = keys.track(np.stack([x, np.full(keys.count, FLOOR_HEIGHT), np.full(keys.count, z)], axis=1))
+        turn = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.uniform(-0.3, 0.3, keys.count))
+        return RigidMotion(place, keys.track(turn))
 
-    def turn() -> Track:
-        return keys.track(rng.uniform(-np.pi, np.pi) + np.cumsum(rng.uniform(-0.3, 0.3, keys.count)))
-
-    short = block("short-block", 0.5, 0.6, lane(0.3, sides), turn())
-    tall = block("tall-block", 0.5, 1.2, lane(-0.5, -sides), turn())
-    brightness = keys.track(LIGHT_RADIANCE * rng.uniform(0.7, 1.3, (keys.count, 1)))
-    lamp = light(keys.between([-0.6, 0.99, -0.5], [0.6, 0.99, 0.5]), brightness)
-    return Scene((*empty_box(), short, tall, lamp), fly(keys, [-0.3, 0.0, 0.85], [0.3, 0.5, 0.98]))
+    short, tall = lane(0.3, sides), lane(-0.5, -sides)
+    radiance = keys.track(LIGHT_RADIANCE * rng.uniform(0.7, 1.3, (keys.count, 1)))
+    light = RigidMotion(keys.between([-0.6, 0.99, -0.5], [0.6, 0.99, 0.5]), Track.constant(0.0))
+    return filled_box(0.5, short, tall, light, radiance, keys.flight([-0.3, 0.0, 0.85], [0.3, 0.5, 0.98]))
 
 
 def repaint(scene: Scene, paint: Callable[[Shape], Bsdf]) -> Scene:

@@ -11,17 +11,11 @@ from scenes.textures import gray_texture, texture
 
 METALS = ("Al", "Ag", "Au", "Cu", "Cr")  # Mitsuba's names
 GLASS = 1.5  # index of refraction; Mitsuba compiles it into kernels, so that rooms share one
+CLEAR_GLASS: Bsdf = {"type": "dielectric", "int_ior": GLASS}
 SHEETS = ("leaf", "shade", "fabric", "print")  # thin, two-sided
 NEVER_GLOSSY = (*SHEETS, "stem", "paper", "cushion", "blanket", "soil", "wax")
 ALWAYS_GLOSSY = ("metal", "glass", "clear", "mirror")
 WHITENED = {"wall": 0.5, "floor": 0.1, "dark wall": 0.0}  # see desaturated
-
-
-def reflectance(rng: Rng, textured: float, repeats: float) -> Bsdf:
-    """A colour, or with probability `textured` a bitmap."""
-    if rng.random() < textured:
-        return bitmap(texture(rng), repeats)
-    return rgb(colour(rng))
 
 
 def desaturated(rng: Rng, base: Bsdf, white: float) -> Bsdf:
@@ -61,9 +55,9 @@ FINISHES: dict[str, Callable[[Rng, Bsdf], Bsdf]] = {
     "glass": lambda rng, base: (
         {"type": "roughdielectric", "alpha": log_uniform(rng, 0.02, 0.2), "int_ior": GLASS}
         if rng.random() < 0.2
-        else {"type": "dielectric", "int_ior": GLASS}
+        else CLEAR_GLASS
     ),
-    "clear": lambda rng, base: {"type": "dielectric", "int_ior": GLASS},
+    "clear": lambda rng, base: CLEAR_GLASS,
 }
 # Weights of the finishes of a slot that is not plainly diffuse.
 GLOSSY_FINISHES = {
@@ -85,10 +79,10 @@ def finish(rng: Rng, slot: str, gloss: float, size: float) -> Bsdf:
 
     `gloss` in [0, 1] is the share of parts that are not plainly diffuse, of those that may be glossy.
     """
-    if slot == "print":  # its texture coordinates are 0..1
-        base = reflectance(rng, 0.85, 1.0)
-    else:
-        base = reflectance(rng, 0.5, log_uniform(rng, 0.5, 2.0) / min(size, 1.0))
+    is_print = slot == "print"  # its texture coordinates are 0..1
+    repeats = 1.0 if is_print else log_uniform(rng, 0.5, 2.0) / min(size, 1.0)
+    is_textured = rng.random() < (0.85 if is_print else 0.5)
+    base = bitmap(texture(rng), repeats) if is_textured else rgb(colour(rng))
     if slot in WHITENED:
         base = desaturated(rng, base, WHITENED[slot])
     if slot in ALWAYS_GLOSSY or (slot not in NEVER_GLOSSY and rng.random() < gloss):

@@ -14,12 +14,11 @@ from scenes.animation import AT_REST, Camera, RigidMotion, Scene, Shape, Track, 
 from scenes.bsdf import Bsdf, bitmap, diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.draws import Rng
-from scenes.finish import GLASS
+from scenes.finish import CLEAR_GLASS, GLASS
 from scenes.meshes import Surface, hollow, lathe, silhouette, slab, solid, superellipsoid, tube
 from scenes.sky import sky
 from scenes.textures import bond, texture
 
-CLEAR_GLASS: Bsdf = {"type": "dielectric", "int_ior": GLASS}
 WATER: Bsdf = {"type": "dielectric", "int_ior": 1.33}
 FROSTED: Bsdf = {"type": "roughdielectric", "int_ior": GLASS, "alpha": 0.2}
 SILVER: Bsdf = {"type": "conductor", "material": "Ag"}

@@ -96,10 +96,6 @@ def flat_shaded(points: Array, faces: Faces) -> Surface:
     return box_mapped(points[faces].reshape(-1, 3), normals, np.arange(faces.size).reshape(-1, 3), False)
 
 
-def smooth_shaded(points: Array, faces: Faces) -> Surface:
-    return box_mapped(points, mean_normals(points, faces), faces, True)
-
-
 @cache
 def unit_box(subdivisions: int) -> tuple[Array, Faces]:
     """Points (V, 3) and the 12 * 4^subdivisions triangles of the cube -1..1."""
@@ -130,14 +126,16 @@ def superellipsoid(width: float, height: float, depth: float, power: float, subd
     points, faces = unit_box(subdivisions)
     points = np.sin(np.pi / 2 * points)  # more points near the edges
     points = points / np.linalg.norm(points, ord=power, axis=1, keepdims=True)
-    return smooth_shaded((points + Y_UP) * (width / 2, height / 2, depth / 2), faces)
+    points = (points + Y_UP) * (width / 2, height / 2, depth / 2)
+    return box_mapped(points, mean_normals(points, faces), faces, True)
 
 
 def blob(rng: Rng, radius: float, roughness: float, subdivisions: int) -> Surface:
     """A ball of `radius` displaced by smooth noise of relative amplitude `roughness`, about the origin."""
     points, faces = unit_sphere(subdivisions)
     noise = np.sin(points @ rng.normal(0, 2.0, (3, 12)) + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / np.sqrt(6)
-    return smooth_shaded(points * radius * np.exp(roughness * noise)[:, None], faces)
+    points = points * radius * np.exp(roughness * noise)[:, None]
+    return box_mapped(points, mean_normals(points, faces), faces, True)
 
 
 def gem(rng: Rng, radius: float, subdivisions: int) -> Surface:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes import lighting
-from scenes.animation import Camera, Scene, Shape, Track
+from scenes.animation import Scene, Shape, Track
 from scenes.boxes import bounding_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
-from scenes.draws import Rng, log_uniform, one_of
+from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
 from scenes.furnishing import against_walls, furnish
@@ -18,7 +18,7 @@ from scenes.layout import Layout
 from scenes.meshes import slab
 from scenes.objects.fittings import make_blind, make_curtain
 from scenes.shell import Opening, horizontal_rectangle, reveal, wall_pose, wall_width, wall_with_openings
-from scenes.sky import sky, sun_through
+from scenes.sky import sky
 
 MAX_LAMPS = 4
 MIN_ZOOM, MAX_ZOOM = 1.5, 6.0  # of close-ups, times the room's focal length
@@ -68,17 +68,6 @@ def add_windows(layout: Layout, count: int) -> None:
             layout.hang(make_curtain(rng, cover, height + 0.2), wall, x + cover / 2, y - 0.1, 0.12)
 
 
-def partition(layout: Layout) -> None:
-    """Add a wall that divides the room up to a gap."""
-    rng = layout.rng
-    x = layout.size[0] * rng.uniform(-0.2, 0.2)
-    gap = rng.uniform(0.8, 1.6)
-    wall = slab(0.1, layout.size[1], layout.size[2] - gap).at(x, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
-    layout.build("partition", wall, np.eye(4))
-    layout.reserve(bounding_box(wall.points))
-    layout.walls += 1
-
-
 def shell(layout: Layout) -> list[Shape]:
     rng = layout.rng
     width, height, depth = layout.size
@@ -110,8 +99,13 @@ def holes(layout: Layout, style: Style) -> None:
             layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
     elif style.day or rng.random() < NIGHT:
         add_windows(layout, int(rng.integers(1, 4)))
-    elif rng.random() < 0.15:
-        partition(layout)
+    elif rng.random() < 0.15:  # a wall that divides the room up to a gap
+        x = layout.size[0] * rng.uniform(-0.2, 0.2)
+        gap = rng.uniform(0.8, 1.6)
+        divider = slab(0.1, layout.size[1], layout.size[2] - gap).at(x, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
+        layout.build("partition", divider, np.eye(4))
+        layout.reserve(bounding_box(divider.points))
+        layout.walls += 1
 
 
 def outside(layout: Layout, style: Style) -> Array | None:
@@ -119,8 +113,11 @@ def outside(layout: Layout, style: Style) -> Array | None:
     rng = layout.rng
     if not style.day or (not layout.missing_walls and rng.random() < 0.5):
         return None
-    sunny = rng.random() < (0.3 if layout.missing_walls else 0.75)
-    return sky(rng, sun_through(rng, next(iter(layout.openings)), layout.size) if sunny else None)
+    if rng.random() >= (0.3 if layout.missing_walls else 0.75):
+        return sky(rng, sun=None)
+    aside, elevation = uniforms(rng, (-1, 1), (0.2, 1.0))
+    through = wall_pose(next(iter(layout.openings)), layout.size)[:3, :3]
+    return sky(rng, sun=through @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])
 
 
 def room(rng: Rng, frames: int) -> Scene:
@@ -155,8 +152,12 @@ def room(rng: Rng, frames: int) -> Scene:
     return Scene(tuple(shapes), camera, depth, environment)
 
 
-def aimed_beside(camera: Camera, across: float, up: float, frames: int) -> Track:
-    """Targets to the right of and above the camera's, in half image widths."""
+def closeup(rng: Rng, frames: int) -> Scene:
+    """A random room through a longer lens, as finely resolved as in an image several times as wide."""
+    scene = room(rng, frames)
+    camera = scene.camera
+    zoom = log_uniform(rng, MIN_ZOOM, MAX_ZOOM)
+    across, up = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)  # to the right and upwards, in half image widths
     half_width = np.tan(np.radians(camera.x_fov.at(0)) / 2)
     targets = []
     for frame in range(frames):
@@ -165,15 +166,6 @@ def aimed_beside(camera: Camera, across: float, up: float, frames: int) -> Track
         right *= np.linalg.norm(ahead) / np.linalg.norm(right)
         above = np.cross(right, ahead) / np.linalg.norm(ahead)
         targets.append(camera.target.at(frame) + half_width * (across * right + up * above))
-    return Track(np.stack(targets), 0, frames - 1)
-
-
-def closeup(rng: Rng, frames: int) -> Scene:
-    """A random room through a longer lens, as finely resolved as in an image several times as wide."""
-    scene = room(rng, frames)
-    camera = scene.camera
-    zoom = log_uniform(rng, MIN_ZOOM, MAX_ZOOM)
-    across, up = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
-    fov = 2 * np.degrees(np.arctan(np.tan(np.radians(camera.x_fov.at(0)) / 2) / zoom))
-    target = aimed_beside(camera, across, up, frames)
+    fov = 2 * np.degrees(np.arctan(half_width / zoom))
+    target = Track(np.stack(targets), 0, frames - 1)
     return replace(scene, camera=replace(camera, target=target, x_fov=Track.constant(float(fov))))

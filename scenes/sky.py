@@ -4,8 +4,7 @@ import numpy as np
 
 from scenes.camera import Array
 from scenes.colours import light_colour
-from scenes.draws import Rng, log_uniform, uniforms
-from scenes.shell import wall_pose
+from scenes.draws import Rng, log_uniform
 
 SKY_SIZE = (64, 128)  # rows and columns; kernels of scenes with skies of the same size are shared
 
@@ -30,9 +29,3 @@ def sky(rng: Rng, sun: Array | None) -> Array:
         column = np.arctan2(x, -z) / np.pi / 2 % 1 * width
         image[int(row), int(column)] += light_colour(rng) * log_uniform(rng, 300, 20000)
     return np.asarray(image)
-
-
-def sun_through(rng: Rng, wall: int, size: Array) -> Array:
-    """A direction (3,) to a sun that shines in through openings of wall 0 to 3 of a room of `size` (3,)."""
-    aside, elevation = uniforms(rng, (-1, 1), (0.2, 1.0))
-    return np.asarray(wall_pose(wall, size)[:3, :3] @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])

@@ -15,7 +15,7 @@ from render.clip import NO_OPTIONS, Options
 from render.job.profiles import DataProfile, profile_of, source_of
 from render.scene_file.description import SplitRequest
 from render.scene_file.load import own_scene
-from scenes.animation import Scene
+from scenes.animation import Scene, frozen
 from scenes.registry import build_scene
 
 GENERATOR = 10  # to be increased when the same seed renders different bytes
@@ -95,7 +95,7 @@ def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tupl
         scene = build_scene(scene_name, seed, profile.size[0])
     else:
         scene = clip_of_own_scene(profile.own, split, kind.number, profile.size[0], seed)
-    return (scene.still() if kind.still else scene), seed
+    return (frozen(scene) if kind.still else scene), seed
 
 
 def clip_of_own_scene(path: Path, split: str, number: int, frames: int, seed: int) -> Scene:

@@ -13,7 +13,7 @@ from render.gbuffer import render_gbuffer
 from render.gradient import GradientSamples, pixel_of_each_stratum, sample_luminance
 from render.path import PathTracer, PosedFrame, SampleRange
 from render.stage import Stage
-from scenes.animation import RigidMotion, Track
+from scenes.animation import RigidMotion, Track, frozen
 from scenes.cornell import cornell_box
 from scenes.registry import build_scene
 
@@ -70,7 +70,7 @@ def test_gradients_average_to_the_change_of_noise_free_light():
     dims = Track(lamp.radiance.at(0) * np.array([[1.0], [0.6]]))
     slides = RigidMotion(Track(np.array([[0.0, 0.99, 0.0], [0.3, 0.99, 0.2]])), lamp.motion.angle)
     shapes = (*rest, replace(lamp, radiance=dims, motion=slides))
-    stage = Stage(replace(scene, shapes=shapes, camera=scene.still().camera), SIZE, SIZE)
+    stage = Stage(replace(scene, shapes=shapes, camera=frozen(scene.camera)), SIZE, SIZE)
     references = [sample_luminance(PosedFrame(stage, frame).reflected(9, 1024).reshape(-1, 3)) for frame in (0, 1)]
     lamp_id = len(scene.shapes)
     visible = [render_gbuffer(stage, stage.view(frame))["mesh_id"].ravel() for frame in (0, 1)]

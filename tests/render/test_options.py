@@ -9,6 +9,7 @@ from render.path import PathTracer
 from render.regularise import blurred
 from render.sampler import CYCLE
 from render.stage import Stage
+from scenes.animation import frozen
 from scenes.cornell import repaint
 from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
@@ -48,7 +49,7 @@ def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
 
 
 def test_a_clip_walks_through_the_cycle():
-    scene = build_scene("cornell_box", 3, 2).still()
+    scene = frozen(build_scene("cornell_box", 3, 2))
     frames = [arrays for arrays, _ in render_clip(scene, CYCLE + 2, 16, 16, Sampling(2, 1, 8, Options(halton=True)), 1)]
     for frame in (0, 1):
         assert np.array_equal(frames[frame]["direct"], frames[frame + CYCLE]["direct"])
