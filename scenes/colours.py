@@ -42,10 +42,9 @@ def hue_saturation_value(rng: Rng) -> tuple[float, float, float]:
     return hue, saturation, value
 
 
-def colour(rng: Rng) -> tuple[float, float, float]:
+def colour(rng: Rng) -> list[float]:
     """A plausible reflectance, linear RGB."""
-    r, g, b = hsv(*hue_saturation_value(rng))
-    return float(r), float(g), float(b)
+    return hsv(*hue_saturation_value(rng)).tolist()
 
 
 def palette(rng: Rng, count: int) -> Array:

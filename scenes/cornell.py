@@ -32,9 +32,7 @@ def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
 
 
 def block_mesh(width: float, height: float) -> trimesh.Trimesh:
-    mesh: trimesh.Trimesh = trimesh.creation.box((width, height, width))
-    mesh.apply_translation((0, height / 2, 0))
-    return mesh
+    return trimesh.creation.box((width, height, width)).apply_translation((0, height / 2, 0))
 
 
 class Keys:
@@ -123,9 +121,7 @@ def tiny_light(rng: Rng, frames: int) -> Scene:
     """A tiny light of radiance 1e5, more than float16 can represent."""
     scene = cornell_box_moving(rng, frames)
     light = scene.shapes[-1]
-    mesh = light.mesh.copy()
-    mesh.apply_scale(0.005)
-    tiny = replace(light, mesh=mesh, radiance=Track.constant([1e5, 1e5, 1e5]))
+    tiny = replace(light, mesh=light.mesh.copy().apply_scale(0.005), radiance=Track.constant([1e5, 1e5, 1e5]))
     return replace(scene, shapes=(*scene.shapes[:-1], tiny))
 
 
@@ -141,10 +137,9 @@ def rescaled(scene: Scene, factor: float) -> Scene:
         return replace(track, keys=track.keys * factor)
 
     def larger(shape: Shape) -> Shape:
-        mesh = shape.mesh.copy()
-        mesh.apply_scale(factor)
         assert isinstance(shape.motion, RigidMotion)
-        return replace(shape, mesh=mesh, motion=RigidMotion(grow(shape.motion.position), shape.motion.angle))
+        motion = RigidMotion(grow(shape.motion.position), shape.motion.angle)
+        return replace(shape, mesh=shape.mesh.copy().apply_scale(factor), motion=motion)
 
     camera = replace(scene.camera, eye=grow(scene.camera.eye), target=grow(scene.camera.target))
     return replace(scene, shapes=tuple(map(larger, scene.shapes)), camera=camera)
@@ -162,8 +157,7 @@ def mirrors(rng: Rng, frames: int) -> Scene:
     """A closed box of mirrors around the camera, the blocks and the light."""
     scene = cornell_box(rng, frames)
     silver = {"type": "conductor", "material": "Ag"}
-    walls = block_mesh(2.0, 2.0)
-    walls.apply_translation((0, -1, 0))
+    walls = trimesh.creation.box((2, 2, 2))
     walls.invert()
     inside = [shape for shape in scene.shapes if "block" in shape.name or shape.radiance is not None]
     return replace(scene, shapes=(Shape("mirrors", walls, silver), *inside), max_depth=8)

@@ -88,7 +88,7 @@ def finish(rng: Rng, slot: str, gloss: float, size: float) -> Bsdf:
     if slot in ALWAYS_GLOSSY or (slot not in NEVER_GLOSSY and rng.random() < gloss):
         weight_of = GLOSSY_FINISHES.get(slot, OTHER_GLOSSY)
         weights = np.array(list(weight_of.values()))
-        chosen = list(weight_of)[int(rng.choice(len(weights), p=weights / weights.sum()))]
-        return FINISHES[chosen](rng, base)
+        chosen = rng.choice(list(weight_of), p=weights / weights.sum())
+        return FINISHES[str(chosen)](rng, base)
     plain = diffuse_bsdf(base)
     return {"type": "twosided", "bsdf": plain} if slot in SHEETS else plain

@@ -15,7 +15,7 @@ from scenes.objects.furniture import CASES, make_column, make_pane, make_screen,
 from scenes.objects.plants import make_floor_plant, make_small_plant
 from scenes.objects.seating import SEATS, UPHOLSTERED, make_bench, make_chair
 from scenes.objects.thing import Maker, Thing
-from scenes.shell import pose, wall_pose, wall_width
+from scenes.shell import pose
 
 # Rooms draw from these in this order.
 FURNITURE: tuple[Maker, ...] = (
@@ -75,11 +75,11 @@ def against_walls(layout: Layout, count: int) -> None:
         bounds = bounds_of(group)
         for _ in range(8):
             wall = int(rng.integers(4))
-            free = wall_width(wall, layout.size) / 2 - bounds[1, 0]
+            free = layout.wall_width(wall) / 2 - bounds[1, 0]
             if free <= 0:
                 continue
             place = [rng.uniform(-free, free), GAP, rng.uniform(0.03, 0.12) - bounds[0, 2], 1]
-            motion = still((wall_pose(wall, layout.size) @ place)[:3], wall * np.pi / 2)
+            motion = still((layout.wall_pose(wall) @ place)[:3], wall * np.pi / 2)
             if layout.try_add(group, motion):
                 layout.backs.append((motion, bounds))
                 break
@@ -106,10 +106,9 @@ def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
 
 
 def movers(layout: Layout, count: int) -> None:
-    rng = layout.rng
     for _ in range(12 * count):
         if count > 0:
-            group = laden(rng, one_of(rng, FURNITURE + DECOR)(rng))
+            group = laden(layout.rng, one_of(layout.rng, FURNITURE + DECOR)(layout.rng))
             count -= layout.try_add(group, random_motion(layout, *layout.floor_position(0.2)))
 
 
@@ -145,7 +144,7 @@ def hang_on_walls(layout: Layout, maker: Maker, count: int) -> None:
     for _ in range(count):
         wall = int(rng.integers(4))
         picture = maker(rng)
-        half = wall_width(wall, layout.size) / 2 + picture.bounds[0, 0]
+        half = layout.wall_width(wall) / 2 + picture.bounds[0, 0]
         top = layout.size[1] - picture.bounds[1, 1] - 0.1
         if half > 0 and top > 0.8 and wall not in layout.openings:
             layout.hang(picture, wall, rng.uniform(-half, half), rng.uniform(0.8, top), 0.004)

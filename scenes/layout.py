@@ -12,7 +12,7 @@ from scenes.draws import Rng
 from scenes.finish import finish
 from scenes.meshes import Surface
 from scenes.objects.thing import Thing
-from scenes.shell import Opening, wall_pose
+from scenes.shell import Opening, pose
 
 MAX_THINGS = 54  # not counting what hangs
 GAP = 0.002  # m, between neighbouring things
@@ -46,6 +46,14 @@ class Layout:
     def last_frame(self) -> int:
         """Where tracks end; at least 1, for clips of one frame."""
         return max(self.frames - 1, 1)
+
+    def wall_pose(self, wall: int) -> Array:
+        """Pose (4, 4) of wall 0 to 3: x along the wall, y up from the floor, z into the room."""
+        distance = self.size[0 if wall % 2 else 2] / 2
+        return pose(0, 0, 0, wall * np.pi / 2) @ pose(0, 0, -distance, 0)
+
+    def wall_width(self, wall: int) -> float:
+        return float(self.size[2 if wall % 2 else 0])
 
     def floor_position(self, margin: float) -> tuple[float, float]:
         """A random place (x, z) at least `margin` from the walls."""
@@ -96,11 +104,11 @@ class Layout:
 
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:
         """Add a thing to a wall if it fits, at (x, y) as visible from inside and `z` in front of it."""
-        motion = still((wall_pose(wall, self.size) @ [x, y, z, 1])[:3], wall * np.pi / 2)
+        motion = still((self.wall_pose(wall) @ [x, y, z, 1])[:3], wall * np.pi / 2)
         if not overlaps(transformed_box(thing.bounds, motion.matrix(0)), self.boxes):
             self.add([(thing, np.eye(4))], motion)
 
-    def build(self, name: str, surface: Surface, matrix: Array, bsdf: Bsdf | None = None) -> None:
-        """Add a part of the building, transformed by `matrix` (4, 4); of a wall's material by default."""
+    def build(self, name: str, surface: Surface, *poses: Array, bsdf: Bsdf | None = None) -> None:
+        """Add a part of the building, transformed by `poses` (4, 4); of a wall's material by default."""
         bsdf = bsdf or finish(self.rng, "wall", 0.0, 1.0)
-        self.shapes.append(Shape(f"{name}-{len(self.shapes)}", surface.mesh(matrix), bsdf, smooth=surface.smooth))
+        self.shapes.append(Shape(f"{name}-{len(self.shapes)}", surface.mesh(*poses), bsdf, smooth=surface.smooth))

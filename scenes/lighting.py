@@ -15,19 +15,19 @@ from scenes.boxes import bounding_box, transformed_box
 from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.colours import light_colour
-from scenes.draws import log_uniform, one_of
+from scenes.draws import log_uniform, one_of, uniforms
 from scenes.layout import GAP, Layout
 from scenes.meshes import Surface, join, lathe, slab, superellipsoid
 from scenes.objects.fittings import make_floor_lamp, make_pendant
 from scenes.objects.thing import Thing
-from scenes.shell import Opening, horizontal_rectangle, wall_pose, wall_width
+from scenes.shell import Opening, horizontal_rectangle
 
 BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
 
 
-def turn_then_shift(axis: int, angle: float, x: float, y: float, z: float) -> Array:
-    """The matrix (4, 4) of a rotation by `angle` radians about x, y or z (0, 1, 2), then a translation."""
-    matrix = np.asarray(trimesh.transformations.rotation_matrix(angle, np.eye(3)[axis]))
+def turn_then_shift(angle: float, x: float, y: float, z: float) -> Array:
+    """The matrix (4, 4) of a rotation by `angle` radians about the x axis, then a translation."""
+    matrix = np.asarray(trimesh.transformations.rotation_matrix(angle, [1, 0, 0]))
     matrix[:3, 3] = x, y, z
     return matrix
 
@@ -41,7 +41,7 @@ def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Shap
     x, z = layout.floor_position(max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
-    panel = lamp(horizontal_rectangle(width, depth), turn_then_shift(0, np.pi, x, y, z))
+    panel = lamp(horizontal_rectangle(width, depth), turn_then_shift(np.pi, x, y, z))
     return panel if layout.claim(box) else []
 
 
@@ -66,15 +66,15 @@ def downlight(layout: Layout) -> list[Shape]:
     if not layout.claim(box):
         return []
     tube = lathe([(radius * 0.9, 0), (radius, 0), (radius, tall), (radius * 0.9, tall), (radius * 0.9, 0)], 24)
-    layout.build("tube", tube, turn_then_shift(1, 0, x, y, z), BLACK)
-    return lamp(horizontal_rectangle(radius, radius), turn_then_shift(0, np.pi, x, y + tall * 0.95, z))
+    layout.build("tube", tube.at(x, y, z), bsdf=BLACK)
+    return lamp(horizontal_rectangle(radius, radius), turn_then_shift(np.pi, x, y + tall * 0.95, z))
 
 
 def bulb(thing: Thing, radius: float, motion: RigidMotion) -> list[Shape]:
     """A ball in the middle of a thing's shade."""
     x, y, z = bounding_box(thing.parts["shade"].points).mean(axis=0)
     ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 1)
-    return lamp(ball, turn_then_shift(1, 0, x, y - radius, z), motion=motion)
+    return lamp(ball.at(x, y - radius, z), motion=motion)
 
 
 def hanging(layout: Layout) -> list[Shape]:
@@ -119,18 +119,16 @@ def cove(layout: Layout) -> list[Shape]:
     """A strip behind a ledge under the ceiling, visible from the ceiling only."""
     rng = layout.rng
     wall = int(rng.integers(4))
-    length = wall_width(wall, layout.size) * rng.uniform(0.4, 0.9)
-    drop = rng.uniform(0.2, 0.4)
-    depth = rng.uniform(0.12, 0.25)
-    lip = rng.uniform(0.05, 0.12)
+    length = layout.wall_width(wall) * rng.uniform(0.4, 0.9)
+    drop, depth, lip = uniforms(rng, (0.2, 0.4), (0.12, 0.25), (0.05, 0.12))
     y = layout.size[1] - drop
-    frame = wall_pose(wall, layout.size)
+    frame = layout.wall_pose(wall)
     ledge = join([slab(length, 0.03, depth).at(0, y - 0.03, depth / 2), slab(length, lip, 0.02).at(0, y, depth - 0.01)])
     box = transformed_box(np.array([[-length / 2, y - 0.03, 0.001], [length / 2, y + lip, depth]]), frame)
     if not layout.claim(box):
         return []
     layout.build("ledge", ledge, frame)
-    return lamp(horizontal_rectangle(length * 0.95, 0.08), turn_then_shift(1, 0, 0, y + 0.005, depth * 0.4), frame)
+    return lamp(horizontal_rectangle(length * 0.95, 0.08).at(0, y + 0.005, depth * 0.4), frame)
 
 
 def behind_opening(layout: Layout) -> list[Shape]:
@@ -139,26 +137,21 @@ def behind_opening(layout: Layout) -> list[Shape]:
     wall = int(rng.integers(4))
     if wall in layout.openings:
         return []
-    width = wall_width(wall, layout.size)
-    height = layout.size[1]
+    width = layout.wall_width(wall)
     if rng.random() < 0.6:  # parallel slits
         count = int(rng.integers(1, 6))
-        thin = rng.uniform(0.1, 0.3)
-        tall = rng.uniform(0.6, 1.6)
-        start = rng.uniform(-width / 2 + 0.3, width / 2 - 0.3 - count * 0.25)
-        y = rng.uniform(0.2, height - tall - 0.2)
-        holes = [Opening((start + 0.25 * i, y), (start + 0.25 * i + thin, y + tall)) for i in range(count)]
+        thin, tall = uniforms(rng, (0.1, 0.3), (0.6, 1.6))
+        span = count * 0.25
     else:
-        side = rng.uniform(0.2, 0.6)
-        x = rng.uniform(-width / 2 + 0.3, width / 2 - 0.3 - side)
-        y = rng.uniform(0.2, height - side - 0.2)
-        holes = [Opening((x, y), (x + side, y + side))]
-    layout.openings[wall] = holes
-    x, y = holes[0].middle
-    size = rng.uniform(0.5, 1.5)
-    away = rng.uniform(0.1, 0.4)
+        count = 1
+        span = thin = tall = rng.uniform(0.2, 0.6)
+    start, y = uniforms(rng, (-width / 2 + 0.3, width / 2 - 0.3 - span), (0.2, layout.size[1] - tall - 0.2))
+    lefts = start + 0.25 * np.arange(count)
+    layout.openings[wall] = [Opening((x, y), (x + thin, y + tall)) for x in lefts.tolist()]
+    x, y = layout.openings[wall][0].middle
+    size, away = uniforms(rng, (0.5, 1.5), (0.1, 0.4))
     shift = (x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.5), -away)
-    return lamp(horizontal_rectangle(size, size), turn_then_shift(0, np.pi / 2, *shift), wall_pose(wall, layout.size))
+    return lamp(horizontal_rectangle(size, size), turn_then_shift(np.pi / 2, *shift), layout.wall_pose(wall))
 
 
 def above_furniture(layout: Layout) -> list[Shape]:
@@ -167,14 +160,14 @@ def above_furniture(layout: Layout) -> list[Shape]:
         return []
     motion, box = one_of(layout.rng, layout.backs)
     width, height, depth = box[1] - box[0]
-    place = turn_then_shift(0, -layout.rng.uniform(0, np.pi / 3), 0, height + 0.08, box[0, 2] + depth / 4)
+    place = turn_then_shift(-layout.rng.uniform(0, np.pi / 3), 0, height + 0.08, box[0, 2] + depth / 4)
     return lamp(horizontal_rectangle(width * 0.7, min(0.08, depth / 3)), place, motion=motion)
 
 
 def sky_panel(layout: Layout, wall: int, opening: Opening) -> list[Shape]:
     """An overcast sky: a bright rectangle behind a window, with its edges hidden."""
     panel = horizontal_rectangle(opening.width + 0.8, opening.height + 0.8)
-    return lamp(panel, turn_then_shift(0, np.pi / 2, *opening.middle, -0.35), wall_pose(wall, layout.size))
+    return lamp(panel, turn_then_shift(np.pi / 2, *opening.middle, -0.35), layout.wall_pose(wall))
 
 
 Fixture = Callable[[Layout], list[Shape]]

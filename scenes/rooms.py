@@ -17,7 +17,7 @@ from scenes.furnishing import against_walls, furnish
 from scenes.layout import Layout
 from scenes.meshes import slab
 from scenes.objects.fittings import make_blind, make_curtain
-from scenes.shell import Opening, horizontal_rectangle, reveal, wall_pose, wall_width, wall_with_openings
+from scenes.shell import Opening, horizontal_rectangle, reveal, wall_with_openings
 from scenes.sky import sky
 
 MAX_LAMPS = 4
@@ -52,14 +52,12 @@ def add_windows(layout: Layout, count: int) -> None:
     """Add windows to `count` walls, some with blinds or curtains."""
     rng = layout.rng
     for wall in map(int, rng.permutation(4)[:count]):
-        span = wall_width(wall, layout.size)
-        width = rng.uniform(0.7, min(3.0, span - 0.6))
-        height = rng.uniform(0.7, layout.size[1] - 0.6)
-        x = rng.uniform(-span / 2 + 0.25, span / 2 - 0.25 - width)
-        y = rng.uniform(0.2, layout.size[1] - height - 0.2)
+        span = layout.wall_width(wall)
+        width, height = uniforms(rng, (0.7, min(3.0, span - 0.6)), (0.7, layout.size[1] - 0.6))
+        x, y = uniforms(rng, (-span / 2 + 0.25, span / 2 - 0.25 - width), (0.2, layout.size[1] - height - 0.2))
         hole = Opening((x, y), (x + width, y + height))
         layout.openings[wall] = [hole]
-        layout.build("reveal", reveal(hole, rng.uniform(0.08, 0.3)), wall_pose(wall, layout.size))
+        layout.build("reveal", reveal(hole, rng.uniform(0.08, 0.3)), layout.wall_pose(wall))
         dressing = rng.random()
         if dressing < 0.2:
             layout.hang(make_blind(rng, width - 0.02, height - 0.02), wall, hole.middle[0], y + 0.01, -0.05)
@@ -82,9 +80,9 @@ def shell(layout: Layout) -> list[Shape]:
         shapes.append(Shape("ceiling", level.mesh(above), diffuse_bsdf(rgb(tone.tolist()))))
     paint = finish(rng, slot, layout.gloss / 3, 1.0)
     for wall in sorted(set(range(4)) - layout.missing_walls):
-        surface = wall_with_openings(wall_width(wall, layout.size) + 0.1, height, layout.openings.get(wall, []))
+        surface = wall_with_openings(layout.wall_width(wall) + 0.1, height, layout.openings.get(wall, []))
         own = finish(rng, slot, layout.gloss / 3, 1.0) if rng.random() < 0.25 else paint
-        shapes.append(Shape(f"wall-{wall}", surface.mesh(wall_pose(wall, layout.size)), own))
+        shapes.append(Shape(f"wall-{wall}", surface.mesh(layout.wall_pose(wall)), own))
     return shapes
 
 
@@ -94,16 +92,16 @@ def holes(layout: Layout, style: Style) -> None:
     if style.missing_walls[1] > 1:
         count = int(rng.integers(*style.missing_walls))
         for wall in map(int, rng.permutation(4)[:count]):
-            span = wall_width(wall, layout.size)
+            span = layout.wall_width(wall)
             layout.missing_walls.add(wall)
             layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
     elif style.day or rng.random() < NIGHT:
         add_windows(layout, int(rng.integers(1, 4)))
     elif rng.random() < 0.15:  # a wall that divides the room up to a gap
-        x = layout.size[0] * rng.uniform(-0.2, 0.2)
-        gap = rng.uniform(0.8, 1.6)
-        divider = slab(0.1, layout.size[1], layout.size[2] - gap).at(x, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
-        layout.build("partition", divider, np.eye(4))
+        width, height, depth = layout.size
+        aside, gap = uniforms(rng, (-0.2, 0.2), (0.8, 1.6))
+        divider = slab(0.1, height, depth - gap).at(width * aside, 0, -gap / 2 * rng.choice([-1.0, 1.0]))
+        layout.build("partition", divider)
         layout.reserve(bounding_box(divider.points))
         layout.walls += 1
 
@@ -116,7 +114,7 @@ def outside(layout: Layout, style: Style) -> Array | None:
     if rng.random() >= (0.3 if layout.missing_walls else 0.75):
         return sky(rng, sun=None)
     aside, elevation = uniforms(rng, (-1, 1), (0.2, 1.0))
-    through = wall_pose(next(iter(layout.openings)), layout.size)[:3, :3]
+    through = layout.wall_pose(next(iter(layout.openings)))[:3, :3]
     return sky(rng, sun=through @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])
 
 

@@ -35,16 +35,6 @@ class Opening:
         return self.high[1] - self.low[1]
 
 
-def wall_pose(wall: int, size: Array) -> Array:
-    """Pose (4, 4) of wall 0 to 3 of a room of `size` (3,): x along the wall, y up from the floor, z into the room."""
-    distance = size[2] / 2 if wall % 2 == 0 else size[0] / 2
-    return pose(0, 0, 0, wall * np.pi / 2) @ pose(0, 0, -distance, 0)
-
-
-def wall_width(wall: int, size: Array) -> float:
-    return float(size[0] if wall % 2 == 0 else size[2])
-
-
 def wall_with_openings(width: float, height: float, openings: list[Opening]) -> Surface:
     """A rectangle in the xy plane on the origin, facing +z, with holes; texture coordinates in metres."""
     xs = np.unique([-width / 2, width / 2, *(e for o in openings for e in (o.low[0], o.high[0]))])

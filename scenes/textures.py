@@ -1,6 +1,5 @@
 """Random bitmap textures of linear reflectances for interiors; all repeat seamlessly. S is TEXTURE_SIZE."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scenes.camera import Array
 from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, palette
-from scenes.draws import Rng, one_of
+from scenes.draws import Rng, one_of, uniforms
 
 TEXTURE_SIZE = 256  # px
 PALETTE_SIZE = 4  # colours of a texture
@@ -107,8 +106,7 @@ def tiles(rng: Rng) -> Pattern:
 
 def clouds(rng: Rng) -> Pattern:
     """Fractal noise, as on concrete, plaster or rust."""
-    smoothness = rng.uniform(0.8, 1.8)
-    contrast = rng.uniform(0.1, 0.8)
+    smoothness, contrast = uniforms(rng, (0.8, 1.8), (0.1, 0.8))
     return Pattern((PALETTE_SIZE - 1) * (0.5 + 0.5 * np.tanh(contrast * periodic_noise(rng, smoothness))), UNSHADED)
 
 
@@ -181,8 +179,7 @@ def scratches(rng: Rng) -> Pattern:
     return Pattern(tone, 1 + rng.uniform(0, 0.1) * periodic_noise(rng, 1))
 
 
-Patterns = tuple[Callable[[Rng], Pattern], ...]
-PATTERNS: Patterns = (checks, stripes, planks, tiles, clouds, marble, weave, prints, scratches)
+PATTERNS = (checks, stripes, planks, tiles, clouds, marble, weave, prints, scratches)
 
 
 def painted(rng: Rng, colours: Array) -> Array:

@@ -90,10 +90,9 @@ def make_table(rng: Rng) -> Thing:
     thickness = rng.uniform(0.015, 0.05)
     if rng.random() < 0.4:
         radius = rng.uniform(0.28, 0.65)
-        side = radius * math.sqrt(2)
-        frame = pedestal(rng, radius, height) if rng.random() < 0.5 else legs(rng, side, side, height)
+        width = depth = radius * math.sqrt(2)
+        frame = pedestal(rng, radius, height) if rng.random() < 0.5 else legs(rng, width, depth, height)
         board = disc(radius, thickness)
-        width = depth = side
     else:
         width, depth = uniforms(rng, (0.5, 1.9), (0.45, 0.95))
         frame = legs(rng, width, depth, height)

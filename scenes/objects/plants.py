@@ -44,8 +44,7 @@ def shrub(rng: Rng, start: float, size: float) -> SurfacesBySlot:
         surfaces["stem"].append(tube(path, np.linspace(0.012, 0.005, 8) * size, 6))
         for k in rng.integers(2, 8, 14):
             reach = length * rng.uniform(0.7, 1.2)
-            towards = rng.uniform(0, 2 * np.pi)
-            droop = rng.uniform(0.2, 1.2)
+            towards, droop = uniforms(rng, (0, 2 * np.pi), (0.2, 1.2))
             surfaces["leaf"].append(leaf(arc(rng, path[k], reach, towards, droop, 6), length * ratio, fold))
     return surfaces
 

@@ -1,23 +1,11 @@
 """What people sit and lie on: chairs, stools, benches, sofas and beds."""
 
-import math
-
 import numpy as np
 
 from scenes.draws import Rng, uniforms
 from scenes.meshes import disc, lathe, silhouette, slab, solid, superellipsoid, tube
 from scenes.objects.furniture import corners, legs, pedestal
 from scenes.objects.thing import SurfacesBySlot, Thing, evenly, shifted, standing, top_support
-
-
-def seat(rng: Rng, width: float, depth: float) -> tuple[SurfacesBySlot, float]:
-    """A chair's seat standing on the origin, and its thickness."""
-    if rng.random() < 0.5:
-        thickness = rng.uniform(0.02, 0.04)
-        return {"wood": [slab(width, thickness, depth)]}, thickness
-    thickness = rng.uniform(0.05, 0.09)
-    cushion = superellipsoid(width, thickness - 0.01, depth, 6).at(0, 0.01)
-    return {"wood": [slab(width, 0.02, depth)], "cushion": [cushion]}, thickness
 
 
 def back(rng: Rng, width: float, height: float) -> SurfacesBySlot:
@@ -39,18 +27,22 @@ def back(rng: Rng, width: float, height: float) -> SurfacesBySlot:
 
 def make_chair(rng: Rng) -> Thing:
     width, depth, height = uniforms(rng, (0.4, 0.5), (0.4, 0.5), (0.4, 0.47))
-    base, thickness = seat(rng, width, depth)
+    is_soft = rng.random() >= 0.5
+    thickness = rng.uniform(0.05, 0.09) if is_soft else rng.uniform(0.02, 0.04)
+    seat = {"wood": [slab(width, 0.02 if is_soft else thickness, depth)]}
+    if is_soft:
+        seat["cushion"] = [superellipsoid(width, thickness - 0.01, depth, 6).at(0, 0.01)]
     frame = legs(rng, width, depth, height)
     rest = shifted(back(rng, width, rng.uniform(0.35, 0.6)), y=height + 0.01, z=0.025 - depth / 2)
     low = (0.05 - width / 2, height + thickness, 0.08 - depth / 2)
     free = np.array([low, (width / 2 - 0.05, np.inf, depth / 2 - 0.05)])
-    return standing("chair", frame, shifted(base, y=height), rest, supports=[free])
+    return standing("chair", frame, shifted(seat, y=height), rest, supports=[free])
 
 
 def make_stool(rng: Rng) -> Thing:
     """A round stool; without a cushion it carries things."""
     radius, height = uniforms(rng, (0.15, 0.22), (0.42, 0.75))
-    side = radius * math.sqrt(2)
+    side = radius * np.sqrt(2)
     frame = pedestal(rng, radius, height) if rng.random() < 0.3 else legs(rng, side, side, height)
     board = {"wood": [disc(radius, 0.03).at(0, height)]}
     if rng.random() < 0.4:

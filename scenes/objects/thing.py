@@ -1,6 +1,5 @@
 """Things, and functions that their makers share."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -57,7 +56,7 @@ def standing(name: str, *groups: SurfacesBySlot, supports: Sequence[Array] = ())
     return Thing(name, parts, [support + shift for support in supports])
 
 
-def top_support(width: float, depth: float, height: float, clearance: float = math.inf, margin: float = 0.01) -> Array:
+def top_support(width: float, depth: float, height: float, clearance: float = np.inf, margin: float = 0.01) -> Array:
     """The support on a board `width` x `depth` about the y axis with its top at `height`, less a `margin`."""
     x, z = width / 2 - margin, depth / 2 - margin
     return np.array([[-x, height, -z], [x, height + clearance, z]])
