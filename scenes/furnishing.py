@@ -8,14 +8,13 @@ from scenes.animation import RigidMotion, Track, still
 from scenes.boxes import overlaps, transformed_box
 from scenes.camera import Array
 from scenes.draws import Rng, one_of
-from scenes.layout import GAP, Group, Layout, bounds_of
+from scenes.layout import GAP, Group, Layout, bounds_of, pose
 from scenes.objects.decor import BODIES, VESSELS, make_basket
 from scenes.objects.fittings import make_floor_lamp, make_glazed_mirror, make_photo, make_picture
 from scenes.objects.furniture import CASES, make_column, make_pane, make_screen, make_showcase, make_table
 from scenes.objects.plants import make_floor_plant, make_small_plant
 from scenes.objects.seating import SEATS, UPHOLSTERED, make_bench, make_chair
 from scenes.objects.thing import Maker, Thing
-from scenes.shell import pose
 
 # Rooms draw from these in this order.
 FURNITURE: tuple[Maker, ...] = (

@@ -12,10 +12,14 @@ from scenes.draws import Rng
 from scenes.finish import finish
 from scenes.meshes import Surface
 from scenes.objects.thing import Thing
-from scenes.shell import Opening, pose
 
 MAX_THINGS = 54  # not counting what hangs
 GAP = 0.002  # m, between neighbouring things
+
+
+def pose(x: float, y: float, z: float, angle: float) -> Array:
+    """object_to_world (4, 4) at (x, y, z), rotated by `angle` radians about the vertical axis."""
+    return still((x, y, z), angle).matrix(0)
 
 
 # A thing and what stands on it, which move together, with their poses (4, 4) relative to the thing's.
@@ -24,6 +28,26 @@ Group = list[tuple[Thing, Array]]
 
 def bounds_of(group: Group) -> Array:
     return bounding_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in group]))
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A hole in a wall, as visible from inside; metres."""
+
+    low: tuple[float, float]  # x to the right of the wall's middle, y above the floor
+    high: tuple[float, float]
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        return (self.low[0] + self.high[0]) / 2, (self.low[1] + self.high[1]) / 2
+
+    @property
+    def width(self) -> float:
+        return self.high[0] - self.low[0]
+
+    @property
+    def height(self) -> float:
+        return self.high[1] - self.low[1]
 
 
 @dataclass

@@ -16,11 +16,10 @@ from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.colours import light_colour
 from scenes.draws import log_uniform, one_of, uniforms
-from scenes.layout import GAP, Layout
-from scenes.meshes import Surface, join, lathe, slab, superellipsoid
+from scenes.layout import GAP, Layout, Opening
+from scenes.meshes import Surface, horizontal_rectangle, join, lathe, slab, superellipsoid
 from scenes.objects.fittings import make_floor_lamp, make_pendant
 from scenes.objects.thing import Thing
-from scenes.shell import Opening, horizontal_rectangle
 
 BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
 

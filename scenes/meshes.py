@@ -112,6 +112,12 @@ def unit_sphere(subdivisions: int) -> tuple[Array, Faces]:
     return np.array(sphere.vertices), np.array(sphere.faces)
 
 
+def horizontal_rectangle(width: float, depth: float) -> Surface:
+    """A rectangle in the xz plane, facing up."""
+    x, z = width / 2, depth / 2
+    return flat_shaded(np.array([(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)]), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
 def slab(width: float, height: float, depth: float) -> Surface:
     """A box along x, y, z, standing on the origin."""
     points, faces = unit_box(0)

@@ -1,6 +1,7 @@
 """`room-N`, a random interior for any integer N, and `closeup-N`, a part of room-N through a longer lens."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,9 @@ from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
 from scenes.furnishing import against_walls, furnish
-from scenes.layout import Layout
-from scenes.meshes import slab
+from scenes.layout import Layout, Opening
+from scenes.meshes import Surface, horizontal_rectangle, join, sheet, slab
 from scenes.objects.fittings import make_blind, make_curtain
-from scenes.shell import Opening, horizontal_rectangle, reveal, wall_with_openings
 from scenes.sky import sky
 
 MAX_LAMPS = 4
@@ -48,6 +48,16 @@ ROOFLESS = 0.6  # share of the rooms with missing walls that have no ceiling eit
 NIGHT = 0.25  # share of the rooms lit by lamps alone that have windows, black outside
 
 
+def reveal(opening: Opening, thickness: float) -> Surface:
+    """The four sides of an opening through a wall of that thickness, behind the plane z = 0."""
+    border = 0.02
+    (left, bottom), (right, top) = opening.low, opening.high
+    level = slab(opening.width + 2 * border, border, thickness)
+    upright = slab(border, opening.height, thickness)
+    sides = [level.at(opening.middle[0], y, -thickness / 2) for y in (bottom - border, top)]
+    return join(sides + [upright.at(x, bottom, -thickness / 2) for x in (left - border / 2, right + border / 2)])
+
+
 def add_windows(layout: Layout, count: int) -> None:
     """Add windows to `count` walls, some with blinds or curtains."""
     rng = layout.rng
@@ -64,6 +74,20 @@ def add_windows(layout: Layout, count: int) -> None:
         elif dressing < 0.45:
             cover = width * rng.uniform(0.3, 0.7)
             layout.hang(make_curtain(rng, cover, height + 0.2), wall, x + cover / 2, y - 0.1, 0.12)
+
+
+def wall_with_openings(width: float, height: float, openings: list[Opening]) -> Surface:
+    """A rectangle in the xy plane on the origin, facing +z, with holes; texture coordinates in metres."""
+    xs = np.unique([-width / 2, width / 2, *(e for o in openings for e in (o.low[0], o.high[0]))])
+    ys = np.unique([0.0, height, *(e for o in openings for e in (o.low[1], o.high[1]))])
+    cells = []
+    for x0, x1 in pairwise(xs):
+        for y0, y1 in pairwise(ys):
+            x, y = (x0 + x1) / 2, (y0 + y1) / 2
+            if not any(o.low[0] < x < o.high[0] and o.low[1] < y < o.high[1] for o in openings):
+                points = np.array([[(x0, y0, 0), (x1, y0, 0)], [(x0, y1, 0), (x1, y1, 0)]])
+                cells.append(sheet(points, points[..., :2]))
+    return join(cells)
 
 
 def shell(layout: Layout) -> list[Shape]:

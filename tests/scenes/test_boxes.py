@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scenes.boxes import bounding_box, first_hit, keeps_clearance, overlaps, transformed_box
-from scenes.shell import pose
+from scenes.layout import pose
 from tests.helpers.scenes import SEEDS
 
 
