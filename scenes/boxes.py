@@ -18,14 +18,9 @@ def transformed_box(box: Array, matrix: Array) -> Array:
 
 
 def overlaps(box: Array, boxes: Array) -> bool:
-    """Whether `box` (2, 3) overlaps any of `boxes` (N, 2, 3)."""
-    return bool(((box[0] < boxes[:, 1]) & (box[1] > boxes[:, 0])).all(axis=1).any())
-
-
-def keeps_clearance(points: Array, boxes: Array, clearance: float) -> bool:
-    """Whether all `points` (N, 3) are `clearance` away from all `boxes` (M, 2, 3) along at least one axis."""
-    inside = (points[:, None] > boxes[:, 0] - clearance) & (points[:, None] < boxes[:, 1] + clearance)
-    return not bool(inside.all(axis=2).any())
+    """Whether `box` (2, 3), or any of several (M, 2, 3), overlaps any of `boxes` (N, 2, 3)."""
+    low, high = box[..., None, 0, :], box[..., None, 1, :]
+    return bool(((low < boxes[:, 1]) & (high > boxes[:, 0])).all(axis=-1).any())
 
 
 def first_hit(origin: Array, targets: Array, boxes: Array) -> Array:

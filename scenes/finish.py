@@ -75,7 +75,7 @@ OTHER_GLOSSY = {"rough plastic": 4, "principled": 2, "plastic": 1, "rough metal"
 
 
 def finish(rng: Rng, slot: str, gloss: float, size: float) -> Bsdf:
-    """A material for a part of a thing of `size` metres; slots are those of ThingPart and WHITENED.
+    """A material for a part of a thing of `size` metres; slots are those of Thing and WHITENED.
 
     `gloss` in [0, 1] is the share of parts that are not plainly diffuse, of those that may be glossy.
     """

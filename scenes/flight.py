@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.animation import Camera, Track
-from scenes.boxes import first_hit, keeps_clearance
+from scenes.boxes import first_hit, overlaps
 from scenes.camera import Array, intrinsics, look_at
 from scenes.draws import log_uniform
 from scenes.layout import Layout
@@ -32,9 +32,9 @@ def flight_path(layout: Layout) -> Track:
         steps = np.stack([np.cos(heading), rng.normal(0, 0.25, 3), np.sin(heading)], axis=1) * reach / 3
         track = Track(start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]), 0, stop)
         points = np.stack([track.at(frame) for frame in range(layout.frames)])
-        if (points > low).all() and (points < high).all() and keeps_clearance(points, layout.boxes, EYE_CLEARANCE):
-            passed = [*points[:: max(1, layout.frames // 16)], points[-1]]
-            layout.reserve(*(np.stack([point - EYE_CLEARANCE, point + EYE_CLEARANCE]) for point in passed))
+        around = np.stack([points - EYE_CLEARANCE, points + EYE_CLEARANCE], axis=1)
+        if (points > low).all() and (points < high).all() and not overlaps(around, layout.boxes):
+            layout.reserve(*around[:: max(1, layout.frames // 16)], around[-1])
             return track
     raise RuntimeError("no free path for the camera")
 

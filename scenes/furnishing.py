@@ -84,12 +84,11 @@ def against_walls(layout: Layout, count: int) -> None:
                 break
 
 
-def random_motion(layout: Layout, x: float, z: float) -> RigidMotion:
-    """A slow rotation, a slide or hops from a place on the floor."""
+def random_motion(layout: Layout, start: Array) -> RigidMotion:
+    """A slow rotation, a slide or hops from the place `start` (3,) on the floor."""
     rng = layout.rng
     last = layout.last_frame
     angle = rng.uniform(-np.pi, np.pi)
-    start = np.array([x, GAP, z])
     turn = rng.uniform(0.01, 0.06) * layout.frames
     slide = rng.uniform(0.005, 0.03) * layout.frames
     kind = rng.integers(3)
@@ -108,7 +107,7 @@ def movers(layout: Layout, count: int) -> None:
     for _ in range(12 * count):
         if count > 0:
             group = laden(layout.rng, one_of(layout.rng, FURNITURE + DECOR)(layout.rng))
-            count -= layout.try_add(group, random_motion(layout, *layout.floor_position(0.2)))
+            count -= layout.try_add(group, random_motion(layout, layout.floor_position(0.2)))
 
 
 def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
@@ -117,16 +116,14 @@ def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
     for _ in range(count):
         group = laden(rng, one_of(rng, makers)(rng))
         for _ in range(4):
-            x, z = layout.floor_position(0.15)
-            if layout.try_add(group, still((x, GAP, z), rng.uniform(-np.pi, np.pi))):
+            if layout.try_add(group, still(layout.floor_position(0.15), rng.uniform(-np.pi, np.pi))):
                 break
 
 
 def dining(layout: Layout) -> None:
     rng = layout.rng
     group = laden(rng, make_table(rng))
-    x, z = layout.floor_position(1.0)
-    if not layout.try_add(group, still((x, GAP, z), rng.choice([0, np.pi / 2]))):
+    if not layout.try_add(group, still(layout.floor_position(1.0), rng.choice([0, np.pi / 2]))):
         return
     low, high = layout.boxes[-1]
     chair = make_chair(rng)
@@ -149,16 +146,6 @@ def hang_on_walls(layout: Layout, maker: Maker, count: int) -> None:
             layout.hang(picture, wall, rng.uniform(-half, half), rng.uniform(0.8, top), 0.004)
 
 
-def glaze(layout: Layout) -> None:
-    """Add clear glass to a third of the rooms, by draws of its own: the others are as they were without it."""
-    rng = layout.rng
-    (layout.rng,) = own = rng.spawn(1)
-    if own[0].random() < 1 / 3:
-        scattered(layout, GLAZING, int(own[0].integers(1, 4)))
-        hang_on_walls(layout, make_glazed_mirror, int(own[0].integers(0, 3)))
-    layout.rng = rng
-
-
 def furnish(layout: Layout) -> None:
     rng = layout.rng
     if rng.random() < 0.5:
@@ -170,4 +157,9 @@ def furnish(layout: Layout) -> None:
     scattered(layout, DECOR, int(rng.integers(0, 8)))
     while len(layout.centres) < MIN_THINGS:
         scattered(layout, DECOR, MIN_THINGS - len(layout.centres))
-    glaze(layout)
+    # Clear glass in a third of the rooms, by draws of its own: the others are as they were without it.
+    (layout.rng,) = rng.spawn(1)
+    if layout.rng.random() < 1 / 3:
+        scattered(layout, GLAZING, int(layout.rng.integers(1, 4)))
+        hang_on_walls(layout, make_glazed_mirror, int(layout.rng.integers(0, 3)))
+    layout.rng = rng

@@ -30,26 +30,6 @@ def bounds_of(group: Group) -> Array:
     return bounding_box(np.stack([transformed_box(thing.bounds, matrix) for thing, matrix in group]))
 
 
-@dataclass(frozen=True)
-class Opening:
-    """A hole in a wall, as visible from inside; metres."""
-
-    low: tuple[float, float]  # x to the right of the wall's middle, y above the floor
-    high: tuple[float, float]
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        return (self.low[0] + self.high[0]) / 2, (self.low[1] + self.high[1]) / 2
-
-    @property
-    def width(self) -> float:
-        return self.high[0] - self.low[0]
-
-    @property
-    def height(self) -> float:
-        return self.high[1] - self.low[1]
-
-
 @dataclass
 class Layout:
     """The content of a room so far. The room spans x and z from -size / 2 to size / 2, y from 0 to its height."""
@@ -62,7 +42,8 @@ class Layout:
     boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # reserved
     centres: list[Array] = field(default_factory=list)  # (3,) of things
     walls: int = 0  # inside the room; the first boxes are theirs
-    openings: dict[int, list[Opening]] = field(default_factory=dict)  # of walls 0 to 3
+    # Holes in walls 0 to 3: boxes (2, 2) of x, as seen from inside to the right of the wall's middle, and y, up.
+    openings: dict[int, list[Array]] = field(default_factory=dict)
     missing_walls: set[int] = field(default_factory=set)
     backs: list[tuple[RigidMotion, Array]] = field(default_factory=list)  # of furniture before walls: pose, bounds
 
@@ -79,11 +60,10 @@ class Layout:
     def wall_width(self, wall: int) -> float:
         return float(self.size[2 if wall % 2 else 0])
 
-    def floor_position(self, margin: float) -> tuple[float, float]:
-        """A random place (x, z) at least `margin` from the walls."""
+    def floor_position(self, margin: float) -> Array:
+        """A random place (3,) on the floor, at least `margin` from the walls."""
         half = np.maximum(self.size[[0, 2]] / 2 - margin, 0.01)
-        x, z = self.rng.uniform(-half, half)
-        return float(x), float(z)
+        return np.insert(self.rng.uniform(-half, half), 1, GAP)
 
     def swept(self, bounds: Array, motion: RigidMotion) -> Array:
         """The bounding box (2, 3) of `bounds` (2, 3) during the whole clip."""

@@ -1,7 +1,6 @@
 """Lamps for rooms, from plain panels to indirect lighting.
 
-A fixture adds its body to the layout and returns its lamp in a list, empty if it does not fit; `shine` decides the
-radiance.
+A fixture adds its body to the layout and returns its lamp in a list, empty if it does not fit; `shine` lights it.
 """
 
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
 from scenes.colours import light_colour
 from scenes.draws import log_uniform, one_of, uniforms
-from scenes.layout import GAP, Layout, Opening
+from scenes.layout import GAP, Layout
 from scenes.meshes import Surface, horizontal_rectangle, join, lathe, slab, superellipsoid
 from scenes.objects.fittings import make_floor_lamp, make_pendant
 from scenes.objects.thing import Thing
@@ -37,7 +36,7 @@ def lamp(surface: Surface, *poses: Array, motion: RigidMotion = AT_REST) -> list
 
 
 def panel_below_ceiling(layout: Layout, width: float, depth: float) -> list[Shape]:
-    x, z = layout.floor_position(max(width, depth) / 2 + 0.05)
+    x, _, z = layout.floor_position(max(width, depth) / 2 + 0.05)
     y = layout.size[1] - 0.02
     box = np.array([[x - width / 2, y - 0.01, z - depth / 2], [x + width / 2, y + 0.01, z + depth / 2]])
     panel = lamp(horizontal_rectangle(width, depth), turn_then_shift(np.pi, x, y, z))
@@ -59,7 +58,7 @@ def downlight(layout: Layout) -> list[Shape]:
     rng = layout.rng
     radius = log_uniform(rng, 0.05, 0.15)
     tall = radius * rng.uniform(0.7, 2.0)
-    x, z = layout.floor_position(0.5)
+    x, _, z = layout.floor_position(0.5)
     y = layout.size[1] - tall - 0.01
     box = np.array([[x - radius, y - GAP, z - radius], [x + radius, y + tall, z + radius]])
     if not layout.claim(box):
@@ -79,7 +78,7 @@ def bulb(thing: Thing, radius: float, motion: RigidMotion) -> list[Shape]:
 def hanging(layout: Layout) -> list[Shape]:
     """A pendant with a bulb in its shade; a closed shade emits light itself instead."""
     thing = make_pendant(layout.rng)
-    x, z = layout.floor_position(0.5)
+    x, _, z = layout.floor_position(0.5)
     motion = still((x, layout.size[1] - thing.bounds[1, 1] - GAP, z), 0.0)
     shade = thing.parts["shade"]
     closed = trimesh.Trimesh(shade.points, shade.faces).is_watertight
@@ -94,20 +93,18 @@ def hanging(layout: Layout) -> list[Shape]:
 def standing_lamp(layout: Layout) -> list[Shape]:
     """A floor lamp whose bulb is hidden in its shade."""
     thing = make_floor_lamp(layout.rng)
-    motion = still(np.insert(layout.floor_position(0.4), 1, GAP), float(layout.rng.uniform(-np.pi, np.pi)))
-    if not layout.try_add([(thing, np.eye(4))], motion):
-        return []
-    return bulb(thing, log_uniform(layout.rng, 0.02, 0.06), motion)
+    motion = still(layout.floor_position(0.4), float(layout.rng.uniform(-np.pi, np.pi)))
+    fits = layout.try_add([(thing, np.eye(4))], motion)
+    return bulb(thing, log_uniform(layout.rng, 0.02, 0.06), motion) if fits else []
 
 
 def orb(layout: Layout) -> list[Shape]:
     """A glowing ball in the air, in half of the cases moving."""
     rng = layout.rng
     radius = log_uniform(rng, 0.06, 0.3)
-    x, z = layout.floor_position(0.4)
-    y = rng.uniform(0.3, layout.size[1] - 0.5)
+    start = layout.floor_position(0.4)
+    start[1] = rng.uniform(0.3, layout.size[1] - 0.5)
     drift = rng.uniform(-0.4, 0.4, 3) * (rng.random() < 0.5)
-    start = np.array([x, y, z])
     motion = RigidMotion(Track(np.stack([start, start + drift]), 0, layout.last_frame), Track.constant(0.0))
     ball = superellipsoid(2 * radius, 2 * radius, 2 * radius, 2, 2)
     fits = layout.claim(layout.swept(bounding_box(ball.points), motion))
@@ -146,8 +143,8 @@ def behind_opening(layout: Layout) -> list[Shape]:
         span = thin = tall = rng.uniform(0.2, 0.6)
     start, y = uniforms(rng, (-width / 2 + 0.3, width / 2 - 0.3 - span), (0.2, layout.size[1] - tall - 0.2))
     lefts = start + 0.25 * np.arange(count)
-    layout.openings[wall] = [Opening((x, y), (x + thin, y + tall)) for x in lefts.tolist()]
-    x, y = layout.openings[wall][0].middle
+    layout.openings[wall] = [np.array([(x, y), (x + thin, y + tall)]) for x in lefts]
+    x, y = layout.openings[wall][0].mean(axis=0)
     size, away = uniforms(rng, (0.5, 1.5), (0.1, 0.4))
     shift = (x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.5), -away)
     return lamp(horizontal_rectangle(size, size), turn_then_shift(np.pi / 2, *shift), layout.wall_pose(wall))
@@ -163,10 +160,10 @@ def above_furniture(layout: Layout) -> list[Shape]:
     return lamp(horizontal_rectangle(width * 0.7, min(0.08, depth / 3)), place, motion=motion)
 
 
-def sky_panel(layout: Layout, wall: int, opening: Opening) -> list[Shape]:
-    """An overcast sky: a bright rectangle behind a window, with its edges hidden."""
-    panel = horizontal_rectangle(opening.width + 0.8, opening.height + 0.8)
-    return lamp(panel, turn_then_shift(np.pi / 2, *opening.middle, -0.35), layout.wall_pose(wall))
+def sky_panel(layout: Layout, wall: int, opening: Array) -> list[Shape]:
+    """An overcast sky: a bright rectangle behind a window (2, 2), with its edges hidden."""
+    panel = horizontal_rectangle(*(opening[1] - opening[0] + 0.8))
+    return lamp(panel, turn_then_shift(np.pi / 2, *opening.mean(axis=0), -0.35), layout.wall_pose(wall))
 
 
 Fixture = Callable[[Layout], list[Shape]]

@@ -165,23 +165,21 @@ def sheet(points: Array, uv: Array, normals: Array | None = None) -> Surface:
     return Surface(points, normals, uv.reshape(-1, 2), faces, True)
 
 
-def profile_normals(profile: Array) -> tuple[Array, Array]:
-    """Normals (N - 1, 2) at the start and at the end of every piece of a lathe's profile (N, 2)."""
+def profile_normals(profile: Array) -> Array:
+    """Normals (2 N - 2, 2) at the start and at the end of every piece of a lathe's profile (N, 2)."""
     normals = unit(np.diff(profile, axis=0)[:, ::-1] * (1, -1))
-    before = np.roll(normals, 1, axis=0)
+    before, after = np.roll(normals, 1, axis=0), np.roll(normals, -1, axis=0)
     if not np.array_equal(profile[0], profile[-1]):
         # On the axis the profile continues as its mirror image, elsewhere it just ends.
         mirror = np.array([-1, 1])
         before[0] = normals[0] * mirror if profile[0, 0] == 0 else normals[0]
-        last = normals[-1] * mirror if profile[-1, 0] == 0 else normals[-1]
-    else:
-        last = normals[0]
+        after[-1] = normals[-1] * mirror if profile[-1, 0] == 0 else normals[-1]
 
     def blend(other: Array) -> Array:
         soft = (normals * other).sum(axis=1, keepdims=True) > CREASE
         return unit(np.where(soft, normals + other, normals))
 
-    return blend(before), blend(np.concatenate([normals[1:], last[None]]))
+    return np.stack([blend(before), blend(after)], axis=1).reshape(-1, 2)
 
 
 def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
@@ -191,12 +189,9 @@ def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
     around and repeats seamlessly, v runs along the profile at the same scale, about a metre each.
     """
     profile = np.asarray(profile, dtype=np.float64)
-    along = arc_lengths(profile)
-    start, end = profile_normals(profile)
     # Every segment has two rows of vertices of its own, for normals of its own. Gaps between them have no area.
-    rows = np.stack([profile[:-1], profile[1:]], axis=1).reshape(-1, 2)
-    normals = np.stack([start, end], axis=1).reshape(-1, 2)
-    v = np.stack([along[:-1], along[1:]], axis=1).ravel()
+    rows = np.repeat(profile, 2, axis=0)[1:-1]
+    v = np.repeat(arc_lengths(profile), 2)[1:-1]
     angle = full_turn(segments)
     around = np.stack([np.cos(angle), -np.sin(angle)], axis=1)
 
@@ -209,7 +204,7 @@ def lathe(profile: ArrayLike, segments: int = 32) -> Surface:
     repeats = max(1, round(circumference))
     u = np.broadcast_to(np.linspace(0, repeats, segments + 1), (len(rows), segments + 1))
     uv = np.stack([u, np.broadcast_to(v[:, None] * repeats / circumference, u.shape)], axis=2)
-    return sheet(sweep(rows), uv, sweep(normals))
+    return sheet(sweep(rows), uv, sweep(profile_normals(profile)))
 
 
 def silhouette(radii: ArrayLike, height: float, count: int = 20) -> Array:

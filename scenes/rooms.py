@@ -15,7 +15,7 @@ from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
 from scenes.furnishing import against_walls, furnish
-from scenes.layout import Layout, Opening
+from scenes.layout import Layout
 from scenes.meshes import Surface, horizontal_rectangle, join, sheet, slab
 from scenes.objects.fittings import make_blind, make_curtain
 from scenes.sky import sky
@@ -48,13 +48,13 @@ ROOFLESS = 0.6  # share of the rooms with missing walls that have no ceiling eit
 NIGHT = 0.25  # share of the rooms lit by lamps alone that have windows, black outside
 
 
-def reveal(opening: Opening, thickness: float) -> Surface:
-    """The four sides of an opening through a wall of that thickness, behind the plane z = 0."""
+def reveal(opening: Array, thickness: float) -> Surface:
+    """The four sides of an opening (2, 2) through a wall of that thickness, behind the plane z = 0."""
     border = 0.02
-    (left, bottom), (right, top) = opening.low, opening.high
-    level = slab(opening.width + 2 * border, border, thickness)
-    upright = slab(border, opening.height, thickness)
-    sides = [level.at(opening.middle[0], y, -thickness / 2) for y in (bottom - border, top)]
+    (left, bottom), (right, top) = opening
+    level = slab(right - left + 2 * border, border, thickness)
+    upright = slab(border, top - bottom, thickness)
+    sides = [level.at((left + right) / 2, y, -thickness / 2) for y in (bottom - border, top)]
     return join(sides + [upright.at(x, bottom, -thickness / 2) for x in (left - border / 2, right + border / 2)])
 
 
@@ -65,26 +65,26 @@ def add_windows(layout: Layout, count: int) -> None:
         span = layout.wall_width(wall)
         width, height = uniforms(rng, (0.7, min(3.0, span - 0.6)), (0.7, layout.size[1] - 0.6))
         x, y = uniforms(rng, (-span / 2 + 0.25, span / 2 - 0.25 - width), (0.2, layout.size[1] - height - 0.2))
-        hole = Opening((x, y), (x + width, y + height))
+        hole = np.array([(x, y), (x + width, y + height)])
         layout.openings[wall] = [hole]
         layout.build("reveal", reveal(hole, rng.uniform(0.08, 0.3)), layout.wall_pose(wall))
         dressing = rng.random()
         if dressing < 0.2:
-            layout.hang(make_blind(rng, width - 0.02, height - 0.02), wall, hole.middle[0], y + 0.01, -0.05)
+            layout.hang(make_blind(rng, width - 0.02, height - 0.02), wall, hole[:, 0].mean(), y + 0.01, -0.05)
         elif dressing < 0.45:
             cover = width * rng.uniform(0.3, 0.7)
             layout.hang(make_curtain(rng, cover, height + 0.2), wall, x + cover / 2, y - 0.1, 0.12)
 
 
-def wall_with_openings(width: float, height: float, openings: list[Opening]) -> Surface:
+def wall_with_openings(width: float, height: float, openings: list[Array]) -> Surface:
     """A rectangle in the xy plane on the origin, facing +z, with holes; texture coordinates in metres."""
-    xs = np.unique([-width / 2, width / 2, *(e for o in openings for e in (o.low[0], o.high[0]))])
-    ys = np.unique([0.0, height, *(e for o in openings for e in (o.low[1], o.high[1]))])
+    xs = np.unique([-width / 2, width / 2, *(x for opening in openings for x in opening[:, 0])])
+    ys = np.unique([0.0, height, *(y for opening in openings for y in opening[:, 1])])
     cells = []
     for x0, x1 in pairwise(xs):
         for y0, y1 in pairwise(ys):
-            x, y = (x0 + x1) / 2, (y0 + y1) / 2
-            if not any(o.low[0] < x < o.high[0] and o.low[1] < y < o.high[1] for o in openings):
+            middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+            if not any(((low < middle) & (middle < high)).all() for low, high in openings):
                 points = np.array([[(x0, y0, 0), (x1, y0, 0)], [(x0, y1, 0), (x1, y1, 0)]])
                 cells.append(sheet(points, points[..., :2]))
     return join(cells)
@@ -118,7 +118,7 @@ def holes(layout: Layout, style: Style) -> None:
         for wall in map(int, rng.permutation(4)[:count]):
             span = layout.wall_width(wall)
             layout.missing_walls.add(wall)
-            layout.openings[wall] = [Opening((-span / 2, 0.0), (span / 2, float(layout.size[1])))]
+            layout.openings[wall] = [np.array([(-span / 2, 0.0), (span / 2, layout.size[1])])]
     elif style.day or rng.random() < NIGHT:
         add_windows(layout, int(rng.integers(1, 4)))
     elif rng.random() < 0.15:  # a wall that divides the room up to a gap

@@ -184,11 +184,9 @@ def make_showcase(rng: Rng) -> Thing:
     """A plinth with panes at its front and sides, open above, before a board or a mirror."""
     width, height, depth, tall = uniforms(rng, (0.6, 1.4), (0.5, 0.9), (0.35, 0.55), (0.35, 0.8))
     thickness = rng.uniform(0.004, 0.012)
+    aside = slab(thickness, tall, depth - 0.08).at(0, height + 0.001, -0.01)
     panes = [slab(width - 0.01, tall, thickness).at(0, height + 0.001, depth / 2 - thickness)]
-    panes += [
-        slab(thickness, tall, depth - 0.08).at(side * (width / 2 - thickness), height + 0.001, -0.01)
-        for side in (-1, 1)
-    ]
+    panes += [aside.at(side * (width / 2 - thickness)) for side in (-1, 1)]
     back = slab(width, tall, 0.02).at(0, height + 0.001, 0.01 - depth / 2)
     surfaces = {"wood": [slab(width, height, depth)], "clear": panes, one_of(rng, ("front", "mirror")): [back]}
     inside = top_support(width - 0.06, depth - 0.1, height, margin=0.02)
