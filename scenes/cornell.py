@@ -127,8 +127,7 @@ def tiny_light(rng: Rng, frames: int) -> Scene:
 
 def black_and_white(rng: Rng, frames: int) -> Scene:
     """Blocks that reflect nothing in a room that reflects everything."""
-    black = diffuse_bsdf(rgb([0.0, 0.0, 0.0]))
-    white = diffuse_bsdf(rgb([1.0, 1.0, 1.0]))
+    black, white = (diffuse_bsdf(rgb([grey] * 3)) for grey in (0.0, 1.0))
     return repaint(cornell_box(rng, frames), lambda shape: black if "block" in shape.name else white)
 
 

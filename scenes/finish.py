@@ -15,16 +15,7 @@ CLEAR_GLASS: Bsdf = {"type": "dielectric", "int_ior": GLASS}
 SHEETS = ("leaf", "shade", "fabric", "print")  # thin, two-sided
 NEVER_GLOSSY = (*SHEETS, "stem", "paper", "cushion", "blanket", "soil", "wax")
 ALWAYS_GLOSSY = ("metal", "glass", "clear", "mirror")
-WHITENED = {"wall": 0.5, "floor": 0.1, "dark wall": 0.0}  # see desaturated
-
-
-def desaturated(rng: Rng, base: Bsdf, white: float) -> Bsdf:
-    """`base` with less saturation, blended with up to the share `white` of white, as is typical of large surfaces."""
-    key = "data" if base["type"] == "bitmap" else "value"
-    values = np.asarray(base[key], np.float32)
-    values = values + (values.mean(axis=-1, keepdims=True) - values) * np.float32(rng.uniform(0, 0.9))
-    values = values + (np.float32(0.85) - values) * np.float32(rng.uniform(0, white))
-    return {**base, key: values if key == "data" else values.tolist()}
+WHITENED = {"wall": 0.5, "floor": 0.1, "dark wall": 0.0}  # up to this share of white is added
 
 
 def alpha(rng: Rng, base: Bsdf, low: float, high: float) -> Bsdf | float:
@@ -82,9 +73,12 @@ def finish(rng: Rng, slot: str, gloss: float, size: float) -> Bsdf:
     is_print = slot == "print"  # its texture coordinates are 0..1
     repeats = 1.0 if is_print else log_uniform(rng, 0.5, 2.0) / min(size, 1.0)
     is_textured = rng.random() < (0.85 if is_print else 0.5)
-    base = bitmap(texture(rng), repeats) if is_textured else rgb(colour(rng))
-    if slot in WHITENED:
-        base = desaturated(rng, base, WHITENED[slot])
+    values = np.asarray(texture(rng) if is_textured else colour(rng))
+    if slot in WHITENED:  # less saturated and whiter, as is typical of large surfaces
+        values = values.astype(np.float32)
+        values = values + (values.mean(axis=-1, keepdims=True) - values) * np.float32(rng.uniform(0, 0.9))
+        values = values + (np.float32(0.85) - values) * np.float32(rng.uniform(0, WHITENED[slot]))
+    base = bitmap(values, repeats) if is_textured else rgb(values.tolist())
     if slot in ALWAYS_GLOSSY or (slot not in NEVER_GLOSSY and rng.random() < gloss):
         weight_of = GLOSSY_FINISHES.get(slot, OTHER_GLOSSY)
         weights = np.array(list(weight_of.values()))

@@ -68,22 +68,16 @@ def pane(rng: Rng) -> Setting:
     shade = np.where(joint < 0.006, 1.3, 1.0)[..., None]
     facade = np.clip(np.array([0.35, 0.16, 0.1]) * tone * shade, 0.02, 0.9)
     plaster = painted(0.75, 0.72, 0.65)
-    wall = [
+    car = superellipsoid(2.6, 1.1, 1.2, 5, 3).at(0, -0.35)
+    shapes = [
         thing("sill", slab(4, 0.8, 0.1), plaster),
         thing("lintel", slab(4, 0.4, 0.1).at(0, 2.2), plaster),
         *(thing(f"post {side}", slab(0.6, 1.4, 0.1).at(1.7 * side, 0.8), plaster) for side in (-1, 1)),
-    ]
-    street = [
+        thing("pane", slab(2.8, 1.4, 0.01).at(0, 0.8), CLEAR_GLASS),
         thing("road", slab(30, 0.1, 12).at(0, -0.5, -6.5), painted(0.2, 0.2, 0.22)),
         thing("kerb", slab(30, 0.15, 1.5).at(0, -0.4, -8), diffuse_bsdf(bitmap(texture(rng), 0.5))),
         thing("facade", slab(30, 8, 0.3).at(0, -0.4, -9), diffuse_bsdf(bitmap(facade.astype(np.float32), 0.4))),
         *(lamp(f"window {i}", slab(0.9, 1.2, 0.1).at(2.2 * i - 4.4, 1.3, -8.85), (0.8, 0.6, 0.3)) for i in (0, 2, 3)),
-    ]
-    car = superellipsoid(2.6, 1.1, 1.2, 5, 3).at(0, -0.35)
-    shapes = [
-        *wall,
-        thing("pane", slab(2.8, 1.4, 0.01).at(0, 0.8), CLEAR_GLASS),
-        *street,
         thing("car", car, painted(0.7, 0.06, 0.04), still((0.4, 0, -5), 0)),
         *(replace(shape, motion=still((0, 0, 2), 0)) for shape in room(rng, 4, 2.6, 4)[:-1]),  # open at the wall
         thing("ball", superellipsoid(0.5, 0.5, 0.5, 2, 4), painted(0.1, 0.5, 0.2), still((-0.5, 0.9, 1.0), 0)),

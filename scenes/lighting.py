@@ -25,9 +25,8 @@ BLACK = diffuse_bsdf(rgb([0.05, 0.05, 0.05]))
 
 def turn_then_shift(angle: float, x: float, y: float, z: float) -> Array:
     """The matrix (4, 4) of a rotation by `angle` radians about the x axis, then a translation."""
-    matrix = np.asarray(trimesh.transformations.rotation_matrix(angle, [1, 0, 0]))
-    matrix[:3, 3] = x, y, z
-    return matrix
+    turn = trimesh.transformations.rotation_matrix(angle, (1, 0, 0))
+    return np.asarray(trimesh.transformations.translation_matrix((x, y, z)) @ turn)
 
 
 def lamp(surface: Surface, *poses: Array, motion: RigidMotion = AT_REST) -> list[Shape]:

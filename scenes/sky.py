@@ -15,8 +15,7 @@ def sky(rng: Rng, sun: Array | None) -> Array:
     `sun` is the direction (3,) to the sun, or None under clouds. The sun gives 0.3 to 30 times the light of its sky.
     """
     height, width = SKY_SIZE
-    rows = (np.arange(height) + 0.5) / height
-    up = np.cos(np.pi * rows)[:, None, None]
+    up = np.cos(np.pi * ((np.arange(height) + 0.5) / height))[:, None, None]
     zenith = rng.uniform(0.6, 1.0, 3) * [0.4, 0.6, 1.0]
     horizon = rng.uniform(0.6, 1.0, 3) * [0.9, 0.95, 1.0]
     ground = rng.uniform(0.5, 1.0, 3) * 0.2

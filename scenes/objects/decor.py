@@ -34,10 +34,9 @@ def make_book_row(rng: Rng) -> Thing:
     x = 0.0
     for _ in range(rng.integers(4, 12)):
         width, height, depth = uniforms(rng, (0.13, 0.18), (0.012, 0.045), (0.18, 0.27))
-        cover, pages = (
-            part.at(width / 2).turned(np.pi / 2, axis=0).turned(np.pi / 2, axis=1).at(x, depth / 2)
-            for part in book(width, height, depth)
-        )
+        lying = (part.at(width / 2) for part in book(width, height, depth))
+        upright = (part.turned(np.pi / 2, axis=0).turned(np.pi / 2, axis=1) for part in lying)
+        cover, pages = (part.at(x, depth / 2) for part in upright)
         volumes.append({f"cover-{rng.integers(1, 4)}": [cover], "paper": [pages]})
         x += height
     return standing("book_row", *volumes)
