@@ -69,8 +69,8 @@ def laden(rng: Rng, thing: Thing) -> Group:
 def against_walls(layout: Layout, count: int) -> None:
     """Add up to `count` pieces of furniture with their backs to a wall."""
     rng = layout.rng
-    for maker in rng.choice(AGAINST_WALLS, count):
-        group = laden(rng, maker(rng))
+    for chosen in rng.integers(len(AGAINST_WALLS), size=count):
+        group = laden(rng, AGAINST_WALLS[chosen](rng))
         bounds = bounds_of(group)
         for _ in range(8):
             wall = int(rng.integers(4))

@@ -3,7 +3,7 @@
 Each by itself with a camera that moves, and as NAME-moving with a camera at rest and things that move.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -57,7 +57,7 @@ class Setting(NamedTuple):
     eyes: tuple[Sequence[float], Sequence[float]]
     target: Sequence[float]
     x_fov: float
-    slides: dict[str, tuple[Sequence[float], Sequence[float], float]]  # by name: start; step and turn (rad) per frame
+    slides: Mapping[str, tuple[Sequence[float], Sequence[float], float]]  # by name: start; step, turn (rad) a frame
     sky: Array | None = None
 
 
@@ -79,7 +79,8 @@ def pane(rng: Rng) -> Setting:
         thing("facade", slab(30, 8, 0.3).at(0, -0.4, -9), diffuse_bsdf(bitmap(facade.astype(np.float32), 0.4))),
         *(lamp(f"window {i}", slab(0.9, 1.2, 0.1).at(2.2 * i - 4.4, 1.3, -8.85), (0.8, 0.6, 0.3)) for i in (0, 2, 3)),
         thing("car", car, painted(0.7, 0.06, 0.04), still((0.4, 0, -5), 0)),
-        *(replace(shape, motion=still((0, 0, 2), 0)) for shape in room(rng, 4, 2.6, 4)[:-1]),  # open at the wall
+        # The window's wall is the room's front.
+        *(replace(shape, motion=still((0, 0, 2), 0)) for shape in room(rng, 4, 2.6, 4)[:-1]),
         thing("ball", superellipsoid(0.5, 0.5, 0.5, 2, 4), painted(0.1, 0.5, 0.2), still((-0.5, 0.9, 1.0), 0)),
         lamp("lamp", slab(2.4, 0.04, 1.4).at(0.6, 2.5, 2.6), (2, 1.8, 1.5)),
     ]
