@@ -141,8 +141,7 @@ def behind_opening(layout: Layout) -> list[Shape]:
         count = 1
         span = thin = tall = rng.uniform(0.2, 0.6)
     start, y = uniforms(rng, (-width / 2 + 0.3, width / 2 - 0.3 - span), (0.2, layout.size[1] - tall - 0.2))
-    lefts = start + 0.25 * np.arange(count)
-    layout.openings[wall] = [np.array([(x, y), (x + thin, y + tall)]) for x in lefts]
+    layout.openings[wall] = [np.array([(x, y), (x + thin, y + tall)]) for x in start + 0.25 * np.arange(count)]
     x, y = layout.openings[wall][0].mean(axis=0)
     size, away = uniforms(rng, (0.5, 1.5), (0.1, 0.4))
     shift = (x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.5), -away)
@@ -161,8 +160,9 @@ def above_furniture(layout: Layout) -> list[Shape]:
 
 def sky_panel(layout: Layout, wall: int, opening: Array) -> list[Shape]:
     """An overcast sky: a bright rectangle behind a window (2, 2), with its edges hidden."""
+    x, y = opening.mean(axis=0)
     panel = horizontal_rectangle(*(opening[1] - opening[0] + 0.8))
-    return lamp(panel, turn_then_shift(np.pi / 2, *opening.mean(axis=0), -0.35), layout.wall_pose(wall))
+    return lamp(panel, turn_then_shift(np.pi / 2, x, y, -0.35), layout.wall_pose(wall))
 
 
 Fixture = Callable[[Layout], list[Shape]]
