@@ -1,55 +1,18 @@
-"""Rendering one clip into its folder: the unit of work of processes and machines."""
+"""Rendering one clip into its folder: the unit of work that processes and machines share."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS, SECOND_LAYER
-from datasets.clip import ClipKind, is_clip
+from datasets.clip import ClipKind
 from datasets.writer import ClipWriter
-from files import locked
 from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, render_clip
 from render.job.pilots import samples_needed
 from render.job.plan import scene_of_clip
-from render.job.profiles import DataProfile, profile_of
+from render.job.profiles import DataProfile
 from scenes.animation import Scene
-
-
-class RenderJob(NamedTuple):
-    """One clip to render, and everything that determines its bytes."""
-
-    path: Path  # DATA/SPLIT/SCENE/CLIP
-    profile: str
-    seed: int  # of the dataset
-    channels: tuple[str, ...]
-    options: Options
-    needed_spp: int | None = None  # by its references, if known
-
-
-class ClipOutcome(NamedTuple):
-    path: Path
-    ending: Literal["rendered", "left", "failed"]
-    reason: str = ""
-
-
-def run_clip_job(job: RenderJob) -> ClipOutcome:
-    """Render a clip unless another process is rendering it or has done so.
-
-    Failures of the renderer are returned. OSError is raised: a full disk concerns all clips.
-    """
-    job.path.parent.mkdir(parents=True, exist_ok=True)
-    with locked(job.path.with_name(f".{job.path.name}.lock")) as ours:
-        if not ours:
-            return ClipOutcome(job.path, "left", "skipped: another process is rendering it")
-        if is_clip(job.path):
-            return ClipOutcome(job.path, "left", "skipped: another process has rendered it")
-        try:
-            render_to_folder(job.path, profile_of(job.profile), job.seed, job.channels, job.options, job.needed_spp)
-        except (RuntimeError, ValueError) as error:
-            return ClipOutcome(job.path, "failed", str(error))
-    return ClipOutcome(job.path, "rendered")
 
 
 def render_to_folder(

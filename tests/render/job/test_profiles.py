@@ -15,7 +15,7 @@ from models.registry import channels_read, create
 from render.clip import NO_OPTIONS
 from render.job import pilots
 from render.job.clip_job import render_to_folder
-from render.job.generate import Share, generate
+from render.job.generate import generate
 from render.job.pilots import choose_rooms, noise_of_reference, samples_needed
 from render.job.plan import clips_of, plan, rooms_of
 from render.job.profiles import DataProfile, SamplingQuality, profile_of
@@ -185,7 +185,7 @@ READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot b
 def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Every other clip of the tiny dataset, the box of each split, for denoisers that do not read all channels."""
     root = tmp_path_factory.mktemp("lean")
-    assert generate(root, "tiny", seed=0, reads=READS, share=Share(1, 2)) == 3
+    assert generate(root, "tiny", seed=0, reads=READS, part="1/2") == 3
     return root
 
 
