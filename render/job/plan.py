@@ -13,7 +13,6 @@ from datasets.clip import SCHEMA, SPLITS, ClipKind
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.profiles import DataProfile, profile_of, source_of
-from render.scene_file.description import SplitRequest
 from render.scene_file.load import own_scene
 from scenes.animation import Scene
 from scenes.registry import build_scene
@@ -101,6 +100,6 @@ def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tupl
 def clip_of_own_scene(path: Path, split: str, number: int, frames: int, seed: int) -> Scene:
     """A clip of the scene that a TOML describes; the first test clip begins with the file's camera."""
     own = own_scene(path)
-    camera = own.described.splits.get(split, SplitRequest()).camera
+    camera = getattr(own.described.splits, split).camera
     by_keyframes = camera == "keyframes" or (camera is None and bool(own.described.camera))
     return own.clip(frames, seed, by_keyframes, from_here=split == "test" and number == 0)

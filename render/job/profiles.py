@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from datasets.clip import SPLITS
 from errors import BadInput
-from render.scene_file.description import SplitRequest, read_description
+from render.scene_file.description import read_description
 from scenes.glass import SETTINGS
 
 
@@ -85,15 +85,6 @@ DATA_PROFILES = {
 }
 
 
-# Defaults of a user's own scene.
-OWN_CLIPS = {"train": 4, "val": 1, "test": 1}
-OWN_QUALITY = {
-    "train": SamplingQuality(realisations=4, reference_spp=128),
-    "val": SamplingQuality(realisations=1, reference_spp=256),
-    "test": SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048),
-}
-
-
 def own_profile(path: Path) -> DataProfile:
     """The profile in the TOML of a user's own scene. Raises BadInput, naming the file, if it cannot be used."""
     described = read_description(path)
@@ -101,12 +92,9 @@ def own_profile(path: Path) -> DataProfile:
     clips: dict[str, list[str]] = {}
     quality: dict[str, SamplingQuality] = {}
     for split in SPLITS:
-        request = described.splits.get(split, SplitRequest())
-        count = OWN_CLIPS[split] if request.clips is None else request.clips
-        clips[split] = [f"{name}/{number:03d}" for number in range(count)]
-        settings = {key: getattr(request, key) for key in ("realisations", "reference_spp", "floor", "most_spp")}
-        given = {key: value for key, value in settings.items() if value is not None}
-        quality[split] = OWN_QUALITY[split]._replace(**given)
+        request = getattr(described.splits, split)
+        clips[split] = [f"{name}/{number:03d}" for number in range(request.clips)]
+        quality[split] = SamplingQuality(request.realisations, request.reference_spp, request.floor, request.most_spp)
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
     width, height = described.resolution

@@ -9,12 +9,12 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.loading import columns, mitsuba_reason
+from render.loading import columns, corners, mitsuba_reason
 from render.path import PathTracer
-from render.scene_file.convert import Converter
+from render.scene_file.convert import SceneFile
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
-from render.scene_file.mesh_file import load_mesh_file
+from render.scene_file.mesh_file import MeshFile
 from render.specular_light import specular_light
 from render.stage import MAX_EVENTS, Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
@@ -124,7 +124,7 @@ class OwnScene:
         self.notes += note_on_depth(self.stage, self.scene)
 
     def from_xml(self) -> tuple[Scene, list[str]]:
-        found = Converter(self.file).convert()
+        found = SceneFile(self.file)
         camera, notes = DEFAULT_CAMERA, [*found.notes]
         if found.sensor:
             try:
@@ -136,7 +136,7 @@ class OwnScene:
         return Scene((), camera, depth, stock=tuple(found.shapes), lights=tuple(found.lights)), notes
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
-        found = load_mesh_file(self.file, self.width / self.height)
+        found = MeshFile(self.file, self.width / self.height)
         return Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky), found.notes
 
     def check_names(self) -> None:
@@ -161,9 +161,9 @@ class OwnScene:
         else:
             camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
         scene = self.scene
-        by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
+        boxes = {shape.id(): corners(shape.bbox()) * self.stage.unit for shape in self.stage.shapes}
         motions = {
-            motion.shape: motion_of(motion.keyframes, centre_of(by_name[motion.shape]) * self.stage.unit, frames)
+            motion.shape: motion_of(motion.keyframes, boxes[motion.shape].mean(axis=0), frames)
             for motion in self.described.motion
         }
         gains = {change.light: gain_of(change.keyframes, frames) for change in self.described.light}
@@ -191,12 +191,6 @@ def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:
     if gain is None or shape.radiance is None:
         return shape
     return replace(shape, radiance=replace(gain, keys=np.outer(gain.keys, shape.radiance.at(0))))
-
-
-def centre_of(shape: mi.Shape) -> Array:
-    """The centre (3,) of a shape's bounding box, about which it rotates, in Mitsuba's units."""
-    box = shape.bbox()
-    return (np.array(box.min, np.float64) + np.array(box.max, np.float64)).ravel() / 2
 
 
 @lru_cache(maxsize=1)
