@@ -1,7 +1,7 @@
 """Renders a clip frame by frame, with all its channels."""
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,9 +12,9 @@ from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS
 from render.backend import mi
 from render.first_bounce import hit_channels
 from render.gbuffer import light_of_second_layer, render_gbuffer
-from render.glass_motion import chains_through_glass, traced_motion
+from render.glass_motion import chains_at, traced_motion
 from render.gradient import GradientSamples
-from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
+from render.motion import dual_motion_vectors, tracked_motion
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
 from scenes.animation import Scene
@@ -92,6 +92,7 @@ def noise_free_frames(
     rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
+    pixels = centres.reshape(-1, 2)
     view = stage.view(0)
     arrays = render_gbuffer(stage, view, regularise, in_layers)
     for name in ("motion", "dual_motion", *(forms["motion"] for forms in layers_of(stage, in_layers))):
@@ -103,7 +104,7 @@ def noise_free_frames(
         view = stage.view(index)
         arrays = render_gbuffer(stage, view, regularise, in_layers)
         shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
-        chains = [chains_through_glass(stage, view, rarer) for rarer in (False, True)] if shows_glass else []
+        chains = [chains_at(stage, view, pixels, rarer) for rarer in (False, True)] if shows_glass else []
         timer.lap("gbuffer")
         surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
         arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
@@ -161,8 +162,8 @@ class SampledChannels:
             ]
             for i in range(self.sampling.realisations)
         ]
-        trace = self.noisy_tracer.split_radiance if self.in_layers else self.noisy_tracer.radiance
-        drawn = [[trace(self.ray, *draw) for draw in draws] for draws in self.draws]
+        tracer, splits = self.noisy_tracer, self.in_layers
+        drawn = [[tracer.radiance(self.ray, *draw, splits) for draw in draws] for draws in self.draws]
         direct, indirect, *of_glass = (
             np.array([[images[i] for images in buffers] for buffers in drawn]) for i in range(len(drawn[0][0]))
         )  # (realisations, buffers, H, W, C)
@@ -179,9 +180,7 @@ class SampledChannels:
         return {name: np.stack([realisation[name] for realisation in hits]) for name in hits[0]}
 
     def shadow_motion(self, frame: FrameInProgress) -> Arrays:
-        draw = self.draws[0][0]
-        hits = hits_of_samples(self.noisy_tracer, frame.view, draw.seed, draw.first)
-        return tracked_motion(hits, frame.arrays, frame.view, frame.previous)
+        return tracked_motion(self.noisy_tracer, self.draws[0][0], frame.arrays, frame.view, frame.previous)
 
     def gradient(self, frame: FrameInProgress) -> Arrays:
         stage = self.stage
@@ -198,16 +197,6 @@ class SampledChannels:
         seeds = [stream_seed(self.seed, frame.index, REFERENCE_STREAM, buffer) for buffer in range(2)]
         direct, indirect = zip(*(self.tracer.radiance(self.ray, seed, spp) for seed in seeds), strict=True)
         return {"direct_reference": np.stack(direct), "indirect_reference": np.stack(indirect)}
-
-
-# By step, in their order; optional steps are those of the channel table.
-MAKERS: dict[str, Callable[[SampledChannels, FrameInProgress], Arrays]] = {
-    "noisy": SampledChannels.noisy,
-    "hit_distance": SampledChannels.hit_distance,
-    "shadow_motion": SampledChannels.shadow_motion,
-    "gradient": SampledChannels.gradient,
-    "reference": SampledChannels.reference,
-}
 
 
 def render_clip(
@@ -233,12 +222,14 @@ def render_clip(
     in_layers = stage.glass is not None and not wanted.isdisjoint(SECOND_LAYER)
     wanted |= {forms[name] for forms in layers_of(stage, in_layers) for name in wanted & forms.keys()}
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
-    makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
     sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers)
+    steps = (sampled.noisy, sampled.hit_distance, sampled.shadow_motion, sampled.gradient, sampled.reference)
+    steps_by_name = {step.__name__: step for step in steps}  # optional ones are called so in the channel table
     wants_dual = "dual_motion" not in skipped
     for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, in_layers, timer):
-        for step, maker in makers.items():
-            frame.arrays |= maker(sampled, frame)
-            timer.lap(step)
+        for name, step in steps_by_name.items():
+            if name not in skipped:
+                frame.arrays |= step(frame)
+                timer.lap(name)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
         yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()

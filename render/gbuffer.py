@@ -9,6 +9,7 @@ from datasets.channels import BACKGROUND, MIRRORED, SECOND
 from render.backend import dr, mi
 from render.loading import columns
 from render.look_through import Shown, Sight, look_through, surface_channels
+from render.materials import is_in
 from render.specular_light import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
@@ -50,7 +51,7 @@ def own_surface(stage: Stage, ray: mi.Ray3f) -> tuple[dict[str, dr.AnyArray], mi
     """(channels of what primary rays hit, their length or 0, whether it reflects or transmits perfectly specularly)."""
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     channels = {**surface_channels(stage, Sight.along(ray, si)), "emission": stage.lights.at(si).eval(si)}
-    return channels, dr.select(si.is_valid(), si.t, 0), stage.specular.at(si.bsdf(), si.is_valid())
+    return channels, dr.select(si.is_valid(), si.t, 0), is_in(stage.specular, si.bsdf(), si.is_valid())
 
 
 def layer_channels(

@@ -33,11 +33,6 @@ def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Change
     return changes
 
 
-def normals_of(name: str) -> str:
-    """The parameter that changes with `name`: Mitsuba recomputes the authored normals of moved vertices otherwise."""
-    return name.replace(".vertex_positions", ".vertex_normals")
-
-
 class StockParameters:
     """The parameters at rest of a stock shape or light that moves or changes. Raises BadInput if it cannot."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
-from render.materials import registry_index, registry_table
+from render.materials import registry_index, registry_number, registry_table
 from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
@@ -47,7 +47,8 @@ class BlurredTable:
 
     def __init__(self, stage: Stage):
         described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
-        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape, _ in described])
+        rows = {registry_number(mi.BSDFPtr(shape.bsdf())): row for row, (shape, _) in enumerate(described)}
+        self.row = registry_table(mi.UInt32, rows)
         # Keeps objects alive, which pointers do not.
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
         self.pointers = mi.BSDFPtr(self.bsdfs)
