@@ -1,14 +1,17 @@
-"""Renders a clip frame by frame, with all its channels."""
+"""Renders a clip frame by frame, with all its channels, and writes it."""
 
 import time
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS, SECOND, SECOND_LAYER
+from datasets.writer import ClipWriter
 from render.backend import mi
 from render.first_bounce import hit_channels
 from render.gbuffer import light_of_second_layer, render_gbuffer
@@ -233,3 +236,31 @@ def render_clip(
                 timer.lap(name)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
         yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()
+
+
+def write_clip(
+    folder: Path,
+    scene: Scene,
+    size: tuple[int, int, int],
+    sampling: Sampling,
+    seed: int,
+    channels: Collection[str],
+    seconds_before: dict[str, float] | None = None,
+) -> None:
+    """Render channels of a scene into a clip of `size` (frames, height, width), completely or not at all.
+
+    `seconds_before` rendering, by step, are recorded with those of rendering.
+    """
+    split, scene_name, clip_name = folder.parts[-3:]
+    frames = render_clip(scene, *size, sampling, seed, channels)
+    derived = {name: "camera" for name in channels if CHANNELS[name].is_camera_motion and not scene.moves()}
+    with ClipWriter(folder) as writer:
+        writer.timing = dict(seconds_before or {})
+        for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame"):
+            writer.add(arrays, seconds)
+        facts = {
+            "noisy_spp": sampling.noisy_spp,
+            "reference_spp": sampling.reference_spp // 2 * 2,
+            "meshes": [shape.name for shape in scene.meshes],
+        }
+        writer.finish(facts, derived)

@@ -3,21 +3,19 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from datasets.card import write_card
-from datasets.channels import USUAL_CHANNELS
-from datasets.clip import Dataset, is_clip
+from datasets.channels import SECOND_LAYER, USUAL_CHANNELS
+from datasets.clip import ClipKind, Dataset, is_clip
 from errors import BadInput
 from files import locked, read_json, write_json
 from provenance import RENDERING, versions
-from render.clip import NO_OPTIONS, Options
-from render.job.clip_job import render_to_folder
-from render.job.pilots import choose_rooms
-from render.job.plan import NO_PILOTS, plan
-from render.job.profiles import profile_of
+from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, write_clip
+from render.job.pilots import choose_rooms, samples_needed
+from render.job.plan import plan, scene_of_clip
+from render.job.profiles import DataProfile, profile_of
 
 
 def share_of(clips: Sequence[Path], part: str) -> Sequence[Path]:
@@ -48,42 +46,39 @@ def generate(
     if seed < 0:
         raise BadInput(f"the seed {seed} is negative: use 0 or more")
     share_of([], part)
-    check_folder(root)
-    facts = root / "dataset.json"
-    if facts.exists():  # its rooms are chosen; write_or_check_plan compares the profile
-        needed_spp = read_json(facts).get("needed_spp", {})
-    else:
-        needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
-    wanted = plan(profile, seed, reads, options, needed_spp)
-    for note in wanted["notes"]:
-        tqdm.write(note)
-    root.mkdir(parents=True, exist_ok=True)
-    write_or_check_plan(root, wanted)
-    dataset = Dataset(root)
+    dataset = begun(root, profile, seed, reads, options)
     missing = [clip for clip in share_of(dataset.planned(), part) if not is_clip(clip)]
     rendered = render_clips(missing, dataset) if missing else 0
     write_card(dataset)
     return rendered
 
 
-def check_folder(root: Path) -> None:
-    """Raise BadInput unless `root` is a new or empty folder, or that of a dataset."""
+def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Options) -> Dataset:
+    """The dataset of that plan at `root`, which may be new.
+
+    Raises BadInput if `root` contains anything but a dataset, or one of another plan.
+    """
     if root.exists() and not root.is_dir():
         raise BadInput(f"{root} is a file, not a folder: choose another --data")
     visible = [path.name for path in root.glob("[!.]*")]
     if visible and "dataset.json" not in visible:
         raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
-
-
-def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
-    """Write the plan into a new dataset's folder. Raises BadInput if it contains another plan."""
-    if not (root / "dataset.json").exists():
-        write_json(root / "dataset.json", wanted)
-        return
-    present = read_json(root / "dataset.json")
-    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options", "source"):
-        if present.get(key, {}) != wanted[key]:
+    facts = root / "dataset.json"
+    if facts.exists():  # its rooms are chosen
+        needed_spp = read_json(facts).get("needed_spp", {})
+    else:
+        needed_spp = choose_rooms(profile_of(profile), seed, options)
+    wanted = plan(profile, seed, reads, options, needed_spp)
+    for note in wanted["notes"]:
+        tqdm.write(note)
+    root.mkdir(parents=True, exist_ok=True)
+    if not facts.exists():
+        write_json(facts, wanted)
+    dataset = Dataset(root)
+    for key in ("profile", "seed", "generator", "splits", "channels", "options", "source"):
+        if dataset.facts.get(key, {}) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
+    return dataset
 
 
 def check_versions(dataset: Dataset) -> None:
@@ -125,3 +120,30 @@ def render_clips(clips: Sequence[Path], dataset: Dataset) -> int:
     if failures:
         raise BadInput(f"{len(failures)} of {len(clips)} clips failed and can be tried again, first {failures[0]}")
     return rendered
+
+
+def render_to_folder(
+    folder: Path,
+    profile: DataProfile,
+    dataset_seed: int,
+    channels: Sequence[str],
+    options: Options = NO_OPTIONS,
+    needed_spp: int | None = None,
+) -> None:
+    """Render channels of the clip in the folder DATA/SPLIT/SCENE/CLIP, completely or not at all.
+
+    By default a pilot predicts `needed_spp`, the samples a pixel that references need. The clip is deterministic in the
+    arguments. Raises BadInput for an unknown scene or clip name.
+    """
+    split, _, clip_name = folder.parts[-3:]
+    noisy_spp = ClipKind.of(clip_name).noisy_spp
+    quality = profile.quality[split]
+    scene, seed = scene_of_clip(folder, profile, dataset_seed)
+    clock = StepTimer()
+    if needed_spp is None:
+        needed_spp = samples_needed(scene, profile.size, quality, seed, options)
+        clock.lap("pilot")
+    spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
+    sampling = Sampling(quality.realisations, noisy_spp, spp, options)
+    layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), clock.read())

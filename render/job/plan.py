@@ -76,20 +76,15 @@ def plan(
     }
 
 
-def clip_seed(seed: int, scene: str, split: str, number: int) -> int:
-    """The 64-bit seed of a clip, independent of other clips. `seed` is that of the dataset."""
-    words = [seed, zlib.crc32(scene.encode()), zlib.crc32(split.encode()), number]
-    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
-
-
 def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tuple[Scene, int]:
-    """The scene and the seed of the clip whose path ends in SPLIT/SCENE/CLIP.
+    """The scene and the 64-bit seed, independent of other clips, of the clip whose path ends in SPLIT/SCENE/CLIP.
 
     Raises BadInput for an unknown scene or clip name, and for a user's own scene that cannot be used.
     """
     split, scene_name, clip_name = folder.parts[-3:]
     kind = ClipKind.of(clip_name)
-    seed = clip_seed(dataset_seed, scene_name, split, kind.number)
+    words = [dataset_seed, zlib.crc32(scene_name.encode()), zlib.crc32(split.encode()), kind.number]
+    seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
     if profile.own is None:
         scene = build_scene(scene_name, seed, profile.size[0])
     else:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import render.job.clip_job
+import render.clip
 import render.job.generate
 import render.job.plan
 from datasets.clip import Dataset, is_clip
@@ -160,7 +160,7 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
 
 def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
     remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = render.job.clip_job.render_clip
+    genuine = render.clip.render_clip
 
     def faulty(scene, *arguments):
         for index, (channels, seconds) in enumerate(genuine(scene, *arguments)):
@@ -169,7 +169,7 @@ def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
                 channels["indirect_reference"][1, 0, 0, 2] = np.inf
             yield channels, seconds
 
-    monkeypatch.setattr(render.job.clip_job, "render_clip", faulty)
+    monkeypatch.setattr(render.clip, "render_clip", faulty)
     assert generate_tiny(tiny_copy) == 2
     box, moving = Dataset(tiny_copy).clips("val")
     assert {name: n for name, n in box.facts["nonfinite"].items() if n} == {"direct": 6, "indirect_reference": 1}
