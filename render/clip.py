@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,17 +51,13 @@ class StepTimer:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self.start()
 
-    def start(self) -> None:
-        """Ignore the time until now."""
-        self.last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        """Count the time since the last lap as `step`."""
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self.last
-        self.last = now
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Count the time within the context as that of a step."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def read(self) -> dict[str, float]:
         """Seconds by step; resets them."""
@@ -87,53 +84,46 @@ class FrameInProgress:
 
 
 def noise_free_frames(
-    stage: Stage, frames: int, regularise: bool, wants_dual: bool, in_layers: bool, timer: StepTimer
+    stage: Stage, frames: int, regularise: bool, wants_dual: bool, layers: list[dict[str, str]], timer: StepTimer
 ) -> Iterator[FrameInProgress]:
-    """Yield every frame with its G-buffer and motion vectors.
+    """Yield every frame with its G-buffer and motion vectors, also of `layers`: MIRRORED, SECOND.
 
     Dual motion vectors and those through glass need rays through the scene of the previous frame, so the G-buffer is
     rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
-    pixels = centres.reshape(-1, 2)
-    view = stage.view(0)
-    arrays = render_gbuffer(stage, view, regularise, in_layers)
-    for name in ("motion", "dual_motion", *(forms["motion"] for forms in layers_of(stage, in_layers))):
-        arrays[name] = np.zeros_like(centres)
-    frame = FrameInProgress(0, view, view, arrays)
-    timer.lap("gbuffer")
+    with timer.step("gbuffer"):
+        view = stage.view(0)
+        arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
+    motions = ("motion", "dual_motion", *(forms["motion"] for forms in layers))
+    frame = FrameInProgress(0, view, view, arrays | dict.fromkeys(motions, np.zeros_like(centres)))
     for index in range(1, frames):
-        stage.pose(index)
-        view = stage.view(index)
-        arrays = render_gbuffer(stage, view, regularise, in_layers)
-        shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
-        chains = [chains_at(stage, view, pixels, rarer) for rarer in (False, True)] if shows_glass else []
-        timer.lap("gbuffer")
-        surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
-        arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
-        for forms in layers_of(stage, in_layers):
-            shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
-            arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
-        timer.lap("motion")
-        stage.pose(index - 1)
-        timer.lap("gbuffer")
+        with timer.step("gbuffer"):
+            stage.pose(index)
+            view = stage.view(index)
+            arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
+            shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
+            branches = (False, True) if shows_glass else ()
+            chains = [chains_at(stage, view, centres.reshape(-1, 2), rarer) for rarer in branches]
+        with timer.step("motion"):
+            surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
+            arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
+            for forms in layers:
+                shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
+                arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
+        with timer.step("gbuffer"):
+            stage.pose(index - 1)
         if wants_dual:
-            arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
-            timer.lap("dual_motion")
-        for forms, chain in zip(layers_of(stage, in_layers), chains, strict=False):
-            arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
-        timer.lap("motion")
+            with timer.step("dual_motion"):
+                arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
+        with timer.step("motion"):
+            for forms, chain in zip(layers, chains, strict=False):
+                arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
         yield frame
-        timer.start()
         frame = FrameInProgress(index, view, frame.view, arrays)
-    stage.pose(frames - 1)
-    timer.lap("gbuffer")
+    with timer.step("gbuffer"):
+        stage.pose(frames - 1)
     yield frame
-
-
-def layers_of(stage: Stage, in_layers: bool) -> list[dict[str, str]]:
-    """The names of the channels of what mirrors and glass show, layer by layer."""
-    return [MIRRORED] * stage.looks_through + [SECOND] * (in_layers and stage.glass is not None)
 
 
 class SampledChannels:
@@ -223,17 +213,18 @@ def render_clip(
     timer = StepTimer()
     wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
     in_layers = stage.glass is not None and not wanted.isdisjoint(SECOND_LAYER)
-    wanted |= {forms[name] for forms in layers_of(stage, in_layers) for name in wanted & forms.keys()}
+    layers = [MIRRORED] * stage.looks_through + [SECOND] * in_layers
+    wanted |= {forms[name] for forms in layers for name in wanted & forms.keys()}
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
     sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers)
     steps = (sampled.noisy, sampled.hit_distance, sampled.shadow_motion, sampled.gradient, sampled.reference)
     steps_by_name = {step.__name__: step for step in steps}  # optional ones are called so in the channel table
     wants_dual = "dual_motion" not in skipped
-    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, in_layers, timer):
+    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, layers, timer):
         for name, step in steps_by_name.items():
             if name not in skipped:
-                frame.arrays |= step(frame)
-                timer.lap(name)
+                with timer.step(name):
+                    frame.arrays |= step(frame)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
         yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()
 

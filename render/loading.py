@@ -131,7 +131,9 @@ class StockLoader:
         try:
             return mi.load_dict(description)
         except RuntimeError as error:
-            unknown = unreferenced(error)
+            text = str(error)
+            unused = text if "unreferenced propert" in text else ""
+            unknown = set(re.findall(r'^  - \w+ "([^"]+)":', unused, re.MULTILINE))
             if not unknown & description.keys():
                 raise BadInput(f"{what} is empty, damaged or cannot be used: {mitsuba_reason(error)}") from None
         names = ", ".join(f"'{name}'" for name in sorted(unknown))
@@ -173,12 +175,6 @@ class StockLoader:
             emitter = self.placed(emitter)
         where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
         return self.made(to_mitsuba(emitter, self.load) | {"id": light.name}, where)
-
-
-def unreferenced(error: RuntimeError) -> set[str]:
-    """The properties that Mitsuba's error message lists as unknown, if it is about these."""
-    text = str(error)
-    return set(re.findall(r'^  - \w+ "([^"]+)":', text, re.MULTILINE)) if "unreferenced propert" in text else set()
 
 
 def mitsuba_reason(error: Exception) -> str:

@@ -48,10 +48,6 @@ class Sight:
         zero, yes = mi.Float(0), mi.Bool(si.is_valid())
         return Sight(si, ray, zero, zero, zero, mi.Color3f(1), axes, yes, yes, mi.Float(1), mi.Bool(False), zero)
 
-    def turned_back(self, normal: mi.Vector3f) -> mi.Vector3f:
-        """A world direction (3,) as the eye sees it."""
-        return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
-
 
 def glass_event(
     glass: mi.Bool, sight: Sight, rarer_first: mi.Bool
@@ -134,10 +130,10 @@ def surface_channels(stage: Stage, sight: Sight) -> dict[str, dr.AnyArray]:
     """The channels of a surface as the eye sees it, but for depth, by name."""
     valid = sight.si.is_valid()
     normal = stage.normals.evaluate(sight.si, valid)
-    normal = sight.turned_back(dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal))
+    normal = dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal)
     albedo, roughness = stage.materials.evaluate(sight.si, valid)
     return {
-        "normal": dr.select(valid, normal, mi.Vector3f(0)),
+        "normal": dr.select(valid, mi.Vector3f(*(dr.dot(axis, normal) for axis in sight.axes)), mi.Vector3f(0)),
         "albedo": sight.tint * albedo,
         "roughness": roughness,
         "mesh_id": stage.mesh_id(sight.si),

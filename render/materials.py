@@ -134,17 +134,10 @@ def principled_material(parameters: BsdfParameters) -> Material | Mixture:
 
 MATERIAL_OF: dict[str, Callable[[BsdfParameters], Material | Mixture]] = {
     "SmoothDiffuse": diffuse_material,
-    "SmoothPlastic": plastic_material,
-    "RoughPlastic": plastic_material,
-    "PolarizedPlastic": plastic_material,
-    "SmoothConductor": conductor_material,
-    "RoughConductor": conductor_material,
-    "SmoothDielectric": clear_material,
-    "ThinDielectric": clear_material,
-    "RoughDielectric": clear_material,
-    "Null": clear_material,
-    "Principled": principled_material,
-    "PrincipledThin": principled_material,
+    **dict.fromkeys(("SmoothPlastic", "RoughPlastic", "PolarizedPlastic"), plastic_material),
+    **dict.fromkeys(("SmoothConductor", "RoughConductor"), conductor_material),
+    **dict.fromkeys(("SmoothDielectric", "ThinDielectric", "RoughDielectric", "Null"), clear_material),
+    **dict.fromkeys(("Principled", "PrincipledThin"), principled_material),
 }
 MIN_PRINCIPLED_ALPHA = 0.001  # as in Mitsuba's plugin
 MAX_MIXTURE_DEPTH = 6  # each level doubles the evaluations

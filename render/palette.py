@@ -11,8 +11,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import trimesh
+from trimesh.visual import TextureVisuals
 
 from render.backend import mi
+from render.loading import load_mesh
+from scenes.animation import Shape, Track
 from scenes.sky import SKY_SIZE
 
 MAX_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
@@ -42,20 +46,12 @@ def materials() -> list[mi.BSDF]:
 
 def mesh(normals: bool, coordinates: bool, emits: bool) -> mi.Mesh:
     """Two triangles, because arrays of one entry are compiled differently."""
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "diffuse"})
-    if emits:
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": HALF_GREY})
-    square = mi.Mesh("palette", 4, 2, props=properties, has_vertex_normals=normals, has_vertex_texcoords=coordinates)
-    parameters = mi.traverse(square)
-    parameters["vertex_positions"] = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0, 1, 1, 0])
-    parameters["faces"] = mi.UInt32([0, 1, 2, 1, 3, 2])
-    if normals:
-        parameters["vertex_normals"] = mi.Float([0, 0, 1] * 4)
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
+    square = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
     if coordinates:
-        parameters["vertex_texcoords"] = mi.Float([0, 0, 1, 0, 0, 1, 1, 1])
-    parameters.update()
-    return square
+        square.visual = TextureVisuals(uv=square.vertices[:, :2])
+    radiance = Track.constant([0.5, 0.5, 0.5]) if emits else None
+    return load_mesh(Shape("palette", square, {"type": "diffuse"}, radiance, smooth=normals))
 
 
 @cache

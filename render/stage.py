@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from render.backend import dr, mi
 from render.lights import Lights
 from render.loading import StockLoader, corners, load_mesh, upload, with_placed_textures
-from render.materials import MaterialTable, bsdfs_of, registry_index, registry_number, registry_table
+from render.materials import BsdfParameters, MaterialTable, bsdfs_of, registry_index, registry_number, registry_table
 from render.palette import palette
 from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
-from render.specular import delta_lobes, is_smooth_glass
 from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
@@ -43,6 +42,29 @@ def has_texture(emitter: dict[str, Any] | None) -> bool:
     """Whether emitted radiance varies over a surface."""
     radiance = (emitter or {}).get("radiance")
     return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
+
+
+def is_masked(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF has a mask in it: Mitsuba cannot sample a single lobe of one."""
+    return bsdf.class_name() == "MaskBSDF" or any(map(is_masked, BsdfParameters(bsdf).nested.values()))
+
+
+def has_flag(bsdf: mi.BSDF, component: int, flag: mi.BSDFFlags) -> bool:
+    return bool(mi.has_flag(bsdf.flags(component), flag))
+
+
+def delta_lobes(bsdf: mi.BSDF) -> list[int]:
+    """The component indices of the delta lobes that can be sampled alone."""
+    if is_masked(bsdf):
+        return []
+    return [i for i in range(bsdf.component_count()) if has_flag(bsdf, i, mi.BSDFFlags.Delta)]
+
+
+def is_smooth_glass(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF reflects and transmits perfectly specularly, and nothing else."""
+    lobes = delta_lobes(bsdf)
+    reflects = [has_flag(bsdf, i, mi.BSDFFlags.DeltaReflection) for i in lobes]
+    return len(lobes) == bsdf.component_count() and any(reflects) and not all(reflects)
 
 
 class Stage:
@@ -98,9 +120,11 @@ class Stage:
         mesh_ids = {registry_number(mi.ShapePtr(shape)): index for index, shape in enumerate(self.shapes, 1)}
         self.mesh_id_of_shape = registry_table(mi.UInt32, mesh_ids)
         self.has_instances = bool(loader.grouped)
-        self.has_textured_lights = any(has_texture(shape.emitter) for shape in scene.stock)
         # Dr.Jit 1.5 cannot freeze textured area lights, and scenes without shapes while another scene is loaded.
-        self.freezes = bool(self.shapes) and not self.has_textured_lights
+        self.freezes = bool(self.shapes) and not any(has_texture(shape.emitter) for shape in scene.stock)
+        tables = [self.materials.state, self.specular, self.glass, self.mesh_id_of_shape]
+        # All that kernels read of it, and the palette, whose objects they may call.
+        self.state = [palette(), self.mitsuba_scene, self.lights, *tables]
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.recordings: dict[Callable[..., Any], Callable[..., Any]] = {}
@@ -115,17 +139,12 @@ class Stage:
         freezes = freezes and self.freezes
         if freezes and function not in self.recordings:
             own = proxy(self)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
-            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state())
+            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state)
             finalize(self, frozen.clear)  # else recordings would keep the scene
             self.recordings[function] = frozen
         result = self.recordings[function](*arguments) if freezes else function(self, *arguments)
         dr.eval(result)
         return result
-
-    def state(self) -> list[Any]:
-        """All that kernels read of it, and the palette, whose objects they may call."""
-        tables = [self.materials.state, self.specular, self.glass, self.mesh_id_of_shape]
-        return [palette(), self.mitsuba_scene, self.lights, *tables]
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """The mesh id at a surface interaction: the shape's index + 1, or 0 for none."""

@@ -139,11 +139,11 @@ def render_to_folder(
     noisy_spp = ClipKind.of(clip_name).noisy_spp
     quality = profile.quality[split]
     scene, seed = scene_of_clip(folder, profile, dataset_seed)
-    clock = StepTimer()
+    timer = StepTimer()
     if needed_spp is None:
-        needed_spp = samples_needed(scene, profile.size, quality, seed, options)
-        clock.lap("pilot")
+        with timer.step("pilot"):
+            needed_spp = samples_needed(scene, profile.size, quality, seed, options)
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     sampling = Sampling(quality.realisations, noisy_spp, spp, options)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
-    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), clock.read())
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), timer.read())

@@ -135,12 +135,9 @@ class SceneFile:
                 return np.array(value.matrix, np.float64)
             case "Vector":
                 return np.array(value).tolist()
-            case "Spectrum":
-                if not value.is_uniform():
-                    self.note(f"the spectrum '{key}' is rendered as red, green and blue", node)
-                return value
-            case _:
-                return value
+            case "Spectrum" if not value.is_uniform():
+                self.note(f"the spectrum '{key}' is rendered as red, green and blue", node)
+        return value
 
     def with_files(self, node: mi.parser.SceneNode, kind: str, described: Properties) -> Properties | None:
         """The dictionary with the full path of its file, or a stand-in if that is missing."""

@@ -193,7 +193,4 @@ def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:
     return replace(shape, radiance=replace(gain, keys=np.outer(gain.keys, shape.radiance.at(0))))
 
 
-@lru_cache(maxsize=1)
-def own_scene(path: Path) -> OwnScene:
-    """The scene that a TOML describes, read once for all of its clips."""
-    return OwnScene(path)
+own_scene = lru_cache(maxsize=1)(OwnScene)  # read once for all of its clips
