@@ -234,7 +234,8 @@ class MaterialTable:
     """The materials of BSDFs: columns with a row for each BSDF, by its registry index, and each part of a mixture."""
 
     def __init__(self, bsdfs: Mapping[int, mi.BSDF]):
-        self.unused = constant(0)
+        unused = constant(0)
+        self.blank = Material(unused, unused, unused, UNSCALED)  # never evaluated
         self.rows: list[tuple[Any, ...]] = []  # of a Material, weight, rows of both parts, sided
         self.depth = 0  # of mixtures within each other
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
@@ -242,7 +243,7 @@ class MaterialTable:
         self.transmits = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs.values())
         self.has_mirrors = any(map(may_be_mirror, bsdfs.values(), trees))
         if not rows:
-            self.add(self.blank())  # an empty scene needs a row too
+            self.add(self.blank)  # an empty scene needs a row too
         self.row = registry_table(mi.UInt32, rows)
         base, roughness, metallic, scale, f0, squared, internal, weight, first, second, sided = map(
             list, zip(*self.rows, strict=True)
@@ -259,20 +260,16 @@ class MaterialTable:
         dr.make_opaque(columns)
         self.state = [base, roughness, metallic, weight, columns]  # all that kernels read; pointers keep nothing alive
 
-    def blank(self) -> Material:
-        """One that is never evaluated."""
-        return Material(self.unused, self.unused, self.unused, UNSCALED)
-
     def add(self, tree: Material | Mixture, level: int = 0) -> int:
         """Append a material, or a mixture and its parts, within so many other mixtures. Returns its row."""
         self.depth = max(self.depth, level)
         row = len(self.rows)
         if isinstance(tree, Material):
-            self.rows.append((*tree, self.unused, row, row, False))  # as a mixture of itself
+            self.rows.append((*tree, self.blank.base, row, row, False))  # as a mixture of itself
             return row
         self.rows.append(())
         parts = self.add(tree.first, level + 1), self.add(tree.second, level + 1)
-        self.rows[row] = (*self.blank(), tree.weight, *parts, tree.sided)
+        self.rows[row] = (*self.blank, tree.weight, *parts, tree.sided)
         return row
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> tuple[mi.Color3f, mi.Float]:

@@ -49,12 +49,9 @@ def dual_motion_vectors(
     was_visible = is_same_surface(then, mesh_id, y, occluder, previous)
     z = y + motion_vectors(y, occluder.depth, occluder.mesh_id, previous, now)
     x_previous = y + (x - z)
-
-    def inside(p: Array) -> NDArray[np.bool_]:
-        return np.asarray(((p >= 0) & (p < (width, height))).all(axis=-1))
-
     # z behind the camera is FAR_OUTSIDE, which takes x_previous out of the image too.
-    return np.where((~was_visible & inside(y) & inside(x_previous))[..., None], x_previous - x, motion)
+    inside = np.all([(p >= 0) & (p < (width, height)) for p in (y, x_previous)], axis=(0, -1))
+    return np.where((~was_visible & inside)[..., None], x_previous - x, motion)
 
 
 class MeshPoint(NamedTuple):

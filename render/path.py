@@ -16,7 +16,6 @@ from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
 
-AnySampler = Sampler | HaltonSampler
 ROULETTE = 3.0  # survival probability over throughput
 
 
@@ -32,7 +31,7 @@ def bounce(
     throughput: mi.Color3f,
     last: mi.Bool,
     chain: mi.Bool,
-    sampler: AnySampler,
+    sampler: Sampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool, mi.UInt32]:
     """(radiance, si, throughput, active, chain, lobe): direct light reflected at `si`, and the path's next vertex.
 
@@ -80,7 +79,7 @@ def sample_mean(
     spp: mi.UInt32,
     max_depth: mi.UInt32,
     max_events: mi.UInt32,
-    draw: type[AnySampler],
+    draw: type[Sampler],
     blurred: BlurredTable | None,
     splits_paths: bool,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
@@ -158,7 +157,7 @@ class PathTracer:
         self.stage = stage
         self.every_pixel = dr.arange(mi.UInt32, stage.height * stage.width)
         dr.make_opaque(self.every_pixel)
-        self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
+        self.draw: type[Sampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
         self.freezes = not halton and not regularise  # which Dr.Jit 1.5 cannot freeze
 

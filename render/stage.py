@@ -105,18 +105,7 @@ class Stage:
         self.shapes = [by_name[shape.name] for shape in scene.meshes]
         described: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
         self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
-        bsdfs = bsdfs_of([*self.shapes, *loader.grouped])
-        self.materials = MaterialTable(bsdfs)
-        lobes = {index: delta_lobes(bsdf) for index, bsdf in bsdfs.items()}
-        self.delta_lobes = sorted({lobe for of_bsdf in lobes.values() for lobe in of_bsdf})
-        # The BSDFs that chains of specular events continue from, and those of smooth glass, if there are any.
-        self.specular = registry_table(mi.Bool, {index: bool(of_bsdf) for index, of_bsdf in lobes.items()})
-        glass = {index: is_smooth_glass(bsdf) for index, bsdf in bsdfs.items()}
-        self.glass = registry_table(mi.Bool, glass) if any(glass.values()) else None
-        self.looks_through = self.materials.has_mirrors or self.glass is not None
-        self.normals = ShadingNormals(bsdfs)
-        # Masks have null transmission; so has thin glass.
-        self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs.values())
+        self.read_bsdfs(bsdfs_of([*self.shapes, *loader.grouped]))
         mesh_ids = {registry_number(mi.ShapePtr(shape)): index for index, shape in enumerate(self.shapes, 1)}
         self.mesh_id_of_shape = registry_table(mi.UInt32, mesh_ids)
         self.has_instances = bool(loader.grouped)
@@ -129,6 +118,19 @@ class Stage:
         self.poses = 0  # how often something has changed
         self.recordings: dict[Callable[..., Any], Callable[..., Any]] = {}
         self.pose(0)
+
+    def read_bsdfs(self, bsdfs: dict[int, mi.BSDF]) -> None:
+        self.materials = MaterialTable(bsdfs)
+        self.normals = ShadingNormals(bsdfs)
+        lobes = {index: delta_lobes(bsdf) for index, bsdf in bsdfs.items()}
+        self.delta_lobes = sorted({lobe for of_bsdf in lobes.values() for lobe in of_bsdf})
+        # The BSDFs that chains of specular events continue from, and those of smooth glass, if there are any.
+        self.specular = registry_table(mi.Bool, {index: bool(of_bsdf) for index, of_bsdf in lobes.items()})
+        glass = {index: is_smooth_glass(bsdf) for index, bsdf in bsdfs.items()}
+        self.glass = registry_table(mi.Bool, glass) if any(glass.values()) else None
+        self.looks_through = self.materials.has_mirrors or self.glass is not None
+        # Masks have null transmission; so has thin glass.
+        self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs.values())
 
     def replay(self, function: Callable[..., T], *arguments: Any, freezes: bool = True) -> T:
         """`function(self, *arguments)`, evaluated; recorded by Dr.Jit, since tracing it takes longer than running it.

@@ -154,10 +154,17 @@ class OwnScene:
                 raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listed}")
 
     def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
-        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes."""
+        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes.
+
+        Raises BadInput, naming the TOML, if keyframes give a frame no valid view.
+        """
         if by_keyframes:
             camera = camera_of(self.described.camera, self.scene.camera, frames)
-            check_camera(camera, frames, self.path)
+            for frame in range(frames):
+                pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
+                if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
+                    faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
+                    raise BadInput(f"{self.path}: in frame {frame} the camera's {faults}: change its keyframes")
         else:
             camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
         scene = self.scene
@@ -176,15 +183,6 @@ class OwnScene:
             stock=tuple(replace(shape, gain=gains.get(shape.name, shape.gain)) for shape in stock),
             lights=tuple(replace(light, gain=gains.get(light.name, light.gain)) for light in scene.lights),
         )
-
-
-def check_camera(camera: Camera, frames: int, path: Path) -> None:
-    """Raise BadInput, naming the TOML, if a camera by keyframes has no valid view."""
-    for frame in range(frames):
-        pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
-        if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
-            faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
-            raise BadInput(f"{path}: in frame {frame} the camera's {faults}: change its keyframes")
 
 
 def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:

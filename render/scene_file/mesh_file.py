@@ -179,8 +179,7 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
     scene = None
     damage = ""
     try:
-        with warnings.catch_warnings(), collected_problems() as problems:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), collected_problems() as problems:
             scene = trimesh.load_scene(path, resolver=resolver, process=False)
     except Exception as error:  # its readers raise many kinds of exceptions for damaged files
         damage = " ".join(f"{type(error).__name__}: {error}"[:200].split())

@@ -135,16 +135,14 @@ def renamed(described: Properties, **names: str | None) -> Properties:
 OLD_PLUGINS: dict[str, Callable[[Properties], StandIn]] = {
     "phong": phong,
     "ward": ward,
-    "coating": coated,
-    "roughcoating": coated,
+    **dict.fromkeys(("coating", "roughcoating"), coated),
     "mixturebsdf": mixture,
     "bump": with_properties("bumpmap, its current name", type="bumpmap"),
     "sky": old_sky,
     "sun": old_sun,
     "scale": scaled,
     "gridtexture": with_properties("a checkerboard", type="checkerboard"),
-    "ldrtexture": with_properties("bitmap, its current name", type="bitmap"),
-    "exrtexture": with_properties("bitmap, its current name", type="bitmap"),
+    **dict.fromkeys(("ldrtexture", "exrtexture"), with_properties("bitmap, its current name", type="bitmap")),
     "perspective_rdist": with_properties("a perspective camera without distortion", type="perspective"),
 }
 

@@ -73,16 +73,12 @@ def elements_of(file: Path, content: bytes) -> LocatedElement:
 Upgrade = Callable[[LocatedElement, Path], tuple[Element, str]]  # the element instead, and a note
 
 
-def split_numbers(text: str) -> list[str]:
-    return text.replace(",", " ").split()
-
-
 def linear_colour(colour: str) -> str:
     """The linear values of a colour of old files: #rrggbb, or three sRGB values."""
     if colour.startswith("#"):
         encoded = np.array([*bytes.fromhex(colour[1:7])]) / 255
     else:
-        encoded = np.array([float(value) for value in split_numbers(colour)])
+        encoded = np.array([float(value) for value in colour.replace(",", " ").split()])
     return ", ".join(f"{value:.6f}" for value in srgb_to_linear(encoded))
 
 
@@ -130,7 +126,7 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     if file is not None and not (folder / file).exists():
         note = f"the file {file} of a spectrum is missing: 0.5 everywhere instead"
         return named_like(element, "spectrum", value="0.5"), note
-    values = split_numbers(element.get("value", ""))
+    values = element.get("value", "").replace(",", " ").split()
     if len(values) < 3 or any(":" in value for value in values):
         return element, ""
     if len(values) == 3:
