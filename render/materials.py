@@ -283,9 +283,8 @@ class MaterialTable:
         hit = si.is_valid()
         flags = si.bsdf().flags()
         faces = (si.wi.z > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
-        no_mirror = scatters(flags)
         albedo, alpha = self.evaluate(si, hit)
-        return hit & faces & ~no_mirror & (alpha < MAX_MIRROR_ALPHA), albedo, alpha
+        return hit & faces & ~scatters(flags) & (alpha < MAX_MIRROR_ALPHA), albedo, alpha
 
     def mixed(
         self, row: mi.UInt32, depth: int, si: mi.SurfaceInteraction3f, hit: mi.Bool

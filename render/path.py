@@ -190,10 +190,9 @@ class PosedFrame:
 
     def __init__(self, stage: Stage, frame: int, regularise: bool = False):
         stage.pose(frame)
-        self.stage = stage
-        self.view = stage.view(frame)
-        self.emission = render_gbuffer(stage, self.view, regularise, in_layers=False)["emission"].astype(np.float64)
-        self.ray = stage.rays(self.view)
+        view = stage.view(frame)
+        self.emission = render_gbuffer(stage, view, regularise, in_layers=False)["emission"].astype(np.float64)
+        self.ray = stage.rays(view)
         self.tracer = PathTracer(stage, regularise=regularise)
 
     def reflected(self, seed: int, spp: int) -> NDArray[np.float64]:

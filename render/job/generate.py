@@ -136,7 +136,6 @@ def render_to_folder(
     arguments. Raises BadInput for an unknown scene or clip name.
     """
     split, _, clip_name = folder.parts[-3:]
-    noisy_spp = ClipKind.of(clip_name).noisy_spp
     quality = profile.quality[split]
     scene, seed = scene_of_clip(folder, profile, dataset_seed)
     timer = StepTimer()
@@ -144,6 +143,6 @@ def render_to_folder(
         with timer.step("pilot"):
             needed_spp = samples_needed(scene, profile.size, quality, seed, options)
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
-    sampling = Sampling(quality.realisations, noisy_spp, spp, options)
+    sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
     write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), timer.read())

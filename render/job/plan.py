@@ -88,13 +88,5 @@ def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tupl
     if profile.own is None:
         scene = build_scene(scene_name, seed, profile.size[0])
     else:
-        scene = clip_of_own_scene(profile.own, split, kind.number, profile.size[0], seed)
+        scene = own_scene(profile.own).clip(split, kind.number, profile.size[0], seed)
     return (scene.still() if kind.still else scene), seed
-
-
-def clip_of_own_scene(path: Path, split: str, number: int, frames: int, seed: int) -> Scene:
-    """A clip of the scene that a TOML describes; the first test clip begins with the file's camera."""
-    own = own_scene(path)
-    camera = getattr(own.described.splits, split).camera
-    by_keyframes = camera == "keyframes" or (camera is None and bool(own.described.camera))
-    return own.clip(frames, seed, by_keyframes, from_here=split == "test" and number == 0)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from msgspec.structs import asdict
+
 from datasets.clip import SPLITS
 from errors import BadInput
 from render.scene_file.description import read_description
@@ -41,8 +43,7 @@ DATA_PROFILES = {
         boxes=dict.fromkeys(SPLITS, 1),
         quality={
             "train": SamplingQuality(realisations=2, reference_spp=64),
-            "val": SamplingQuality(realisations=1, reference_spp=128),
-            "test": SamplingQuality(realisations=1, reference_spp=128),
+            **dict.fromkeys(("val", "test"), SamplingQuality(realisations=1, reference_spp=128)),
         },
     ),
     "quick": DataProfile(
@@ -91,10 +92,9 @@ def own_profile(path: Path) -> DataProfile:
     name = re.sub(r"[^\w-]", "_", path.stem)
     clips: dict[str, list[str]] = {}
     quality: dict[str, SamplingQuality] = {}
-    for split in SPLITS:
-        request = getattr(described.splits, split)
-        clips[split] = [f"{name}/{number:03d}" for number in range(request.clips)]
-        quality[split] = SamplingQuality(request.realisations, request.reference_spp, request.floor, request.most_spp)
+    for split, wanted in asdict(described.splits).items():
+        clips[split] = [f"{name}/{number:03d}" for number in range(wanted.clips)]
+        quality[split] = SamplingQuality(wanted.realisations, wanted.reference_spp, wanted.floor, wanted.most_spp)
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
     width, height = described.resolution

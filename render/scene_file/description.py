@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import asdict
+from numpy.typing import ArrayLike
 
-from datasets.clip import SPLITS
 from errors import BadInput
 from scenes.animation import Camera, FreeMotion, KeyframedTrack
 from scenes.camera import Array
@@ -117,12 +118,12 @@ def read_description(path: Path) -> Description:
     for names in ([motion.shape for motion in described.motion], [change.light for change in described.light]):
         if len(set(names)) < len(names):
             raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: merge them into one table")
-    if any(getattr(described.splits, name).camera == "keyframes" for name in SPLITS) and not described.camera:
+    if any(split.camera == "keyframes" for split in asdict(described.splits).values()) and not described.camera:
         raise BadInput(f"{path}: a split's camera uses keyframes, but there are none: add [[camera]] tables")
     return described
 
 
-def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:
+def spline(values: ArrayLike, times: list[float], frames: int) -> KeyframedTrack:
     """The track through `values` at `times`, fractions of a clip of so many frames."""
     return KeyframedTrack(np.array(values, np.float64), times=np.array(times) * (frames - 1))
 
@@ -143,8 +144,7 @@ def camera_of(keys: list[CameraKey], file: Camera, frames: int) -> Camera:
 def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
     """The motion of a shape that rotates about `pivot` (3,), its centre in the file."""
     times = [key.time for key in keys]
-    turns = spline([key.rotation for key in keys], times, frames)
-    turns = replace(turns, keys=np.radians(turns.keys))
+    turns = spline(np.radians([key.rotation for key in keys]), times, frames)
     return FreeMotion(pivot, spline([key.position for key in keys], times, frames), turns)
 
 

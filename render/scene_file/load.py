@@ -153,12 +153,14 @@ class OwnScene:
                 listed = f"there are {', '.join(sorted(names)[:20])}{more}" if names else "there are none"
                 raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listed}")
 
-    def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
+    def clip(self, split: str, number: int, frames: int, seed: int) -> Scene:
         """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes.
 
-        Raises BadInput, naming the TOML, if keyframes give a frame no valid view.
+        The first test clip begins with the file's camera. Raises BadInput, naming the TOML, if keyframes give no valid
+        view of a frame.
         """
-        if by_keyframes:
+        chosen = getattr(self.described.splits, split).camera
+        if chosen == "keyframes" or (chosen is None and self.described.camera):
             camera = camera_of(self.described.camera, self.scene.camera, frames)
             for frame in range(frames):
                 pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
@@ -166,7 +168,7 @@ class OwnScene:
                     faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
                     raise BadInput(f"{self.path}: in frame {frame} the camera's {faults}: change its keyframes")
         else:
-            camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
+            camera = fly(self.stage, self.scene.camera, frames, seed, from_here=(split, number) == ("test", 0))
         scene = self.scene
         boxes = {shape.id(): corners(shape.bbox()) * self.stage.unit for shape in self.stage.shapes}
         motions = {
