@@ -148,19 +148,15 @@ class SampledChannels:
         halton = self.sampling.options.halton
         first = frame.index * self.sampling.noisy_spp if halton else 0
         shift = 0 if halton else frame.index
-        self.draws = [
-            [
-                SampleRange(stream_seed(self.seed, shift, stream, i), spp, first + n * spp)
-                for n, stream in enumerate(streams)
-            ]
-            for i in range(self.sampling.realisations)
-        ]
+        realisations = range(self.sampling.realisations)
+        seeds = [[stream_seed(self.seed, shift, stream, i) for stream in streams] for i in realisations]
+        self.draws = [[SampleRange(seed, spp, first + n * spp) for n, seed in enumerate(each)] for each in seeds]
         tracer, splits = self.noisy_tracer, self.in_layers
         drawn = [[tracer.radiance(self.ray, *draw, splits) for draw in draws] for draws in self.draws]
         direct, indirect, *of_glass = (
             np.array([[images[i] for images in buffers] for buffers in drawn]) for i in range(len(drawn[0][0]))
         )  # (realisations, buffers, H, W, C)
-        self.first_sample = direct[0, 0], indirect[0, 0]
+        self.first_sample = direct[0, 0] + indirect[0, 0]
         arrays = {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
         if of_glass:
             means = (image.mean(axis=1) for image in (direct + indirect, *of_glass))
@@ -176,13 +172,11 @@ class SampledChannels:
         return tracked_motion(self.noisy_tracer, self.draws[0][0], frame.arrays, frame.view, frame.previous)
 
     def gradient(self, frame: FrameInProgress) -> Arrays:
-        stage = self.stage
-        still = np.zeros((stage.height, stage.width, 2))
+        still = np.zeros((self.stage.height, self.stage.width, 2))
         gradient = self.samples.gradient(self.noisy_tracer, frame.view) if self.samples else still
         choice = stream_seed(self.seed, frame.index, GRADIENT_STREAM, 0)
-        self.samples = GradientSamples.of(
-            frame.arrays, np.add(*self.first_sample), frame.view, stage.poses, self.draws[0][0], choice
-        )
+        shaded = frame.arrays, self.first_sample, frame.view
+        self.samples = GradientSamples.of(*shaded, self.stage.poses, self.draws[0][0], choice)
         return {"gradient": gradient}
 
     def reference(self, frame: FrameInProgress) -> Arrays:

@@ -168,11 +168,9 @@ class StockLoader:
 
     def light(self, light: StockLight) -> mi.Emitter:
         """Raises BadInput, naming the light, if it cannot be loaded."""
-        emitter = dict(light.emitter)
-        if isinstance(emitter.get("position"), list):
-            emitter["position"] = [x / self.unit for x in emitter["position"]]
-        else:
-            emitter = self.placed(emitter)
+        emitter, position = self.placed(light.emitter), light.emitter.get("position")
+        if isinstance(position, list):
+            emitter = light.emitter | {"position": [x / self.unit for x in position]}
         where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
         return self.made(to_mitsuba(emitter, self.load) | {"id": light.name}, where)
 

@@ -245,9 +245,8 @@ class MaterialTable:
         if not rows:
             self.add(self.blank)  # an empty scene needs a row too
         self.row = registry_table(mi.UInt32, rows)
-        base, roughness, metallic, scale, f0, squared, internal, weight, first, second, sided = map(
-            list, zip(*self.rows, strict=True)
-        )
+        by_column = map(list, zip(*self.rows, strict=True))
+        base, roughness, metallic, scale, f0, squared, internal, weight, first, second, sided = by_column
         self.base, self.roughness, self.metallic, self.weight = map(mi.TexturePtr, (base, roughness, metallic, weight))
         self.scale = mi.Color3f(np.stack(scale, axis=1))
         self.f0, self.internal = (mi.Float(np.array(column, np.float32)) for column in (f0, internal))

@@ -19,7 +19,7 @@ from render.loading import load_mesh
 from scenes.animation import Shape, Track
 from scenes.sky import SKY_SIZE
 
-MAX_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
+MAX_BSDFS, MAX_TEXTURES, MAX_SHAPES, MAX_EMITTERS = 256, 1024, 256, 16
 HALF_GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
 
 
@@ -63,10 +63,8 @@ def palette() -> list[object]:
     objects += [mesh(normals, uv, emits) for emits in flags for normals in flags for uv in flags]
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((*SKY_SIZE, 3), np.float32))}
     objects += [mi.load_dict({"type": "scene", "sky": sky})]  # a sky depends on the extent of its scene
-    fillers = {
-        "BSDF": lambda: mi.load_dict({"type": "diffuse"}),
-        "Texture": lambda: mi.load_dict({"type": "uniform", "value": 0.5}),
-        "Shape": lambda: mesh(False, False, False),
-        "Emitter": lambda: mi.load_dict({"type": "area", "radiance": HALF_GREY}),
-    }
-    return objects + [[fillers[name]() for _ in range(most)][-1] for name, most in MAX_OBJECTS.items()]
+    objects += [mi.load_dict({"type": "diffuse"}) for _ in range(MAX_BSDFS)][-1:]
+    objects += [mi.load_dict({"type": "uniform", "value": 0.5}) for _ in range(MAX_TEXTURES)][-1:]
+    objects += [mesh(False, False, False) for _ in range(MAX_SHAPES)][-1:]
+    objects += [mi.load_dict({"type": "area", "radiance": HALF_GREY}) for _ in range(MAX_EMITTERS)][-1:]
+    return objects

@@ -16,6 +16,7 @@ from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
 ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
+NESTED = (*ROUGH, *ROUGH.values(), "principled", "diffuse")  # BSDFs that are blurred within others
 Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
 
 
@@ -29,17 +30,14 @@ def at_least(roughness: Roughness, least: float) -> Roughness:
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
     """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, if it has one."""
-    nested = {key: blurred(value) if is_bsdf(value) else value for key, value in bsdf.items()}
+    parts = {key: value for key, value in bsdf.items() if isinstance(value, dict) and value.get("type") in NESTED}
+    nested = bsdf | {key: blurred(value) for key, value in parts.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
         return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}
     if kind == "principled":
         return nested | {"roughness": at_least(bsdf.get("roughness", 0.5), MIN_BLURRED_ALPHA**0.5)}
     return nested
-
-
-def is_bsdf(value: object) -> bool:
-    return isinstance(value, dict) and value.get("type") in (*ROUGH, *ROUGH.values(), "principled", "diffuse")
 
 
 class BlurredTable:

@@ -12,16 +12,14 @@ from render.loading import columns, upload
 from render.materials import is_in
 from render.stage import Stage
 
-Branch = tuple[mi.Bool, list[mi.Float]]  # where a lobe continues chains; origin, direction and throughput then
 
-
-def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[Branch]]:
-    """(radiance from where `rays` end, a branch for each of the delta lobes there)."""
+def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[tuple[mi.Bool, list[mi.Float]]]]:
+    """(radiance from where `rays` end, for each delta lobe where it continues them; origin, direction, throughput)."""
     origin, direction, throughput = mi.Point3f(rays[:3]), mi.Vector3f(rays[3:6]), mi.Color3f(rays[6:])
     si = stage.mitsuba_scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False)
     active = si.is_valid()
     active &= is_in(stage.specular, si.bsdf(), active)
-    branches: list[Branch] = []
+    branches = []
     for lobe in stage.delta_lobes:
         context = mi.BSDFContext()
         context.component = lobe

@@ -70,8 +70,6 @@ def elements_of(file: Path, content: bytes) -> LocatedElement:
 
 # --- Elements of old files --------------------------------------------------------------------------------------------
 
-Upgrade = Callable[[LocatedElement, Path], tuple[Element, str]]  # the element instead, and a note
-
 
 def linear_colour(colour: str) -> str:
     """The linear values of a colour of old files: #rrggbb, or three sRGB values."""
@@ -136,7 +134,8 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     return with_parameters(regular, "string", values=", ".join(values)), ""
 
 
-UPGRADES: dict[str, Upgrade] = {
+# The element instead, and a note.
+UPGRADES: dict[str, Callable[[LocatedElement, Path], tuple[Element, str]]] = {
     "subsurface": old_subsurface,
     "animation": old_animation,
     "srgb": old_srgb,
