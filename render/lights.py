@@ -8,8 +8,8 @@ from render.backend import dr, mi
 class Lights:
     """All emitters of a Mitsuba scene.
 
-    Equivalent to Mitsuba's `Scene.sample_emitter_direction` and `SurfaceInteraction3f.emitter`, which compile the number
-    of emitters into every kernel.
+    Equivalent to Mitsuba's `Scene.sample_emitter_direction` and `SurfaceInteraction3f.emitter`, which compile the
+    number of emitters into every kernel.
     """
 
     DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32}
