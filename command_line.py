@@ -68,7 +68,6 @@ def dataset(
     seed: int = 0,
     reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
     part: Annotated[str, arg(metavar="K/N")] = "1/1",
-    ray: Flag = False,
     halton: Flag = False,
     regularise: Flag = False,
 ) -> None:
@@ -78,23 +77,18 @@ def dataset(
         scene: your own scene instead of a profile (docs/scenes.md). Unsupported features of its file are listed first.
         reads: store in training clips only what these denoisers read; by default all networks that can be trained.
         part: render only the K-th of N disjoint shares, to distribute the work.
-        ray: render on the Ray cluster at RAY_ADDRESS, or on all cores of this machine; every machine must see the
-            dataset's folder under the same path.
         halton: sample noisy frames from 16 Halton points with a per-pixel shift (SVGF, RAE).
         regularise: roughen glossy materials after the first bounce (RAE): fewer fireflies, softer caustics.
     """
     from models.registry import channels_read
     from render.clip import Options
-    from render.job.generate import Share, generate, render_here
+    from render.job.generate import generate
     from train.recipes import TRAINABLE
 
-    if ray:
-        from render.job.cluster import render_on_cluster
     folder = data_folder(data, scene.stem if scene else profile)
     source = str(scene.resolve()) if scene else profile
-    render = render_on_cluster if ray else render_here
     channels = channels_read(reads or TRAINABLE)
-    rendered = generate(folder, source, seed, Share.parse(part), channels, Options(halton, regularise), render)
+    rendered = generate(folder, source, seed, part, channels, Options(halton, regularise))
     print(f"{folder}: {rendered} clips rendered")
 
 

@@ -8,7 +8,6 @@ import ctypes
 import os
 import re
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,16 +21,11 @@ MIN_THREADS = 2  # with one, Mitsuba waits forever for the first EXR that it rea
 def installed_llvms() -> list[tuple[int, str]]:
     """(major version, path) of every libLLVM in the loader's cache and the usual folders."""
     listing = ""
-    if sys.platform.startswith("linux"):
-        with suppress(OSError):  # no ldconfig (musl): the folders below remain
-            listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True).stdout
+    with suppress(OSError):  # no ldconfig (musl, macOS): the folders below remain
+        listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True).stdout
     paths = [line.rsplit("=> ", 1)[-1] for line in listing.splitlines() if "libLLVM" in line]
-    for pattern in (
-        "usr/lib/llvm-*/lib/libLLVM*.so*",
-        "usr/lib64/libLLVM*.so*",
-        "opt/homebrew/opt/llvm*/lib/libLLVM.dylib",
-    ):
-        paths += [str(path) for path in Path("/").glob(pattern)]
+    for folder in ("usr/lib/llvm-*/lib", "usr/lib64", "opt/homebrew/opt/llvm*/lib"):
+        paths += [str(path) for path in Path("/").glob(f"{folder}/libLLVM*")]
     found = []
     for path in paths:
         # The version is part of the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or of its folder (llvm-19).

@@ -1,20 +1,24 @@
-"""Renders a clip frame by frame, with all its channels."""
+"""Renders a clip frame by frame, with all its channels, and writes it."""
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS, SECOND, SECOND_LAYER
+from datasets.writer import ClipWriter
 from render.backend import mi
 from render.first_bounce import hit_channels
 from render.gbuffer import light_of_second_layer, render_gbuffer
-from render.glass_motion import chains_through_glass, traced_motion
+from render.glass_motion import chains_at, traced_motion
 from render.gradient import GradientSamples
-from render.motion import dual_motion_vectors, hits_of_samples, tracked_motion
+from render.motion import dual_motion_vectors, tracked_motion
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
 from scenes.animation import Scene
@@ -47,17 +51,13 @@ class StepTimer:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self.start()
 
-    def start(self) -> None:
-        """Ignore the time until now."""
-        self.last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        """Count the time since the last lap as `step`."""
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self.last
-        self.last = now
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Count the time within the context as that of a step."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def read(self) -> dict[str, float]:
         """Seconds by step; resets them."""
@@ -84,52 +84,46 @@ class FrameInProgress:
 
 
 def noise_free_frames(
-    stage: Stage, frames: int, regularise: bool, wants_dual: bool, in_layers: bool, timer: StepTimer
+    stage: Stage, frames: int, regularise: bool, wants_dual: bool, layers: list[dict[str, str]], timer: StepTimer
 ) -> Iterator[FrameInProgress]:
-    """Yield every frame with its G-buffer and motion vectors.
+    """Yield every frame with its G-buffer and motion vectors, also of `layers`: MIRRORED, SECOND.
 
     Dual motion vectors and those through glass need rays through the scene of the previous frame, so the G-buffer is
     rendered a frame ahead.
     """
     centres = pixel_centres(stage.height, stage.width)
-    view = stage.view(0)
-    arrays = render_gbuffer(stage, view, regularise, in_layers)
-    for name in ("motion", "dual_motion", *(forms["motion"] for forms in layers_of(stage, in_layers))):
-        arrays[name] = np.zeros_like(centres)
-    frame = FrameInProgress(0, view, view, arrays)
-    timer.lap("gbuffer")
+    with timer.step("gbuffer"):
+        view = stage.view(0)
+        arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
+    motions = ("motion", "dual_motion", *(forms["motion"] for forms in layers))
+    frame = FrameInProgress(0, view, view, arrays | dict.fromkeys(motions, np.zeros_like(centres)))
     for index in range(1, frames):
-        stage.pose(index)
-        view = stage.view(index)
-        arrays = render_gbuffer(stage, view, regularise, in_layers)
-        shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
-        chains = [chains_through_glass(stage, view, rarer) for rarer in (False, True)] if shows_glass else []
-        timer.lap("gbuffer")
-        surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
-        arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
-        for forms in layers_of(stage, in_layers):
-            shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
-            arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
-        timer.lap("motion")
-        stage.pose(index - 1)
-        timer.lap("gbuffer")
+        with timer.step("gbuffer"):
+            stage.pose(index)
+            view = stage.view(index)
+            arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
+            shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
+            branches = (False, True) if shows_glass else ()
+            chains = [chains_at(stage, view, centres.reshape(-1, 2), rarer) for rarer in branches]
+        with timer.step("motion"):
+            surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
+            arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
+            for forms in layers:
+                shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
+                arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
+        with timer.step("gbuffer"):
+            stage.pose(index - 1)
         if wants_dual:
-            arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
-            timer.lap("dual_motion")
-        for forms, chain in zip(layers_of(stage, in_layers), chains, strict=False):
-            arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
-        timer.lap("motion")
+            with timer.step("dual_motion"):
+                arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
+        with timer.step("motion"):
+            for forms, chain in zip(layers, chains, strict=False):
+                arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
         yield frame
-        timer.start()
         frame = FrameInProgress(index, view, frame.view, arrays)
-    stage.pose(frames - 1)
-    timer.lap("gbuffer")
+    with timer.step("gbuffer"):
+        stage.pose(frames - 1)
     yield frame
-
-
-def layers_of(stage: Stage, in_layers: bool) -> list[dict[str, str]]:
-    """The names of the channels of what mirrors and glass show, layer by layer."""
-    return [MIRRORED] * stage.looks_through + [SECOND] * (in_layers and stage.glass is not None)
 
 
 class SampledChannels:
@@ -154,19 +148,15 @@ class SampledChannels:
         halton = self.sampling.options.halton
         first = frame.index * self.sampling.noisy_spp if halton else 0
         shift = 0 if halton else frame.index
-        self.draws = [
-            [
-                SampleRange(stream_seed(self.seed, shift, stream, i), spp, first + n * spp)
-                for n, stream in enumerate(streams)
-            ]
-            for i in range(self.sampling.realisations)
-        ]
-        trace = self.noisy_tracer.split_radiance if self.in_layers else self.noisy_tracer.radiance
-        drawn = [[trace(self.ray, *draw) for draw in draws] for draws in self.draws]
+        realisations = range(self.sampling.realisations)
+        seeds = [[stream_seed(self.seed, shift, stream, i) for stream in streams] for i in realisations]
+        self.draws = [[SampleRange(seed, spp, first + n * spp) for n, seed in enumerate(each)] for each in seeds]
+        tracer, splits = self.noisy_tracer, self.in_layers
+        drawn = [[tracer.radiance(self.ray, *draw, splits) for draw in draws] for draws in self.draws]
         direct, indirect, *of_glass = (
             np.array([[images[i] for images in buffers] for buffers in drawn]) for i in range(len(drawn[0][0]))
         )  # (realisations, buffers, H, W, C)
-        self.first_sample = direct[0, 0], indirect[0, 0]
+        self.first_sample = direct[0, 0] + indirect[0, 0]
         arrays = {"direct": direct.mean(axis=1), "indirect": indirect.mean(axis=1)}
         if of_glass:
             means = (image.mean(axis=1) for image in (direct + indirect, *of_glass))
@@ -179,18 +169,14 @@ class SampledChannels:
         return {name: np.stack([realisation[name] for realisation in hits]) for name in hits[0]}
 
     def shadow_motion(self, frame: FrameInProgress) -> Arrays:
-        draw = self.draws[0][0]
-        hits = hits_of_samples(self.noisy_tracer, frame.view, draw.seed, draw.first)
-        return tracked_motion(hits, frame.arrays, frame.view, frame.previous)
+        return tracked_motion(self.noisy_tracer, self.draws[0][0], frame.arrays, frame.view, frame.previous)
 
     def gradient(self, frame: FrameInProgress) -> Arrays:
-        stage = self.stage
-        still = np.zeros((stage.height, stage.width, 2))
+        still = np.zeros((self.stage.height, self.stage.width, 2))
         gradient = self.samples.gradient(self.noisy_tracer, frame.view) if self.samples else still
         choice = stream_seed(self.seed, frame.index, GRADIENT_STREAM, 0)
-        self.samples = GradientSamples.of(
-            frame.arrays, np.add(*self.first_sample), frame.view, stage.poses, self.draws[0][0], choice
-        )
+        shaded = frame.arrays, self.first_sample, frame.view
+        self.samples = GradientSamples.of(*shaded, self.stage.poses, self.draws[0][0], choice)
         return {"gradient": gradient}
 
     def reference(self, frame: FrameInProgress) -> Arrays:
@@ -198,16 +184,6 @@ class SampledChannels:
         seeds = [stream_seed(self.seed, frame.index, REFERENCE_STREAM, buffer) for buffer in range(2)]
         direct, indirect = zip(*(self.tracer.radiance(self.ray, seed, spp) for seed in seeds), strict=True)
         return {"direct_reference": np.stack(direct), "indirect_reference": np.stack(indirect)}
-
-
-# By step, in their order; optional steps are those of the channel table.
-MAKERS: dict[str, Callable[[SampledChannels, FrameInProgress], Arrays]] = {
-    "noisy": SampledChannels.noisy,
-    "hit_distance": SampledChannels.hit_distance,
-    "shadow_motion": SampledChannels.shadow_motion,
-    "gradient": SampledChannels.gradient,
-    "reference": SampledChannels.reference,
-}
 
 
 def render_clip(
@@ -231,14 +207,45 @@ def render_clip(
     timer = StepTimer()
     wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
     in_layers = stage.glass is not None and not wanted.isdisjoint(SECOND_LAYER)
-    wanted |= {forms[name] for forms in layers_of(stage, in_layers) for name in wanted & forms.keys()}
+    layers = [MIRRORED] * stage.looks_through + [SECOND] * in_layers
+    wanted |= {forms[name] for forms in layers for name in wanted & forms.keys()}
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
-    makers = {step: maker for step, maker in MAKERS.items() if step not in skipped}
     sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers)
+    steps = (sampled.noisy, sampled.hit_distance, sampled.shadow_motion, sampled.gradient, sampled.reference)
+    steps_by_name = {step.__name__: step for step in steps}  # optional ones are called so in the channel table
     wants_dual = "dual_motion" not in skipped
-    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, in_layers, timer):
-        for step, maker in makers.items():
-            frame.arrays |= maker(sampled, frame)
-            timer.lap(step)
+    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, layers, timer):
+        for name, step in steps_by_name.items():
+            if name not in skipped:
+                with timer.step(name):
+                    frame.arrays |= step(frame)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
         yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()
+
+
+def write_clip(
+    folder: Path,
+    scene: Scene,
+    size: tuple[int, int, int],
+    sampling: Sampling,
+    seed: int,
+    channels: Collection[str],
+    seconds_before: dict[str, float] | None = None,
+) -> None:
+    """Render channels of a scene into a clip of `size` (frames, height, width), completely or not at all.
+
+    `seconds_before` rendering, by step, are recorded with those of rendering.
+    """
+    split, scene_name, clip_name = folder.parts[-3:]
+    frames = render_clip(scene, *size, sampling, seed, channels)
+    derived = {name: "camera" for name in channels if CHANNELS[name].is_camera_motion and not scene.moves()}
+    with ClipWriter(folder) as writer:
+        writer.timing = dict(seconds_before or {})
+        for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame"):
+            writer.add(arrays, seconds)
+        facts = {
+            "noisy_spp": sampling.noisy_spp,
+            "reference_spp": sampling.reference_spp // 2 * 2,
+            "meshes": [shape.name for shape in scene.meshes],
+        }
+        writer.finish(facts, derived)

@@ -4,7 +4,7 @@ Axis-aligned filtering (Mehta et al. 2012, 2013) derives from them how fast ligh
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,15 @@ from scenes.camera import View
 UNIFORM_VARIANCE = 1 / 12  # of a uniform distribution over [0, 1]
 
 
-class FirstBounce(NamedTuple):
-    """One sample of each pixel; only its primary ray has been traced."""
+def first_bounce(
+    tracer: PathTracer, view: View, seed: int, index: int
+) -> tuple[mi.SurfaceInteraction3f, mi.DirectionSample3f, mi.Color3f, mi.Bool, mi.Bool, mi.BSDFSample3f]:
+    """The sample number `index` of those that `tracer.radiance` draws with `seed`, with the stage posed for `view`.
 
-    si: mi.SurfaceInteraction3f  # the visible surface
-    light: mi.DirectionSample3f  # the point on a light that next-event estimation has chosen
-    radiance: mi.Color3f  # unoccluded radiance from there over the density of the choice
-    infinite: mi.Bool  # whether the light is infinitely far away
-    faces: mi.Bool  # whether the surface reflects light from there to the camera
-    sample: mi.BSDFSample3f  # the direction in which the path continues
-
-
-def first_bounce(tracer: PathTracer, view: View, seed: int, index: int) -> FirstBounce:
-    """The sample number `index` of those that `tracer.radiance` draws with `seed`, with the stage posed for `view`."""
+    Of each pixel: (the visible surface, the point on a light that next-event estimation has chosen, unoccluded radiance
+    from there over the density of the choice, whether that light is infinitely far away, whether the surface reflects
+    it to the camera, the direction in which the path continues). Only primary rays are traced.
+    """
     stage = tracer.stage
     si = stage.mitsuba_scene.ray_intersect(stage.rays(view), mi.RayFlags.All, coherent=True)
     key = hash32(hash32(tracer.every_pixel) ^ dr.opaque(mi.UInt32, seed))
@@ -44,7 +40,7 @@ def first_bounce(tracer: PathTracer, view: View, seed: int, index: int) -> First
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     faces = smooth & (light.pdf != 0) & (si.to_local(light.d).z * si.wi.z > 0)
     sample, _ = bsdf.sample(mi.BSDFContext(), si, u_lobe, u_direction, si.is_valid())
-    return FirstBounce(si, light, radiance, infinite, faces, sample)
+    return si, light, radiance, infinite, faces, sample
 
 
 def hits_of_sample(tracer: PathTracer, view: View, seed: int, index: int) -> NDArray[np.float64]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from datasets.channels import BACKGROUND, MIRRORED, SECOND
 from render.backend import dr, mi
 from render.loading import columns
-from render.look_through import Shown, Sight, look_through, surface_channels
+from render.look_through import Sight, look_through, surface_channels
+from render.materials import is_in
 from render.specular_light import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
@@ -50,16 +51,21 @@ def own_surface(stage: Stage, ray: mi.Ray3f) -> tuple[dict[str, dr.AnyArray], mi
     """(channels of what primary rays hit, their length or 0, whether it reflects or transmits perfectly specularly)."""
     si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     channels = {**surface_channels(stage, Sight.along(ray, si)), "emission": stage.lights.at(si).eval(si)}
-    return channels, dr.select(si.is_valid(), si.t, 0), stage.specular.at(si.bsdf(), si.is_valid())
+    return channels, dr.select(si.is_valid(), si.t, 0), is_in(stage.specular, si.bsdf(), si.is_valid())
 
 
 def layer_channels(
-    stage: Stage, view: View, ray: mi.Ray3f, shown: Shown, forms: dict[str, str]
-) -> dict[str, NDArray[Any]]:
-    """What mirrors and glass show along primary rays, by the names of its channels in `forms`."""
+    stage: Stage, view: View, ray: mi.Ray3f, forms: dict[str, str], max_splits: int
+) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32]]:
+    """What mirrors and glass show along primary rays, by the names of its channels in `forms`, MIRRORED or SECOND.
+
+    And the probability of reflection at the glass that splits them. See `look_through`.
+    """
+    shown = look_through(stage, view, ray, forms is SECOND, max_splits)
     depth = depth_along_axis(stage, shown.length, ray, view)
     arrays = {forms[name]: stage.image(value) for name, value in shown.channels.items()}
-    return arrays | {forms["depth"]: depth.reshape(stage.height, stage.width, 1)}
+    arrays[forms["depth"]] = depth.reshape(stage.height, stage.width, 1)
+    return arrays, stage.image(shown.reflectance)
 
 
 def render_gbuffer(
@@ -113,9 +119,7 @@ def layers(
     arrays = {MIRRORED[name]: own[name] for name in MIRRORED.keys() & own.keys()}
     reflectance = np.zeros_like(own["depth"])
     if shines or stage.materials.has_mirrors:
-        shown = look_through(stage, view, ray, max_splits=max_splits)
-        arrays = layer_channels(stage, view, ray, shown, MIRRORED)
-        reflectance = stage.image(shown.reflectance)
+        arrays, reflectance = layer_channels(stage, view, ray, MIRRORED, max_splits)
     if stage.glass is None or not in_layers:
         return arrays
     second = {
@@ -123,8 +127,7 @@ def layers(
     }
     splits = splits_at(reflectance)
     if splits.any():
-        shown = look_through(stage, view, ray, rarer_first=True, max_splits=max_splits)
-        rarer = layer_channels(stage, view, ray, shown, SECOND)
+        rarer, _ = layer_channels(stage, view, ray, SECOND, max_splits)
         second = {name: np.where(splits, rarer[name], background) for name, background in second.items()}
     return {**arrays, **second, "glass_reflectance": reflectance}
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from render.loading import columns
 from render.look_through import look_through
 from render.stage import Stage
-from scenes.camera import FAR_OUTSIDE, Array, View, move, pixel_centres
+from scenes.camera import FAR_OUTSIDE, Array, View, move
 
 NEWTON_STEPS = 6
 PROBE = 0.25  # px between the rays from which derivatives are estimated
@@ -26,11 +26,6 @@ class TracedChains(NamedTuple):
     through_glass: NDArray[np.bool_]  # (N,)
 
 
-class NewtonStep(NamedTuple):
-    step: Array  # (N, 2), px
-    off: Array  # (N,), about how many pixels the start is off; infinite on another mesh
-
-
 def chains_at(stage: Stage, view: View, pixels: Array, rarer_first: bool) -> TracedChains:
     """The chains through `pixels` (N, 2), for a stage posed for `view`'s frame."""
     shown = look_through(stage, view, stage.rays(view, pixels), rarer_first)
@@ -39,15 +34,13 @@ def chains_at(stage: Stage, view: View, pixels: Array, rarer_first: bool) -> Tra
     return TracedChains(pixels, rarer_first, ends, mesh_id, np.array(shown.through_glass))
 
 
-def chains_through_glass(stage: Stage, view: View, rarer_first: bool) -> TracedChains:
-    """Those through all pixel centres."""
-    return chains_at(stage, view, pixel_centres(stage.height, stage.width).reshape(-1, 2), rarer_first)
-
-
 def newton_step(
     stage: Stage, view: View, place: Array, rarer_first: bool, target: Array, mesh_id: NDArray[np.integer]
-) -> NewtonStep:
-    """From pixels `place` (N, 2) towards those whose chains end at `target` (N, 3), on the meshes `mesh_id` (N,)."""
+) -> tuple[Array, Array]:
+    """From pixels `place` (N, 2) towards those whose chains end at `target` (N, 3), on the meshes `mesh_id` (N,).
+
+    (the step (N, 2) in px, about how many pixels `place` is off (N,): infinite on another mesh).
+    """
     probes = np.stack([place, place + np.array([PROBE, 0]), place + np.array([0, PROBE])])
     there = chains_at(stage, view, probes.reshape(-1, 2), rarer_first)
     ends = there.ends.reshape(3, -1, 3)
@@ -58,7 +51,7 @@ def newton_step(
     step = np.stack([yy * x - xy * y, xx * y - xy * x], axis=-1) / np.maximum(xx * yy - xy**2, 1e-30)[:, None]
     same = (there.mesh_id.reshape(3, -1) == mesh_id).all(axis=0)
     pixels_off = np.linalg.norm(error, axis=-1) / np.sqrt(np.maximum(np.maximum(xx, yy), 1e-30))
-    return NewtonStep(step.clip(-MAX_STEP, MAX_STEP), np.where(same, pixels_off, np.inf))
+    return step.clip(-MAX_STEP, MAX_STEP), np.where(same, pixels_off, np.inf)
 
 
 def traced_motion(stage: Stage, chains: TracedChains, motion: Array, now: View, previous: View) -> Array:

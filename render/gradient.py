@@ -43,7 +43,6 @@ class GradientSamples(NamedTuple):
     """Some samples of a frame, to be shaded again in the next one."""
 
     pixel: NDArray[np.int64]  # (N,), row-major index
-    number: mi.UInt32  # the same, for kernels
     luminance: Array  # (N,), of direct + indirect light
     point: Array  # (N, 3), in the world; a direction where nothing was hit
     mesh_id: NDArray[np.integer]  # (N,)
@@ -61,8 +60,7 @@ class GradientSamples(NamedTuple):
         centre = np.stack([pixel % width, pixel // width], axis=-1) + 0.5
         point = unproject(centre, frame["depth"].ravel()[pixel].astype(np.float64), view)
         luminance = sample_luminance(light.reshape(-1, 3)[pixel])
-        number = uploaded(pixel.astype(np.uint32), mi.UInt32)
-        return GradientSamples(pixel, number, luminance, point, frame["mesh_id"].ravel()[pixel], view, poses, draw)
+        return GradientSamples(pixel, luminance, point, frame["mesh_id"].ravel()[pixel], view, poses, draw)
 
     def gradient(self, tracer: PathTracer, now: View) -> Array:
         """The channel `gradient` (H, W, 2) of the next frame, for which the tracer's stage must be posed.
@@ -78,7 +76,8 @@ class GradientSamples(NamedTuple):
         place = project(point, self.mesh_id > 0, now)
         visible = is_same_surface(point, self.mesh_id, place, trace_visible(stage, now, place), now)
         inside = ((place >= 0) & (place < (stage.width, stage.height))).all(axis=-1)
-        direct, indirect, *_ = tracer.samples(stage.rays(now, place), self.number, *self.draw)
+        pixel = uploaded(self.pixel.astype(np.uint32), mi.UInt32)
+        direct, indirect, *_ = tracer.samples(stage.rays(now, place), pixel, *self.draw)
         shaded = sample_luminance(columns(direct) + columns(indirect))
         pairs = np.stack([shaded - self.luminance, np.maximum(shaded, self.luminance)], axis=-1)
         column, row = place[visible & inside].astype(int).T

@@ -8,8 +8,8 @@ from render.backend import dr, mi
 class Lights:
     """All emitters of a Mitsuba scene.
 
-    Equivalent to Mitsuba's `Scene.sample_emitter_direction`, `pdf_emitter_direction` and
-    `SurfaceInteraction3f.emitter`, which compile the number of emitters into every kernel.
+    Equivalent to Mitsuba's `Scene.sample_emitter_direction` and `SurfaceInteraction3f.emitter`, which compile the
+    number of emitters into every kernel.
     """
 
     DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32}
@@ -34,10 +34,6 @@ class Lights:
         light, weight = emitter.sample_direction(si, mi.Point2f(scaled - mi.Float(index), u.y), active)
         light.pdf = light.pdf / mi.Float(self.count)
         return light, weight * mi.Float(self.count)
-
-    def pdf_direction(self, si: mi.SurfaceInteraction3f, light: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
-        """The density with which `sample_direction` chooses a direction that leads to a light."""
-        return light.emitter.pdf_direction(si, light, active) / mi.Float(self.count)
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
         """The emitter at `si`, the sky where nothing is hit; none elsewhere."""

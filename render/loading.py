@@ -1,7 +1,7 @@
 """Mitsuba objects from descriptions of shapes and lights."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -13,19 +13,20 @@ from errors import BadInput
 from render.backend import VARIANT, dr, mi
 from scenes.animation import Shape, StockLight, StockShape
 from scenes.bsdf import Bsdf
+from scenes.camera import Array
 
 ArrayT = TypeVar("ArrayT", bound=dr.AnyArray)
-
-
 PLACE = "_place"  # where a file describes it: a key in descriptions that Mitsuba does not get
 
 
-def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
-    """A Mitsuba dictionary with the numpy arrays of bitmaps as Mitsuba's types."""
+def to_mitsuba(description: Mapping[str, Any], load: Callable[[Bsdf], object] | None = None) -> dict[str, Any]:
+    """A Mitsuba dictionary with numpy arrays as Mitsuba's types. `load` makes objects of nested ones but colours."""
 
     def convert(key: str, value: Any) -> object:
         if isinstance(value, dict):
-            return to_mitsuba(value)
+            return load(value) if load and value["type"] not in ("rgb", "spectrum") else to_mitsuba(value)
+        if isinstance(value, np.ndarray) and value.shape == (4, 4):
+            return mi.ScalarTransform4f(value)
         if key == "to_uv":
             return mi.ScalarTransform3f(value)
         if isinstance(value, np.ndarray):
@@ -35,20 +36,12 @@ def to_mitsuba(description: dict[str, Any]) -> dict[str, Any]:
     return {key: convert(key, value) for key, value in description.items() if key != PLACE}
 
 
-def bitmaps_of(bsdf: Bsdf) -> list[Bsdf]:
-    """The bitmaps in a material's dictionary, at any depth."""
-    nested = [value for value in bsdf.values() if isinstance(value, dict)]
-    own = [bsdf] if bsdf["type"] == "bitmap" else []
-    return own + [bitmap for value in nested for bitmap in bitmaps_of(value)]
-
-
-def without_placement(bsdf: Bsdf) -> Bsdf:
-    """The material without the texture transforms of its bitmaps."""
-    return {
-        key: without_placement(value) if isinstance(value, dict) else value
-        for key, value in bsdf.items()
-        if key != "to_uv"
-    }
+def without_placement(bsdf: Bsdf, placements: list[Array]) -> Bsdf:
+    """The material without the texture transforms of its bitmaps at any depth, which are added to `placements`."""
+    if bsdf["type"] == "bitmap":
+        placements.append(bsdf.get("to_uv", np.eye(3)))
+    items = ((key, value) for key, value in bsdf.items() if key != "to_uv")
+    return {key: without_placement(value, placements) if isinstance(value, dict) else value for key, value in items}
 
 
 def with_placed_textures(shape: Shape) -> Shape:
@@ -57,14 +50,15 @@ def with_placed_textures(shape: Shape) -> Shape:
     Mitsuba compiles the transform of a bitmap into kernels, while texture coordinates are data. Different transforms in
     one material stay.
     """
-    placements = [bitmap.get("to_uv", np.eye(3)) for bitmap in bitmaps_of(shape.bsdf)]
+    placements: list[Array] = []
+    bsdf = without_placement(shape.bsdf, placements)
     uv = getattr(shape.mesh.visual, "uv", None)
     if uv is None or not placements or any((other != placements[0]).any() for other in placements):
         return shape
     mesh = shape.mesh.copy(include_cache=True)  # keeps the authored normals
     assert isinstance(mesh.visual, TextureVisuals)
     mesh.visual.uv = uv @ placements[0][:2, :2].T + placements[0][:2, 2]
-    return replace(shape, mesh=mesh, bsdf=without_placement(shape.bsdf))
+    return replace(shape, mesh=mesh, bsdf=bsdf)
 
 
 def load_mesh(shape: Shape) -> mi.Mesh:
@@ -137,7 +131,9 @@ class StockLoader:
         try:
             return mi.load_dict(description)
         except RuntimeError as error:
-            unknown = unreferenced(error)
+            text = str(error)
+            unused = text if "unreferenced propert" in text else ""
+            unknown = set(re.findall(r'^  - \w+ "([^"]+)":', unused, re.MULTILINE))
             if not unknown & description.keys():
                 raise BadInput(f"{what} is empty, damaged or cannot be used: {mitsuba_reason(error)}") from None
         names = ", ".join(f"'{name}'" for name in sorted(unknown))
@@ -147,26 +143,12 @@ class StockLoader:
     def load(self, description: Mapping[str, Any]) -> Any:
         if id(description) not in self.loaded:
             what = f"{description.get('filename', description['type'])}{description.get(PLACE, '')}"
-            loaded = self.made(self.resolved(description), what)
+            loaded = self.made(to_mitsuba(description, self.load), what)
             self.loaded[id(description)] = (description, loaded)
             if isinstance(loaded, mi.Shape):
                 check_shape(loaded, what)
                 (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
         return self.loaded[id(description)][1]
-
-    def resolved(self, description: Mapping[str, Any]) -> dict[str, Any]:
-        """The dictionary with Mitsuba's objects and types in place of nested dictionaries and arrays."""
-
-        def resolve(key: str, value: Any) -> object:
-            if isinstance(value, dict) and value["type"] in ("rgb", "spectrum"):
-                return value
-            if isinstance(value, dict):
-                return self.load(value)
-            if isinstance(value, np.ndarray) and value.shape == (4, 4):
-                return mi.ScalarTransform4f(value)
-            return to_mitsuba({key: value})[key]
-
-        return {key: resolve(key, value) for key, value in description.items() if key != PLACE}
 
     def placed(self, geometry: Mapping[str, Any]) -> dict[str, Any]:
         """The description of a shape or light, scaled from world units."""
@@ -176,29 +158,21 @@ class StockLoader:
 
     def shape(self, shape: StockShape) -> mi.Shape:
         """Raises BadInput, naming the shape and its file, if it cannot be loaded or is damaged."""
-        parts = {"bsdf": shape.bsdf, "emitter": shape.emitter}
-        nested = {key: self.load(value) for key, value in parts.items() if value is not None}
+        parts = {"id": shape.name, "bsdf": shape.bsdf, "emitter": shape.emitter}
+        description = self.placed(shape.geometry) | {key: value for key, value in parts.items() if value is not None}
         where = f"shape '{shape.name}'{shape.geometry.get(PLACE, '')}"
         where += f" ({shape.geometry['filename']})" if "filename" in shape.geometry else ""
-        loaded = self.made(self.resolved(self.placed(shape.geometry)) | nested | {"id": shape.name}, where)
+        loaded = self.made(to_mitsuba(description, self.load), where)
         check_shape(loaded, where)
         return loaded
 
     def light(self, light: StockLight) -> mi.Emitter:
         """Raises BadInput, naming the light, if it cannot be loaded."""
-        emitter = dict(light.emitter)
-        if isinstance(emitter.get("position"), list):
-            emitter["position"] = [x / self.unit for x in emitter["position"]]
-        else:
-            emitter = self.placed(emitter)
+        emitter, position = self.placed(light.emitter), light.emitter.get("position")
+        if isinstance(position, list):
+            emitter = light.emitter | {"position": [x / self.unit for x in position]}
         where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
-        return self.made(self.resolved(emitter) | {"id": light.name}, where)
-
-
-def unreferenced(error: RuntimeError) -> set[str]:
-    """The properties that Mitsuba's error message lists as unknown, if it is about these."""
-    text = str(error)
-    return set(re.findall(r'^  - \w+ "([^"]+)":', text, re.MULTILINE)) if "unreferenced propert" in text else set()
+        return self.made(to_mitsuba(emitter, self.load) | {"id": light.name}, where)
 
 
 def mitsuba_reason(error: Exception) -> str:
@@ -225,10 +199,10 @@ def check_shape(shape: mi.Shape, where: str) -> None:
         if not np.isfinite(vertices).all():
             raise BadInput(f"{where} is damaged: it has vertices that are not finite")
     box = shape.bbox()
-    if shape.class_name() != "ShapeGroupPlugin" and not extent_of(box) < MAX_EXTENT:
+    if shape.class_name() != "ShapeGroupPlugin" and not np.abs(corners(box)).max() < MAX_EXTENT:
         raise BadInput(f"{where} is too far away or too large: it reaches from {box.min} to {box.max}")
 
 
-def extent_of(box: mi.ScalarBoundingBox3f) -> float:
-    """The largest absolute coordinate of a box; NaN if it has one."""
-    return float(np.abs([np.array(box.min), np.array(box.max)]).max())
+def corners(box: mi.ScalarBoundingBox3f) -> Array:
+    """The least and the greatest coordinates (2, 3) of a box."""
+    return np.array([np.array(box.min), np.array(box.max)], np.float64).reshape(2, 3)

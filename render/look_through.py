@@ -7,13 +7,13 @@ at the first glass on the way, one by the other. Behind it both take the more fr
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from render.backend import dr, mi
 from render.loading import upload
-from render.specular import BsdfSet
+from render.materials import is_in
 from render.stage import Stage
 from scenes.camera import View
 
@@ -48,27 +48,18 @@ class Sight:
         zero, yes = mi.Float(0), mi.Bool(si.is_valid())
         return Sight(si, ray, zero, zero, zero, mi.Color3f(1), axes, yes, yes, mi.Float(1), mi.Bool(False), zero)
 
-    def turned_back(self, normal: mi.Vector3f) -> mi.Vector3f:
-        """A world direction (3,) as the eye sees it."""
-        return mi.Vector3f(*(dr.dot(axis, normal) for axis in self.axes))
 
+def glass_event(
+    glass: mi.Bool, sight: Sight, rarer_first: mi.Bool
+) -> tuple[mi.Bool, mi.Vector3f, mi.Bool, mi.Color3f, mi.Float, mi.Float]:
+    """The more frequent branch at smooth glass, or if `rarer_first` at the first glass on the way the other one.
 
-class GlassEvent(NamedTuple):
-    """A branch at smooth glass, where there is any (`here`)."""
-
-    here: mi.Bool
-    direction: mi.Vector3f
-    reflects: mi.Bool
-    tint: mi.Color3f
-    eta: mi.Float  # index of refraction behind the surface over that before it
-    reflectance: mi.Float  # the probability of reflection
-
-
-def glass_event(glass: BsdfSet, sight: Sight, rarer_first: mi.Bool) -> GlassEvent:
-    """The more frequent branch, or if `rarer_first` at the first glass on the way the other one."""
+    (whether there is glass, the direction behind it, whether it reflects, its tint, the index of refraction behind the
+    surface over that before it, the probability of reflection).
+    """
     si: Any = sight.si  # Mitsuba's stubs know its types by two names
     bsdf = si.bsdf()
-    here = glass.at(bsdf, sight.goes_on)
+    here = is_in(glass, bsdf, sight.goes_on)
     context = mi.BSDFContext()
     reflection, reflected_weight = bsdf.sample(context, si, 0, mi.Point2f(0.5), here)
     transmission, transmitted_weight = bsdf.sample(context, si, ALMOST_ONE, mi.Point2f(0.5), here)
@@ -76,7 +67,7 @@ def glass_event(glass: BsdfSet, sight: Sight, rarer_first: mi.Bool) -> GlassEven
     reflects = (chance > 0.5) ^ (rarer_first & ~sight.glass)
     sample = dr.select(reflects, reflection, transmission)
     weight = dr.select(reflects, reflected_weight, transmitted_weight)
-    return GlassEvent(here, si.to_world(sample.wo), reflects, weight, sample.eta, chance)
+    return here, si.to_world(sample.wo), reflects, weight, sample.eta, chance
 
 
 def turned(axis: mi.Vector3f, before: mi.Vector3f, after: mi.Vector3f) -> mi.Vector3f:
@@ -104,20 +95,20 @@ def one_further(
     axes = [flipped(axis, normal) for axis in sight.axes]
     shows, index, reflectance, glass = is_mirror, sight.index, sight.reflectance, sight.glass
     if stage.glass is not None:
-        event = glass_event(stage.glass, sight, rarer_first)
-        shows = shows | event.here
-        tint = dr.select(event.here, event.tint, tint)
-        alpha = dr.select(event.here, 0, alpha)
-        direction = dr.select(event.here, event.direction, direction)
-        index = dr.select(event.here, index * event.eta, index)
-        splits = event.here & ~glass & sight.exact & may_split
-        reflectance = dr.select(splits, event.reflectance, reflectance)
-        glass = glass | event.here
+        is_glass, behind, reflects, glass_tint, eta, chance = glass_event(stage.glass, sight, rarer_first)
+        shows = shows | is_glass
+        tint = dr.select(is_glass, glass_tint, tint)
+        alpha = dr.select(is_glass, 0, alpha)
+        direction = dr.select(is_glass, behind, direction)
+        index = dr.select(is_glass, index * eta, index)
+        splits = is_glass & ~glass & sight.exact & may_split
+        reflectance = dr.select(splits, chance, reflectance)
+        glass = glass | is_glass
         across = dr.normalize(direction - sight.ray.d)
         for number, axis in enumerate(sight.axes):
-            bent = dr.select(event.reflects, flipped(axis, across), turned(axis, sight.ray.d, direction))
-            axes[number] = dr.select(event.here, bent, axes[number])
-    exact = sight.exact & stage.specular.at(here.bsdf(), here.is_valid())
+            bent = dr.select(reflects, flipped(axis, across), turned(axis, sight.ray.d, direction))
+            axes[number] = dr.select(is_glass, bent, axes[number])
+    exact = sight.exact & is_in(stage.specular, here.bsdf(), here.is_valid())
 
     onward = stage.past_cutouts(here.spawn_ray(direction))
     there = stage.mitsuba_scene.ray_intersect(onward, mi.RayFlags.All, coherent=False, active=shows)
@@ -135,27 +126,14 @@ def one_further(
     return result
 
 
-def chain_end(
-    stage: Stage, ray: mi.Ray3f, si: Any, focal: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32
-) -> Sight:
-    """What mirrors and glass at the ends `si` of primary rays show: the loop over events runs in the kernel."""
-    longest = MAX_MIRRORS if stage.glass is None else LONGEST_CHAIN
-
-    def step(number: mi.UInt32, sight: Sight) -> tuple[mi.UInt32, Sight]:
-        return number + 1, one_further(stage, sight, si.t, focal, rarer_first, number < max_splits)
-
-    start = mi.UInt32(0), Sight.along(ray, si)
-    return dr.while_loop(start, lambda number, sight: (number < longest) & sight.goes_on, step)[1]
-
-
 def surface_channels(stage: Stage, sight: Sight) -> dict[str, dr.AnyArray]:
     """The channels of a surface as the eye sees it, but for depth, by name."""
     valid = sight.si.is_valid()
     normal = stage.normals.evaluate(sight.si, valid)
-    normal = sight.turned_back(dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal))
+    normal = dr.select(dr.dot(normal, sight.ray.d) > 0, -normal, normal)
     albedo, roughness = stage.materials.evaluate(sight.si, valid)
     return {
-        "normal": dr.select(valid, normal, mi.Vector3f(0)),
+        "normal": dr.select(valid, mi.Vector3f(*(dr.dot(axis, normal) for axis in sight.axes)), mi.Vector3f(0)),
         "albedo": sight.tint * albedo,
         "roughness": roughness,
         "mesh_id": stage.mesh_id(sight.si),
@@ -174,8 +152,15 @@ class Shown:
 
 
 def shown(stage: Stage, ray: mi.Ray3f, focal: mi.Float, rarer_first: mi.Bool, max_splits: mi.UInt32) -> Shown:
-    si = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    sight = chain_end(stage, ray, si, focal, rarer_first, max_splits)
+    """As `look_through`: the loop over events runs in the kernel."""
+    si: Any = stage.mitsuba_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    longest = MAX_MIRRORS if stage.glass is None else LONGEST_CHAIN
+
+    def step(number: mi.UInt32, sight: Sight) -> tuple[mi.UInt32, Sight]:
+        return number + 1, one_further(stage, sight, si.t, focal, rarer_first, number < max_splits)
+
+    start = mi.UInt32(0), Sight.along(ray, si)
+    sight = dr.while_loop(start, lambda number, sight: (number < longest) & sight.goes_on, step)[1]
     length = dr.select(si.is_valid(), si.t + sight.beyond, 0)
     through_glass = sight.glass & (sight.beyond > 0)
     return Shown(surface_channels(stage, sight), length, sight.si.p, through_glass, sight.reflectance)

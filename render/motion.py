@@ -14,7 +14,7 @@ from render.backend import dr, mi
 from render.first_bounce import first_bounce
 from render.gbuffer import VisibleSurface, trace_visible
 from render.materials import registry_index
-from render.path import PathTracer
+from render.path import PathTracer, SampleRange
 from render.stage import Stage
 from scenes.camera import FAR_OUTSIDE, Array, View, motion_vectors, move, pixel_centres, project, unproject
 
@@ -49,12 +49,9 @@ def dual_motion_vectors(
     was_visible = is_same_surface(then, mesh_id, y, occluder, previous)
     z = y + motion_vectors(y, occluder.depth, occluder.mesh_id, previous, now)
     x_previous = y + (x - z)
-
-    def inside(p: Array) -> NDArray[np.bool_]:
-        return np.asarray(((p >= 0) & (p < (width, height))).all(axis=-1))
-
     # z behind the camera is FAR_OUTSIDE, which takes x_previous out of the image too.
-    return np.where((~was_visible & inside(y) & inside(x_previous))[..., None], x_previous - x, motion)
+    inside = np.all([(p >= 0) & (p < (width, height)) for p in (y, x_previous)], axis=(0, -1))
+    return np.where((~was_visible & inside)[..., None], x_previous - x, motion)
 
 
 class MeshPoint(NamedTuple):
@@ -73,21 +70,17 @@ class MeshPoint(NamedTuple):
         return np.concatenate([[False], moved])[self.mesh_id]
 
 
-class SampleHits(NamedTuple):
-    """Hits of the shadow ray and the reflected ray of each pixel's first sample."""
+def hits_of_samples(
+    tracer: PathTracer, view: View, draw: SampleRange
+) -> tuple[MeshPoint, MeshPoint, MeshPoint, NDArray[np.bool_], Array]:
+    """Hits of the shadow ray and the reflected ray of each pixel's first sample of `draw`, posed for `view`.
 
-    blocker: MeshPoint  # between surface and light; not finite where there is none
-    light: MeshPoint
-    reflected: MeshPoint  # where the surface `reflects` (H, W)
-    reflects: NDArray[np.bool_]
-    normal: Array  # (H, W, 3), geometric, of the surface itself
-
-
-def hits_of_samples(tracer: PathTracer, view: View, seed: int, first: int) -> SampleHits:
-    """Hits of the samples that `tracer.radiance` draws with `seed`, with the stage posed for `view`'s frame."""
+    (the blocker between surface and light, not finite where there is none; the light; what is reflected, and where
+    (H, W); the geometric normal of the surface itself (H, W, 3)).
+    """
     stage = tracer.stage
     scene = stage.mitsuba_scene
-    si, light, _, infinite, faces, sample = first_bounce(tracer, view, seed, first)
+    si, light, _, infinite, faces, sample = first_bounce(tracer, view, draw.seed, draw.first)
     blocker = scene.ray_intersect(si.spawn_ray_to(light.p), mi.RayFlags.Minimal, coherent=False, active=faces)
     glossy = mi.has_flag(sample.sampled_type, mi.BSDFFlags.GlossyReflection)
     reflects = (sample.pdf > 0) & (glossy | mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection))
@@ -109,8 +102,8 @@ def hits_of_samples(tracer: PathTracer, view: View, seed: int, first: int) -> Sa
         in_world = point * np.where(finite, stage.unit, 1.0)
         return MeshPoint(in_world, finite[..., 0].astype(bool), mesh_id[..., 0])
 
-    points = [mesh_point(*arrays[i : i + 3]) for i in (0, 3, 6)]
-    return SampleHits(*points, reflects=arrays[9][..., 0].astype(bool), normal=arrays[10].astype(np.float64))
+    blocking, lighting, shown = (mesh_point(*arrays[i : i + 3]) for i in (0, 3, 6))
+    return blocking, lighting, shown, arrays[9][..., 0].astype(bool), arrays[10].astype(np.float64)
 
 
 def mirror_image(point: Array, finite: NDArray[np.bool_], mirror: Array, normal: Array) -> Array:
@@ -127,7 +120,9 @@ def shadow_of(blocker: Array, light: Array, infinite: NDArray[np.bool_], plane: 
         return blocker + np.where(steps > 0, steps, np.nan)[..., None] * along
 
 
-def tracked_motion(hits: SampleHits, frame: dict[str, NDArray[Any]], now: View, previous: View) -> dict[str, Array]:
+def tracked_motion(
+    tracer: PathTracer, draw: SampleRange, frame: dict[str, NDArray[Any]], now: View, previous: View
+) -> dict[str, Array]:
     """The channels `shadow_motion` and `reflection_motion` (H, W, 2), in pixels, of a frame with depth and motion.
 
     shadow_motion: to where, in the previous frame, the blocker cast its shadow from the same point on the light onto
@@ -137,25 +132,25 @@ def tracked_motion(hits: SampleHits, frame: dict[str, NDArray[Any]], now: View, 
     They are `motion` where nothing blocks or is reflected and where a point is behind a camera; so is shadow_motion
     where nothing but the camera moves.
     """
+    blocker, light, reflected, reflects, own_normal = hits_of_samples(tracer, now, draw)
     motion = frame["motion"].astype(np.float64)
     depth = frame["depth"][..., 0].astype(np.float64)
     centres = pixel_centres(*depth.shape)
     surface = MeshPoint(unproject(centres, depth, now), depth > 0, frame["mesh_id"][..., 0])
     plane = surface.in_previous(now, previous)
-    normal = move(surface.point + hits.normal, surface.mesh_id, now, previous) - plane
-    light = hits.light.in_previous(now, previous)
-    shadow = shadow_of(hits.blocker.in_previous(now, previous), light, ~hits.light.finite, plane, normal)
-    shadowed = hits.blocker.finite & np.isfinite(shadow).all(axis=-1)
-    shadowed &= np.any([point.moved(now, previous) for point in (surface, hits.blocker, hits.light)], axis=0)
+    normal = move(surface.point + own_normal, surface.mesh_id, now, previous) - plane
+    blocker_then, light_then = (point.in_previous(now, previous) for point in (blocker, light))
+    shadow = shadow_of(blocker_then, light_then, ~light.finite, plane, normal)
+    shadowed = blocker.finite & np.isfinite(shadow).all(axis=-1)
+    shadowed &= np.any([point.moved(now, previous) for point in (surface, blocker, light)], axis=0)
     then = project(np.where(shadowed[..., None], shadow, plane), shadowed, previous)
     shadowed &= np.abs(then).max(axis=-1) < FAR_OUTSIDE
 
-    reflected = hits.reflected
-    image = mirror_image(reflected.point, reflected.finite, surface.point, hits.normal)
+    image = mirror_image(reflected.point, reflected.finite, surface.point, own_normal)
     image_then = mirror_image(reflected.in_previous(now, previous), reflected.finite, plane, normal)
     here = project(image, reflected.finite, now)
     there = project(image_then, reflected.finite, previous)
-    visible = hits.reflects & (np.abs(np.concatenate([here, there], axis=-1)).max(axis=-1) < FAR_OUTSIDE)
+    visible = reflects & (np.abs(np.concatenate([here, there], axis=-1)).max(axis=-1) < FAR_OUTSIDE)
     return {
         "shadow_motion": np.where(shadowed[..., None], then - centres, motion),
         "reflection_motion": np.where(visible[..., None], there - here, motion),

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.gbuffer import render_gbuffer
+from render.materials import is_in
 from render.regularise import BlurredTable
 from render.sampler import HaltonSampler, Sampler, hash32
 from render.stage import Stage
 
-AnySampler = Sampler | HaltonSampler
-FloatImage = NDArray[np.float64]  # (H, W, 3)
 ROULETTE = 3.0  # survival probability over throughput
 
 
@@ -32,7 +31,7 @@ def bounce(
     throughput: mi.Color3f,
     last: mi.Bool,
     chain: mi.Bool,
-    sampler: AnySampler,
+    sampler: Sampler,
 ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f, mi.Color3f, mi.Bool, mi.Bool, mi.UInt32]:
     """(radiance, si, throughput, active, chain, lobe): direct light reflected at `si`, and the path's next vertex.
 
@@ -63,17 +62,12 @@ def bounce(
     towards = mi.DirectionSample3f(None, following, si)  # with the scene it would compile in the index of the sky
     towards.emitter = emitter
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    chain &= delta & stage.specular.at(bsdf, chain)
-    emitter_pdf = lights.pdf_direction(si, towards, active & (emitter != None) & ~delta)  # noqa: E711 - traced
+    chain &= delta & is_in(stage.specular, bsdf, chain)
+    competes = active & (emitter != None) & ~delta  # noqa: E711 - traced
+    emitter_pdf = emitter.pdf_direction(si, towards, competes) / mi.Float(lights.count)
     mis = mis_weight(sample.pdf, emitter_pdf)
     radiance += dr.select(active & ~chain, throughput * emitter.eval(following, active) * mis, 0)
     return radiance, following, throughput, active & following.is_valid(), chain, sample.sampled_type
-
-
-def survive(throughput: mi.Color3f, depth: mi.UInt32, active: mi.Bool, u: mi.Float) -> tuple[mi.Color3f, mi.Bool]:
-    """Russian roulette from the second bounce on, with the random number `u`: (throughput, active)."""
-    chance = dr.select(depth > 1, dr.clip(ROULETTE * dr.max(throughput), 0.05, 1), 1)
-    return throughput / chance, active & (u < chance)
 
 
 @dr.syntax
@@ -86,7 +80,7 @@ def sample_mean(
     spp: mi.UInt32,
     max_depth: mi.UInt32,
     max_events: mi.UInt32,
-    draw: type[AnySampler],
+    draw: type[Sampler],
     blurred: BlurredTable | None,
     splits_paths: bool,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
@@ -120,7 +114,7 @@ def sample_mean(
         bsdf = si.bsdf() if blurred is None else blurred.after_first(si, depth)
         chain &= depth <= max_events
         last = depth + 1 == max_depth
-        splits = mi.Bool(False) if glass is None else chain & whole & glass.at(bsdf, chain)
+        splits = mi.Bool(False) if glass is None else chain & whole & is_in(glass, bsdf, chain)
         radiance, si, throughput, active, chain, lobe = bounce(stage, si, bsdf, throughput, last, chain, sampler)
         mirrors = splits & mi.has_flag(lobe, mi.BSDFFlags.DeltaReflection)
         # Conditional expressions: without glass, nothing is added to the loop.
@@ -130,7 +124,10 @@ def sample_mean(
         reflected += 0 if glass is None else dr.select(mirrored, radiance, 0)
         direct += dr.select(depth == 1, radiance, 0)
         indirect += dr.select(depth == 1, 0, radiance)
-        throughput, active = survive(throughput, depth, active, sampler.next_1d())
+        # Russian roulette, from the second bounce on.
+        survival = dr.select(depth > 1, dr.clip(ROULETTE * dr.max(throughput), 0.05, 1), 1)
+        throughput = throughput / survival
+        active &= sampler.next_1d() < survival
         depth += 1
         ended = ~active | (depth >= max_depth)
         si = dr.select(ended, primary, si)
@@ -161,9 +158,9 @@ class PathTracer:
         self.stage = stage
         self.every_pixel = dr.arange(mi.UInt32, stage.height * stage.width)
         dr.make_opaque(self.every_pixel)
-        self.draw: type[AnySampler] = HaltonSampler if halton else Sampler
+        self.draw: type[Sampler] = HaltonSampler if halton else Sampler
         self.blurred = BlurredTable(stage) if regularise else None
-        self.freezes = stage.freezes and not halton and not regularise  # which Dr.Jit 1.5 cannot freeze either
+        self.freezes = not halton and not regularise  # which Dr.Jit 1.5 cannot freeze
 
     def samples(
         self, ray: mi.Ray3f, pixel: mi.UInt32, seed: int, spp: int, first: int = 0, splits: bool = False
@@ -175,26 +172,18 @@ class PathTracer:
         max_events = self.stage.max_events(self.blurred is not None)
         numbers = (seed, first, spp, self.stage.scene.max_depth, max_events)
         data = [dr.opaque(mi.UInt32, number) for number in numbers]
-        if self.freezes:
-            return self.stage.replay(sample_mean, ray, pixel, *data, self.draw, None, splits)
-        means = sample_mean(self.stage, ray, pixel, *data, self.draw, self.blurred, splits)  # type: ignore[call-arg]
-        dr.eval(means)
-        return means
+        arguments = (ray, pixel, *data, self.draw, self.blurred, splits)
+        return self.stage.replay(sample_mean, *arguments, freezes=self.freezes)
 
     def radiance(
-        self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(direct, indirect) radiance (H, W, 3), without emission, along the primary rays of all pixels."""
-        direct, indirect, *_ = self.samples(ray, self.every_pixel, seed, spp, first)
-        return self.stage.image(direct), self.stage.image(indirect)
+        self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0, splits: bool = False
+    ) -> list[NDArray[np.float32]]:
+        """[direct, indirect] radiance (H, W, 3), without emission, along the primary rays of all pixels.
 
-    def split_radiance(self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0) -> list[NDArray[np.float32]]:
-        """Also the part of it that glass reflects first, and the share of such samples (H, W, 1)."""
-        return [self.stage.image(mean) for mean in self.samples(ray, self.every_pixel, seed, spp, first, splits=True)]
-
-
-def finite_or_zero(image: NDArray[np.floating]) -> FloatImage:
-    return np.nan_to_num(image.astype(np.float64), nan=0, posinf=0, neginf=0)
+        Where glass `splits` paths, also the part of it that glass reflects first and the share of such samples.
+        """
+        means = self.samples(ray, self.every_pixel, seed, spp, first, splits)
+        return [self.stage.image(mean) for mean in (means if splits else means[:2])]
 
 
 class PosedFrame:
@@ -202,16 +191,12 @@ class PosedFrame:
 
     def __init__(self, stage: Stage, frame: int, regularise: bool = False):
         stage.pose(frame)
-        self.stage = stage
-        self.view = stage.view(frame)
-        self.emission = render_gbuffer(stage, self.view, regularise, in_layers=False)["emission"].astype(np.float64)
-        self.ray = stage.rays(self.view)
+        view = stage.view(frame)
+        self.emission = render_gbuffer(stage, view, regularise, in_layers=False)["emission"].astype(np.float64)
+        self.ray = stage.rays(view)
         self.tracer = PathTracer(stage, regularise=regularise)
 
-    def reflected(self, seed: int, spp: int) -> FloatImage:
+    def reflected(self, seed: int, spp: int) -> NDArray[np.float64]:
         """Direct + indirect radiance (H, W, 3) of `spp` samples a pixel; non-finite values are 0."""
-        return finite_or_zero(np.add(*self.tracer.radiance(self.ray, seed, spp)))
-
-    def radiance(self, seed: int, spp: int) -> FloatImage:
-        """Emitted + reflected radiance (H, W, 3)."""
-        return self.reflected(seed, spp) + self.emission
+        light = np.add(*self.tracer.radiance(self.ray, seed, spp))
+        return np.nan_to_num(light.astype(np.float64), nan=0, posinf=0, neginf=0)

@@ -33,11 +33,6 @@ def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Change
     return changes
 
 
-def normals_of(name: str) -> str:
-    """The parameter that changes with `name`: Mitsuba recomputes the authored normals of moved vertices otherwise."""
-    return name.replace(".vertex_positions", ".vertex_normals")
-
-
 class StockParameters:
     """The parameters at rest of a stock shape or light that moves or changes. Raises BadInput if it cannot."""
 
@@ -71,11 +66,9 @@ class StockParameters:
 
 def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array]:
     """The values of the named parameters that exist and are not empty."""
-    values: dict[str, Array] = {}
-    for name in names:
-        if name in parameters:
-            value = parameters[name]
-            values[name] = np.array(value.matrix if isinstance(value, mi.AffineTransform4f) else value, np.float64)
+    found = {name: parameters[name] for name in names if name in parameters}
+    plain = {name: getattr(value, "matrix", value) for name, value in found.items()}  # of a transform
+    values = {name: np.array(value, np.float64) for name, value in plain.items()}
     return {name: value for name, value in values.items() if value.size}
 
 

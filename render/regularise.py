@@ -11,11 +11,12 @@ import numpy as np
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
-from render.materials import registry_index, registry_table
+from render.materials import registry_index, registry_number, registry_table
 from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
 ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
+NESTED = (*ROUGH, *ROUGH.values(), "principled", "diffuse")  # BSDFs that are blurred within others
 Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
 
 
@@ -29,7 +30,8 @@ def at_least(roughness: Roughness, least: float) -> Roughness:
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
     """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, if it has one."""
-    nested = {key: blurred(value) if is_bsdf(value) else value for key, value in bsdf.items()}
+    parts = {key: value for key, value in bsdf.items() if isinstance(value, dict) and value.get("type") in NESTED}
+    nested = bsdf | {key: blurred(value) for key, value in parts.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
         return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}
@@ -38,16 +40,13 @@ def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def is_bsdf(value: object) -> bool:
-    return isinstance(value, dict) and value.get("type") in (*ROUGH, *ROUGH.values(), "principled", "diffuse")
-
-
 class BlurredTable:
     """The blurred versions of all BSDFs of a stage, by registry index."""
 
     def __init__(self, stage: Stage):
         described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
-        self.row = registry_table([mi.BSDFPtr(shape.bsdf()) for shape, _ in described])
+        rows = {registry_number(mi.BSDFPtr(shape.bsdf())): row for row, (shape, _) in enumerate(described)}
+        self.row = registry_table(mi.UInt32, rows)
         # Keeps objects alive, which pointers do not.
         self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
         self.pointers = mi.BSDFPtr(self.bsdfs)

@@ -83,7 +83,7 @@ PRIMES = (  # bases: a row for each bounce, a column for each of its six numbers
 )
 
 
-class HaltonSampler:
+class HaltonSampler(Sampler):
     """Point `index` mod 16 of the Halton sequence, with a random shift (mod 1) for each pixel that `key` determines.
 
     Real-time renderers draw one point of the cycle a frame (SVGF §3, RAE §3.1): each frame is unbiased, and the mean of
@@ -92,10 +92,9 @@ class HaltonSampler:
     """
 
     def __init__(self, key: mi.UInt32, index: mi.UInt32, depth: mi.UInt32):
-        self.key = hash32(key ^ depth)
+        super().__init__(key, index, depth)
         self.index = index & (CYCLE - 1)
         self.bounce = (depth - 1) & (len(PRIMES) - 1)
-        self.dimension = 0
 
     def next_1d(self) -> mi.Float:
         base = mi.UInt32(PRIMES[0][self.dimension])

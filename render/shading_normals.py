@@ -1,10 +1,10 @@
 """Shading normals, perturbed by normal and bump maps."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from render.backend import dr, mi
-from render.materials import BsdfParameters, bsdfs_of, registry_index
+from render.materials import BsdfParameters, registry_index
 
 
 class Relief(NamedTuple):
@@ -42,8 +42,8 @@ def relief_of(bsdf: mi.BSDF, two_sided: bool = False) -> Relief | None:
 
 
 class ShadingNormals:
-    def __init__(self, shapes: Iterable[mi.Shape]):
-        reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs_of(shapes).items()}
+    def __init__(self, bsdfs: Mapping[int, mi.BSDF]):
+        reliefs = {number: relief_of(bsdf) for number, bsdf in bsdfs.items()}
         self.reliefs = {number: relief for number, relief in reliefs.items() if relief is not None}
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> mi.Vector3f:

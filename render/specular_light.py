@@ -4,34 +4,23 @@ Chains of perfectly specular events (delta lobes) need no random numbers: from e
 followed, and the light at its end, weighted by the chain's throughput, is emission. The path tracer leaves it out.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.loading import columns, upload
+from render.materials import is_in
 from render.stage import Stage
 
 
-class Chains(NamedTuple):
-    """Chains of perfectly specular events: several for a pixel that shows glass, none for many."""
-
-    pixel: NDArray[np.integer]  # (N,)
-    rays: NDArray[np.float32]  # (N, 9): origin and direction of the last ray, and throughput
-
-
-Branch = tuple[mi.Bool, list[mi.Float]]  # where a lobe continues chains; origin, direction and throughput then
-
-
-def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[Branch]]:
-    """(radiance from where `rays` end, a branch for each of the delta lobes there)."""
+def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[tuple[mi.Bool, list[mi.Float]]]]:
+    """(radiance from where `rays` end, for each delta lobe where it continues them; origin, direction, throughput)."""
     origin, direction, throughput = mi.Point3f(rays[:3]), mi.Vector3f(rays[3:6]), mi.Color3f(rays[6:])
     si = stage.mitsuba_scene.ray_intersect(mi.Ray3f(origin, direction), mi.RayFlags.All, coherent=False)
     active = si.is_valid()
-    active &= stage.specular.at(si.bsdf(), active)
-    branches: list[Branch] = []
-    for lobe in stage.specular.lobes:
+    active &= is_in(stage.specular, si.bsdf(), active)
+    branches = []
+    for lobe in stage.delta_lobes:
         context = mi.BSDFContext()
         context.component = lobe
         sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
@@ -40,13 +29,6 @@ def branches_at_end(stage: Stage, *rays: mi.Float) -> tuple[mi.Color3f, list[Bra
         onward = si.spawn_ray(si.to_world(sample.wo))
         branches.append((follows, [*onward.o, *onward.d, *weight]))
     return throughput * stage.lights.at(si).eval(si), branches
-
-
-def advance(chains: Chains, branches: list[Branch]) -> Chains:
-    """The chains with one event more: one for each delta lobe at their ends."""
-    pixels = [chains.pixel[:0], *(chains.pixel[np.array(follows)] for follows, _ in branches)]
-    rays = [chains.rays[:0], *(columns(ray)[np.array(follows)] for follows, ray in branches)]
-    return Chains(np.concatenate(pixels), np.concatenate(rays))
 
 
 def specular_light(
@@ -59,11 +41,14 @@ def specular_light(
     count = dr.width(ray.d)
     values = [np.broadcast_to(np.array(value), count) for value in (*ray.o, *ray.d, *mi.Color3f(1))]
     pixel = np.arange(count) if shines is None else np.flatnonzero(shines)
-    chains = Chains(pixel, np.stack(values, axis=-1)[pixel])
+    rays = np.stack(values, axis=-1)[pixel]  # (N, 9): origin and direction of a chain's last ray, and its throughput
     total = np.zeros((count, 3))
     for _ in range(max_events + 1):
-        if len(chains.pixel):
-            radiance, branches = stage.replay(branches_at_end, *map(upload, chains.rays.T))
-            np.add.at(total, chains.pixel, columns(radiance))  # in the order of chains; Dr.Jit would add in any order
-            chains = advance(chains, branches)
+        if len(pixel):
+            radiance, branches = stage.replay(branches_at_end, *map(upload, rays.T))
+            np.add.at(total, pixel, columns(radiance))  # in the order of chains; Dr.Jit would add in any order
+            # Chains branch: a pixel that shows glass has several, and many have none.
+            longer = [(np.array(follows), columns(onward)) for follows, onward in branches]
+            rays = np.concatenate([rays[:0], *(onward[follows] for follows, onward in longer)])
+            pixel = np.concatenate([pixel[:0], *(pixel[follows] for follows, _ in longer)])
     return total.astype(np.float32)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.lights import Lights
-from render.loading import StockLoader, extent_of, load_mesh, upload, with_placed_textures
-from render.materials import MaterialTable, bsdfs_of, registry_index, registry_table
+from render.loading import StockLoader, corners, load_mesh, upload, with_placed_textures
+from render.materials import BsdfParameters, MaterialTable, bsdfs_of, registry_index, registry_number, registry_table
 from render.palette import palette
-from render.posing import Changes, StockParameters, as_parameter, mesh_changes, normals_of
+from render.posing import Changes, StockParameters, as_parameter, mesh_changes
 from render.shading_normals import ShadingNormals
-from render.specular import SpecularSurfaces, smooth_glass
 from scenes.animation import Scene, StockLight, StockShape
 from scenes.camera import Array, View, directions, pixel_centres
 
@@ -45,6 +44,29 @@ def has_texture(emitter: dict[str, Any] | None) -> bool:
     return isinstance(radiance, dict) and radiance["type"] not in ("rgb", "spectrum", "uniform")
 
 
+def is_masked(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF has a mask in it: Mitsuba cannot sample a single lobe of one."""
+    return bsdf.class_name() == "MaskBSDF" or any(map(is_masked, BsdfParameters(bsdf).nested.values()))
+
+
+def has_flag(bsdf: mi.BSDF, component: int, flag: mi.BSDFFlags) -> bool:
+    return bool(mi.has_flag(bsdf.flags(component), flag))
+
+
+def delta_lobes(bsdf: mi.BSDF) -> list[int]:
+    """The component indices of the delta lobes that can be sampled alone."""
+    if is_masked(bsdf):
+        return []
+    return [i for i in range(bsdf.component_count()) if has_flag(bsdf, i, mi.BSDFFlags.Delta)]
+
+
+def is_smooth_glass(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF reflects and transmits perfectly specularly, and nothing else."""
+    lobes = delta_lobes(bsdf)
+    reflects = [has_flag(bsdf, i, mi.BSDFFlags.DeltaReflection) for i in lobes]
+    return len(lobes) == bsdf.component_count() and any(reflects) and not all(reflects)
+
+
 class Stage:
     """An animated scene loaded into Mitsuba for images of `height` x `width` pixels.
 
@@ -63,7 +85,7 @@ class Stage:
         loaded = [loader.shape(shape) for shape in scene.stock]
         # Upper bounds of coordinates in frame 0:
         extents = [np.abs(each.mesh.bounds).max() + np.abs(each.motion.position.at(0)).max() for each in scene.shapes]
-        self.unit = unit_of([*extents, *(extent_of(shape.bbox()) for shape in loaded)])
+        self.unit = unit_of([*extents, *(np.abs(corners(shape.bbox())).max() for shape in loaded)])
         if self.unit != 1:
             loader = StockLoader(self.unit)
             loaded = [loader.shape(shape) for shape in scene.stock]
@@ -83,42 +105,48 @@ class Stage:
         self.shapes = [by_name[shape.name] for shape in scene.meshes]
         described: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
         self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
-        visible = [*self.shapes, *loader.grouped]
-        self.materials = MaterialTable(visible)
-        self.specular = SpecularSurfaces(visible)
-        self.glass = smooth_glass(visible)
-        self.looks_through = self.materials.has_mirrors or self.glass is not None
-        self.normals = ShadingNormals(visible)
-        # Masks have null transmission; so has thin glass.
-        self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(visible).values())
-        self.mesh_id_of_shape = registry_table([mi.ShapePtr(shape) for shape in self.shapes], first=1)
+        self.read_bsdfs(bsdfs_of([*self.shapes, *loader.grouped]))
+        mesh_ids = {registry_number(mi.ShapePtr(shape)): index for index, shape in enumerate(self.shapes, 1)}
+        self.mesh_id_of_shape = registry_table(mi.UInt32, mesh_ids)
         self.has_instances = bool(loader.grouped)
-        self.has_textured_lights = any(has_texture(shape.emitter) for shape in scene.stock)
         # Dr.Jit 1.5 cannot freeze textured area lights, and scenes without shapes while another scene is loaded.
-        self.freezes = bool(self.shapes) and not self.has_textured_lights
+        self.freezes = bool(self.shapes) and not any(has_texture(shape.emitter) for shape in scene.stock)
+        tables = [self.materials.state, self.specular, self.glass, self.mesh_id_of_shape]
+        # All that kernels read of it, and the palette, whose objects they may call.
+        self.state = [palette(), self.mitsuba_scene, self.lights, *tables]
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.recordings: dict[Callable[..., Any], Callable[..., Any]] = {}
         self.pose(0)
 
-    def replay(self, function: Callable[..., T], *arguments: Any) -> T:
+    def read_bsdfs(self, bsdfs: dict[int, mi.BSDF]) -> None:
+        self.materials = MaterialTable(bsdfs)
+        self.normals = ShadingNormals(bsdfs)
+        lobes = {index: delta_lobes(bsdf) for index, bsdf in bsdfs.items()}
+        self.delta_lobes = sorted({lobe for of_bsdf in lobes.values() for lobe in of_bsdf})
+        # The BSDFs that chains of specular events continue from, and those of smooth glass, if there are any.
+        self.specular = registry_table(mi.Bool, {index: bool(of_bsdf) for index, of_bsdf in lobes.items()})
+        glass = {index: is_smooth_glass(bsdf) for index, bsdf in bsdfs.items()}
+        self.glass = registry_table(mi.Bool, glass) if any(glass.values()) else None
+        self.looks_through = self.materials.has_mirrors or self.glass is not None
+        # Masks have null transmission; so has thin glass.
+        self.has_cutouts = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs.values())
+
+    def replay(self, function: Callable[..., T], *arguments: Any, freezes: bool = True) -> T:
         """`function(self, *arguments)`, evaluated; recorded by Dr.Jit, since tracing it takes longer than running it.
 
+        Functions that cannot be recorded, which do not `freezes`, and all of scenes that cannot, are only evaluated.
         What changes between calls, other than the pose, must be among the arguments: arrays as data, or hashable.
         """
-        if self.freezes and function not in self.recordings:
+        freezes = freezes and self.freezes
+        if freezes and function not in self.recordings:
             own = proxy(self)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
-            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state())
+            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state)
             finalize(self, frozen.clear)  # else recordings would keep the scene
             self.recordings[function] = frozen
-        result = self.recordings[function](*arguments) if self.freezes else function(self, *arguments)
+        result = self.recordings[function](*arguments) if freezes else function(self, *arguments)
         dr.eval(result)
         return result
-
-    def state(self) -> list[Any]:
-        """All that kernels read of it, and the palette, whose objects they may call."""
-        tables = [self.materials.state(), self.specular, self.glass, self.mesh_id_of_shape]
-        return [palette(), self.mitsuba_scene, self.lights, *tables]
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """The mesh id at a surface interaction: the shape's index + 1, or 0 for none."""
@@ -137,7 +165,8 @@ class Stage:
         for stock in self.stock:
             changes |= stock.changes(frame)
         changed = {name for name, value in changes.items() if not np.array_equal(value, self.posed.get(name, np.nan))}
-        changed |= {normals_of(name) for name in changed} & changes.keys()
+        # Mitsuba recomputes the authored normals of moved vertices otherwise.
+        changed |= {name.replace(".vertex_positions", ".vertex_normals") for name in changed} & changes.keys()
         changes = {name: changes[name] for name in changes if name in changed}
         for name, value in changes.items():
             self.parameters[name] = as_parameter(value, self.parameters[name])

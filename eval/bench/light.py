@@ -21,8 +21,7 @@ from models.denoiser import Denoiser, State
 from models.operators import finite
 from plotting import DPI, Figure, plt, save_figure
 from provenance import device_in_words
-from render.clip import Sampling
-from render.job.clip_job import write_clip
+from render.clip import Sampling, write_clip
 from render.job.plan import GENERATOR
 from scenes.animation import KeyframedTrack, RigidMotion, Scene, Track
 from scenes.camera import Array

@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 from datasets.tonemap import clip_exposure, display, luminance
 from plotting import DPI, plt, save_figure
-from render.job.plan import clip_of_own_scene
 from render.path import PosedFrame
+from render.scene_file.load import own_scene
 from render.stage import Stage
 from scenes.registry import build_scene
 
@@ -26,7 +26,7 @@ def displayed_frame(
     `name` is that of a built-in scene or the path of a TOML. Raises BadInput for an unknown scene.
     """
     own = name.endswith(".toml")
-    scene = clip_of_own_scene(Path(name), "test", 0, frames, seed) if own else build_scene(name, seed, frames)
+    scene = own_scene(Path(name)).clip("test", 0, frames, seed) if own else build_scene(name, seed, frames)
     posed = PosedFrame(Stage(scene, height, width), frame)
     reflected = posed.reflected(seed, spp)
     return display(reflected + posed.emission, clip_exposure(luminance(reflected)))

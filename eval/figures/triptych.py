@@ -16,8 +16,7 @@ from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
 from models.denoiser import Denoiser, State
 from plotting import Image
-from render.clip import Sampling
-from render.job.clip_job import write_clip
+from render.clip import Sampling, write_clip
 from render.path import PosedFrame
 from render.stage import Stage
 from scenes.registry import build_scene

@@ -1,116 +1,84 @@
 """The rendering job: renders the missing clips of a dataset."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from datasets.card import write_card
-from datasets.channels import USUAL_CHANNELS
-from datasets.clip import Dataset, is_clip
+from datasets.channels import SECOND_LAYER, USUAL_CHANNELS
+from datasets.clip import ClipKind, Dataset, is_clip
 from errors import BadInput
-from files import read_json, write_json
+from files import locked, read_json, write_json
 from provenance import RENDERING, versions
-from render.clip import NO_OPTIONS, Options
-from render.job.clip_job import ClipOutcome, RenderJob, run_clip_job
-from render.job.pilots import choose_rooms
-from render.job.plan import NO_PILOTS, plan
-from render.job.profiles import profile_of
+from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, write_clip
+from render.job.pilots import choose_rooms, samples_needed
+from render.job.plan import plan, scene_of_clip
+from render.job.profiles import DataProfile, profile_of
 
 
-@dataclass(frozen=True)
-class Share:
-    """Share `index` (from 1) of `count` disjoint shares of a dataset's clips."""
-
-    index: int
-    count: int
-
-    @staticmethod
-    def parse(text: str) -> "Share":
-        """The share written as "K/N". Raises BadInput unless 1 <= K <= N."""
-        match = re.fullmatch(r"(\d+)/(\d+)", text)
-        if match and 1 <= int(match[1]) <= int(match[2]):
-            return Share(int(match[1]), int(match[2]))
-        raise BadInput(f"'{text}' is not a share: write K/N with K from 1 to N, such as 2/8")
-
-    def of(self, clips: Sequence[Path]) -> Sequence[Path]:
-        return clips[self.index - 1 :: self.count]
-
-
-WHOLE_DATASET = Share(1, 1)
-
-
-def render_here(jobs: Sequence[RenderJob]) -> Iterator[ClipOutcome]:
-    return map(run_clip_job, jobs)
+def share_of(clips: Sequence[Path], part: str) -> Sequence[Path]:
+    """Share K of N disjoint shares of clips, for a `part` "K/N". Raises BadInput unless 1 <= K <= N."""
+    match = re.fullmatch(r"(\d+)/(\d+)", part)
+    if match and 1 <= int(match[1]) <= int(match[2]):
+        return clips[int(match[1]) - 1 :: int(match[2])]
+    raise BadInput(f"'{part}' is not a share: write K/N with K from 1 to N, such as 2/8")
 
 
 def generate(
     root: Path,
     profile: str,
     seed: int,
-    share: Share = WHOLE_DATASET,
+    part: str = "1/1",
     reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
-    render: Callable[[Sequence[RenderJob]], Iterator[ClipOutcome]] = render_here,
 ) -> int:
-    """Render the missing clips of a share of the dataset at `root`. Returns how many were rendered.
+    """Render the missing clips of the dataset at `root`, or of `part` "K/N" of them. Returns how many were rendered.
 
     Clips for training and validation get the channels in `reads` and the essential ones.
 
-    Several jobs may work on one folder; each clip is rendered by one of them. Folders of disjoint shares can be merged.
+    Several jobs may work on one folder; each clip is rendered by one of them. Folders of disjoint parts can be merged.
     A clip that fails is skipped. A complete dataset gets its card.
 
     Raises BadInput at the end, naming the first clip that failed, and OSError (such as a full disk) at once.
     """
     if seed < 0:
         raise BadInput(f"the seed {seed} is negative: use 0 or more")
-    check_folder(root)
-    facts = root / "dataset.json"
-    if facts.exists():  # its rooms are chosen; write_or_check_plan compares the profile
-        needed_spp = read_json(facts).get("needed_spp", {})
-    else:
-        needed_spp = choose_rooms(profile_of(profile), seed, options, NO_PILOTS)
-    wanted = plan(profile, seed, reads, options, needed_spp)
-    for note in wanted["notes"]:
-        tqdm.write(note)
-    root.mkdir(parents=True, exist_ok=True)
-    write_or_check_plan(root, wanted)
-    dataset = Dataset(root)
-
-    def job(clip: Path) -> RenderJob:
-        channels = tuple(wanted["channels"][clip.parts[-3]])
-        return RenderJob(clip, profile, seed, channels, options, needed_spp.get("/".join(clip.parts[-3:])))
-
-    jobs = [job(clip) for clip in share.of(dataset.planned()) if not is_clip(clip)]
-    rendered = 0
-    if jobs:
-        check_versions(dataset)
-        rendered = count_rendered(tqdm(render(jobs), "clips", len(jobs), unit="clip"))
+    share_of([], part)
+    dataset = begun(root, profile, seed, reads, options)
+    missing = [clip for clip in share_of(dataset.planned(), part) if not is_clip(clip)]
+    rendered = render_clips(missing, dataset) if missing else 0
     write_card(dataset)
     return rendered
 
 
-def check_folder(root: Path) -> None:
-    """Raise BadInput unless `root` is a new or empty folder, or that of a dataset."""
+def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Options) -> Dataset:
+    """The dataset of that plan at `root`, which may be new.
+
+    Raises BadInput if `root` contains anything but a dataset, or one of another plan.
+    """
     if root.exists() and not root.is_dir():
         raise BadInput(f"{root} is a file, not a folder: choose another --data")
     visible = [path.name for path in root.glob("[!.]*")]
     if visible and "dataset.json" not in visible:
         raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
-
-
-def write_or_check_plan(root: Path, wanted: dict[str, Any]) -> None:
-    """Write the plan into a new dataset's folder. Raises BadInput if it contains another plan."""
-    if not (root / "dataset.json").exists():
-        write_json(root / "dataset.json", wanted)
-        return
-    present = read_json(root / "dataset.json")
-    for key in ("schema", "profile", "seed", "generator", "splits", "channels", "options", "source"):
-        if present.get(key, {}) != wanted[key]:
+    facts = root / "dataset.json"
+    if facts.exists():  # its rooms are chosen
+        needed_spp = read_json(facts).get("needed_spp", {})
+    else:
+        needed_spp = choose_rooms(profile_of(profile), seed, options)
+    wanted = plan(profile, seed, reads, options, needed_spp)
+    for note in wanted["notes"]:
+        tqdm.write(note)
+    root.mkdir(parents=True, exist_ok=True)
+    if not facts.exists():
+        write_json(facts, wanted)
+    dataset = Dataset(root)
+    for key in ("profile", "seed", "generator", "splits", "channels", "options", "source"):
+        if dataset.facts.get(key, {}) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
+    return dataset
 
 
 def check_versions(dataset: Dataset) -> None:
@@ -125,16 +93,56 @@ def check_versions(dataset: Dataset) -> None:
         raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
-def count_rendered(outcomes: Iterable[ClipOutcome]) -> int:
-    """Wait for all clips, report those not rendered and count the others. Raises BadInput at the end if any failed."""
-    ended = []
-    for outcome in outcomes:
-        ended.append(outcome)
-        if outcome.ending != "rendered":
-            failed = "failed, the others continue: " if outcome.ending == "failed" else ""
-            tqdm.write(f"{outcome.path}: {failed}{outcome.reason}")
-    failures = [outcome for outcome in ended if outcome.ending == "failed"]
+def render_clips(clips: Sequence[Path], dataset: Dataset) -> int:
+    """Render clips unless other processes render them or have done so. Returns how many were rendered.
+
+    Reports the others. Raises BadInput at the end if the renderer failed for any, OSError at once: a full disk concerns
+    all clips.
+    """
+    check_versions(dataset)
+    facts = dataset.facts
+    profile, seed, options = profile_of(facts["profile"]), facts["seed"], Options(**facts["options"])
+    rendered, failures = 0, []
+    for clip in tqdm(clips, "clips", unit="clip"):
+        clip.parent.mkdir(parents=True, exist_ok=True)
+        with locked(clip.with_name(f".{clip.name}.lock")) as ours:
+            if not ours or is_clip(clip):
+                tqdm.write(f"{clip}: skipped: another process {'has rendered' if ours else 'is rendering'} it")
+                continue
+            split = clip.parts[-3]
+            needed_spp = facts.get("needed_spp", {}).get("/".join(clip.parts[-3:]))
+            try:
+                render_to_folder(clip, profile, seed, facts["channels"][split], options, needed_spp)
+                rendered += 1
+            except (RuntimeError, ValueError) as error:
+                tqdm.write(f"{clip}: failed, the others continue: {error}")
+                failures.append(f"{clip}: {error}")
     if failures:
-        first = f"first {failures[0].path}: {failures[0].reason}"
-        raise BadInput(f"{len(failures)} of {len(ended)} clips failed and can be tried again, {first}")
-    return sum(outcome.ending == "rendered" for outcome in ended)
+        raise BadInput(f"{len(failures)} of {len(clips)} clips failed and can be tried again, first {failures[0]}")
+    return rendered
+
+
+def render_to_folder(
+    folder: Path,
+    profile: DataProfile,
+    dataset_seed: int,
+    channels: Sequence[str],
+    options: Options = NO_OPTIONS,
+    needed_spp: int | None = None,
+) -> None:
+    """Render channels of the clip in the folder DATA/SPLIT/SCENE/CLIP, completely or not at all.
+
+    By default a pilot predicts `needed_spp`, the samples a pixel that references need. The clip is deterministic in the
+    arguments. Raises BadInput for an unknown scene or clip name.
+    """
+    split, _, clip_name = folder.parts[-3:]
+    quality = profile.quality[split]
+    scene, seed = scene_of_clip(folder, profile, dataset_seed)
+    timer = StepTimer()
+    if needed_spp is None:
+        with timer.step("pilot"):
+            needed_spp = samples_needed(scene, profile.size, quality, seed, options)
+    spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
+    sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options)
+    layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), timer.read())

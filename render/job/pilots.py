@@ -8,7 +8,7 @@ from tqdm import tqdm
 from datasets.tonemap import clip_exposure, display, luminance, noise_of_mean
 from errors import BadInput
 from render.clip import NO_OPTIONS, Options
-from render.job.plan import NeededSpp, rooms_of, scene_of_clip
+from render.job.plan import rooms_of, scene_of_clip
 from render.job.profiles import DataProfile, SamplingQuality
 from render.path import PosedFrame
 from render.stage import Stage
@@ -55,18 +55,12 @@ def samples_needed(
     return spp
 
 
-def needed_for(profile: DataProfile, room: str, seed: int, options: Options) -> int:
-    """Samples a pixel that the references of a room, SPLIT/SCENE/CLIP, need."""
-    scene, clip_seed = scene_of_clip(Path(room), profile, seed)
-    return samples_needed(scene, profile.size, profile.quality[room.split("/")[0]], clip_seed, options)
-
-
-def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: NeededSpp) -> dict[str, int]:
-    """`measured`, and the samples that further rooms need, until enough rooms are within the bounds of the profile.
+def choose_rooms(profile: DataProfile, seed: int, options: Options) -> dict[str, int]:
+    """The samples a pixel that rooms, SPLIT/SCENE/CLIP, need, until enough are within the bounds of the profile.
 
     Raises BadInput if hardly any room is.
     """
-    needed = dict(measured)
+    needed: dict[str, int] = {}
     for split, quality in profile.quality.items():
         wanted = profile.rooms.get(split, 0)
         while quality.skips_noisy_rooms:
@@ -77,5 +71,6 @@ def choose_rooms(profile: DataProfile, seed: int, options: Options, measured: Ne
                 bound = f"{quality.floor:g} dB within {quality.most_spp} spp"
                 raise BadInput(f"fewer than {wanted} in {MAX_PILOTS * wanted} rooms reach {bound}: allow more samples")
             for room in tqdm(sorted(unknown), f"pilots for {split}", unit="room", leave=False):
-                needed[room] = needed_for(profile, room, seed, options)
+                scene, clip_seed = scene_of_clip(Path(room), profile, seed)
+                needed[room] = samples_needed(scene, profile.size, quality, clip_seed, options)
     return needed

@@ -13,7 +13,6 @@ from datasets.clip import SCHEMA, SPLITS, ClipKind
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.profiles import DataProfile, profile_of, source_of
-from render.scene_file.description import SplitRequest
 from render.scene_file.load import own_scene
 from scenes.animation import Scene, frozen
 from scenes.registry import build_scene
@@ -77,30 +76,17 @@ def plan(
     }
 
 
-def clip_seed(seed: int, scene: str, split: str, number: int) -> int:
-    """The 64-bit seed of a clip, independent of other clips. `seed` is that of the dataset."""
-    words = [seed, zlib.crc32(scene.encode()), zlib.crc32(split.encode()), number]
-    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
-
-
 def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tuple[Scene, int]:
-    """The scene and the seed of the clip whose path ends in SPLIT/SCENE/CLIP.
+    """The scene and the 64-bit seed, independent of other clips, of the clip whose path ends in SPLIT/SCENE/CLIP.
 
     Raises BadInput for an unknown scene or clip name, and for a user's own scene that cannot be used.
     """
     split, scene_name, clip_name = folder.parts[-3:]
     kind = ClipKind.of(clip_name)
-    seed = clip_seed(dataset_seed, scene_name, split, kind.number)
+    words = [dataset_seed, zlib.crc32(scene_name.encode()), zlib.crc32(split.encode()), kind.number]
+    seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
     if profile.own is None:
         scene = build_scene(scene_name, seed, profile.size[0])
     else:
-        scene = clip_of_own_scene(profile.own, split, kind.number, profile.size[0], seed)
+        scene = own_scene(profile.own).clip(split, kind.number, profile.size[0], seed)
     return (frozen(scene) if kind.still else scene), seed
-
-
-def clip_of_own_scene(path: Path, split: str, number: int, frames: int, seed: int) -> Scene:
-    """A clip of the scene that a TOML describes; the first test clip begins with the file's camera."""
-    own = own_scene(path)
-    camera = own.described.splits.get(split, SplitRequest()).camera
-    by_keyframes = camera == "keyframes" or (camera is None and bool(own.described.camera))
-    return own.clip(frames, seed, by_keyframes, from_here=split == "test" and number == 0)

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from msgspec.structs import asdict
+
 from datasets.clip import SPLITS
 from errors import BadInput
-from render.scene_file.description import SplitRequest, read_description
+from render.scene_file.description import read_description
 from scenes.glass import SETTINGS
 
 
@@ -41,8 +43,7 @@ DATA_PROFILES = {
         boxes=dict.fromkeys(SPLITS, 1),
         quality={
             "train": SamplingQuality(realisations=2, reference_spp=64),
-            "val": SamplingQuality(realisations=1, reference_spp=128),
-            "test": SamplingQuality(realisations=1, reference_spp=128),
+            **dict.fromkeys(("val", "test"), SamplingQuality(realisations=1, reference_spp=128)),
         },
     ),
     "quick": DataProfile(
@@ -85,28 +86,15 @@ DATA_PROFILES = {
 }
 
 
-# Defaults of a user's own scene.
-OWN_CLIPS = {"train": 4, "val": 1, "test": 1}
-OWN_QUALITY = {
-    "train": SamplingQuality(realisations=4, reference_spp=128),
-    "val": SamplingQuality(realisations=1, reference_spp=256),
-    "test": SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048),
-}
-
-
 def own_profile(path: Path) -> DataProfile:
     """The profile in the TOML of a user's own scene. Raises BadInput, naming the file, if it cannot be used."""
     described = read_description(path)
     name = re.sub(r"[^\w-]", "_", path.stem)
     clips: dict[str, list[str]] = {}
     quality: dict[str, SamplingQuality] = {}
-    for split in SPLITS:
-        request = described.splits.get(split, SplitRequest())
-        count = OWN_CLIPS[split] if request.clips is None else request.clips
-        clips[split] = [f"{name}/{number:03d}" for number in range(count)]
-        settings = {key: getattr(request, key) for key in ("realisations", "reference_spp", "floor", "most_spp")}
-        given = {key: value for key, value in settings.items() if value is not None}
-        quality[split] = OWN_QUALITY[split]._replace(**given)
+    for split, wanted in asdict(described.splits).items():
+        clips[split] = [f"{name}/{number:03d}" for number in range(wanted.clips)]
+        quality[split] = SamplingQuality(wanted.realisations, wanted.reference_spp, wanted.floor, wanted.most_spp)
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
     width, height = described.resolution

@@ -1,6 +1,6 @@
 """Scene files as plain data: shapes, lights and a camera as Mitsuba dictionaries."""
 
-from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,38 +33,48 @@ def turned_to_y(described: Properties) -> Properties:
     return described | {"to_world": described.get("to_world", np.eye(4)) @ turn}
 
 
-@dataclass
 class SceneFile:
-    """The content of a scene file; `notes` list what is not honoured, and its stand-ins."""
+    """The content of a Mitsuba XML file; `notes` list what is not honoured, and its stand-ins.
 
-    path: Path
-    shapes: list[StockShape] = field(default_factory=list)
-    lights: list[StockLight] = field(default_factory=list)
-    sensor: Properties | None = None
-    max_depth: int | None = None
-    notes: list[str] = field(default_factory=list)
-
-
-class Converter:
-    """Converts a Mitsuba XML file to dictionaries; a node with several references is one shared dictionary.
-
-    Raises BadInput, naming the file, if it cannot be used.
+    A node with several references is one shared dictionary. Raises BadInput, naming the file, if it cannot be used, or
+    if nothing is left to render.
     """
 
     def __init__(self, path: Path):
-        self.root = path.resolve().parent
         self.parsed = ParsedFile(path)
+        self.path = self.parsed.path
         self.state = self.parsed.state
-        self.made: dict[int, Properties | None] = {}
-        self.file = SceneFile(path.resolve(), notes=self.parsed.notes)
+        self.shapes: list[StockShape] = []
+        self.lights: list[StockLight] = []
+        self.sensor: Properties | None = None
+        self.max_depth: int | None = None
+        self.notes = self.parsed.notes
         self.names = Names()
+        self.described = cache(self.describe)
+        adders = {
+            "Shape": self.add_shape,
+            "Sensor": self.add_sensor,
+            "Integrator": self.add_integrator,
+            "Emitter": self.add_light,
+        }
+        for _, index in self.children(self.state.root):
+            kind = self.kind(index)
+            if kind in adders:
+                adders[kind](index)
+            elif kind not in ("BSDF", "Texture", *RENDERER_SETTINGS):
+                self.note(f"a {kind.lower()} is left out", self.state.nodes[index])
+        if not self.shapes:
+            raise BadInput("; ".join([f"{self.path} has no shape to render", *self.notes]))
+        if not self.lights and not any(shape.emitter for shape in self.shapes):
+            self.note("there is no light: a uniform white sky instead")
+            self.lights.append(StockLight(self.names.unique("white-sky"), WHITE_SKY))
 
     def note(self, text: str, node: mi.parser.SceneNode | None = None) -> None:
         """Add a note, on a node by its id, its file, or its plugin."""
         if node is not None:
             name = node.props.id() or str(node.props.get("filename", "")) or node.props.plugin_name()
             text = f"{name}{self.parsed.line_of(node)}: {text}"
-        self.file.notes.append(text)
+        self.notes.append(text)
 
     def kind(self, index: int) -> str:
         return str(self.state.nodes[index].type).rpartition(".")[2]
@@ -74,13 +84,8 @@ class Converter:
         props = node.props
         return [(key, props[key].index()) for key in props if props.type(key) == mi.Properties.Type.ResolvedReference]
 
-    def described(self, index: int) -> Properties | None:
-        """The dictionary of a node, the same at each call; None if it is left out."""
-        if index not in self.made:
-            self.made[index] = self.describe(index)
-        return self.made[index]
-
     def describe(self, index: int) -> Properties | None:
+        """The dictionary of a node, which is `described` once; None if it is left out."""
         node = self.state.nodes[index]
         kind = self.kind(index)
         plugin = node.props.plugin_name()
@@ -130,12 +135,9 @@ class Converter:
                 return np.array(value.matrix, np.float64)
             case "Vector":
                 return np.array(value).tolist()
-            case "Spectrum":
-                if not value.is_uniform():
-                    self.note(f"the spectrum '{key}' is rendered as red, green and blue", node)
-                return value
-            case _:
-                return value
+            case "Spectrum" if not value.is_uniform():
+                self.note(f"the spectrum '{key}' is rendered as red, green and blue", node)
+        return value
 
     def with_files(self, node: mi.parser.SceneNode, kind: str, described: Properties) -> Properties | None:
         """The dictionary with the full path of its file, or a stand-in if that is missing."""
@@ -143,7 +145,7 @@ class Converter:
             return described
         name = str(described["filename"])
         for folder in self.parsed.searched:
-            path = inside(self.root, str(folder / name), self.file.path)
+            path = inside(self.path.parent, str(folder / name), self.path)
             if path.is_file():
                 return described | {"filename": str(path)}
         replacements: dict[str, StandIn] = {
@@ -187,11 +189,11 @@ class Converter:
                 elif value is not None:
                     parts[kind] = value
         name = self.unique_name(node)
-        self.file.shapes.append(StockShape(name, described, parts.get("BSDF"), parts.get("Emitter")))
+        self.shapes.append(StockShape(name, described, parts.get("BSDF"), parts.get("Emitter")))
 
     def add_sensor(self, index: int) -> None:
         node = self.state.nodes[index]
-        if self.file.sensor is not None:
+        if self.sensor is not None:
             self.note("a further sensor is left out: the first one is the camera", node)
             return
         described = self.described(index)
@@ -202,7 +204,7 @@ class Converter:
             self.note("a lens: a pinhole instead, without depth of field", node)
         if "near_clip" in described or "far_clip" in described:
             self.note("near_clip and far_clip: nothing is clipped", node)
-        self.file.sensor = described
+        self.sensor = described
 
     def add_light(self, index: int) -> None:
         """Add a light that belongs to no shape."""
@@ -213,10 +215,10 @@ class Converter:
         if light["type"] in SURFACE_LIGHTS:
             self.note("a light for surfaces, but on none: left out", node)
             return
-        if light["type"] in SKIES and any(other.emitter["type"] in SKIES for other in self.file.lights):
+        if light["type"] in SKIES and any(other.emitter["type"] in SKIES for other in self.lights):
             self.note("a second sky is left out: there can be only one", node)
             return
-        self.file.lights.append(StockLight(self.unique_name(node), light))
+        self.lights.append(StockLight(self.unique_name(node), light))
 
     def add_integrator(self, index: int) -> None:
         props = self.state.nodes[index].props
@@ -228,27 +230,6 @@ class Converter:
             self.note(f"the integrator '{props.plugin_name()}': path tracing instead")
         depth = props.get("max_depth", None)
         if isinstance(depth, int) and depth > 0:
-            self.file.max_depth = depth
+            self.max_depth = depth
         elif props.plugin_name() == "direct":
-            self.file.max_depth = 2
-
-    def convert(self) -> SceneFile:
-        """The whole file. Raises BadInput if nothing is left to render."""
-        adders = {
-            "Shape": self.add_shape,
-            "Sensor": self.add_sensor,
-            "Integrator": self.add_integrator,
-            "Emitter": self.add_light,
-        }
-        for _, index in self.children(self.state.root):
-            kind = self.kind(index)
-            if kind in adders:
-                adders[kind](index)
-            elif kind not in ("BSDF", "Texture", *RENDERER_SETTINGS):
-                self.note(f"a {kind.lower()} is left out", self.state.nodes[index])
-        if not self.file.shapes:
-            raise BadInput("; ".join([f"{self.file.path} has no shape to render", *self.file.notes]))
-        if not self.file.lights and not any(shape.emitter for shape in self.file.shapes):
-            self.note("there is no light: a uniform white sky instead")
-            self.file.lights.append(StockLight(self.names.unique("white-sky"), WHITE_SKY))
-        return self.file
+            self.max_depth = 2

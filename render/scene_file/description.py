@@ -1,6 +1,5 @@
 """The TOML description of a user's own scene: its file, camera flight, motion and what to render."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +8,17 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import asdict
+from numpy.typing import ArrayLike
 
-from datasets.clip import SPLITS
 from errors import BadInput
 from scenes.animation import Camera, FreeMotion, KeyframedTrack
 from scenes.camera import Array
 
-Vector = tuple[float, float, float]
+LARGEST = 1e18  # of all numbers: its square is a finite float32; and none is NaN
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Count = Annotated[int, Meta(ge=0)]
 Positive = Annotated[int, Meta(ge=1)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame, 1 its last
 Even = Annotated[int, Meta(ge=2, multiple_of=2)]
@@ -47,7 +50,7 @@ class GainKey(Table):
     """The brightness of a light at a time, relative to the file."""
 
     time: Fraction
-    gain: Annotated[float, Meta(ge=0)]
+    gain: Annotated[float, Meta(ge=0, le=LARGEST)]
 
 
 class Motion(Table):
@@ -60,15 +63,32 @@ class LightChange(Table):
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
 
-class SplitRequest(Table):
-    """The clips of a split, with the defaults of docs/scenes.md."""
+class Split(Table, frozen=True):
+    """The clips of a split, and how they are sampled."""
 
-    clips: Annotated[int, Meta(ge=0)] | None = None
-    camera: Literal["auto", "keyframes"] | None = None
-    realisations: Positive | None = None
-    reference_spp: Even | None = None
-    floor: Annotated[float, Meta(gt=0)] | None = None  # dB
-    most_spp: Even | None = None
+    clips: Count = 1
+    camera: Literal["auto", "keyframes"] | None = None  # by default by keyframes, where there are any
+    realisations: Positive = 1
+    reference_spp: Even = 256
+    floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = None  # dB
+    most_spp: Even = 4096
+
+
+class TrainSplit(Split, frozen=True):
+    clips: Count = 4
+    realisations: Positive = 4
+    reference_spp: Even = 128
+
+
+class TestSplit(Split, frozen=True):
+    floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = 35.0
+    most_spp: Even = 2048
+
+
+class Splits(Table, frozen=True):
+    train: TrainSplit = TrainSplit()
+    val: Split = Split()
+    test: TestSplit = TestSplit()
 
 
 class Description(Table):
@@ -79,7 +99,7 @@ class Description(Table):
     camera: list[CameraKey] = []
     motion: list[Motion] = []
     light: list[LightChange] = []
-    splits: dict[str, SplitRequest] = {}  # train, val, test
+    splits: Splits = Splits()
 
 
 def read_description(path: Path) -> Description:
@@ -90,28 +110,20 @@ def read_description(path: Path) -> Description:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
-    try:
-        json.dumps(msgspec.to_builtins(described), allow_nan=False)
-    except ValueError:
-        raise BadInput(f"{path}: a number is infinite or not a number") from None
-    unknown = set(described.splits) - set(SPLITS)
-    if unknown:
-        raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
     all_keys: list[Sequence[CameraKey | PoseKey | GainKey]] = [described.camera]
-    all_keys += [motion.keyframes for motion in described.motion]
-    all_keys += [change.keyframes for change in described.light]
+    all_keys += [moving.keyframes for moving in (*described.motion, *described.light)]
     for times in ([key.time for key in keys] for keys in all_keys):
         if times != sorted(set(times)):
             raise BadInput(f"{path}: the times {times} of keyframes do not increase: put them in order, each time once")
     for names in ([motion.shape for motion in described.motion], [change.light for change in described.light]):
         if len(set(names)) < len(names):
             raise BadInput(f"{path}: '{max(names, key=names.count)}' has keyframes twice: merge them into one table")
-    if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
+    if any(split.camera == "keyframes" for split in asdict(described.splits).values()) and not described.camera:
         raise BadInput(f"{path}: a split's camera uses keyframes, but there are none: add [[camera]] tables")
     return described
 
 
-def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:
+def spline(values: ArrayLike, times: list[float], frames: int) -> KeyframedTrack:
     """The track through `values` at `times`, fractions of a clip of so many frames."""
     return KeyframedTrack(np.array(values, np.float64), times=np.array(times) * (frames - 1))
 
@@ -132,8 +144,7 @@ def camera_of(keys: list[CameraKey], file: Camera, frames: int) -> Camera:
 def motion_of(keys: list[PoseKey], pivot: Array, frames: int) -> FreeMotion:
     """The motion of a shape that rotates about `pivot` (3,), its centre in the file."""
     times = [key.time for key in keys]
-    turns = spline([key.rotation for key in keys], times, frames)
-    turns = replace(turns, keys=np.radians(turns.keys))
+    turns = spline(np.radians([key.rotation for key in keys]), times, frames)
     return FreeMotion(pivot, spline([key.position for key in keys], times, frames), turns)
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend import dr, mi
-from render.loading import upload
+from render.loading import corners, upload
 from render.stage import Stage
 from scenes.animation import Camera, Track
 from scenes.camera import Array, View, directions, intrinsics, look_at, pixel_centres
@@ -36,9 +36,7 @@ class Space:
 
     def __init__(self, stage: Stage):
         self.stage = stage
-        box = stage.mitsuba_scene.bbox()
-        self.low = np.array(box.min, np.float64).ravel() * stage.unit
-        self.high = np.array(box.max, np.float64).ravel() * stage.unit
+        self.low, self.high = corners(stage.mitsuba_scene.bbox()) * stage.unit
         self.size = float(np.linalg.norm(self.high - self.low)) or 1.0  # of a single point
 
     def distances(self, origins: Array, towards: Array) -> Array:

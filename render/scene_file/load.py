@@ -9,12 +9,12 @@ import numpy as np
 
 from errors import BadInput
 from render.backend import mi
-from render.loading import columns, mitsuba_reason
+from render.loading import columns, corners, mitsuba_reason
 from render.path import PathTracer
-from render.scene_file.convert import Converter
+from render.scene_file.convert import SceneFile
 from render.scene_file.description import camera_of, gain_of, motion_of, read_description
 from render.scene_file.flight import Space, fly
-from render.scene_file.mesh_file import load_mesh_file
+from render.scene_file.mesh_file import MeshFile
 from render.specular_light import specular_light
 from render.stage import MAX_EVENTS, Stage
 from scenes.animation import Camera, KeyframedTrack, Scene, Shape
@@ -124,7 +124,7 @@ class OwnScene:
         self.notes += note_on_depth(self.stage, self.scene)
 
     def from_xml(self) -> tuple[Scene, list[str]]:
-        found = Converter(self.file).convert()
+        found = SceneFile(self.file)
         camera, notes = DEFAULT_CAMERA, [*found.notes]
         if found.sensor:
             try:
@@ -136,7 +136,7 @@ class OwnScene:
         return Scene((), camera, depth, stock=tuple(found.shapes), lights=tuple(found.lights)), notes
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
-        found = load_mesh_file(self.file, self.width / self.height)
+        found = MeshFile(self.file, self.width / self.height)
         return Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky), found.notes
 
     def check_names(self) -> None:
@@ -153,17 +153,26 @@ class OwnScene:
                 listed = f"there are {', '.join(sorted(names)[:20])}{more}" if names else "there are none"
                 raise BadInput(f"{self.path}: there is no {kind} '{name}'; {listed}")
 
-    def clip(self, frames: int, seed: int, by_keyframes: bool, from_here: bool) -> Scene:
-        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes."""
-        if by_keyframes:
+    def clip(self, split: str, number: int, frames: int, seed: int) -> Scene:
+        """The scene of a clip, with a camera by the keyframes of the TOML, or a flight as flight.fly describes.
+
+        The first test clip begins with the file's camera. Raises BadInput, naming the TOML, if keyframes give no valid
+        view of a frame.
+        """
+        chosen = getattr(self.described.splits, split).camera
+        if chosen == "keyframes" or (chosen is None and self.described.camera):
             camera = camera_of(self.described.camera, self.scene.camera, frames)
-            check_camera(camera, frames, self.path)
+            for frame in range(frames):
+                pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
+                if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
+                    faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
+                    raise BadInput(f"{self.path}: in frame {frame} the camera's {faults}: change its keyframes")
         else:
-            camera = fly(self.stage, self.scene.camera, frames, seed, from_here)
+            camera = fly(self.stage, self.scene.camera, frames, seed, from_here=(split, number) == ("test", 0))
         scene = self.scene
-        by_name = {shape.name: loaded for shape, loaded in zip(scene.meshes, self.stage.shapes, strict=True)}
+        boxes = {shape.id(): corners(shape.bbox()) * self.stage.unit for shape in self.stage.shapes}
         motions = {
-            motion.shape: motion_of(motion.keyframes, centre_of(by_name[motion.shape]) * self.stage.unit, frames)
+            motion.shape: motion_of(motion.keyframes, boxes[motion.shape].mean(axis=0), frames)
             for motion in self.described.motion
         }
         gains = {change.light: gain_of(change.keyframes, frames) for change in self.described.light}
@@ -178,28 +187,10 @@ class OwnScene:
         )
 
 
-def check_camera(camera: Camera, frames: int, path: Path) -> None:
-    """Raise BadInput, naming the TOML, if a camera by keyframes has no valid view."""
-    for frame in range(frames):
-        pose = look_at(camera.eye.at(frame), camera.target.at(frame), camera.up.at(frame))
-        if not np.isfinite(pose).all() or not 0 < camera.x_fov.at(frame) < 180:
-            faults = "position equals its target, its up is its viewing axis, or its fov is 180 degrees or more"
-            raise BadInput(f"{path}: in frame {frame} the camera's {faults}: change its keyframes")
-
-
 def brightened(shape: Shape, gain: KeyframedTrack | None) -> Shape:
     if gain is None or shape.radiance is None:
         return shape
     return replace(shape, radiance=replace(gain, keys=np.outer(gain.keys, shape.radiance.at(0))))
 
 
-def centre_of(shape: mi.Shape) -> Array:
-    """The centre (3,) of a shape's bounding box, about which it rotates, in Mitsuba's units."""
-    box = shape.bbox()
-    return (np.array(box.min, np.float64) + np.array(box.max, np.float64)).ravel() / 2
-
-
-@lru_cache(maxsize=1)
-def own_scene(path: Path) -> OwnScene:
-    """The scene that a TOML describes, read once for all of its clips."""
-    return OwnScene(path)
+own_scene = lru_cache(maxsize=1)(OwnScene)  # read once for all of its clips

@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +27,6 @@ from scenes.sky import sky
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply")
 SUN = np.array([0.4, 0.8, 0.45])  # the direction to it, y up
-
-
-@dataclass
-class MeshFile:
-    shapes: list[Shape] = field(default_factory=list)
-    camera: Camera | None = None
-    sky: Array | None = None
-    notes: list[str] = field(default_factory=list)
 
 
 class InsideResolver(FilePathResolver):
@@ -188,8 +179,7 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
     scene = None
     damage = ""
     try:
-        with warnings.catch_warnings(), collected_problems() as problems:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), collected_problems() as problems:
             scene = trimesh.load_scene(path, resolver=resolver, process=False)
     except Exception as error:  # its readers raise many kinds of exceptions for damaged files
         damage = " ".join(f"{type(error).__name__}: {error}"[:200].split())
@@ -231,33 +221,36 @@ def camera_of(scene: trimesh.Scene, aspect: float) -> Camera | None:
     return Camera.at_rest(eye, eye - axes[:, 2], float(x_fov), axes[:, 1])
 
 
-def load_mesh_file(path: Path, aspect: float) -> MeshFile:
-    """All meshes of a file, and its camera for images of that `aspect` (width over height); a clear sky if unlit.
+class MeshFile:
+    """All meshes of a file, and its camera for images of an `aspect` (width over height); a clear sky if unlit.
 
-    Raises BadInput, naming the file, if it is missing, damaged or empty.
+    `notes` list what is not honoured. Raises BadInput, naming the file, if it is missing, damaged or empty.
     """
-    scene, notes = load_scene(path)
-    found = MeshFile(camera=camera_of(scene, aspect), notes=notes)
-    names = Names()
-    for node in scene.graph.nodes_geometry:
-        transform, geometry = scene.graph[node]
-        mesh = scene.geometry[geometry]
-        name = names.unique(str(node))
-        if not isinstance(mesh, trimesh.Trimesh):
-            found.notes.append(f"{name}: no mesh, but a {type(mesh).__name__}: left out")
-            continue
-        mesh = mesh.copy(include_cache=True)
-        mesh.apply_transform(transform)
-        if not len(mesh.faces) or not np.abs(mesh.vertices).max() < MAX_EXTENT:
-            raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces or non-finite vertices")
-        bsdf, radiance = bsdf_of(mesh, name, found.notes)
-        if not isinstance(mesh.visual, TextureVisuals):
-            mesh.visual = TextureVisuals()
-        emission = None if radiance is None else Track.constant(radiance)
-        found.shapes.append(Shape(name, mesh, bsdf, emission, smooth=True))
-    if not found.shapes:
-        raise BadInput("; ".join([f"{path} has no mesh to render", *found.notes]))
-    if not any(shape.radiance for shape in found.shapes):
-        found.notes.append("there is no light: a clear sky with the sun, y up")
-        found.sky = sky(np.random.default_rng(0), SUN)
-    return found
+
+    def __init__(self, path: Path, aspect: float):
+        scene, self.notes = load_scene(path)
+        self.camera = camera_of(scene, aspect)
+        self.shapes: list[Shape] = []
+        self.sky: Array | None = None
+        names = Names()
+        for node in scene.graph.nodes_geometry:
+            transform, geometry = scene.graph[node]
+            mesh = scene.geometry[geometry]
+            name = names.unique(str(node))
+            if not isinstance(mesh, trimesh.Trimesh):
+                self.notes.append(f"{name}: no mesh, but a {type(mesh).__name__}: left out")
+                continue
+            mesh = mesh.copy(include_cache=True)
+            mesh.apply_transform(transform)
+            if not len(mesh.faces) or not np.abs(mesh.vertices).max() < MAX_EXTENT:
+                raise BadInput(f"{path}: mesh '{name}' is empty or damaged: it has no faces or non-finite vertices")
+            bsdf, radiance = bsdf_of(mesh, name, self.notes)
+            if not isinstance(mesh.visual, TextureVisuals):
+                mesh.visual = TextureVisuals()
+            emission = None if radiance is None else Track.constant(radiance)
+            self.shapes.append(Shape(name, mesh, bsdf, emission, smooth=True))
+        if not self.shapes:
+            raise BadInput("; ".join([f"{path} has no mesh to render", *self.notes]))
+        if not any(shape.radiance for shape in self.shapes):
+            self.notes.append("there is no light: a clear sky with the sun, y up")
+            self.sky = sky(np.random.default_rng(0), SUN)

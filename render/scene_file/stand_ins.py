@@ -135,16 +135,14 @@ def renamed(described: Properties, **names: str | None) -> Properties:
 OLD_PLUGINS: dict[str, Callable[[Properties], StandIn]] = {
     "phong": phong,
     "ward": ward,
-    "coating": coated,
-    "roughcoating": coated,
+    **dict.fromkeys(("coating", "roughcoating"), coated),
     "mixturebsdf": mixture,
     "bump": with_properties("bumpmap, its current name", type="bumpmap"),
     "sky": old_sky,
     "sun": old_sun,
     "scale": scaled,
     "gridtexture": with_properties("a checkerboard", type="checkerboard"),
-    "ldrtexture": with_properties("bitmap, its current name", type="bitmap"),
-    "exrtexture": with_properties("bitmap, its current name", type="bitmap"),
+    **dict.fromkeys(("ldrtexture", "exrtexture"), with_properties("bitmap, its current name", type="bitmap")),
     "perspective_rdist": with_properties("a perspective camera without distortion", type="perspective"),
 }
 
@@ -184,12 +182,12 @@ def dark_group(described: Properties) -> StandIn | None:
     shapes = {key: value for key, value in described.items() if isinstance(value, dict)}
     if not shapes:
         return None, "a group without shapes is left out"
-    dark = {key: without_emitters(value) for key, value in shapes.items()}
+
+    def emits(part: Any) -> bool:
+        return isinstance(part, dict) and part["type"] in SURFACE_LIGHTS
+
+    dark = {name: {key: part for key, part in shape.items() if not emits(part)} for name, shape in shapes.items()}
     return None if dark == shapes else (described | dark, "instanced shapes do not emit light")
-
-
-def without_emitters(shape: Properties) -> Properties:
-    return {key: v for key, v in shape.items() if not (isinstance(v, dict) and v["type"] in SURFACE_LIGHTS)}
 
 
 def tabulated(wavelengths: Any, values: Any) -> StandIn:
@@ -265,17 +263,13 @@ def valid_lens(described: Properties) -> StandIn | None:
 # By plugins of this Mitsuba: the stand-in if an object cannot be rendered as described, else None;
 # its description is empty where that makes no difference.
 REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
-    "bumpmap": without_relief,
-    "normalmap": without_relief,
+    **dict.fromkeys(("bumpmap", "normalmap"), without_relief),
     # Mitsuba crashes without a volume, and without a file or values.
     "volume": lambda described: None if has_volume(described) else (GREY, "grey, because its volume is missing"),
     "bitmap": valid_bitmap,
     "conductor": valid_metal,
-    "roughconductor": valid_microfacets,
-    "roughdielectric": valid_microfacets,
-    "roughplastic": valid_microfacets,
-    "perspective": valid_lens,
-    "thinlens": valid_lens,
+    **dict.fromkeys(("roughconductor", "roughdielectric", "roughplastic"), valid_microfacets),
+    **dict.fromkeys(("perspective", "thinlens"), valid_lens),
     "spot": spot_without_texture,
     "shapegroup": dark_group,
     "instance": lambda described: None if nested(described) else (None, "an instance of nothing is left out"),

@@ -1,8 +1,7 @@
 """Parses Mitsuba's XML files of this and earlier versions; nothing outside of their folder is read."""
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 from xml.etree import ElementTree
@@ -35,9 +34,11 @@ def inside(root: Path, name: str, source: Path) -> Path:
 
 
 class LocatedElement(Element):
-    """An element that remembers its file and line."""
+    """An element that remembers its `place`: its file and line."""
 
-    place = ""
+    def __init__(self, tag: str, attributes: dict[str, str], place: str):
+        super().__init__(tag, attributes)
+        self.place = place
 
 
 def elements_of(file: Path, content: bytes) -> LocatedElement:
@@ -47,17 +48,16 @@ def elements_of(file: Path, content: bytes) -> LocatedElement:
     parser = expat.ParserCreate()
     opened: list[Element] = []
 
-    def element(tag: str, attributes: dict[str, str]) -> LocatedElement:
-        made = LocatedElement(tag, attributes)
-        made.place = f"{file} line {parser.CurrentLineNumber}"
-        return made
-
     def start(tag: str, attributes: dict[str, str]) -> None:
         opened.append(builder.start(tag, attributes))
         if len(opened) > MAX_ELEMENT_DEPTH:
             raise BadInput(f"{file}: more than {MAX_ELEMENT_DEPTH} elements within each other")
 
-    builder = ElementTree.TreeBuilder(element_factory=element)
+    builder = ElementTree.TreeBuilder(
+        element_factory=lambda tag, attributes: LocatedElement(
+            tag, attributes, f"{file} line {parser.CurrentLineNumber}"
+        )
+    )
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda tag: (builder.end(tag), opened.pop())
     parser.CharacterDataHandler = builder.data
@@ -68,71 +68,7 @@ def elements_of(file: Path, content: bytes) -> LocatedElement:
     return cast(LocatedElement, builder.close())
 
 
-class IncludeReader:
-    """Reads a scene file and all that it includes; `searched` are the folders in which they search for files.
-
-    Raises BadInput unless they are XML of bounded size and name nothing outside of their folder.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.searched = [path.parent]
-        self.bytes = 0
-        self.included = -1
-
-    def read(self, file: Path, depth: int = 0) -> LocatedElement:
-        """The root of `file`, with the content of included files of its version in place."""
-        self.included += 1
-        if depth > MAX_INCLUDE_DEPTH or self.included > MAX_INCLUDES:
-            limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
-            raise BadInput(f"{self.path} includes more than {limits}: merge some")
-        try:
-            content = file.read_bytes()
-        except OSError as error:
-            raise BadInput(f"{file} cannot be read: {error.strerror}") from None
-        self.bytes += len(content)
-        if self.bytes > MAX_BYTES:
-            raise BadInput(f"{self.path}: more than {MAX_BYTES >> 20} MiB of XML")
-        root = elements_of(file, content)
-        for parent in [*root.iter()]:
-            for child in [*parent]:
-                name = child.get("value" if child.tag == "path" else "filename")
-                if child.tag not in ("path", "include", "spectrum") or name is None:
-                    continue
-                if "$" in name:
-                    raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
-                named = inside(self.path.parent, name, file)
-                if child.tag == "path":
-                    self.searched.append(named)
-                elif child.tag == "include":
-                    part = self.read(named, depth + 1)
-                    if part.get("version") == root.get("version"):
-                        place = [*parent].index(child)
-                        parent[place : place + 1] = [*part]
-        return root
-
-
-@contextmanager
-def searched_in(folder: Path) -> Iterator[None]:
-    """Within the context Mitsuba searches `folder` first."""
-    resolver = mi.file_resolver()  # type: ignore[operator]
-    before = [resolver[i] for i in range(len(resolver))]
-    resolver.prepend(str(folder))
-    try:
-        yield
-    finally:
-        resolver.clear()
-        for path in before:
-            resolver.append(path)
-
-
 # --- Elements of old files --------------------------------------------------------------------------------------------
-
-Upgrade = Callable[[LocatedElement, Path], tuple[Element, str]]  # the element instead, and a note
-
-
-def split_numbers(text: str) -> list[str]:
-    return text.replace(",", " ").split()
 
 
 def linear_colour(colour: str) -> str:
@@ -140,22 +76,17 @@ def linear_colour(colour: str) -> str:
     if colour.startswith("#"):
         encoded = np.array([*bytes.fromhex(colour[1:7])]) / 255
     else:
-        encoded = np.array([float(value) for value in split_numbers(colour)])
+        encoded = np.array([float(value) for value in colour.replace(",", " ").split()])
     return ", ".join(f"{value:.6f}" for value in srgb_to_linear(encoded))
 
 
 def named_like(element: LocatedElement, tag: str, **attributes: str) -> LocatedElement:
     """Another element under the same name, at the same place."""
-    made = LocatedElement(tag, {"name": element.get("name", "")} | attributes)
-    made.place = element.place
-    return made
+    return LocatedElement(tag, {"name": element.get("name", "")} | attributes, element.place)
 
 
 def with_parameters(element: LocatedElement, tag: str = "float", **parameters: str) -> LocatedElement:
-    for name, value in parameters.items():
-        parameter = LocatedElement(tag, {"name": name, "value": value})
-        parameter.place = element.place
-        element.append(parameter)
+    element.extend(named_like(element, tag, name=name, value=value) for name, value in parameters.items())
     return element
 
 
@@ -193,7 +124,7 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     if file is not None and not (folder / file).exists():
         note = f"the file {file} of a spectrum is missing: 0.5 everywhere instead"
         return named_like(element, "spectrum", value="0.5"), note
-    values = split_numbers(element.get("value", ""))
+    values = element.get("value", "").replace(",", " ").split()
     if len(values) < 3 or any(":" in value for value in values):
         return element, ""
     if len(values) == 3:
@@ -203,7 +134,8 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     return with_parameters(regular, "string", values=", ".join(values)), ""
 
 
-UPGRADES: dict[str, Upgrade] = {
+# The element instead, and a note.
+UPGRADES: dict[str, Callable[[LocatedElement, Path], tuple[Element, str]]] = {
     "subsurface": old_subsurface,
     "animation": old_animation,
     "srgb": old_srgb,
@@ -242,26 +174,64 @@ def upgrade(root: LocatedElement, folder: Path) -> list[str]:
 class ParsedFile:
     """The nodes of a scene file with references resolved; `searched` are the folders for its files.
 
-    `notes` list omissions. Raises BadInput, naming file, line and element, if it is invalid.
+    `notes` list omissions. Raises BadInput, naming file, line and element, if it is invalid, and unless all files that
+    it includes are XML of bounded size and name nothing outside of their folder.
     """
 
     def __init__(self, path: Path):
-        path = path.resolve()
-        reader = IncludeReader(path)
-        self.searched = reader.searched
+        self.path = path.resolve()
+        self.searched = [self.path.parent]
+        self.bytes = 0
+        self.included = -1
         config = mi.parser.ParserConfig(VARIANT)
         config.unused_parameters = mi.LogLevel.Debug
+        usual_folders = mi.file_resolver()  # type: ignore[operator]
+        folders = mi.FileResolver(usual_folders)
+        folders.prepend(str(self.path.parent))
+        mi.set_file_resolver(folders)
         try:
-            root = reader.read(path)
-            self.notes = upgrade(root, path.parent)
+            root = self.read(self.path)
+            self.notes = upgrade(root, self.path.parent)
             self.elements = [element for element in root.iter() if isinstance(element, LocatedElement)]
             self.text = ElementTree.tostring(root, "unicode")
-            with searched_in(path.parent):
-                self.state = mi.parser.parse_string(config, self.text)
-                mi.parser.transform_upgrade(config, self.state)
-                mi.parser.transform_resolve_references(config, self.state)
+            self.state = mi.parser.parse_string(config, self.text)
+            mi.parser.transform_upgrade(config, self.state)
+            mi.parser.transform_resolve_references(config, self.state)
         except (RuntimeError, ValueError) as error:
-            raise BadInput(f"{path} cannot be read: {self.reason(error)}") from None
+            raise BadInput(f"{self.path} cannot be read: {self.reason(error)}") from None
+        finally:
+            mi.set_file_resolver(usual_folders)
+
+    def read(self, file: Path, depth: int = 0) -> LocatedElement:
+        """The root of `file`, with the content of included files of its version in place."""
+        self.included += 1
+        if depth > MAX_INCLUDE_DEPTH or self.included > MAX_INCLUDES:
+            limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
+            raise BadInput(f"{self.path} includes more than {limits}: merge some")
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise BadInput(f"{file} cannot be read: {error.strerror}") from None
+        self.bytes += len(content)
+        if self.bytes > MAX_BYTES:
+            raise BadInput(f"{self.path}: more than {MAX_BYTES >> 20} MiB of XML")
+        root = elements_of(file, content)
+        for parent in [*root.iter()]:
+            for child in [*parent]:
+                name = child.get("value" if child.tag == "path" else "filename")
+                if child.tag not in ("path", "include", "spectrum") or name is None:
+                    continue
+                if "$" in name:
+                    raise BadInput(f"{file}: the name '{name}' depends on a parameter: write the file's name")
+                named = inside(self.path.parent, name, file)
+                if child.tag == "path":
+                    self.searched.append(named)
+                elif child.tag == "include":
+                    part = self.read(named, depth + 1)
+                    if part.get("version") == root.get("version"):
+                        place = [*parent].index(child)
+                        parent[place : place + 1] = [*part]
+        return root
 
     def element(self, offset: int) -> LocatedElement:
         """The element that begins at an offset in the text, or the last one before it."""

@@ -11,7 +11,6 @@ import pytest
 from datasets.card import CARD_FILE, PAGE_FILE, card_of, page_of
 from datasets.clip import Dataset
 from datasets.info import find_problems
-from render.job.generate import Share
 from tests.helpers.datasets import generate_tiny
 
 
@@ -72,7 +71,7 @@ def test_it_comes_with_the_last_clip_and_harms_nothing(tiny, tiny_copy):
     shutil.rmtree(tiny_copy / "val" / "cornell_box" / "000")
     for name in (CARD_FILE, PAGE_FILE):
         (tiny_copy / name).unlink()
-    assert generate_tiny(tiny_copy, share=Share(1, 6)) == 0
+    assert generate_tiny(tiny_copy, part="1/6") == 0
     assert not (tiny_copy / CARD_FILE).exists()
     assert generate_tiny(tiny_copy) == 1
     assert all((tiny_copy / name).read_bytes() == (tiny / name).read_bytes() for name in (CARD_FILE, PAGE_FILE))

@@ -13,8 +13,7 @@ from datasets.exr import write_exr
 from datasets.frame import read_frame
 from denoise.exr_image import ExrImage
 from denoise.frames import OwnFrameBuilder
-from render.clip import Sampling
-from render.job.clip_job import write_clip
+from render.clip import Sampling, write_clip
 from scenes.animation import Scene
 from tests.helpers.mirrors import FRAMES, HAND_MIRROR, SILVER, SIZE, painted, room
 

@@ -10,8 +10,7 @@ from datasets.frame import Frame, read_frame
 from eval.stress.irradiance_range import ROUNDING, range_violation
 from models import registry
 from models.registry import DENOISERS, channels_read
-from render.clip import Sampling
-from render.job.clip_job import write_clip
+from render.clip import Sampling, write_clip
 from scenes.animation import Scene, Shape, Track
 from tests.helpers.frames import run
 from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, panel, placed, room

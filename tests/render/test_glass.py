@@ -16,9 +16,8 @@ from datasets.exr import write_exr
 from datasets.frame import read_frame
 from denoise.exr_image import ExrImage
 from denoise.frames import OwnFrameBuilder
-from render.clip import Arrays, Sampling, render_clip
+from render.clip import Arrays, Sampling, render_clip, write_clip
 from render.gbuffer import render_gbuffer
-from render.job.clip_job import write_clip
 from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, StockShape, Track
 from scenes.bsdf import Bsdf

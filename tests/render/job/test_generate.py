@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import render.job.clip_job
+import render.clip
+import render.job.generate
 import render.job.plan
 from datasets.clip import Dataset, is_clip
 from datasets.info import summarise
 from errors import BadInput
 from files import locked
-from render.job.clip_job import RenderJob
-from render.job.generate import Share, generate
+from render.job.generate import generate, share_of
 from render.job.plan import plan
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 from tests.helpers.training import full_disk
@@ -119,18 +119,15 @@ def test_two_processes_on_one_folder_share_the_work(tiny, tiny_copy):
 
 
 @pytest.mark.parametrize("count", [4, 8])
-def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path):
+def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path, monkeypatch):
     """Here clips are not rendered: those of the fixture take their place, in the same folder."""
 
-    def copied(jobs: list[RenderJob]):
-        for job in jobs:
-            shutil.copytree(tiny / job.path.relative_to(root), job.path)
-            yield render.job.clip_job.ClipOutcome(job.path, "rendered")
+    def copied(folder: Path, *_: object) -> None:
+        shutil.copytree(tiny.joinpath(*folder.parts[-3:]), folder)
 
+    monkeypatch.setattr(render.job.generate, "render_to_folder", copied)
     roots = [tmp_path / str(index) for index in range(1, count + 1)]
-    counts = []
-    for index, root in enumerate(roots, 1):
-        counts.append(generate_tiny(root, share=Share.parse(f"{index}/{count}"), render=copied))
+    counts = [generate_tiny(root, part=f"{index}/{count}") for index, root in enumerate(roots, 1)]
     assert sum(counts) == 6 and max(counts) - min(counts) <= 1
     merged = tmp_path / "merged"
     for root in roots:
@@ -142,7 +139,7 @@ def test_shares_are_disjoint_and_their_union_is_the_whole(count, tiny, tmp_path)
 @pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "x", "1", "-1/2"])
 def test_invalid_shares_are_refused(text):
     with pytest.raises(BadInput, match="K/N"):
-        Share.parse(text)
+        share_of([], text)
 
 
 def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
@@ -163,7 +160,7 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
 
 def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
     remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
-    genuine = render.job.clip_job.render_clip
+    genuine = render.clip.render_clip
 
     def faulty(scene, *arguments):
         for index, (channels, seconds) in enumerate(genuine(scene, *arguments)):
@@ -172,7 +169,7 @@ def test_non_finite_samples_are_counted_and_reported(tiny_copy, monkeypatch):
                 channels["indirect_reference"][1, 0, 0, 2] = np.inf
             yield channels, seconds
 
-    monkeypatch.setattr(render.job.clip_job, "render_clip", faulty)
+    monkeypatch.setattr(render.clip, "render_clip", faulty)
     assert generate_tiny(tiny_copy) == 2
     box, moving = Dataset(tiny_copy).clips("val")
     assert {name: n for name, n in box.facts["nonfinite"].items() if n} == {"direct": 6, "indirect_reference": 1}
@@ -189,11 +186,10 @@ def test_incomplete_files_are_replaced(tiny, tmp_path):
     root = tmp_path / "data"
     root.mkdir()
     (root / ".dataset.json.tmp").write_text("{")  # killed before the first file was in place
-    first = Share(1, 6)
-    assert generate_tiny(root, share=first) == 1
+    assert generate_tiny(root, part="1/6") == 1
     [clip] = root.glob("*/*/*")
     (clip / "clip.json").unlink()
-    assert generate_tiny(root, share=first) == 1
+    assert generate_tiny(root, part="1/6") == 1
     assert is_clip(clip) and (root / "dataset.json").exists() and digest(root).items() < digest(tiny).items()
 
 

@@ -10,7 +10,7 @@ from command_line import main
 from datasets.clip import Dataset
 from errors import BadInput
 from eval.tradeoff.resampled_clips import scene_of
-from render.job.profiles import OWN_CLIPS, OWN_QUALITY, own_profile, profile_of
+from render.job.profiles import SamplingQuality, own_profile, profile_of
 from render.scene_file.load import own_scene
 from tests.helpers.datasets import digest
 from tests.helpers.scene_files import old_xml, write
@@ -112,8 +112,12 @@ def test_defaults_and_names(tmp_path):
     toml = write(tmp_path, CONTENT).rename(tmp_path / "größe 1.b.toml")
     profile = own_profile(toml)
     assert profile == profile_of(str(toml))
-    assert profile.quality == OWN_QUALITY
-    assert {split: len(clips) for split, clips in profile.special.items()} == OWN_CLIPS
+    assert profile.quality == {
+        "train": SamplingQuality(realisations=4, reference_spp=128),
+        "val": SamplingQuality(realisations=1, reference_spp=256),
+        "test": SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048),
+    }
+    assert {split: len(clips) for split, clips in profile.special.items()} == {"train": 4, "val": 1, "test": 1}
     assert profile.special["test"] == ["größe_1_b/000"]
 
 

@@ -14,8 +14,7 @@ from errors import BadInput
 from models.registry import channels_read, create
 from render.clip import NO_OPTIONS
 from render.job import pilots
-from render.job.clip_job import render_to_folder
-from render.job.generate import Share, generate
+from render.job.generate import generate, render_to_folder
 from render.job.pilots import choose_rooms, noise_of_reference, samples_needed
 from render.job.plan import clips_of, plan, rooms_of
 from render.job.profiles import DataProfile, SamplingQuality, profile_of
@@ -155,21 +154,20 @@ def test_references_stop_at_the_most(tmp_path):
 def test_rooms_that_would_need_too_many_samples_are_skipped():
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=33.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile((2, 32, 32), {"test": bounded}, rooms={"test": 3})
-    needed = choose_rooms(profile, 0, NO_OPTIONS, {})
+    needed = choose_rooms(profile, 0, NO_OPTIONS)
     chosen = [f"test/{room}" for room in rooms_of(profile, "test", 0, needed)]
     assert len(chosen) == 3
     assert all(needed[room] <= 128 for room in chosen)
     skipped = set(needed) - set(chosen)
     assert skipped and all(needed[room] > 128 for room in skipped)
-    assert choose_rooms(profile, 0, NO_OPTIONS, needed) == needed  # nothing is rendered again
 
 
 def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
-    monkeypatch.setattr(pilots, "needed_for", lambda *_: 4096)
+    monkeypatch.setattr(pilots, "samples_needed", lambda *_: 4096)
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile((2, 32, 32), {"test": bounded}, rooms={"test": 2})
     with pytest.raises(BadInput, match="fewer than 2 in 64 rooms reach 90 dB within 128 spp"):
-        choose_rooms(profile, 0, NO_OPTIONS, {})
+        choose_rooms(profile, 0, NO_OPTIONS)
 
 
 @pytest.mark.parametrize("name", ["rooms-0x16", "rooms-4x1", "rooms-4x0"])
@@ -185,7 +183,7 @@ READS = channels_read(["accumulated", "rae"])  # not dual_motion, which cannot b
 def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Every other clip of the tiny dataset, the box of each split, for denoisers that do not read all channels."""
     root = tmp_path_factory.mktemp("lean")
-    assert generate(root, "tiny", seed=0, reads=READS, share=Share(1, 2)) == 3
+    assert generate(root, "tiny", seed=0, reads=READS, part="1/2") == 3
     return root
 
 

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 
 from errors import BadInput
 from render.loading import StockLoader
-from render.scene_file.convert import Converter
+from render.scene_file.convert import SceneFile
 from render.scene_file.stand_ins import RESERVED_NAMES, Names
 from tests.helpers.scene_files import own, write, xml
 
 
 def converted(folder, content: str):
     write(folder, content)
-    return Converter(folder / "scene.xml").convert()
+    return SceneFile(folder / "scene.xml")
 
 
 def test_names_are_unique_and_usable(tmp_path):

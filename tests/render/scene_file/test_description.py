@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from datasets.clip import SPLITS
 from errors import BadInput
 from provenance import ROOT
-from render.job.profiles import OWN_CLIPS, OWN_QUALITY
 from render.scene_file.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
 from scenes.animation import Camera, FreeMotion, KeyframedTrack, Track
 
@@ -44,7 +45,7 @@ def test_all_keys(tmp_path):
     assert parsed.resolution == (8, 4) and parsed.frames == 5 and parsed.bounces == 2
     assert parsed.camera[1].fov == 50 and parsed.camera[0].up is None
     assert parsed.motion[0].keyframes[1].rotation == (0, 90, 0) and parsed.light[0].keyframes[1].gain == 0.5
-    assert parsed.splits["test"].most_spp == 128
+    assert parsed.splits.test.most_spp == 128
 
 
 def test_the_example_of_the_docs(tmp_path):
@@ -55,10 +56,9 @@ def test_the_example_of_the_docs(tmp_path):
     assert parsed.motion[0].shape == "ball" and parsed.light[0].light == "lamp"
     plain = described(tmp_path, "file = 'a.xml'")
     assert (parsed.resolution, parsed.frames) == (plain.resolution, plain.frames)
-    for split, wanted in parsed.splits.items():
-        quality = OWN_QUALITY[split]._asdict() | {"clips": OWN_CLIPS[split]}
-        for key, default in quality.items():
-            assert getattr(wanted, key, None) in (None, default)
+    for split in SPLITS:
+        wanted, default = (getattr(each.splits, split) for each in (parsed, plain))
+        assert replace(wanted, camera=None) == default
 
 
 REFUSED = {
@@ -69,17 +69,19 @@ REFUSED = {
     "file = 'a'\nresolution = [4]": "resolution",
     "file = 'a'\nframes = 0": "frames",
     "file = 'a'\nframes = 1.5": "frames",
-    "file = 'a'\n[splits.holiday]\nclips = 1": "no split 'holiday'",
+    "file = 'a'\n[splits.holiday]\nclips = 1": "unknown field `holiday`",
     "file = 'a'\n[splits.test]\nclips = -1": "clips",
     "file = 'a'\n[splits.test]\nreference_spp = 3": "reference_spp",
     "file = 'a'\n[splits.test]\ncamera = 'keyframes'": "add \\[\\[camera\\]\\] tables",
     "file = 'a'\n[[camera]]\ntime = 2\nposition = [0,0,0]\ntarget = [0,0,1]": "time",
-    "file = 'a'\n[[camera]]\ntime = 0\nposition = [nan,0,0]\ntarget = [0,0,1]": "not a number",
-    "file = 'a'\n[[camera]]\ntime = 0\nposition = [0,0,0]\ntarget = [0,0,inf]": "infinite",
+    "file = 'a'\n[[camera]]\ntime = 0\nposition = [nan,0,0]\ntarget = [0,0,1]": "float",
+    "file = 'a'\n[[camera]]\ntime = 0\nposition = [0,0,0]\ntarget = [0,0,inf]": "float",
     "file = 'a'\n[[camera]]\ntime = 0\nposition = [0,0,0]\ntarget = [0,0,1]\nfov = 180": "fov",
     "file = 'a'\n[[motion]]\nshape = 'b'\nkeyframes = []": "keyframes",
     "file = 'a'\n[[motion]]\nshape = 'b'\nkeyframes = [{time=1},{time=0}]": "do not increase",
     "file = 'a'\n[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=-1}]": "gain",
+    "file = 'a'\n[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=inf}]": "gain",
+    "file = 'a'\n[splits.test]\nfloor = inf": "floor",
     "file = 'a'\n" + 2 * "[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=1}]\n": "'b' has keyframes twice",
     "file = 'a": "docs/scenes.md",
 }

@@ -90,7 +90,7 @@ def test_a_camera_that_cannot_see(tmp_path, key):
     """Its position is its target, or its up is its viewing axis."""
     scene = own(tmp_path, xml(), f"[[camera]]\ntime = 0\nposition = [1, 0, 5]\n{key}\n")
     with pytest.raises(BadInput, match=r"my\.toml: in frame 0 the camera"), np.errstate(invalid="ignore"):
-        scene.clip(2, 0, by_keyframes=True, from_here=True)
+        scene.clip("test", 0, 2, 0)
 
 
 def test_keyframes_move_and_brighten(tmp_path):
@@ -103,7 +103,7 @@ def test_keyframes_move_and_brighten(tmp_path):
     light = "constant"
     keyframes = [{ time = 0, gain = 1 }, { time = 1, gain = 3 }]
     """
-    clip = own(tmp_path, xml(), toml).clip(2, 0, by_keyframes=True, from_here=True)
+    clip = own(tmp_path, xml(), toml).clip("test", 0, 2, 0)
     assert clip.max_depth == 2
     stage = Stage(clip, 24, 32)
     first, last = (PosedFrame(stage, frame).emission.max() for frame in (0, 1))
@@ -130,7 +130,7 @@ def test_meshes_of_gltf_move_as_their_vectors_say(tmp_path):
     keyframes = [{ time = 0 }, { time = 1, position = [0.2, 0.1, 0], rotation = [0, 0, 10] }]
     """
     scene = own(tmp_path, world.export(file_type="glb"), toml, name="scene.glb")
-    clip = scene.clip(2, 0, by_keyframes=False, from_here=True)
+    clip = scene.clip("test", 0, 2, 0)
     stage = Stage(clip, 48, 64)
     before = render_gbuffer(stage, stage.view(0))["mesh_id"][..., 0]
     *_, mesh_id, vectors = posed_surfaces(stage, 1)
@@ -145,13 +145,15 @@ def test_the_smallest_images_and_clips(tmp_path):
     scene = own(tmp_path, xml(), "")
     scene.described.resolution = (1, 1)
     for frames in (1, 2):
-        clip = scene.clip(frames, 0, False, False)
-        assert np.isfinite(PosedFrame(Stage(clip, 1, 1), frames - 1).radiance(0, 2)).all()
+        clip = scene.clip("train", 0, frames, 0)
+        posed = PosedFrame(Stage(clip, 1, 1), frames - 1)
+        assert np.isfinite(posed.reflected(0, 2) + posed.emission).all()
 
 
 def test_points_of_no_size_and_deep_mixtures(tmp_path):
     point = own(tmp_path, xml(shape=painted('<float name="radius" value="0"/>'), camera=""))
-    assert np.isfinite(PosedFrame(Stage(point.clip(2, 0, False, False), 4, 4), 1).radiance(0, 2)).all()
+    posed = PosedFrame(Stage(point.clip("train", 0, 2, 0), 4, 4), 1)
+    assert np.isfinite(posed.reflected(0, 2) + posed.emission).all()
     blends = '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse"/>'
     deep = own(tmp_path, xml(shape=painted(blends * 30 + '<bsdf type="plastic"/>' + "</bsdf>" * 30)))
     assert deep.stage.materials.depth == 6

@@ -10,7 +10,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from errors import BadInput
-from render.scene_file.mesh_file import linear_image, load_mesh_file, texture
+from render.scene_file.mesh_file import MeshFile, linear_image, texture
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
 OBJ = f"mtllib m.mtl\n{TRIANGLE}usemtl red\nf 1/1 2/2 3/3\n"
@@ -37,7 +37,7 @@ def world(**material) -> trimesh.Scene:
 def loaded(folder, scene: trimesh.Scene):
     path = folder / "scene.glb"
     path.write_bytes(scene.export(file_type="glb"))
-    return load_mesh_file(path, 1.5)
+    return MeshFile(path, 1.5)
 
 
 def gltf(folder, change, **material):
@@ -93,7 +93,7 @@ def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
         content["nodes"].append({"camera": 0, "translation": [0, 0, 4], "name": "eye"})
         content["nodes"][0].setdefault("children", []).append(len(content["nodes"]) - 1)
 
-    camera = load_mesh_file(gltf(tmp_path, add), aspect).camera
+    camera = MeshFile(gltf(tmp_path, add), aspect).camera
     np.testing.assert_allclose(camera.eye.at(0), [0, 0, 4])
     np.testing.assert_allclose(camera.target.at(0), [0, 0, 3])
     assert np.tan(np.radians(camera.x_fov.at(0)) / 2) / aspect == pytest.approx(np.tan(0.4))
@@ -104,7 +104,7 @@ def test_what_gltf_says_beyond_meshes(tmp_path):
         content["animations"] = [{"channels": [], "samplers": []}]
         content["extensionsUsed"] = ["KHR_lights_punctual"]
 
-    notes = load_mesh_file(gltf(tmp_path, add), 1.0).notes
+    notes = MeshFile(gltf(tmp_path, add), 1.0).notes
     assert any("animations" in note for note in notes) and any("KHR_lights_punctual" in note for note in notes)
 
 
@@ -119,12 +119,12 @@ def test_materials_of_obj(tmp_path):
     picture().save(tmp_path / "tex.png")
     (tmp_path / "scene.obj").write_text(OBJ)
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0.5 0.5 0.5\nKe 3 2 1\nd 0.5\n")
-    found = load_mesh_file(tmp_path / "scene.obj", 1.0)
+    found = MeshFile(tmp_path / "scene.obj", 1.0)
     assert found.shapes[0].bsdf["bsdf"]["reflectance"]["value"] == pytest.approx([0.8, 0.2, 0.4], abs=1e-6)
     np.testing.assert_array_equal(found.shapes[0].radiance.at(0), [3, 2, 1])
     assert ["gloss" in note for note in found.notes] == [True, False] and "transparency" in found.notes[1]
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0 0 0\nd 1\nmap_Kd tex.png\n")
-    found = load_mesh_file(tmp_path / "scene.obj", 1.0)
+    found = MeshFile(tmp_path / "scene.obj", 1.0)
     stored = found.shapes[0].bsdf["bsdf"]["reflectance"]["data"]
     np.testing.assert_allclose(stored, linear_image(picture())[::-1], rtol=1e-6)
     assert len(found.notes) == 1  # of the sky
@@ -134,23 +134,23 @@ def test_colours_of_ply(tmp_path):
     box = trimesh.creation.box()
     box.visual.vertex_colors = [200, 50, 50, 255]
     box.export(tmp_path / "scene.ply")
-    found = load_mesh_file(tmp_path / "scene.ply", 1.0)
+    found = MeshFile(tmp_path / "scene.ply", 1.0)
     assert found.shapes[0].bsdf["bsdf"]["reflectance"]["value"] == pytest.approx([200 / 255, 50 / 255, 50 / 255])
     assert "colours of its vertices" in found.notes[0]
 
 
 def test_missing_files_are_said(tmp_path):
     (tmp_path / "scene.obj").write_text(OBJ)
-    assert "m.mtl is missing" in load_mesh_file(tmp_path / "scene.obj", 1.0).notes[0]
+    assert "m.mtl is missing" in MeshFile(tmp_path / "scene.obj", 1.0).notes[0]
     (tmp_path / "m.mtl").write_text("newmtl red\nmap_Kd gone.png\n")
-    assert "gone.png is missing" in load_mesh_file(tmp_path / "scene.obj", 1.0).notes[0]
+    assert "gone.png is missing" in MeshFile(tmp_path / "scene.obj", 1.0).notes[0]
 
     def lose(content):
         content["images"] = [{"uri": "gone.png"}]
 
-    assert "gone.png is missing" in load_mesh_file(gltf(tmp_path, lose, baseColorTexture=picture()), 1.0).notes[0]
+    assert "gone.png is missing" in MeshFile(gltf(tmp_path, lose, baseColorTexture=picture()), 1.0).notes[0]
     with pytest.raises(BadInput, match=r"gone\.bin is missing"):
-        load_mesh_file(gltf(tmp_path, lambda content: content["buffers"][0].update(uri="gone.bin")), 1.0)
+        MeshFile(gltf(tmp_path, lambda content: content["buffers"][0].update(uri="gone.bin")), 1.0)
 
 
 def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
@@ -161,24 +161,24 @@ def test_nothing_outside_of_its_folder_is_read(tmp_path, capfd):
     for library in ("../m.mtl", str(tmp_path / "m.mtl")):
         (folder / "scene.obj").write_text(OBJ.replace("m.mtl", library))
         with pytest.raises(BadInput, match="leaves the scene's folder"):
-            load_mesh_file(folder / "scene.obj", 1.0)
+            MeshFile(folder / "scene.obj", 1.0)
     (folder / "scene.obj").write_text(OBJ)
     (folder / "m.mtl").write_text("newmtl red\nmap_Kd ../tex.png\n")
     with pytest.raises(BadInput, match="leaves the scene's folder"):
-        load_mesh_file(folder / "scene.obj", 1.0)
+        MeshFile(folder / "scene.obj", 1.0)
     for uri in ("../model.bin", "/etc/hostname", "..%2Fmodel.bin", "file:///etc/hostname"):
         path = gltf(folder, lambda content, uri=uri: content["buffers"][0].update(uri=uri))
         with pytest.raises(BadInput):
-            load_mesh_file(path, 1.0)
+            MeshFile(path, 1.0)
     with pytest.raises(BadInput, match="leaves the scene's folder"):
         path = gltf(folder, lambda content: content.update(images=[{"uri": "../tex.png"}]), baseColorTexture=picture())
-        load_mesh_file(path, 1.0)
+        MeshFile(path, 1.0)
     ply = "ply\nformat ascii 1.0\ncomment TextureFile ../tex.png\nelement vertex 3\n"
     ply += "".join(f"property float {name}\n" for name in "xyzst") + "element face 1\n"
     ply += "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
     (folder / "scene.ply").write_text(ply)
     with pytest.raises(BadInput, match="leaves the scene's folder"):
-        load_mesh_file(folder / "scene.ply", 1.0)
+        MeshFile(folder / "scene.ply", 1.0)
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -193,20 +193,20 @@ def test_damaged_files(tmp_path, suffix):
             continue  # lines that are whole are a smaller mesh
         path.write_bytes(content)
         with pytest.raises(BadInput, match=rf"scene\.{suffix}"):
-            load_mesh_file(path, 1.0)
+            MeshFile(path, 1.0)
     path.unlink()
     with pytest.raises(BadInput, match="missing"):
-        load_mesh_file(path, 1.0)
+        MeshFile(path, 1.0)
 
 
 @pytest.mark.parametrize("vertex", ["nan 1 0", "inf 1 0", "1e30 1 0"])
 def test_vertices_that_are_nowhere(tmp_path, vertex):
     (tmp_path / "scene.obj").write_text(TRIANGLE.replace("1 1 0", vertex) + "f 1/1 2/2 3/3\n")
     with pytest.raises(BadInput, match=r"scene\.obj: mesh 'scene_obj' is empty or damaged"):
-        load_mesh_file(tmp_path / "scene.obj", 1.0)
+        MeshFile(tmp_path / "scene.obj", 1.0)
 
 
 def test_points_are_no_mesh(tmp_path):
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "scene.ply")
     with pytest.raises(BadInput, match=r"no mesh to render; .*PointCloud"):
-        load_mesh_file(tmp_path / "scene.ply", 1.0)
+        MeshFile(tmp_path / "scene.ply", 1.0)
