@@ -16,7 +16,7 @@ from files import read_json, write_json
 from models.denoiser import Denoiser
 from models.export.one import OneStep
 from models.export.page import instructions
-from models.export.program import OPSET, RUN, WRITE, Format, Operators, check_installed, play, trace
+from models.export.program import OPSET, RUN, WRITE, Format, check_installed, play, trace
 from models.export.step import Port, Step, Warp
 from models.export.wskp import WSKPStep
 from models.networks.one import One
@@ -58,10 +58,6 @@ class Export:
     precision: Literal["float32", "float16"]  # of its network; images and state are float32
     warp: Warp  # whether the step reprojects its history itself
 
-    @property
-    def file(self) -> str:
-        return f"{self.name}.{self.to}"
-
 
 def largest_difference(a: torch.Tensor, b: torch.Tensor) -> float:
     """max |a - b| / max(1, |b|): relative where numbers are large, absolute where they are small."""
@@ -94,13 +90,12 @@ def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], gold
     return {"from_golden": from_golden, "from_onespp": from_ours}
 
 
-def manifest(export: Export, step: Step, operators: Operators, differences: dict[str, float]) -> dict[str, Any]:
+def manifest(export: Export, step: Step, operators: dict[str, Any], differences: dict[str, float]) -> dict[str, Any]:
     """The content of manifest.json without the hashes of files."""
-    total = sum(operators.kinds.values())  # outside of branches
     return {
         "schema": 1,
         "denoiser": export.name,
-        "file": export.file,
+        "file": f"{export.name}.{export.to}",
         "format": export.to,
         "opset": OPSET if export.to == "onnx" else None,
         "precision": export.precision,
@@ -108,30 +103,13 @@ def manifest(export: Export, step: Step, operators: Operators, differences: dict
         "inputs": [port_entry(port) for port in step.inputs],
         "outputs": [port_entry(port) for port in step.outputs],
         "state": [
-            {"input": each.port.name, "from": each.source, "warp_first": each.warped, "initial": 0}
-            for each in step.carried
+            {"input": port.name, "from": port.source, "warp_first": port.warped, "initial": 0} for port in step.carried
         ],
         "weights_sha256": file_digest(export.weights),
-        "operators": {"total": total, "branches": operators.branches, "kinds": operators.kinds},
+        "operators": operators,
         "largest_difference": differences,
         "versions": versions(PACKAGES),
     }
-
-
-def write_files(folder: Path, export: Export, frames: Sequence[Frame]) -> dict[str, Any]:
-    """Write all files of an export into the empty `folder`. Returns the manifest."""
-    step = load_step(export.name, export.weights, PRECISIONS[export.precision], export.warp)
-    program = trace(step, frames[0])
-    path = folder / export.file
-    operators = WRITE[export.to](program, step, path)
-    golden = folder / "golden"
-    golden.mkdir()
-    content = manifest(export, step, operators, verify(export, path, step, frames, golden))
-    (folder / "README.md").write_text(instructions(content))
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    content["sha256"] = {str(file.relative_to(folder)): file_digest(file) for file in files}
-    write_json(folder / MANIFEST, content)
-    return content
 
 
 def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[str, Any]:
@@ -145,11 +123,18 @@ def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[
     is_export = earlier.exists() and "sha256" in read_json(earlier)
     if folder.exists() and any(folder.iterdir()) and not is_export:
         raise BadInput(f"{folder} contains files that are not an export: choose another --out")
-    folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    temporary.mkdir()
+    golden = temporary / "golden"
+    golden.mkdir(parents=True)
     try:
-        content = write_files(temporary, export, frames)
+        step = load_step(export.name, export.weights, PRECISIONS[export.precision], export.warp)
+        path = temporary / f"{export.name}.{export.to}"
+        operators = WRITE[export.to](trace(step, frames[0]), step, path)
+        content = manifest(export, step, operators, verify(export, path, step, frames, golden))
+        (temporary / "README.md").write_text(instructions(content))
+        files = sorted(file for file in temporary.rglob("*") if file.is_file())
+        content["sha256"] = {str(file.relative_to(temporary)): file_digest(file) for file in files}
+        write_json(temporary / MANIFEST, content)
         shutil.rmtree(folder, ignore_errors=True)
         temporary.rename(folder)
     finally:
