@@ -82,7 +82,8 @@ class Denoiser(nn.Module):
     has_kernels: bool = True  # whether compiled kernels do a part of its work
     baseline_for: tuple[Signal, ...] = ()  # whose denoisers are compared with it, in evaluations, cards and trade-offs
     evaluated_with: tuple[str, ...] = ()  # suffixes with which `onespp eval` runs it beside the denoiser itself
-    # Channels that its network can do without where they do not vary, and its input for a value.
+    inputs: Mapping[str, int] = MappingProxyType({})  # of its network in order, and how many channels each has
+    # Channels, by the names of inputs, that its network can do without where they do not vary; its input for a value.
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
     first_layer: str  # the path of the convolution, or of the list of those, that such channels are dropped from
     precision: torch.dtype = torch.float32  # what its network computes in, see `prepare`
@@ -92,7 +93,6 @@ class Denoiser(nn.Module):
         """`signal` is the class's unless another one is named."""
         super().__init__()
         self.signal = signal or type(self).signal
-        self.inputs: dict[str, int] = {}  # of its network in order, and their numbers of channels; channels by name
         self.constants: dict[str, list[float]] = {}  # see `specialise`: channels it does without, and their values
 
     def unavailable(self) -> str | None:
@@ -145,7 +145,7 @@ class Denoiser(nn.Module):
             first = sum(self.inputs[other] for other in names[: names.index(name)])
             for layer in self.first_layers():
                 drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
-            del self.inputs[name]
+            self.inputs = {other: count for other, count in self.inputs.items() if other != name}
             self.constants[name] = list(constants[name])
 
     def check_constants(self, frame: Frame) -> None:

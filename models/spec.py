@@ -54,8 +54,8 @@ def bfloat16_speedup() -> float:
     """How many times faster this processor convolves in bfloat16, by the time that one thread computes, busy or not."""
     work = {}
     for dtype in (torch.float32, torch.bfloat16):
-        image, weight = (torch.ones(shape, dtype=dtype) for shape in ((1, 32, 96, 96), (32, 32, 3, 3)))
-        image, weight = (each.contiguous(memory_format=torch.channels_last) for each in (image, weight))
+        ones = (torch.ones(shape, dtype=dtype) for shape in ((1, 32, 96, 96), (32, 32, 3, 3)))
+        image, weight = (each.contiguous(memory_format=torch.channels_last) for each in ones)
         work[str(dtype)] = partial(F.conv2d, image, weight, padding=1)
     with thread_count(1), torch.no_grad():
         seconds = take_turns(work, TURNS, clock=time.thread_time, label=None)

@@ -13,7 +13,7 @@ from models.compiled.one import SIDE_MULTIPLE
 from models.export.history import updated_scale
 from models.export.step import Step, Warp, demodulation, image
 from models.filters.neighbours import means_of, summands
-from models.networks.one import HISTORY, PATCH, Decoded, One, PixelInputs, Trunk, carried, decode, input_channels
+from models.networks.one import HISTORY, PATCH, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
@@ -37,7 +37,7 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
 def affinity_level(
     image: Tensor, features: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> Tensor:
-    """See models.networks.affinity.affinity_level; `image` is 0 for background."""
+    """See models.networks.one.affinity_level; `image` is 0 for background."""
     values = torch.cat([image, surface], dim=1)
     difference = neighbour_taps(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
@@ -77,19 +77,16 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
     return x
 
 
-class Coarsest(nn.Module):
-    """The trunk's `down_c` and `up_b`, on images padded with zeros: a tracer needs two pixels at 1/8 of the size."""
-
-    def __init__(self, trunk: Trunk):
-        super().__init__()
-        self.down, self.up = trunk.down_c, trunk.up_b
+class Coarsest(nn.Sequential):
+    """The layers at 1/8 of the resolution and the next, on images padded with zeros: a tracer needs two pixels."""
 
     def forward(self, x: Tensor) -> Tensor:
+        *layers, up = self
         inside = F.pad(torch.ones_like(x[:, :1]), COARSE_PADDING)[..., ::2, ::2]
         x = F.pad(x, COARSE_PADDING)
-        for layer in self.down:
+        for layer in layers:
             x = layer(x) * inside
-        return self.up(x)[..., :-2, :-2]
+        return up(x)[..., :-2, :-2]
 
 
 class OneStep(Step):
@@ -108,7 +105,8 @@ class OneStep(Step):
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = nn.Sequential(*map(pointwise, self.trunk.detail))
-        self.trunk.down_c, self.trunk.up_b = Coarsest(self.trunk), nn.Identity()  # type: ignore[assignment]
+        self.trunk.down_c = Coarsest(*self.trunk.down_c, self.trunk.up_b)
+        self.trunk.up_b = nn.Identity()  # type: ignore[assignment]
         self.requires_grad_(False)
 
     def forward(self, x: dict[str, Tensor]) -> dict[str, Tensor]:

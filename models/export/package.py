@@ -37,15 +37,11 @@ def check_exportable(name: str) -> None:
         raise BadInput(f"'{name}' cannot be exported; {', '.join(EXPORTABLE)} can")
 
 
-def step_of(denoiser: Denoiser, warp: Warp) -> Step:
-    """The step of a denoiser, which is prepared for inference and must not be used afterwards."""
-    return next(step for kind, step in EXPORT_STEPS.items() if isinstance(denoiser, kind))(denoiser, warp)
-
-
 def load_step(name: str, weights: Path, precision: torch.dtype, warp: Warp) -> Step:
     """The step of a named denoiser with the weights of a file. Raises BadInput where either does not fit."""
     check_exportable(name)
-    return step_of(load(name, weights, precision), warp)
+    denoiser = load(name, weights, precision)
+    return next(step for kind, step in EXPORT_STEPS.items() if isinstance(denoiser, kind))(denoiser, warp)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ What differs, since frames have 1 spp and noise-free features:
 
 from collections.abc import Iterator
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
@@ -270,12 +271,12 @@ class LBF(KernelPredictor):
     )
     offline = True
     convex = True
+    inputs = MappingProxyType({"secondary features": SECONDARY})
     dispensable: ClassVar = {}
     state = LBFState
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = {"secondary features": SECONDARY}
         last = nn.Linear(HIDDEN_UNITS, 1 + len(FEATURE_GROUPS))
         nn.init.constant_(last.bias, FIRST_BIAS)
         self.network = nn.Sequential(nn.Linear(SECONDARY, HIDDEN_UNITS), nn.Sigmoid(), last, nn.Softplus())

@@ -174,11 +174,11 @@ class NTD(Denoiser):
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": nn.Identity()}
+    inputs = NTD_INPUTS
     first_layer = "network.encode.0.0"
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = dict(NTD_INPUTS)
         if self.signal == "total":
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]

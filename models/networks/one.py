@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,9 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models import compiled
+from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
+from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import (
     INPUT_CHANNELS,
     LATENT,
@@ -23,13 +25,12 @@ from models.compiled.one import (
     head_channels,
 )
 from models.denoiser import Denoiser, State, matching_state
-from models.filters.neighbours import mesh_means
+from models.filters.neighbours import mesh_means, taps_3x3
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
-from models.networks.affinity import affinity_level
 from models.networks.convolution import ConvReLU
-from models.operators import MAX_IRRADIANCE, pad_to_multiple
+from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
@@ -134,6 +135,51 @@ def decode_head(
     return decode(head + last(hidden.movedim(1, -1)).movedim(-1, 1), inputs, samples)
 
 
+def plain_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """See affinity_level: the way that PyTorch takes."""
+    count = features.shape[1]
+    taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
+    distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
+    exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
+    weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
+    total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
+    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=MIN_DIVISOR), 0)
+
+
+class AffinityLevel(torch.autograd.Function):
+    """Both directions by kernels for the processor."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        """The arguments are those of affinity_level."""
+        *given, surface, step = arguments
+        out, total = affinity_kernels.filter_level(*arguments)
+        ctx.step = step
+        ctx.save_for_backward(*given, surface, out, total)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *given, surface, out, total = ctx.saved_tensors
+        return *affinity_kernels.pull_level(gradients[0], given, surface, out, total, ctx.step), None, None
+
+
+def affinity_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """A convex mean over 3 x 3 taps `step` pixels apart (Isik et al. 2021, Eq. 4, with two weights more).
+
+    The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p). Only
+    pixels that show a surface count; the others become 0.
+    image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
+    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
+    """
+    level = AffinityLevel.apply if compiled.with_gradients(image) else plain_level
+    return cast(Tensor, level(image, features, sharpness, own, importance, surface, step))
+
+
 def carried(
     decoded: Decoded, past: Tensor, surface: Tensor, steps: Sequence[int], level: Callable[..., Tensor] = affinity_level
 ) -> tuple[Tensor, ...]:
@@ -196,13 +242,13 @@ class One(Denoiser):
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     convex = True
+    inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
     def __init__(self, *, steps: Sequence[int] = TAP_SPACINGS, signal: Signal | None = None):
         """`steps` are the pixels between the taps of each filter level."""
         super().__init__(signal=signal)
         self.steps = steps
-        self.inputs = dict(INPUT_CHANNELS)
         self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(head_channels(len(steps)).values()), self.widths)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:

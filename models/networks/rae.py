@@ -107,11 +107,11 @@ class RAE(Denoiser):
     is_network = True
     has_kernels = False
     dispensable: ClassVar = {"roughness": nn.Identity()}
+    inputs = RAE_INPUTS
     first_layer = "network.first"
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = dict(RAE_INPUTS)
         network = RecurrentAutoencoder(sum(RAE_INPUTS.values()))
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -1,6 +1,6 @@
 """WSKP: weight-sharing kernel prediction (Fan et al. 2021), its multi-resolution variant and its baselines KP."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar
@@ -86,6 +86,7 @@ class KernelPredictor(Accumulating):
 
     reads: tuple[str, ...] = Accumulated.reads
     is_network = True
+    inputs: Mapping[str, int] = FEATURE_CHANNELS
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
     filter_reads: tuple[str, ...] = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
     filter_image: Callable[[Tensor, Tensor, Tensor | None], Filtered] = staticmethod(shared_kernels)
@@ -93,10 +94,6 @@ class KernelPredictor(Accumulating):
     network: nn.Module
     side_multiple = 1  # of the network's images; they are padded
     reach: int | None = None  # rows above and below that a pixel depends on; None for all
-
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.inputs = dict(FEATURE_CHANNELS)
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         """Irradiance (B, 3, H, W) of surfaces, filtered with the network's output."""

@@ -22,12 +22,12 @@ from models.export import program as programs
 from models.export import wskp
 from models.export.history import GraphGBuffer, reprojected
 from models.export.one import affinity_level, mesh_sums
-from models.export.package import EXPORTABLE, Export, largest_difference, load_step, step_of, write_export
+from models.export.package import EXPORTABLE, Export, largest_difference, load_step, write_export
 from models.export.program import play, run_onnx, run_pt2, trace, write_onnx, write_pt2
 from models.filters import neighbours
 from models.history.geometry import GBuffer, to_previous_camera
 from models.history.reprojection import reproject
-from models.networks.affinity import plain_level
+from models.networks.one import plain_level
 from models.registry import create
 from models.spec import load
 from models.weights import save_weights
@@ -302,7 +302,7 @@ def test_extreme_logits_take_the_slower_branch_in_files(weights, tmp_path):
         denoiser.network[-1].merged.weight[:6] *= 300
         if hasattr(denoiser.network[-1].merged, "pair"):
             denoiser.network[-1].merged.pair()
-    step = step_of(copy.deepcopy(denoiser), "outside")
+    step = wskp.WSKPStep(copy.deepcopy(denoiser), "outside")
     for compute in files_of(step, tmp_path):
         check_equal(step, denoiser, sequence((40, 56), frames=3), compute, 10 * TOLERANCE)
 
