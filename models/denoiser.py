@@ -74,13 +74,13 @@ class Denoiser(nn.Module):
     refuses: Mapping[torch.dtype, str] = MappingProxyType({})  # precisions that it does not compute in, with the reason
     made_from: str = "paper"  # what it follows, for tables: others' papers, their authors' code, accounts of either
     is_network: bool = False  # whether it needs trained weights
-    offline: bool = False  # whether a frame takes seconds: commands that run all denoisers leave it out
-    convex: bool = False  # whether irradiance is a weighted mean of that since the last reset, with weights >= 0
+    offline: bool = False  # whether a frame takes seconds: it runs only where it is named, not in runs of all
+    convex: bool = False  # whether it returns weighted means of irradiance since the last reset, with weights >= 0
     separates_lights: bool = False  # whether it filters direct and indirect light apart
-    filters_emission: bool = False  # whether emission is a part of what it filters, or is added back untouched
+    filters_emission: bool = False  # whether emission is a part of what it filters; else it is added back untouched
     blends_layers: bool = False  # whether it takes glass in one layer, with guides blended from both, instead of twice
     has_kernels: bool = True  # whether compiled kernels do a part of its work
-    baseline_for: tuple[Signal, ...] = ()  # whose denoisers are compared with it, in evaluations, cards and trade-offs
+    baseline_for: tuple[Signal, ...] = ()  # signals whose denoisers evaluations, cards and trade-offs compare with it
     evaluated_with: tuple[str, ...] = ()  # suffixes with which `onespp eval` runs it beside the denoiser itself
     inputs: Mapping[str, int] = MappingProxyType({})  # of its network in order, and how many channels each has
     # Channels, by the names of inputs, that its network can do without where they do not vary; its input for a value.
@@ -93,7 +93,7 @@ class Denoiser(nn.Module):
         """`signal` is the class's unless another one is named."""
         super().__init__()
         self.signal = signal or type(self).signal
-        self.constants: dict[str, list[float]] = {}  # see `specialise`: channels it does without, and their values
+        self.constants: dict[str, list[float]] = {}  # channels that it does without, with the value each has everywhere
 
     def unavailable(self) -> str | None:
         """Why it cannot run on this machine, with what to install; None where it can."""

@@ -89,7 +89,7 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, An
 
 
 def write_pt2(program: ExportedProgram, step: Step, path: Path) -> dict[str, Any]:
-    """The same."""
+    """See write_onnx."""
 
     def calls(graph: torch.fx.Graph) -> list[str]:
         return [str(node.target) for node in graph.nodes if node.op == "call_function"]
@@ -141,5 +141,6 @@ def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tupl
         inputs = {**step.frame_inputs(frame), **state}
         outputs = compute(inputs)
         yield inputs, outputs
-        state = {port.name: {**inputs, **outputs}[port.source] for port in step.carried}
+        tensors = {**inputs, **outputs}
+        state = {port.name: tensors[port.source] for port in step.carried}
         previous = frame

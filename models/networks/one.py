@@ -169,10 +169,10 @@ class AffinityLevel(torch.autograd.Function):
 def affinity_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> Tensor:
-    """A convex mean over 3 x 3 taps `step` pixels apart (Isik et al. 2021, Eq. 4, with two weights more).
+    """One level of an à-trous transform by learned features: a convex mean over 3 x 3 taps `step` pixels apart.
 
-    The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p). Only
-    pixels that show a surface count; the others become 0.
+    The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
+    et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
     image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """

@@ -19,11 +19,8 @@ class Wrapper(Denoiser):
         super().__init__(signal=inner.signal)
         self.inner = inner
         self.reads = tuple(dict.fromkeys((*inner.reads, *self.needs)))
-        self.refuses = inner.refuses
-        self.made_from = inner.made_from
-        self.is_network = inner.is_network
-        self.offline = inner.offline
-        self.constants = inner.constants
+        for fact in ("refuses", "made_from", "is_network", "offline", "constants"):
+            setattr(self, fact, getattr(inner, fact))
 
     def unavailable(self) -> str | None:
         return self.inner.unavailable()
