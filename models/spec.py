@@ -164,6 +164,5 @@ def load(
         weights = None
     elif weights is None:
         raise BadInput(f"'{name}' needs trained weights")
-    names = {dtype: key for key, dtype in PRECISIONS.items()}
-    chosen = names[precision] if precision else fastest_precision(parsed, device)
+    chosen = str(precision).removeprefix("torch.") if precision else fastest_precision(parsed, device)
     return DenoiserSpec(parsed, signal, chosen, weights, device=device).build()

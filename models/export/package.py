@@ -13,35 +13,29 @@ import torch
 from datasets.frame import Frame
 from errors import BadInput
 from files import read_json, write_json
-from models.denoiser import Denoiser
 from models.export.one import OneStep
 from models.export.page import instructions
 from models.export.program import OPSET, RUN, WRITE, Format, check_installed, play, trace
 from models.export.step import Port, Step, Warp
 from models.export.wskp import WSKPStep
-from models.networks.one import One
-from models.networks.wskp import WSKP
-from models.registry import DENOISERS, prototype
 from models.spec import PRECISIONS, load
 from provenance import file_digest, versions
 
 MANIFEST = "manifest.json"
 PACKAGES = ("onespp", "torch", "onnx", "onnxscript", "onnxruntime")
-EXPORT_STEPS: dict[type[Denoiser], type[Step]] = {WSKP: WSKPStep, One: OneStep}  # by class, subclasses included
-EXPORTABLE = [name for name, kind in DENOISERS.items() if issubclass(kind, tuple(EXPORT_STEPS))]
+EXPORTABLE: dict[str, type[Step]] = {"wskp3": WSKPStep, "wskp6": WSKPStep, "one": OneStep}  # denoisers that have one
 
 
 def check_exportable(name: str) -> None:
     """Raise BadInput for the name of a denoiser that has no step."""
-    if not isinstance(prototype(name), tuple(EXPORT_STEPS)):
+    if name not in EXPORTABLE:
         raise BadInput(f"'{name}' cannot be exported; {', '.join(EXPORTABLE)} can")
 
 
 def load_step(name: str, weights: Path, precision: torch.dtype, warp: Warp) -> Step:
     """The step of a named denoiser with the weights of a file. Raises BadInput where either does not fit."""
     check_exportable(name)
-    denoiser = load(name, weights, precision)
-    return next(step for kind, step in EXPORT_STEPS.items() if isinstance(denoiser, kind))(denoiser, warp)
+    return EXPORTABLE[name](load(name, weights, precision), warp)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from torch.nn import functional as F
 
 from models.compiled.accumulation import MIN_ALPHA
 from models.compiled.exponential import MIN_EXPONENT
-from models.compiled.features import GAMMA
 from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE, WINDOWS
 from models.export.history import updated_scale
 from models.export.step import Step, Warp, demodulation, image
 from models.networks.repvgg import RepVGGBlock
-from models.networks.wskp import WSKP, scaled_normal
+from models.networks.wskp import WSKP, feature_images
 from models.operators import MIN_DIVISOR
 
 SUMMED = 4  # channels of each window's sums: weighted red, green and blue, and the weights
@@ -105,14 +104,8 @@ class WSKPStep(Step):
         irradiance = history + (1 / length).clamp(min=MIN_ALPHA) * (noisy - history)
         radiance = irradiance * divisor
         state, exposure, depth = updated_scale(x["scale"], radiance, x["depth"])
-        features = {  # see models.networks.wskp.network_features
-            "colour": (radiance * exposure).clamp(0, 1) ** (1 / GAMMA),
-            "albedo": x["albedo"],
-            "normal": scaled_normal(x["normal"]),
-            "depth": depth,
-        }
-        network_input = torch.cat([features[name] for name in self.features], dim=1)
-        predicted = self.network(network_input.to(self.precision)).to(radiance)
+        features = feature_images(radiance * exposure, x["albedo"], x["normal"], depth, self.features)
+        predicted = self.network(features.to(self.precision)).to(radiance)
         importance, mixture = predicted.chunk(2, dim=1)
         filtered = fuse(irradiance, importance, mixture, surface)
         return {

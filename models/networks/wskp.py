@@ -33,6 +33,17 @@ def scaled_normal(normal: Tensor) -> Tensor:
     return normal / 2 + 0.5
 
 
+def feature_images(radiance: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor, names: Sequence[str]) -> Tensor:
+    """See network_features: of exposed radiance and normalised depth."""
+    parts = {
+        "colour": radiance.clamp(0, 1) ** (1 / GAMMA),
+        "albedo": albedo,
+        "normal": scaled_normal(normal),
+        "depth": depth,
+    }
+    return torch.cat([parts[name] for name in names], dim=1)
+
+
 @compiled.by(kernels.network_features)
 def network_features(
     frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
@@ -42,14 +53,8 @@ def network_features(
     Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
     world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.
     """
-    exposure = scale.exposure() * frame.gain
-    parts = {
-        "colour": (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA),
-        "albedo": frame.albedo,
-        "normal": scaled_normal(frame.normal),
-        "depth": scale.normalised_depth(frame.depth),
-    }
-    return torch.cat([parts[name] for name in names], dim=1)
+    exposed = irradiance * frame.divisor * (scale.exposure() * frame.gain)
+    return feature_images(exposed, frame.albedo, frame.normal, scale.normalised_depth(frame.depth), names)
 
 
 Filtered = tuple[Tensor, Tensor | None]  # irradiance (B, 3, H, W), and parameters of the filter to display, if any
