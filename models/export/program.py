@@ -15,11 +15,12 @@ from torch.export import Dim, ExportedProgram
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.export.step import HEIGHT, MESHES, WIDTH, Step, Tensors
+from models.export.step import HEIGHT, MESHES, WIDTH, Step
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 
-Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, of inputs by name
+Tensors = dict[str, Tensor]  # by name
+Compute = Callable[[Tensors], Tensors]  # outputs of inputs
 Format = Literal["onnx", "pt2"]
 OPSET = 20
 NEEDED = {"onnx": ("onnx", "onnxscript", "onnxruntime"), "pt2": ()}
@@ -111,7 +112,7 @@ def run_onnx(path: Path) -> Compute:
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
 
-    def compute(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    def compute(inputs: Tensors) -> Tensors:
         outputs = session.run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
         return {name: torch.from_numpy(array) for name, array in zip(names, outputs, strict=True)}
 
@@ -132,7 +133,7 @@ def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tupl
     """Inputs and outputs of each frame (B = 1). After a cut the state is the initial one."""
     warped = [port.name for port in step.carried if port.warped]
     previous: Frame | None = None
-    state: dict[str, Tensor] = {}
+    state: Tensors = {}
     for frame in frames:
         if previous is None or not frame.follows(previous.moment):
             state = step.initial_state(frame)

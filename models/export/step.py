@@ -1,6 +1,6 @@
 """What an exported denoiser is: one frame and its state in, radiance and the next state out, all plain tensors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -14,7 +14,6 @@ from models.export.history import GraphGBuffer, reprojected
 from models.history.geometry import to_previous_camera
 
 Warp = Literal["inside", "outside"]
-Tensors = Mapping[str, Tensor]
 
 HEIGHT = "height"
 WIDTH = "width"
