@@ -66,50 +66,34 @@ class Denoiser(nn.Module):
     Facts of a denoiser are attributes of its class; wrappers (models/wrappers) take over those of the wrapped denoiser.
     `registry.prototype` returns an instance without weights to read them from.
 
-    Attributes:
-        reads: channels it needs; nothing else is loaded, rendered or stored for it.
-        signal: what it returns: "total" or "indirect" light.
-        refuses: precisions that it does not compute in, with the reason.
-        made_from: what its implementation follows, for tables: others' papers, their authors' code, accounts of either.
-        is_network: whether it needs trained weights.
-        offline: whether a frame takes seconds: commands that run all denoisers run it only where it is named.
-        convex: whether output irradiance is a weighted mean of irradiance since the last reset, with weights >= 0.
-        separates_lights: whether it filters direct and indirect light apart.
-        filters_emission: whether emission is a part of what it filters, which it otherwise adds back untouched.
-        blends_layers: whether it takes glass in one layer, with guides blended from both, instead of twice.
-        has_kernels: whether compiled kernels do a part of its work.
-        baseline_for: the signals whose denoisers are compared with it, in evaluations, cards and trade-offs.
-        evaluated_with: suffixes with which `onespp eval` runs it beside the denoiser itself.
-        dispensable: channels that its network can do without where they do not vary, and its input for a value.
-        inputs: the inputs of its network in order, and how many channels each has; channels by their names.
-        constants: channels that it does without, see `specialise`, and the value that each has everywhere.
-        precision: what its network computes in, see `prepare`. Frames, states' images and outputs are always float32.
-        device: "cpu" or "cuda", where it was moved to: frames have to be there, and its output is.
+    Frames, states' images and outputs are always float32.
     """
 
-    reads: tuple[str, ...]
-    signal: Signal = "total"
-    refuses: Mapping[torch.dtype, str] = MappingProxyType({})
-    made_from: str = "paper"
-    is_network: bool = False
-    offline: bool = False
-    convex: bool = False
-    separates_lights: bool = False
-    filters_emission: bool = False
-    blends_layers: bool = False
-    has_kernels: bool = True
-    baseline_for: tuple[Signal, ...] = ()
-    evaluated_with: tuple[str, ...] = ()
+    reads: tuple[str, ...]  # channels it needs; nothing else is loaded, rendered or stored for it
+    signal: Signal = "total"  # the light that it returns
+    refuses: Mapping[torch.dtype, str] = MappingProxyType({})  # precisions that it does not compute in, with the reason
+    made_from: str = "paper"  # what it follows, for tables: others' papers, their authors' code, accounts of either
+    is_network: bool = False  # whether it needs trained weights
+    offline: bool = False  # whether a frame takes seconds: it runs only where it is named, not in runs of all
+    convex: bool = False  # whether it returns weighted means of irradiance since the last reset, with weights >= 0
+    separates_lights: bool = False  # whether it filters direct and indirect light apart
+    filters_emission: bool = False  # whether emission is a part of what it filters; else it is added back untouched
+    blends_layers: bool = False  # whether it takes glass in one layer, with guides blended from both, instead of twice
+    has_kernels: bool = True  # whether compiled kernels do a part of its work
+    baseline_for: tuple[Signal, ...] = ()  # signals whose denoisers evaluations, cards and trade-offs compare with it
+    evaluated_with: tuple[str, ...] = ()  # suffixes with which `onespp eval` runs it beside the denoiser itself
+    inputs: Mapping[str, int] = MappingProxyType({})  # of its network in order, and how many channels each has
+    # Channels, by the names of inputs, that its network can do without where they do not vary; its input for a value.
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
-    precision: torch.dtype = torch.float32
-    device: str = "cpu"
+    first_layer: str  # the path of the convolution, or of the list of those, that such channels are dropped from
+    precision: torch.dtype = torch.float32  # what its network computes in, see `prepare`
+    device: str = "cpu"  # or "cuda", where it was moved to: frames have to be there, and its output is
 
     def __init__(self, *, signal: Signal | None = None):
         """`signal` is the class's unless another one is named."""
         super().__init__()
         self.signal = signal or type(self).signal
-        self.inputs: dict[str, int] = {}
-        self.constants: dict[str, list[float]] = {}
+        self.constants: dict[str, list[float]] = {}  # channels that it does without, with the value each has everywhere
 
     def unavailable(self) -> str | None:
         """Why it cannot run on this machine, with what to install; None where it can."""
@@ -147,7 +131,8 @@ class Denoiser(nn.Module):
 
     def first_layers(self) -> Sequence[nn.Conv2d]:
         """The convolutions that read `inputs`."""
-        raise NotImplementedError
+        first = self.get_submodule(self.first_layer)
+        return cast(Sequence[nn.Conv2d], first if isinstance(first, nn.ModuleList) else [first])
 
     def specialise(self, constants: Mapping[str, Sequence[float]]) -> None:
         """Remove the inputs of `constants` from the network's first convolutions and add their effect to the biases.
@@ -160,7 +145,7 @@ class Denoiser(nn.Module):
             first = sum(self.inputs[other] for other in names[: names.index(name)])
             for layer in self.first_layers():
                 drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
-            del self.inputs[name]
+            self.inputs = {other: count for other, count in self.inputs.items() if other != name}
             self.constants[name] = list(constants[name])
 
     def check_constants(self, frame: Frame) -> None:

@@ -18,6 +18,7 @@ from datasets.frame import Frame
 from models import compiled
 from models.compiled import layers as kernels
 from models.compiled.layers import FILL_WINDOWS
+from models.networks.pixel_kernels import window_taps
 from models.operators import MIN_DIVISOR
 
 LAYER_SCALE = 2  # px, for a pixel of the second layer
@@ -31,15 +32,9 @@ def second_share(frame: Frame) -> Tensor:
 
 def window_sums(image: Tensor, mesh_id: Tensor, radius: int, of_mesh: bool) -> Tensor:
     """Sums of an image (B, C, H, W) over windows of 2 radius + 1 pixels a side, or those of the same mesh there."""
-    height, width = mesh_id.shape[-2:]
-    sides = (radius, radius, radius, radius)
-    padded, meshes = F.pad(image, sides), F.pad(mesh_id, sides, value=-1.0)
     sums = torch.zeros_like(image)
-    for dy in range(2 * radius + 1):
-        for dx in range(2 * radius + 1):
-            rows, columns = slice(dy, dy + height), slice(dx, dx + width)
-            counts = (meshes[..., rows, columns] == mesh_id) if of_mesh else 1
-            sums += padded[..., rows, columns] * counts
+    for _, here, there in window_taps(2 * radius + 1, *mesh_id.shape[-2:]):
+        sums[here] += image[there] * (mesh_id[there] == mesh_id[here]) if of_mesh else image[there]
     return sums
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.channels import LUMINANCE_WEIGHTS
+from models.history.geometry import pixel_centres
 
 MAX_LUMINANCE = 1e16  # its square must stay finite
 MAX_IRRADIANCE = 1e30  # sums with weights of exp(10) must stay finite
@@ -55,3 +56,13 @@ def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
     right = -x.shape[-1] % multiple
     bottom = -x.shape[-2] % multiple
     return F.pad(x, (0, right, 0, bottom), mode="replicate") if right or bottom else x
+
+
+def sampling_grid(motion: Tensor) -> Tensor:
+    """Where F.grid_sample fetches what `motion` (B, 2, H, W), in pixels, leads each pixel to: (B, H, W, 2)."""
+    height, width = motion.shape[-2:]
+    x, y = pixel_centres(height, width, motion)
+    # Far outside the image an index would overflow; any place outside is as good.
+    x = (x + motion[:, 0]).clamp(-1, width + 1) * (2 / width) - 1
+    y = (y + motion[:, 1]).clamp(-1, height + 1) * (2 / height) - 1
+    return torch.stack([x, y], dim=-1)

@@ -27,8 +27,7 @@ from models.networks.ntd import NTD, NTDMean, NTDTraditional
 from models.networks.one import One
 from models.networks.rae import RAE
 from models.networks.wskp import KP, MRKP, WSKP, WSKP3, WSKPMR
-from models.wrappers.accumulated import AccumulatedAfter
-from models.wrappers.adaptive import Adaptive
+from models.wrappers.adaptive import AccumulatedAfter, Adaptive
 from models.wrappers.shrinkage import JamesStein
 from models.wrappers.taa import TAA
 from models.wrappers.wrapper import Wrapper

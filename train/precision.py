@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from lightning_fabric import Fabric
 
-from models.fastest import MIN_SPEEDUP
+from models.spec import MIN_SPEEDUP
 from timing import device_clock, take_turns, thread_count
 from train.crops import AnyBatch
 from train.losses.network_loss import NetworkLoss

@@ -1,4 +1,4 @@
-"""models.networks.affinity for the CPU, with its gradients: every loop along a row is vectorised.
+"""The affinity filter of models.networks.one for the CPU, with its gradients: every loop along a row is vectorised.
 
 A level filters with 3 x 3 taps q, `step` pixels apart, of each pixel p that shows a surface (surface_p = 1, else 0):
 
@@ -25,7 +25,7 @@ STRIDE = 4  # features that are compared in one pass
 
 
 class Level(NamedTuple):
-    """What a level filters, row after row (see models.networks.affinity), or the gradients of that."""
+    """What a level filters, row after row (see models.networks.one), or the gradients of that."""
 
     image: Image  # (B, 3, N)
     features: Image  # (B, F, N), F a multiple of STRIDE
@@ -180,7 +180,7 @@ def layout_of(surface: Tensor, step: int) -> TapLayout:
 def filter_level(
     image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> tuple[Tensor, Tensor]:
-    """See models.networks.affinity.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
+    """See models.networks.one.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
     level, layout = level_of([image, features, sharpness, own, importance]), layout_of(surface, step)

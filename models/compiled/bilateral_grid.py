@@ -1,4 +1,4 @@
-"""models.networks.bilateral_grid for the CPU: two rows of cells at a time, which stay in the cache.
+"""models.networks.nbgd.grid_mean for the CPU: two rows of cells at a time, which stay in the cache.
 
 A row of cells is a line of columns * levels * 4 numbers: red, green, blue and weight. It has an empty column and level
 more at either end, so that no pixel has to test whether its cells are inside.

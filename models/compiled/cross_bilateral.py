@@ -1,4 +1,4 @@
-"""models.networks.cross_bilateral for the CPU, with its gradient: rows in parallel, loops along them vectorised."""
+"""The filter of models.networks.lbf for the CPU, with its gradient: rows in parallel, loops along them vectorised."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,7 +24,7 @@ from models.compiled.lines import (
 from models.operators import MIN_DIVISOR
 
 if TYPE_CHECKING:
-    from models.networks.cross_bilateral import Pixels
+    from models.networks.lbf import Pixels
 
 FILTER_RADIUS = 27  # px: windows of 55 x 55
 FEATURE_GROUPS = (3, 3, 3, 1, 1)  # channels of each feature: position, normal, albedo, roughness, visibility
@@ -35,7 +35,7 @@ FIRST_OF_GROUP = tuple(np.cumsum((0, *FEATURE_GROUPS)).tolist())  # channel of e
 
 
 class Planes(NamedTuple):
-    """What is filtered of one item, see models.networks.cross_bilateral."""
+    """What is filtered of one item, see models.networks.lbf."""
 
     image: Image
     variance: Image

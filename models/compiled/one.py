@@ -4,7 +4,7 @@ Networks take and give pixels with their channels side by side; all other loops 
 """
 
 import itertools
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -32,35 +32,23 @@ SIDE_MULTIPLE = 8  # of the sides of the network's images
 MIN_LENGTH = 1e-3  # samples of a history, to divide by
 
 
-class NetworkInput(NamedTuple):
-    """A row of ONE_INPUTS."""
-
-    name: str
-    channels: int
-    # "log exposed": log(1 + exposure · irradiance); "per pixel": models.networks.one.per_pixel_inputs; "surface": of
-    # the G-buffer
-    transform: Literal["log exposed", "per pixel", "surface"]
-    without_history: str | None = None  # the input whose irradiance stands in where there is no history
-
-
-# The inputs of the network, in order. PyTorch, kernel and export all take their order from here.
-ONE_INPUTS = (
-    NetworkInput("noisy", 3, "log exposed"),
-    NetworkInput("mean_3x3", 3, "log exposed"),
-    NetworkInput("mean_9x9", 3, "log exposed"),
-    NetworkInput("output", 3, "log exposed", without_history="mean_9x9"),
-    NetworkInput("accumulated", 3, "log exposed", without_history="noisy"),
-    NetworkInput("deviation", 1, "per pixel"),
-    NetworkInput("1/samples", 1, "per pixel"),
-    NetworkInput("1/(length + samples)", 1, "per pixel"),
-    NetworkInput("has_history", 1, "per pixel"),
-    NetworkInput("latent", LATENT, "per pixel"),
-    NetworkInput("albedo", 3, "surface"),
-    NetworkInput("view_normal", 3, "surface"),
-    NetworkInput("depth", 1, "surface"),
-    NetworkInput("roughness", 1, "surface"),
-)
-INPUT_CHANNELS = {row.name: row.channels for row in ONE_INPUTS}
+# The inputs of the network in order, and how many channels each has: see models.networks.one.input_channels.
+INPUT_CHANNELS = {
+    "noisy": 3,
+    "mean_3x3": 3,
+    "mean_9x9": 3,
+    "output": 3,
+    "accumulated": 3,
+    "deviation": 1,
+    "1/samples": 1,
+    "1/(length + samples)": 1,
+    "has_history": 1,
+    "latent": LATENT,
+    "albedo": 3,
+    "view_normal": 3,
+    "depth": 1,
+    "roughness": 1,
+}
 
 
 def head_channels(levels: int) -> dict[str, int]:
@@ -74,8 +62,8 @@ def filter_levels(outputs: int) -> int:
     return (outputs - sum(head_channels(0).values())) // 3
 
 
-# The first channel of each input, in the order of ONE_INPUTS: constants, as Numba needs them.
-FIRST_CHANNELS = itertools.accumulate([row.channels for row in ONE_INPUTS[:-1]], initial=0)
+# The first channel of each input, in the order of INPUT_CHANNELS: constants, as Numba needs them.
+FIRST_CHANNELS = itertools.accumulate([*INPUT_CHANNELS.values()][:-1], initial=0)
 NOISY, MEAN_3X3, MEAN_9X9, OUTPUT, ACCUMULATED, DEVIATION, NEWEST, OLDEST, HAS_HISTORY, *OTHERS = FIRST_CHANNELS
 LATENT_INPUT, ALBEDO, VIEW_NORMAL, DEPTH, ROUGHNESS = OTHERS
 CHUNK = 512
@@ -177,7 +165,7 @@ class SurfaceArrays(NamedTuple):
 
 @jit_in_any_order
 def fill_lines(lines: Rows, pixels: PixelArrays, surfaces: SurfaceArrays, y: Index, x: Index, n: int) -> None:
-    """The network's inputs (C, ·) of n pixels of a row from x on, in the order of ONE_INPUTS."""
+    """The network's inputs (C, ·) of n pixels of a row from x on, in the order of INPUT_CHANNELS."""
     row = slice(x, x + n)
     noisy, _, mean_9x9, _, history, _ = pixels
     valid = pixels.has_history[0, y, row]

@@ -33,22 +33,13 @@ class GraphGBuffer(NamedTuple):
 
     def points(self, pixels: Tensor) -> Tensor:
         """Visible points (3, n) of `pixels` (2, n), in camera space."""
-        entries = self.K.flatten()
-        focal = entries.index_select(0, torch.tensor([0, 4]))[:, None]
-        middle = entries.index_select(0, torch.tensor([2, 5]))[:, None]
+        focal, middle = self.K.flatten().index_select(0, torch.tensor([0, 4, 2, 5]))[:, None].split(2)
         along_axis = self.depth.view(1, -1)
         return torch.cat([(pixels + 0.5 - middle) / focal * along_axis, along_axis])
 
     def normals(self) -> Tensor:
         """Normals (3, n) in camera space."""
         return self.camera_to_world[:3, :3].T @ self.normal.view(3, -1)
-
-
-def pixel_coordinates(height: int, width: int) -> Tensor:
-    """Columns and rows (2, n) of all pixels."""
-    columns = torch.arange(width, dtype=torch.float32).expand(height, width)
-    rows = torch.arange(height, dtype=torch.float32)[:, None].expand(height, width)
-    return torch.stack([columns, rows]).flatten(1)
 
 
 def reprojection_table(history: Tensor, previous: GraphGBuffer, pixels: Tensor) -> Tensor:
@@ -88,12 +79,19 @@ def taps(table: Tensor, expected: Tensor, at: Tensor, height: int, width: int) -
     return history, ((mesh == expected_mesh) & same_surface)[0].to(history)
 
 
-def reprojected(table: Tensor, expected: Tensor, motion: Tensor, pixels: Tensor) -> Tensor:
+def reprojected(
+    history: Tensor, now: GraphGBuffer, previous: GraphGBuffer, to_previous: Tensor, motion: Tensor
+) -> Tensor:
     """The history (1, C, H, W) at all pixels, 0 where no tap is valid. `motion` is (1, 2, H, W).
 
     2 x 2 taps for every pixel, 3 x 3 for those without a valid one.
     """
     height, width = motion.shape[-2:]
+    columns = torch.arange(width, dtype=torch.float32).expand(height, width)
+    rows = torch.arange(height, dtype=torch.float32)[:, None].expand(height, width)
+    pixels = torch.stack([columns, rows]).flatten(1)
+    table = reprojection_table(history, previous, pixels)
+    expected = expected_surfaces(now, to_previous, pixels)
     # Far outside the image an index would overflow; any position outside is as good.
     position = (pixels + motion.view(2, -1)).clamp(-2, torch.sym_max(height, width) + 1)
     floor = position.floor()
@@ -112,17 +110,6 @@ def reprojected(table: Tensor, expected: Tensor, motion: Tensor, pixels: Tensor)
     mean = (nearby * valid).sum(dim=1) / valid.sum(dim=0).clamp(min=1)
     history = history.scatter(1, lost.expand(len(history), -1), mean)
     return history.view(1, -1, height, width)
-
-
-class Scale(NamedTuple):
-    """Running exposure and depth scale, each (1,)."""
-
-    exposure: Tensor
-    depth: Tensor  # the running median
-
-    def normalised_depth(self, depth: Tensor) -> Tensor:
-        """See models.history.running_scale.RunningScale.normalised_depth."""
-        return torch.where(depth > 0, depth / (depth + self.depth), 1)
 
 
 def measured_luminance(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,8 +139,8 @@ def measured_depth(depth: Tensor, height: int, width: int) -> tuple[Tensor, Tens
     return torch.log(torch.where(hits > 0, median, 1)), any_hit
 
 
-def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tensor, Scale]:
-    """The next `state`, and its scale: see models.history.running_scale.running_scale.
+def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The next `state`, the exposure (1,) and the normalised depth: see models.history.running_scale.
 
     The state (4,) contains the running means of both measurements and their frame counts; zeros at first.
     """
@@ -164,5 +151,5 @@ def updated_scale(state: Tensor, radiance: Tensor, depth: Tensor) -> tuple[Tenso
     count = count + valid
     rate = (1 / count.clamp(min=1)).clamp(min=MIN_RATE) * valid
     mean = mean + rate * (new - mean)
-    grey_over_luminance, depth_scale = torch.exp(mean * torch.tensor([-1.0, 1.0])).split(1)
-    return torch.cat([mean, count]), Scale(grey_over_luminance, depth_scale)
+    exposure, depth_scale = torch.exp(mean * torch.tensor([-1.0, 1.0])).split(1)
+    return torch.cat([mean, count]), exposure, torch.where(depth > 0, depth / (depth + depth_scale), 1)

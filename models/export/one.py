@@ -9,21 +9,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from models.compiled.affinity import MIN_LOGIT
-from models.compiled.one import MAX_EXPOSED, SIDE_MULTIPLE
-from models.export.history import Scale, updated_scale
+from models.compiled.one import SIDE_MULTIPLE
+from models.export.history import updated_scale
 from models.export.step import Step, Warp, demodulation, image
 from models.filters.neighbours import means_of, summands
-from models.networks.one import (
-    HISTORY,
-    PATCH,
-    Decoded,
-    One,
-    PixelInputs,
-    decode,
-    exposed_images,
-    per_pixel_inputs,
-    surface_inputs,
-)
+from models.networks.one import HISTORY, PATCH, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
 
 COARSE_PADDING = (0, 2, 0, 2)  # one more pixel of half the resolution, at the right and the bottom
@@ -47,7 +37,7 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
 def affinity_level(
     image: Tensor, features: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, surface: Tensor, step: int
 ) -> Tensor:
-    """See models.networks.affinity.affinity_level; `image` is 0 for background."""
+    """See models.networks.one.affinity_level; `image` is 0 for background."""
     values = torch.cat([image, surface], dim=1)
     difference = neighbour_taps(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
@@ -58,16 +48,13 @@ def affinity_level(
     return torch.where(surface > 0, weighted / weights.clamp(min=MIN_DIVISOR), 0)
 
 
-def pointwise(layers: nn.Sequential) -> nn.Sequential:
-    """Per-pixel layers on images: linear ones as convolutions of 1 x 1."""
-    plain: list[nn.Module] = []
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            convolution = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=layer.bias is not None)
-            convolution.load_state_dict(layer.state_dict() | {"weight": layer.weight[:, :, None, None]})
-            layer = convolution
-        plain.append(layer)
-    return nn.Sequential(*plain)
+def pointwise(layer: nn.Module) -> nn.Module:
+    """A layer on pixels as one on images: linear ones become convolutions of 1 x 1."""
+    if not isinstance(layer, nn.Linear):
+        return layer
+    convolution = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=layer.bias is not None)
+    convolution.load_state_dict(layer.state_dict() | {"weight": layer.weight[:, :, None, None]})
+    return convolution
 
 
 def on_pixels(layer: nn.Module) -> nn.Sequential:
@@ -91,21 +78,15 @@ def resized(x: Tensor, height: int, width: int) -> Tensor:
 
 
 class Coarsest(nn.Sequential):
-    """The layers at 1/8 of the resolution, on images padded with zeros: a tracer needs two pixels."""
+    """The layers at 1/8 of the resolution and the next, on images padded with zeros: a tracer needs two pixels."""
 
     def forward(self, x: Tensor) -> Tensor:
+        *layers, up = self
         inside = F.pad(torch.ones_like(x[:, :1]), COARSE_PADDING)[..., ::2, ::2]
         x = F.pad(x, COARSE_PADDING)
-        for layer in self:
+        for layer in layers:
             x = layer(x) * inside
-        return x
-
-
-class CropPadding(nn.Module):
-    """Removes the padding of `Coarsest`, at twice its resolution."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x[..., :-2, :-2]
+        return up(x)[..., :-2, :-2]
 
 
 class OneStep(Step):
@@ -115,7 +96,6 @@ class OneStep(Step):
     history = image(
         "history",
         sum(HISTORY),
-        None,
         "output and accumulated irradiance, linear RGB each; effective length of the accumulation in samples; latent",
     )
 
@@ -124,50 +104,32 @@ class OneStep(Step):
         self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
-        self.trunk.detail = pointwise(self.trunk.detail)
-        self.trunk.down_c = Coarsest(*self.trunk.down_c)
-        self.trunk.up_b = nn.Sequential(self.trunk.up_b, CropPadding())  # type: ignore[assignment]
+        self.trunk.detail = nn.Sequential(*map(pointwise, self.trunk.detail))
+        self.trunk.down_c = Coarsest(*self.trunk.down_c, self.trunk.up_b)
+        self.trunk.up_b = nn.Identity()  # type: ignore[assignment]
         self.requires_grad_(False)
 
-    def pixel_inputs(self, x: dict[str, Tensor], noisy: Tensor, surface: Tensor) -> PixelInputs:
-        """See One.pixel_inputs."""
+    def forward(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
+        noisy, divisor, surface = demodulation(x)
+        noisy = noisy.clamp(0.0, MAX_IRRADIANCE) * surface
+        state, exposure, depth = updated_scale(x["scale"], noisy * divisor, x["depth"])
         mesh = x["mesh_id"].to(noisy) + 1
         sums_3x3 = mesh_sums(summands(noisy), mesh, 1)
         means = means_of(sums_3x3, mesh_sums(sums_3x3, mesh, 3))
         history = self.reprojected_history(x)
         has_history = (history[:, 6:7] > 0).to(noisy) * surface  # after the first frame, no length is 0
-        return PixelInputs(noisy, *means, history, has_history)
-
-    def network_inputs(self, x: dict[str, Tensor], inputs: PixelInputs, scale: Scale) -> Tensor:
-        """The inputs of models.networks.one.network_inputs, for pixels."""
-        images = torch.cat(exposed_images(inputs), dim=1)
-        colours = torch.log1p((images.clamp(min=0) * scale.exposure).clamp(max=MAX_EXPOSED))
+        inputs = PixelInputs(noisy, *means, history, has_history)
         to_view = torch.tensor((-1.0, 1.0, -1.0))[:, None] * x["camera_to_world"][:3, :3].T  # see Frame.to_view
         normal = (to_view @ x["normal"].view(3, -1)).view_as(x["normal"])
-        surfaces = surface_inputs(x["albedo"], normal, scale.normalised_depth(x["depth"]), x["roughness"])
-        return torch.cat([colours, *per_pixel_inputs(inputs, x["samples"]), *surfaces], dim=1)
-
-    def network(self, channels: Tensor) -> Tensor:
-        """Head outputs (1, ·, H, W)."""
-        height, width = channels.shape[-2:]
-        whole = (SIDE_MULTIPLE * ((size + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for size in (height, width))
-        return resized(self.trunk(resized(channels, *whole)), height, width) + self.trunk.detail(channels)
-
-    def forward(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        x = tensors
-        noisy, divisor, surface = demodulation(x)
-        noisy = noisy.clamp(0.0, MAX_IRRADIANCE) * surface
-        state, scale = updated_scale(x["scale"], noisy * divisor, x["depth"])
-        inputs = self.pixel_inputs(x, noisy, surface)
-        head = self.network(self.network_inputs(x, inputs, scale))
+        surfaces = (x["albedo"], normal, depth, x["roughness"])
+        channels = input_channels(inputs, exposure, x["samples"], surfaces)
+        size = channels.shape[-2:]
+        whole = (SIDE_MULTIPLE * ((side + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for side in size)
+        head = resized(self.trunk(resized(channels, *whole)), *size) + self.trunk.detail(channels)
         decoded = Decoded(*decode(head, inputs, x["samples"]))
-        filtered = decoded.accumulated
-        planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
-        for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):
-            filtered = affinity_level(filtered, decoded.features, sharpness, centre, importance, surface, step)
-        output = torch.lerp(inputs.history[:, :3], filtered, decoded.alpha[:, 1:]) * surface
+        images = carried(decoded, history, surface, self.steps, affinity_level)
         return {
-            "radiance": output * divisor + x["emission"],
-            "new_history": torch.cat([output, decoded.accumulated, decoded.length, decoded.latent], dim=1),
+            "radiance": images[0] * divisor + x["emission"],
+            "new_history": torch.cat(images, dim=1),
             "new_scale": state,
         }

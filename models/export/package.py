@@ -13,39 +13,29 @@ import torch
 from datasets.frame import Frame
 from errors import BadInput
 from files import read_json, write_json
-from models.denoiser import Denoiser
 from models.export.one import OneStep
 from models.export.page import instructions
-from models.export.program import OPSET, RUN, WRITE, Format, Operators, check_installed, play, trace
+from models.export.program import OPSET, RUN, WRITE, Format, check_installed, play, trace
 from models.export.step import Port, Step, Warp
 from models.export.wskp import WSKPStep
-from models.networks.one import One
-from models.networks.wskp import WSKP
-from models.registry import DENOISERS, prototype
 from models.spec import PRECISIONS, load
 from provenance import file_digest, versions
 
 MANIFEST = "manifest.json"
 PACKAGES = ("onespp", "torch", "onnx", "onnxscript", "onnxruntime")
-EXPORT_STEPS: dict[type[Denoiser], type[Step]] = {WSKP: WSKPStep, One: OneStep}  # by class, subclasses included
-EXPORTABLE = [name for name, kind in DENOISERS.items() if issubclass(kind, tuple(EXPORT_STEPS))]
+EXPORTABLE: dict[str, type[Step]] = {"wskp3": WSKPStep, "wskp6": WSKPStep, "one": OneStep}  # denoisers that have one
 
 
 def check_exportable(name: str) -> None:
     """Raise BadInput for the name of a denoiser that has no step."""
-    if not isinstance(prototype(name), tuple(EXPORT_STEPS)):
+    if name not in EXPORTABLE:
         raise BadInput(f"'{name}' cannot be exported; {', '.join(EXPORTABLE)} can")
-
-
-def step_of(denoiser: Denoiser, warp: Warp) -> Step:
-    """The step of a denoiser, which is prepared for inference and must not be used afterwards."""
-    return next(step for kind, step in EXPORT_STEPS.items() if isinstance(denoiser, kind))(denoiser, warp)
 
 
 def load_step(name: str, weights: Path, precision: torch.dtype, warp: Warp) -> Step:
     """The step of a named denoiser with the weights of a file. Raises BadInput where either does not fit."""
     check_exportable(name)
-    return step_of(load(name, weights, precision), warp)
+    return EXPORTABLE[name](load(name, weights, precision), warp)
 
 
 @dataclass(frozen=True)
@@ -57,10 +47,6 @@ class Export:
     to: Format
     precision: Literal["float32", "float16"]  # of its network; images and state are float32
     warp: Warp  # whether the step reprojects its history itself
-
-    @property
-    def file(self) -> str:
-        return f"{self.name}.{self.to}"
 
 
 def largest_difference(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -94,13 +80,12 @@ def verify(export: Export, path: Path, step: Step, frames: Sequence[Frame], gold
     return {"from_golden": from_golden, "from_onespp": from_ours}
 
 
-def manifest(export: Export, step: Step, operators: Operators, differences: dict[str, float]) -> dict[str, Any]:
+def manifest(export: Export, step: Step, operators: dict[str, Any], differences: dict[str, float]) -> dict[str, Any]:
     """The content of manifest.json without the hashes of files."""
-    total = sum(operators.kinds.values())  # outside of branches
     return {
         "schema": 1,
         "denoiser": export.name,
-        "file": export.file,
+        "file": f"{export.name}.{export.to}",
         "format": export.to,
         "opset": OPSET if export.to == "onnx" else None,
         "precision": export.precision,
@@ -108,30 +93,13 @@ def manifest(export: Export, step: Step, operators: Operators, differences: dict
         "inputs": [port_entry(port) for port in step.inputs],
         "outputs": [port_entry(port) for port in step.outputs],
         "state": [
-            {"input": each.port.name, "from": each.source, "warp_first": each.warped, "initial": 0}
-            for each in step.carried
+            {"input": port.name, "from": port.source, "warp_first": port.warped, "initial": 0} for port in step.carried
         ],
         "weights_sha256": file_digest(export.weights),
-        "operators": {"total": total, "branches": operators.branches, "kinds": operators.kinds},
+        "operators": operators,
         "largest_difference": differences,
         "versions": versions(PACKAGES),
     }
-
-
-def write_files(folder: Path, export: Export, frames: Sequence[Frame]) -> dict[str, Any]:
-    """Write all files of an export into the empty `folder`. Returns the manifest."""
-    step = load_step(export.name, export.weights, PRECISIONS[export.precision], export.warp)
-    program = trace(step, frames[0])
-    path = folder / export.file
-    operators = WRITE[export.to](program, step, path)
-    golden = folder / "golden"
-    golden.mkdir()
-    content = manifest(export, step, operators, verify(export, path, step, frames, golden))
-    (folder / "README.md").write_text(instructions(content))
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    content["sha256"] = {str(file.relative_to(folder)): file_digest(file) for file in files}
-    write_json(folder / MANIFEST, content)
-    return content
 
 
 def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[str, Any]:
@@ -145,11 +113,18 @@ def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[
     is_export = earlier.exists() and "sha256" in read_json(earlier)
     if folder.exists() and any(folder.iterdir()) and not is_export:
         raise BadInput(f"{folder} contains files that are not an export: choose another --out")
-    folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    temporary.mkdir()
+    golden = temporary / "golden"
+    golden.mkdir(parents=True)
     try:
-        content = write_files(temporary, export, frames)
+        step = load_step(export.name, export.weights, PRECISIONS[export.precision], export.warp)
+        path = temporary / f"{export.name}.{export.to}"
+        operators = WRITE[export.to](trace(step, frames[0]), step, path)
+        content = manifest(export, step, operators, verify(export, path, step, frames, golden))
+        (temporary / "README.md").write_text(instructions(content))
+        files = sorted(file for file in temporary.rglob("*") if file.is_file())
+        content["sha256"] = {str(file.relative_to(temporary)): file_digest(file) for file in files}
+        write_json(temporary / MANIFEST, content)
         shutil.rmtree(folder, ignore_errors=True)
         temporary.rename(folder)
     finally:

@@ -5,10 +5,9 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -16,11 +15,12 @@ from torch.export import Dim, ExportedProgram
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.export.step import HEIGHT, MESHES, WIDTH, Step, Tensors
+from models.export.step import HEIGHT, MESHES, WIDTH, Step
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 
-Compute = Callable[[dict[str, Tensor]], dict[str, Tensor]]  # outputs by name, of inputs by name
+Tensors = dict[str, Tensor]  # by name
+Compute = Callable[[Tensors], Tensors]  # outputs of inputs
 Format = Literal["onnx", "pt2"]
 OPSET = 20
 NEEDED = {"onnx": ("onnx", "onnxscript", "onnxruntime"), "pt2": ()}
@@ -48,9 +48,7 @@ def quiet() -> Iterator[None]:
 
 def dynamic(step: Step) -> dict[str, dict[int, str]]:
     """The names of each input's sizes that may differ from call to call, by axis."""
-    return {
-        port.name: {axis: size for axis, size in enumerate(port.shape) if isinstance(size, str)} for port in step.inputs
-    }
+    return {p.name: {axis: size for axis, size in enumerate(p.shape) if isinstance(size, str)} for p in step.inputs}
 
 
 def trace(step: Step, frame: Frame) -> ExportedProgram:
@@ -59,19 +57,17 @@ def trace(step: Step, frame: Frame) -> ExportedProgram:
     shapes = {name: {axis: sizes[size] for axis, size in named.items()} for name, named in dynamic(step).items()}
     inputs = {**step.frame_inputs(frame), **step.initial_state(frame)}
     with torch.no_grad(), quiet():
-        return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"tensors": shapes})
+        return torch.export.export(step.eval(), (inputs,), dynamic_shapes={"x": shapes})
 
 
-@dataclass(frozen=True)
-class Operators:
-    """Operators of a graph, counted by kind, and in each branch, of which a frame takes one."""
-
-    kinds: dict[str, int]
-    branches: dict[str, int]
+def counted(kinds: Iterable[str], branches: dict[str, int]) -> dict[str, Any]:
+    """A manifest's count of a graph's operators by kind, and of those in each branch, of which a frame takes one."""
+    by_kind = Counter(sorted(kinds))
+    return {"total": by_kind.total(), "branches": branches, "kinds": by_kind}
 
 
-def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
-    """Write one file, weights included."""
+def write_onnx(program: ExportedProgram, step: Step, path: Path) -> dict[str, Any]:
+    """Write one file, weights included. Returns its operators, see `counted`."""
     from onnxscript.optimizer import remove_unused_nodes
 
     with quiet():
@@ -81,7 +77,7 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
             opset_version=OPSET,
             input_names=[port.name for port in step.inputs],
             output_names=[port.name for port in step.outputs],
-            dynamic_shapes={"tensors": dynamic(step)},
+            dynamic_shapes={"x": dynamic(step)},
             verbose=False,
         )
         assert written is not None
@@ -90,20 +86,20 @@ def write_onnx(program: ExportedProgram, step: Step, path: Path) -> Operators:
     nodes = list(written.model.graph)
     attributes = [attribute for node in nodes for attribute in node.attributes.values()]
     branches = {each.name: len(each.value) for each in attributes if each.type.name == "GRAPH"}
-    return Operators(dict(Counter(sorted(node.op_type for node in nodes))), branches)
+    return counted((node.op_type for node in nodes), branches)
 
 
-def write_pt2(program: ExportedProgram, step: Step, path: Path) -> Operators:
-    """Write one file, weights included."""
+def write_pt2(program: ExportedProgram, step: Step, path: Path) -> dict[str, Any]:
+    """See write_onnx."""
 
     def calls(graph: torch.fx.Graph) -> list[str]:
-        return sorted(str(node.target) for node in graph.nodes if node.op == "call_function")
+        return [str(node.target) for node in graph.nodes if node.op == "call_function"]
 
     with quiet():
         torch.export.save(program, path)
     children = program.graph_module.named_children()
     branches = {name: len(calls(each.graph)) for name, each in children if isinstance(each, torch.fx.GraphModule)}
-    return Operators(dict(Counter(calls(program.graph))), branches)
+    return counted(calls(program.graph), branches)
 
 
 def run_onnx(path: Path) -> Compute:
@@ -116,7 +112,7 @@ def run_onnx(path: Path) -> Compute:
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
 
-    def compute(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    def compute(inputs: Tensors) -> Tensors:
         outputs = session.run(names, {name: tensor.numpy() for name, tensor in inputs.items()})
         return {name: torch.from_numpy(array) for name, array in zip(names, outputs, strict=True)}
 
@@ -126,14 +122,7 @@ def run_onnx(path: Path) -> Compute:
 def run_pt2(path: Path) -> Compute:
     """The file's step in PyTorch."""
     with quiet():
-        module = torch.export.load(path).module()
-
-    def compute(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-        with torch.no_grad():
-            outputs: dict[str, Tensor] = module(inputs)
-        return outputs
-
-    return compute
+        return torch.no_grad()(torch.export.load(path).module())
 
 
 WRITE = {"onnx": write_onnx, "pt2": write_pt2}
@@ -142,9 +131,9 @@ RUN = {"onnx": run_onnx, "pt2": run_pt2}
 
 def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tuple[Tensors, Tensors]]:
     """Inputs and outputs of each frame (B = 1). After a cut the state is the initial one."""
-    warped = [each.port.name for each in step.carried if each.warped]
+    warped = [port.name for port in step.carried if port.warped]
     previous: Frame | None = None
-    state: dict[str, Tensor] = {}
+    state: Tensors = {}
     for frame in frames:
         if previous is None or not frame.follows(previous.moment):
             state = step.initial_state(frame)
@@ -153,5 +142,6 @@ def play(step: Step, frames: Iterable[Frame], compute: Compute) -> Iterator[tupl
         inputs = {**step.frame_inputs(frame), **state}
         outputs = compute(inputs)
         yield inputs, outputs
-        state = step.next_state(inputs, outputs)
+        tensors = {**inputs, **outputs}
+        state = {port.name: tensors[port.source] for port in step.carried}
         previous = frame

@@ -1,4 +1,6 @@
-"""Convolution, sum and ReLU fused: on CPUs, passes over memory take most of the time of a large image."""
+"""Layers of U-Nets. Convolution, sum and ReLU are fused: on CPUs, passes over memory take most of the time."""
+
+from itertools import accumulate
 
 import torch
 from torch import Tensor, nn
@@ -35,3 +37,9 @@ def fusable(x: Tensor) -> bool:
     if not plain or not torch.backends.mkldnn.is_available() or not hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
         return False
     return x.dtype == torch.float32 or (x.dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+def encoded(blocks: nn.ModuleList, x: Tensor) -> list[Tensor]:
+    """The features of each level of an encoder, finest first: each block gets those before, at half the resolution."""
+    first, *others = blocks
+    return [*accumulate(others, lambda x, block: block(F.max_pool2d(x, 2)), initial=first(x))]

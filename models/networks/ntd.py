@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import torch
@@ -10,11 +11,10 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
 from models.denoiser import Denoiser, State, matching_state
-from models.history.geometry import pixel_centres
 from models.history.running_scale import RunningScale, running_scale
-from models.networks.convolution import ConvReLU
+from models.networks.convolution import ConvReLU, encoded
 from models.networks.pixel_kernels import apply_kernels
-from models.operators import halve, halve_surface, pad_to_multiple, pyramid
+from models.operators import halve, halve_surface, pad_to_multiple, pyramid, sampling_grid
 
 NTD_INPUTS = {"noisy": 3, "warped": 3, "albedo": 3, "normal": 3, "depth": 1}  # of the network (§4.2)
 WIDTHS = (32, 48, 64, 80, 96)  # ours: the paper does not print its own
@@ -47,11 +47,9 @@ class KernelNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        inputs = (sum(NTD_INPUTS.values()), *WIDTHS[:-1])
-        self.encode = nn.ModuleList(
-            nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in zip(inputs, WIDTHS, strict=True)
-        )
-        self.decode = nn.ModuleList(Decode(WIDTHS[i + 1], WIDTHS[i]) for i in reversed(range(len(WIDTHS) - 1)))
+        widths = (sum(NTD_INPUTS.values()), *WIDTHS)
+        self.encode = nn.ModuleList(nn.Sequential(ConvReLU(a, b), ConvReLU(b, b)) for a, b in pairwise(widths))
+        self.decode = nn.ModuleList(Decode(below, skip) for below, skip in pairwise(WIDTHS[::-1]))
         outputs = (KERNEL_TAPS + 1, KERNEL_TAPS + 1, 2 * KERNEL_TAPS + 1)
         self.heads = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(WIDTHS[2::-1], outputs, strict=True))
         for layer in self.modules():
@@ -62,12 +60,9 @@ class KernelNet(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Predictions at 1/4 and 1/2 (26 channels) and at full resolution (51), from x (B, 13, H, W)."""
-        skips: list[Tensor] = []
-        for level, encode in enumerate(self.encode):
-            x = encode(F.max_pool2d(x, 2) if level else x)
-            skips.append(x)
+        *skips, x = encoded(self.encode, x)
         decoded = []
-        for decode, skip in zip(self.decode, skips[-2::-1], strict=True):
+        for decode, skip in zip(self.decode, skips[::-1], strict=True):
             x = decode(x, skip)
             decoded.append(x)
         return [head(x) for head, x in zip(self.heads, decoded[-3:], strict=True)]
@@ -78,9 +73,7 @@ def warp(image: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
 
     Outside, the border is repeated. `image` (B, C, H, W); `motion` (B, 2, H, W) in pixels.
     """
-    height, width = image.shape[-2:]
-    x, y = pixel_centres(height, width, motion)
-    grid = torch.stack([(x + motion[:, 0]) * (2 / width), (y + motion[:, 1]) * (2 / height)], dim=-1) - 1
+    grid = sampling_grid(motion)
     inside = (grid.abs() <= 1).all(dim=-1)[:, None]
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False), inside
 
@@ -181,16 +174,14 @@ class NTD(Denoiser):
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": nn.Identity()}
+    inputs = NTD_INPUTS
+    first_layer = "network.encode.0.0"
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = dict(NTD_INPUTS)
         if self.signal == "total":
             self.reads = ("direct", "emission", *type(self).reads)
         self.network = KernelNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def first_layers(self) -> Sequence[nn.Conv2d]:
-        return [self.network.encode[0][0]]
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
         """Irradiance (B, 3, H, W) into a bounded range: sign(x) log(1 + abs(x)), x = gain · exposure · irradiance."""

@@ -1,8 +1,8 @@
 """`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -10,32 +10,31 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal
 from models import compiled
+from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
+from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import (
     INPUT_CHANNELS,
     LATENT,
     MAX_EXPOSED,
     MAX_LOGIT,
     MIN_LENGTH,
-    ONE_INPUTS,
     SIDE_MULTIPLE,
     TAP_SPACINGS,
-    NetworkInput,
     filter_levels,
     head_channels,
 )
 from models.denoiser import Denoiser, State, matching_state
-from models.filters.neighbours import mesh_means
+from models.filters.neighbours import mesh_means, taps_3x3
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
-from models.networks.affinity import affinity_level
 from models.networks.convolution import ConvReLU
-from models.operators import MAX_IRRADIANCE, pad_to_multiple
+from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
-HISTORY = (3, 3, 1, LATENT)  # channels: output, accumulated irradiance, its effective length, latent
+HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
 
 
 class Trunk(nn.Module):
@@ -54,13 +53,6 @@ class Trunk(nn.Module):
         self.leave = nn.ConvTranspose2d(a, outputs, 2, stride=2)
         # Per pixel; applied where inputs are computed and outputs decoded: see network_inputs and decode_head.
         self.detail = nn.Sequential(nn.Linear(inputs, DETAIL), nn.ReLU(), nn.Linear(DETAIL, outputs, bias=False))
-
-    @property
-    def detail_layers(self) -> tuple[nn.Linear, nn.Linear]:
-        """The first and the last layer of `detail`."""
-        first, _, last = self.detail
-        assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
-        return first, last
 
     def forward(self, patches: Tensor) -> Tensor:
         """The U-Net's outputs (B, outputs, H, W) from patches_of (B, inputs, H, W)."""
@@ -143,6 +135,63 @@ def decode_head(
     return decode(head + last(hidden.movedim(1, -1)).movedim(-1, 1), inputs, samples)
 
 
+def plain_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """See affinity_level: the way that PyTorch takes."""
+    count = features.shape[1]
+    taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
+    distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
+    exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
+    weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
+    total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
+    return torch.where(surface > 0, total / weight.sum(dim=1, keepdim=True).clamp(min=MIN_DIVISOR), 0)
+
+
+class AffinityLevel(torch.autograd.Function):
+    """Both directions by kernels for the processor."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        """The arguments are those of affinity_level."""
+        *given, surface, step = arguments
+        out, total = affinity_kernels.filter_level(*arguments)
+        ctx.step = step
+        ctx.save_for_backward(*given, surface, out, total)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *given, surface, out, total = ctx.saved_tensors
+        return *affinity_kernels.pull_level(gradients[0], given, surface, out, total, ctx.step), None, None
+
+
+def affinity_level(
+    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+) -> Tensor:
+    """One level of an à-trous transform by learned features: a convex mean over 3 x 3 taps `step` pixels apart.
+
+    The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
+    et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
+    image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
+    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
+    """
+    level = AffinityLevel.apply if compiled.with_gradients(image) else plain_level
+    return cast(Tensor, level(image, features, sharpness, own, importance, surface, step))
+
+
+def carried(
+    decoded: Decoded, past: Tensor, surface: Tensor, steps: Sequence[int], level: Callable[..., Tensor] = affinity_level
+) -> tuple[Tensor, ...]:
+    """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`."""
+    image = decoded.accumulated
+    planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
+    for step, sharpness, centre, importance in zip(steps, *planes, strict=True):
+        image = level(image, decoded.features, sharpness, centre, importance, surface, step)
+    output = torch.lerp(past[:, :3], image, decoded.alpha[:, 1:]) * surface
+    return output, decoded.accumulated, decoded.length, decoded.latent
+
+
 def patches_of(x: Tensor) -> Tensor:
     """Patches of 2 x 2 pixels, (B, 4 C, ⌈H / 8⌉ 4, ⌈W / 8⌉ 4), of x (B, C, H, W), whose borders are repeated.
 
@@ -154,45 +203,33 @@ def patches_of(x: Tensor) -> Tensor:
     return pixels.reshape(batch, PATCH * channels, height // 2, width // 2)
 
 
-def exposed_images(inputs: PixelInputs) -> list[Tensor]:
-    """The irradiance (B, 3, H, W) of the inputs that are "log exposed", in order; another one where history lacks."""
-    output, accumulated, _, _ = inputs.history.split(HISTORY, dim=1)
-    images = {"output": output, "accumulated": accumulated, **inputs._asdict()}
+def input_channels(inputs: PixelInputs, exposure: Tensor, samples: Tensor, surfaces: Sequence[Tensor]) -> Tensor:
+    """The network's inputs (B, ·, H, W), in the order of INPUT_CHANNELS, for `samples` (B, 1, 1, 1) a pixel.
 
-    def image(row: NetworkInput) -> Tensor:
-        other = row.without_history
-        return torch.where(inputs.has_history > 0, images[row.name], images[other]) if other else images[row.name]
-
-    return [image(row) for row in ONE_INPUTS if row.transform == "log exposed"]
-
-
-def per_pixel_inputs(inputs: PixelInputs, samples: Tensor) -> list[Tensor]:
-    """The inputs (B, ·, H, W) that are "per pixel", in order, for `samples` (B, 1, 1, 1) a pixel."""
-    _, _, length, latent = inputs.history.split(HISTORY, dim=1)
-    values = {
-        "deviation": torch.log1p(inputs.deviation),
-        "1/samples": (1 / samples).expand_as(length),
-        "1/(length + samples)": 1 / (length * inputs.has_history + samples),
-        "has_history": inputs.has_history,
-        "latent": latent * inputs.has_history,
-    }
-    return [values[row.name] for row in ONE_INPUTS if row.transform == "per pixel"]
-
-
-def surface_inputs(albedo: Tensor, view_normal: Tensor, depth: Tensor, roughness: Tensor) -> list[Tensor]:
-    """The inputs (B, ·, H, W) of the G-buffer, in order; normals in view space, depth normalised."""
-    values = {"albedo": albedo, "view_normal": view_normal, "depth": depth, "roughness": roughness}
-    return [values[row.name] for row in ONE_INPUTS if row.transform == "surface"]
+    `exposure` is that of the 15 channels of irradiance; `surfaces` are albedo, normals in view space, normalised depth
+    and roughness.
+    """
+    output, accumulated, length, latent = inputs.history.split(HISTORY, dim=1)
+    valid = inputs.has_history > 0
+    past = torch.where(valid, output, inputs.mean_9x9), torch.where(valid, accumulated, inputs.noisy)
+    light = torch.cat([inputs.noisy, inputs.mean_3x3, inputs.mean_9x9, *past], dim=1)
+    per_pixel = (
+        torch.log1p(inputs.deviation),
+        (1 / samples).expand_as(length),
+        1 / (length * inputs.has_history + samples),
+        inputs.has_history,
+        latent * inputs.has_history,
+    )
+    colours = torch.log1p((light.clamp(min=0) * exposure).clamp(max=MAX_EXPOSED))
+    return torch.cat([colours, *per_pixel, *surfaces], dim=1)
 
 
 @compiled.by(kernels.network_inputs)
 def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidden: nn.Linear) -> tuple[Tensor, Tensor]:
-    """patches_of the network's inputs (see ONE_INPUTS), and ReLU of the layer `hidden` of each pixel, (B, ·, H, W)."""
-    exposed = torch.stack(exposed_images(inputs), dim=1).clamp(min=0) * (scale.exposure() * frame.gain)[:, None]
-    colours = torch.log1p(exposed.clamp(max=MAX_EXPOSED)).flatten(1, 2)
-    depth = scale.normalised_depth(frame.depth)
-    surfaces = surface_inputs(frame.albedo, frame.view_normal(), depth, frame.roughness)
-    channels = torch.cat([colours, *per_pixel_inputs(inputs, frame.samples), *surfaces], dim=1)
+    """patches_of the network's inputs, and ReLU of the layer `hidden` of each pixel, (B, ·, H, W)."""
+    exposure = (scale.exposure() * frame.gain).repeat(1, 5, 1, 1)
+    surfaces = (frame.albedo, frame.view_normal(), scale.normalised_depth(frame.depth), frame.roughness)
+    channels = input_channels(inputs, exposure, frame.samples, surfaces)
     pixels = torch.relu(hidden(channels.movedim(1, -1).to(hidden.weight.dtype))).movedim(-1, 1)
     return patches_of(channels), pixels
 
@@ -205,24 +242,14 @@ class One(Denoiser):
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
     convex = True
+    inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
     def __init__(self, *, steps: Sequence[int] = TAP_SPACINGS, signal: Signal | None = None):
         """`steps` are the pixels between the taps of each filter level."""
         super().__init__(signal=signal)
         self.steps = steps
-        self.inputs = dict(INPUT_CHANNELS)
         self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(head_channels(len(steps)).values()), self.widths)
-
-    def pixel_inputs(self, frame: Frame, noisy: Tensor, surface: Tensor, before: OneState | None) -> PixelInputs:
-        """Local means and reprojected history."""
-        has_history = torch.zeros_like(surface)
-        history = has_history.expand(-1, sum(HISTORY), -1, -1)
-        if before is not None:
-            carried = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
-            history, valid = reproject(frame, carried, before.gbuffer)
-            has_history = valid.to(noisy) * surface
-        return PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
@@ -230,19 +257,20 @@ class One(Denoiser):
         surface = (frame.depth > 0).to(frame.depth)
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        inputs = self.pixel_inputs(frame, noisy, surface, before)
-        first, last = self.network.detail_layers
+        has_history = torch.zeros_like(surface)
+        history = has_history.expand(-1, sum(HISTORY), -1, -1)
+        if before is not None:
+            images = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
+            history, valid = reproject(frame, images, before.gbuffer)
+            has_history = valid.to(noisy) * surface
+        inputs = PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
+        first, _, last = cast(Sequence[nn.Linear], self.network.detail)  # ReLU in between
         patches, hidden = network_inputs(frame, scale, inputs, first)
         height, width = frame.size
         head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
         decoded = Decoded(*decode_head(head.to(noisy), hidden, last, inputs, frame.samples.to(noisy)))
-        image = decoded.accumulated
-        planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
-        for step, sharpness, centre, importance in zip(self.steps, *planes, strict=True):
-            image = affinity_level(image, decoded.features, sharpness, centre, importance, surface, step)
-        output = torch.lerp(inputs.history[:, :3], image, decoded.alpha[:, 1:]) * surface
-        carried = (output, decoded.accumulated, decoded.length, decoded.latent)
-        return output, OneState(frame.moment, *carried, GBuffer.of(frame), scale, decoded.alpha.detach())
+        images = carried(decoded, history, surface, self.steps)
+        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         irradiance, after = self.predict(frame, state)

@@ -1,6 +1,6 @@
 """RAE: the recurrent denoising autoencoder of Chaitanya et al. 2017."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
@@ -19,12 +19,7 @@ SLOPE = 0.1  # §5.3: leaky ReLU
 MIN_SLOPE_AT = 0.01  # exposed irradiance, below which `raised` has no flatter slope
 ENCODER = (32, 32, 43, 57, 76, 101, 101)  # widths; ours, like the decoder's: the paper does not print its own
 DECODER = ((76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
-# The auxiliary inputs (§3.2): the number of channels of each, and how to compute it.
-AUXILIARY: dict[str, tuple[int, Callable[[Frame, RunningScale], Tensor]]] = {
-    "normal": (2, lambda frame, scale: frame.view_normal()[:, :2]),
-    "depth": (1, lambda frame, scale: scale.normalised_depth(frame.depth)),
-    "roughness": (1, lambda frame, scale: frame.roughness),
-}
+RAE_INPUTS = {"colour": 3, "normal": 2, "depth": 1, "roughness": 1}  # of the network, and their channels (§3.2)
 
 
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
@@ -76,14 +71,12 @@ class RecurrentAutoencoder(nn.Module):
         self.first = conv(inputs, ENCODER[0])
         self.encoder = nn.ModuleList(conv(a, b) for a, b in pairwise(ENCODER))
         self.recurrent = nn.ModuleList(RecurrentBlock(width) for width in widths)
-        below = widths[-1]
-        stages = []
-        for skip, (middle, out) in zip(widths[-2::-1], DECODER, strict=True):
-            activation = nn.LeakyReLU(SLOPE, inplace=True)
-            stages.append(nn.Sequential(conv(below + skip, middle), activation, conv(middle, out)))
-            below = out
-        self.decoder = nn.ModuleList(stages)
-        self.output = conv(below, 3)
+        below = (widths[-1], *(out for _, out in DECODER))
+        self.decoder = nn.ModuleList(
+            nn.Sequential(conv(a + skip, middle), nn.LeakyReLU(SLOPE, inplace=True), conv(middle, out))
+            for a, skip, (middle, out) in zip(below, widths[-2::-1], DECODER, strict=False)
+        )
+        self.output = conv(below[-1], 3)
 
     def forward(self, x: Tensor, hidden: Sequence[Tensor] | None) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Output (B, 3, H, W) and the new hidden features, finest first."""
@@ -114,15 +107,13 @@ class RAE(Denoiser):
     is_network = True
     has_kernels = False
     dispensable: ClassVar = {"roughness": nn.Identity()}
+    inputs = RAE_INPUTS
+    first_layer = "network.first"
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.inputs = {"colour": 3} | {name: channels for name, (channels, _) in AUXILIARY.items()}
-        network = RecurrentAutoencoder(sum(self.inputs.values()))
+        network = RecurrentAutoencoder(sum(RAE_INPUTS.values()))
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def first_layers(self) -> Sequence[nn.Conv2d]:
-        return [self.network.first]
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, RAEState]:
         """The raw output p (B, 3, H, W), which estimates (gain · exposure · irradiance)^0.2, and the next state."""
@@ -130,12 +121,16 @@ class RAE(Denoiser):
         before = matching_state(state, RAEState, frame)
         irradiance = frame.irradiance(self.signal).clamp(min=0)
         scale = running_scale(irradiance * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        colour = self.compress(irradiance, scale, frame)
-        auxiliary = (AUXILIARY[name][1](frame, scale) for name in self.inputs if name in AUXILIARY)
-        x = pad_to_multiple(torch.cat([colour, *auxiliary], dim=1), 32)
+        parts = {
+            "colour": self.compress(irradiance, scale, frame),
+            "normal": frame.view_normal()[:, :2],
+            "depth": scale.normalised_depth(frame.depth),
+            "roughness": frame.roughness,
+        }
+        x = pad_to_multiple(torch.cat([parts[name] for name in self.inputs], dim=1), 32)
         x = x.to(self.precision, memory_format=torch.channels_last)
         p, hidden = self.network(x, before.hidden if before else None)
-        return p[..., :height, :width].to(colour.dtype), RAEState(frame.moment, hidden, scale)
+        return p[..., :height, :width].to(irradiance.dtype), RAEState(frame.moment, hidden, scale)
 
     def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
         return raised(prediction)

@@ -19,11 +19,8 @@ class PairedConv2d(nn.Conv2d):
     no memory is moved.
     """
 
-    pair_weight: Tensor  # (2 outputs, 2 inputs, k, (k + 1) / 2)
-    pair_bias: Tensor
-
     def pair(self) -> None:
-        """Compute the weights for pairs from `weight` and `bias`; k is 5, 9, ..."""
+        """Compute the weights for pairs, (2 outputs, 2 inputs, k, (k + 1) / 2), and their bias; k is 5, 9, ..."""
         outputs, inputs, size, _ = self.weight.shape
         middle = size // 4
         weight = self.weight.new_zeros(2, outputs, 2, inputs, size, 2 * middle + 1)
@@ -31,9 +28,9 @@ class PairedConv2d(nn.Conv2d):
             for tap in range(size):
                 pairs, other = divmod(pixel + tap - size // 2, 2)
                 weight[pixel, :, other, :, :, middle + pairs] = self.weight[..., tap]
-        self.register_buffer("pair_weight", weight.flatten(2, 3).flatten(0, 1), persistent=False)
         assert self.bias is not None
-        self.register_buffer("pair_bias", self.bias.repeat(2), persistent=False)
+        self.pair_weight = nn.Buffer(weight.flatten(2, 3).flatten(0, 1), persistent=False)
+        self.pair_bias = nn.Buffer(self.bias.repeat(2), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         if x.device.type != "cpu":

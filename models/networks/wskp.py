@@ -1,6 +1,6 @@
 """WSKP: weight-sharing kernel prediction (Fan et al. 2021), its multi-resolution variant and its baselines KP."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar
@@ -17,9 +17,10 @@ from models.compiled.fusion import THREAD_ROWS, WINDOWS
 from models.denoiser import State, matching_state
 from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
 from models.history.running_scale import RunningScale, running_scale
+from models.networks.convolution import encoded
 from models.networks.fusion import fuse
 from models.networks.pixel_kernels import apply_kernels
-from models.networks.repvgg import BRANCH_SIZES, RepVGGBlock, merge, repvgg
+from models.networks.repvgg import BRANCH_SIZES, merge, repvgg
 from models.operators import halve, pad_to_multiple, pyramid
 
 WSKP_WIDTH = 24  # ours: the paper does not print its widths
@@ -32,6 +33,17 @@ def scaled_normal(normal: Tensor) -> Tensor:
     return normal / 2 + 0.5
 
 
+def feature_images(radiance: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor, names: Sequence[str]) -> Tensor:
+    """See network_features: of exposed radiance and normalised depth."""
+    parts = {
+        "colour": radiance.clamp(0, 1) ** (1 / GAMMA),
+        "albedo": albedo,
+        "normal": scaled_normal(normal),
+        "depth": depth,
+    }
+    return torch.cat([parts[name] for name in names], dim=1)
+
+
 @compiled.by(kernels.network_features)
 def network_features(
     frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
@@ -41,65 +53,64 @@ def network_features(
     Accumulated `irradiance` (B, 3, H, W), modulated and displayed (causal exposure, clipped, gamma 2.2); albedo; the
     world-space normal scaled to [0, 1]; the depth d / (d + s) with s its running `scale`.
     """
-    exposure = scale.exposure() * frame.gain
-    parts = {
-        "colour": (irradiance * frame.divisor * exposure).clamp(0, 1) ** (1 / GAMMA),
-        "albedo": frame.albedo,
-        "normal": scaled_normal(frame.normal),
-        "depth": scale.normalised_depth(frame.depth),
-    }
-    return torch.cat([parts[name] for name in names], dim=1)
+    exposed = irradiance * frame.divisor * (scale.exposure() * frame.gain)
+    return feature_images(exposed, frame.albedo, frame.normal, scale.normalised_depth(frame.depth), names)
 
 
-Filtered = tuple[Tensor, Tensor | None]  # irradiance (B, 3, H, W), and the logits between windows, if any
+Filtered = tuple[Tensor, Tensor | None]  # irradiance (B, 3, H, W), and parameters of the filter to display, if any
+
+
+def shared_kernels(image: Tensor, predicted: Tensor, surface: Tensor | None) -> Filtered:
+    """By the first M of WINDOWS, whose importance maps and mixture are `predicted` (B, 2 M, H, W) (§4.1)."""
+    importance, mixture = predicted.to(image.dtype).chunk(2, dim=1)
+    return fuse(image, importance, mixture, WINDOWS[: mixture.shape[1]], surface), mixture
+
+
+def free_kernels(image: Tensor, predicted: Tensor, surface: Tensor | None) -> Filtered:
+    """By one free kernel per pixel, whose logits are `predicted` (B, k², H, W): the paper's baseline (§6.1)."""
+    return apply_kernels(image, predicted, surface), None
 
 
 @dataclass(frozen=True)
-class WSKPState(AccumulatedState):
-    """Accumulated frames, running exposure and depth scale; for debugging, the mixture of windows."""
+class FilteredState(AccumulatedState):
+    """Accumulated frames, running exposure and depth scale; for debugging, the filter's parameters."""
 
     scale: RunningScale
-    mixture: Tensor | None  # logits (B, M, H, W)
+    parameters: Tensor | None = None  # of windows, the logits of the mixture (B, M, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
-        if self.mixture is None:
+        if self.parameters is None:
             return super().pictures()
-        windows = torch.tensor(WINDOWS[: self.mixture.shape[1]]).to(self.mixture)
-        mean = (torch.softmax(self.mixture, dim=1) * windows[:, None, None]).sum(dim=1, keepdim=True)
+        windows = torch.tensor(WINDOWS[: self.parameters.shape[1]]).to(self.parameters)
+        mean = (torch.softmax(self.parameters, dim=1) * windows[:, None, None]).sum(dim=1, keepdim=True)
         return super().pictures() | {"mean window (px)": mean}
 
 
 class KernelPredictor(Accumulating):
     """Temporal accumulation, a network that predicts filter parameters, the filter on irradiance, remodulation (§4)."""
 
-    reads = Accumulated.reads
+    reads: tuple[str, ...] = Accumulated.reads
     is_network = True
+    inputs: Mapping[str, int] = FEATURE_CHANNELS
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
-    filter_reads = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
+    filter_reads: tuple[str, ...] = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
+    filter_image: Callable[[Tensor, Tensor, Tensor | None], Filtered] = staticmethod(shared_kernels)
+    state: ClassVar[type[FilteredState]] = FilteredState
     network: nn.Module
     side_multiple = 1  # of the network's images; they are padded
     reach: int | None = None  # rows above and below that a pixel depends on; None for all
 
-    def __init__(self, *, signal: Signal | None = None):
-        super().__init__(signal=signal)
-        self.inputs = dict(FEATURE_CHANNELS)
-
-    def first_layers(self) -> Sequence[nn.Conv2d]:
-        first = next(iter(self.network.children()))
-        assert isinstance(first, RepVGGBlock)
-        return first.branches
-
     def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         """Irradiance (B, 3, H, W) of surfaces, filtered with the network's output."""
-        raise NotImplementedError
+        return self.filter_image(irradiance, predicted, surface)
 
-    def accumulate(self, frame: Frame, state: State | None) -> WSKPState:
+    def accumulate(self, frame: Frame, state: State | None) -> FilteredState:
         """The state before filtering: accumulated irradiance and running scales."""
-        before = matching_state(state, WSKPState, frame)
+        before = matching_state(state, FilteredState, frame)
         history = self.accumulated(frame, before)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
-        return WSKPState(frame.moment, history, scale, mixture=None)
+        return self.state(frame.moment, history, scale)
 
     def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Filtered:
         """Accumulated `irradiance` (B, 3, H, W) filtered, of large images in strips of rows."""
@@ -128,8 +139,8 @@ class KernelPredictor(Accumulating):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         after = self.accumulate(frame, state)
-        irradiance, mixture = self.filter(frame, after.history.irradiance, after.scale)
-        return frame.remodulate(irradiance, self.signal), replace(after, mixture=mixture)
+        irradiance, parameters = self.filter(frame, after.history.irradiance, after.scale)
+        return frame.remodulate(irradiance, self.signal), replace(after, parameters=parameters)
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         merge(self.network)  # in the precision of training
@@ -141,6 +152,7 @@ class TrunkPredictor(KernelPredictor):
     """A trunk of RepVGG blocks that predicts windows or kernels of up to 13 x 13 pixels."""
 
     convex = True
+    first_layer = "network.0.branches"
     layers: ClassVar[int] = 6
     outputs: ClassVar[int]
 
@@ -156,10 +168,6 @@ class WSKP(TrunkPredictor):
     evaluated_with: tuple[str, ...] = ("adaptive",)
     outputs = 2 * len(WINDOWS)
 
-    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
-        importance, mixture = predicted.to(irradiance.dtype).chunk(2, dim=1)
-        return fuse(irradiance, importance, mixture, WINDOWS, surface), mixture
-
 
 class WSKP3(WSKP):
     """The smaller of the paper's two networks."""
@@ -172,9 +180,7 @@ class KP(TrunkPredictor):
     """The paper's baseline (§6.1): the trunk of wskp6, and one free 13 x 13 kernel per pixel."""
 
     outputs = max(WINDOWS) ** 2
-
-    def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
-        return apply_kernels(irradiance, predicted, surface), None
+    filter_image = staticmethod(free_kernels)
 
 
 def convolutions(inputs: int, outputs: int) -> nn.Sequential:
@@ -196,12 +202,9 @@ class MultiResolutionNet(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Predictions (B, outputs, H / 2^k, W / 2^k) for k = 2, 1, 0. H and W are multiples of 4."""
-        skips: list[Tensor] = []
-        for level, block in enumerate(self.down):
-            x = block(F.max_pool2d(x, 2) if level else x)
-            skips.append(x)
+        *skips, x = encoded(self.down, x)
         predictions = [self.heads[0](x)]
-        for block, head, skip in zip(self.up, list(self.heads)[1:], skips[-2::-1], strict=True):
+        for block, head, skip in zip(self.up, list(self.heads)[1:], skips[::-1], strict=True):
             x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip], dim=1))
             predictions.append(head(x))
         return predictions
@@ -217,17 +220,11 @@ class MultiResolution(KernelPredictor):
 
     maps: ClassVar[int]  # channels of filter parameters at each resolution
     side_multiple = 4
+    first_layer = "network.down.0.0"
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         self.network = MultiResolutionNet(sum(FEATURE_CHANNELS.values()), self.maps + 1)
-
-    def first_layers(self) -> Sequence[nn.Conv2d]:
-        return [self.network.down[0][0]]  # type: ignore[index, list-item]
-
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
-        """The image (B, 3, h, w) of one resolution, filtered with its `maps` (B, ·, h, w)."""
-        raise NotImplementedError
 
     def reconstruct(  # type: ignore[override]
         self, irradiance: Tensor, predicted: Sequence[Tensor], surface: Tensor | None = None
@@ -238,7 +235,7 @@ class MultiResolution(KernelPredictor):
         output: Tensor | None = None
         for (image, valid), predictions in zip(levels, predicted, strict=True):
             maps, alpha = predictions.to(image.dtype).split([self.maps, 1], dim=1)
-            fine, mixture = self.filter_level(image, maps, valid)
+            fine, mixture = self.filter_image(image, maps, valid)
             output = fine if output is None else combine_resolutions(fine, output, torch.sigmoid(alpha), valid)
         assert output is not None
         if mixture is not None:
@@ -251,16 +248,10 @@ class WSKPMR(MultiResolution):
 
     maps = 4
 
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
-        importance, mixture = maps.chunk(2, dim=1)
-        return fuse(image, importance, mixture, (3, 5), surface), mixture
-
 
 class MRKP(MultiResolution):
     """The paper's other baseline (§6.1): the network of wskp-mr, and a 5 x 5 kernel per pixel at each resolution."""
 
     made_from = "ours, after code"
     maps = 25
-
-    def filter_level(self, image: Tensor, maps: Tensor, surface: Tensor | None) -> Filtered:
-        return apply_kernels(image, maps, surface), None
+    filter_image = staticmethod(free_kernels)

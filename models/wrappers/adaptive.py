@@ -1,8 +1,8 @@
-"""NAME+adaptive: temporal accumulation that follows changes of light and suppresses fireflies. Our own.
+"""Temporal accumulation around a denoiser: NAME+accumulated after it, NAME+adaptive, our own, in place of its own.
 
-Plain accumulation lags behind light that changes, and shows a firefly until its weight has faded. So before a frame is
-blended into its history, two things are done, both from neighbourhoods of the same surface: 7 x 7 strata of 3 x 3
-pixels.
+NAME+adaptive follows changes of light and suppresses fireflies. Plain accumulation lags behind light that changes, and
+shows a firefly until its weight has faded. So before a frame is blended into its history, two things are done, both
+from neighbourhoods of the same surface: 7 x 7 strata of 3 x 3 pixels.
 
 - Samples brighter than three times the mean are clamped to that, and the energy removed is spread evenly over the
   neighbourhood: fireflies become faint blotches, and on average no energy is lost.
@@ -22,10 +22,10 @@ from torch import Tensor
 from datasets.frame import Frame
 from errors import BadInput
 from models.compiled.accumulation import MIN_ALPHA
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser, State, matching_state
 from models.filters.asvgf import repeat_strata, strata_centres, strata_sums
 from models.filters.atrous import Tap, WindowSum, strip_taps
-from models.filters.baselines import Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
 from models.history.geometry import GBuffer
@@ -160,3 +160,33 @@ class Adaptive(Wrapper):
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return self.inner.run(frame, state)
+
+
+@dataclass(frozen=True)
+class AccumulatedAfterState(AccumulatedState):
+    """The history of denoised irradiance, and the inner denoiser's state."""
+
+    inner: State
+
+    def pictures(self) -> dict[str, Tensor]:
+        return super().pictures() | self.inner.pictures()
+
+
+class AccumulatedAfter(Wrapper, Accumulating):
+    """Denoised irradiance averaged over frames along motion vectors, as models.filters.baselines.Accumulated does.
+
+    With +adaptive after it, by adaptive accumulation.
+    """
+
+    needs = ("emission", "albedo", "normal", "depth", "mesh_id", "motion")
+
+    def __init__(self, inner: Denoiser):
+        super().__init__(inner)
+        self.convex = inner.convex
+
+    def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
+        previous = matching_state(state, AccumulatedAfterState, frame)
+        output, inner = self.inner.run(frame, previous.inner if previous else None)
+        irradiance = frame.demodulate(output, self.signal)
+        history = self.accumulation(frame, irradiance, previous.history if previous else None)
+        return frame.remodulate(history.irradiance, self.signal), AccumulatedAfterState(frame.moment, history, inner)

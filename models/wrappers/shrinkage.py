@@ -19,15 +19,12 @@ Our own choices, by measurement:
 Without sample buffers, as at one sample per pixel, it is the denoiser itself.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from datasets.channels import SAMPLE_BUFFERS
 from datasets.frame import Frame, Signal
-from models.denoiser import State
+from models.denoiser import Denoiser, State
 from models.filters.neighbours import mesh_sums, mesh_sums_9x9
 from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers.wrapper import Wrapper
@@ -39,40 +36,30 @@ MAX_RATIO = 1e6  # of noise to denoised irradiance; the square of a square must 
 MIN_RELATIVE_LUMINANCE = 0.01  # of the mean luminance: added to what irradiance is divided by
 
 
-class WindowMeans(NamedTuple):
-    """Means over the window of each pixel, (B, 3, H, W)."""
+def window_means(sums: Tensor, rare: Tensor, samples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means (B, 3, H, W) over windows: (N - O)² - v, the denoiser's own squared error; (N - O)²; the first's error.
 
-    excess: Tensor  # (N - O)² - v: the denoiser's own squared error
-    distance: Tensor  # (N - O)²
-    error: Tensor  # standard error of `excess`
-
-    @staticmethod
-    def of(sums: Tensor, rare: Tensor, samples: Tensor) -> "WindowMeans":
-        """From sums (B, 13, H, W) of excess, distance, 2 v², v and 1, and the sum `rare` of light possibly missed."""
-        pixels = sums[:, 12:]
-        excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
-        error = (squares / pixels).sqrt() + (SCARCE_SAMPLES / samples * distance + rare) / pixels
-        return WindowMeans(excess, distance.clamp(min=MIN_DIVISOR), error)
+    From sums (B, 13, H, W) of both, 2 v², v and 1, and the sum `rare` of light possibly missed. The error is standard.
+    """
+    pixels = sums[:, 12:]
+    excess, distance, squares = (sums[:, :9] / pixels).chunk(3, dim=1)
+    error = (squares / pixels).sqrt() + (SCARCE_SAMPLES / samples * distance + rare) / pixels
+    return excess, distance.clamp(min=MIN_DIVISOR), error
 
 
-def window_means(
-    distance: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor
-) -> tuple[WindowMeans, WindowMeans]:
-    """Those of 9 x 9 and of 27 x 27 pixels of the same mesh, from squares (B, 3, H, W) of `samples` (B, 1, 1, 1)."""
+def weight_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
+    """ρ (B, 3, H, W) in [0, 1] from N - O and the variance of N, both relative to the denoised irradiance."""
+    distance = difference.square()
     squares = [distance - variance, distance, 2 * variance.square(), variance]
     sums_9x9 = mesh_sums_9x9(torch.cat([*squares, torch.ones_like(mesh_id)], dim=1), mesh_id)
     sums_27x27 = mesh_sums(sums_9x9, mesh_id, 9)
     sums_81x81 = mesh_sums(sums_27x27[:, 9:], mesh_id, 27)
     rare = RARE_PIXELS * sums_81x81[:, :3] / sums_81x81[:, 3:]
-    return WindowMeans.of(sums_9x9, rare, samples), WindowMeans.of(sums_27x27, rare, samples)
-
-
-def weight_of_noise(difference: Tensor, variance: Tensor, mesh_id: Tensor, samples: Tensor) -> Tensor:
-    """ρ (B, 3, H, W) in [0, 1] from N - O and the variance of N, both relative to the denoised irradiance."""
-    small, wide = window_means(difference.square(), variance, mesh_id, samples)
-    overall = ((wide.excess - STANDARD_ERRORS * wide.error) / wide.distance).clamp(0, 1)
-    correction = small.excess - overall * small.distance
-    rho = (overall + significant_part(correction, small.error) * correction / small.distance).clamp(0, 1)
+    excess, distance, error = window_means(sums_27x27, rare, samples)
+    overall = ((excess - STANDARD_ERRORS * error) / distance).clamp(0, 1)
+    excess, distance, error = window_means(sums_9x9, rare, samples)
+    correction = excess - overall * distance
+    rho = (overall + significant_part(correction, error) * correction / distance).clamp(0, 1)
     return mesh_mean_3x3(rho, mesh_id)
 
 
@@ -116,8 +103,10 @@ class JamesStein(Wrapper):
 
     needs = ("albedo", "depth", "mesh_id")
 
-    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
-        return super().reads_with((*reads, *(SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in reads)))
+    def __init__(self, inner: Denoiser):
+        super().__init__(inner)
+        buffers = (SAMPLE_BUFFERS[name] for name in SAMPLE_BUFFERS if name in inner.reads)
+        self.reads = tuple(dict.fromkeys((*self.reads, *buffers)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         output, after = self.inner.run(frame, state)

@@ -8,9 +8,10 @@ from torch.nn import functional as F
 
 from datasets.frame import Frame
 from models.denoiser import State, matching_state
-from models.history.geometry import GBuffer, pixel_centres
+from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
+from models.operators import sampling_grid
 from models.wrappers.wrapper import Wrapper
 
 TAA_ALPHA = 0.1  # weight of the current frame
@@ -39,16 +40,6 @@ def inverse_tone_map(tone_mapped: Tensor) -> Tensor:
     return transform_colours(tone_mapped[:, :3] / tone_mapped[:, 3:], RGB_FROM_YCOCG).clamp(min=0)
 
 
-def fetch_bicubic(image: Tensor, motion: Tensor) -> Tensor:
-    """The `image` (B, 3, H, W) at p + motion(p), in pixels, bicubic, clamped at 0; its border pixels are repeated."""
-    height, width = image.shape[-2:]
-    x, y = pixel_centres(height, width, motion)
-    # Far outside the image an index would overflow; any place outside is as good.
-    x = (x + motion[:, 0]).clamp(-1, width + 1) * (2 / width) - 1
-    y = (y + motion[:, 1]).clamp(-1, height + 1) * (2 / height) - 1
-    return F.grid_sample(image, torch.stack([x, y], dim=-1), "bicubic", "border", align_corners=False).clamp(min=0)
-
-
 def max_3x3(image: Tensor) -> Tensor:
     """Maxima over 3 × 3 pixels; much faster than F.max_pool2d on a CPU."""
     for dim, border in ((-1, (1, 1, 0, 0)), (-2, (0, 0, 1, 1))):
@@ -57,12 +48,6 @@ def max_3x3(image: Tensor) -> Tensor:
         left, middle, right = (padded.narrow(dim, start, length) for start in range(3))
         image = torch.maximum(torch.maximum(left, middle), right)
     return image
-
-
-def resolve(current: Tensor, history: Tensor, has_history: Tensor) -> Tensor:
-    """Blend tone-mapped images (B, 4, H, W), the history, if any, clamped to the range of the current 3 x 3 pixels."""
-    clamped = torch.clamp(history, -max_3x3(-current), max_3x3(current))
-    return torch.lerp(clamped, current, torch.where(has_history, TAA_ALPHA, 1))
 
 
 @dataclass(frozen=True)
@@ -82,7 +67,8 @@ class TAA(Wrapper):
     """Temporal antialiasing of a denoiser's output.
 
     The history is fetched along motion vectors across edges, which is what smooths them, and dropped where reprojection
-    finds none: disoccluded, or off-screen. Tone mapping takes the causal exposure of the outputs so far.
+    finds none: disoccluded, or off-screen. Tone-mapped, it is clamped to the range of the current 3 x 3 pixels. Tone
+    mapping takes the causal exposure of the outputs so far.
     """
 
     needs = ("normal", "depth", "mesh_id", "motion")
@@ -94,6 +80,10 @@ class TAA(Wrapper):
         if previous:
             exposure = scale.exposure()
             _, has_history = reproject(frame, previous.gbuffer.mesh_id, previous.gbuffer)
-            history = tone_map(fetch_bicubic(previous.output, frame.motion) * exposure)
-            output = inverse_tone_map(resolve(tone_map(output * exposure), history, has_history)) / exposure
+            grid = sampling_grid(frame.motion)
+            history = F.grid_sample(previous.output, grid, "bicubic", "border", align_corners=False).clamp(min=0)
+            current = tone_map(output * exposure)
+            clamped = tone_map(history * exposure).clamp(-max_3x3(-current), max_3x3(current))
+            blended = torch.lerp(clamped, current, torch.where(has_history, TAA_ALPHA, 1))
+            output = inverse_tone_map(blended) / exposure
         return output, TAAState(frame.moment, inner, output, GBuffer.of(frame), scale)

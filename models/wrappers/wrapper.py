@@ -1,6 +1,6 @@
 """The base class of wrappers: denoisers that change the input or output of another one."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import ClassVar
 
 import torch
@@ -18,16 +18,9 @@ class Wrapper(Denoiser):
     def __init__(self, inner: Denoiser):
         super().__init__(signal=inner.signal)
         self.inner = inner
-        self.reads = self.reads_with(inner.reads)
-        self.refuses = inner.refuses
-        self.made_from = inner.made_from
-        self.is_network = inner.is_network
-        self.offline = inner.offline
-        self.constants = inner.constants
-
-    def reads_with(self, reads: Sequence[str]) -> tuple[str, ...]:
-        """The channels that the inner denoiser `reads`, and those that the wrapper needs."""
-        return tuple(dict.fromkeys((*reads, *self.needs)))
+        self.reads = tuple(dict.fromkeys((*inner.reads, *self.needs)))
+        for fact in ("refuses", "made_from", "is_network", "offline", "constants"):
+            setattr(self, fact, getattr(inner, fact))
 
     def unavailable(self) -> str | None:
         return self.inner.unavailable()

@@ -8,10 +8,10 @@ from errors import BadInput
 from models import registry
 from models.filters.baselines import Accumulated
 from models.history.accumulation import accumulate
-from models.wrappers.accumulated import AccumulatedAfter
 from models.wrappers.adaptive import (
     FIREFLY_RATIO,
     MAX_GAIN,
+    AccumulatedAfter,
     SurfaceNeighbourhoods,
     accumulate_adaptively,
     firefly_limit,

@@ -1,4 +1,4 @@
-"""models.networks.affinity: means, edges and gradients, by kernels and by PyTorch."""
+"""The affinity filter of models.networks.one: means, edges and gradients, by kernels and by PyTorch."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from models import compiled
-from models.networks.affinity import affinity_level
+from models.networks.one import affinity_level
 
 FEATURES = 8
 

@@ -19,15 +19,15 @@ from models import compiled
 from models.compiled.fusion import WINDOWS
 from models.denoiser import Denoiser
 from models.export import program as programs
-from models.export.history import GraphGBuffer, expected_surfaces, pixel_coordinates, reprojected, reprojection_table
+from models.export import wskp
+from models.export.history import GraphGBuffer, reprojected
 from models.export.one import affinity_level, mesh_sums
-from models.export.package import EXPORTABLE, Export, largest_difference, load_step, step_of, write_export
+from models.export.package import EXPORTABLE, Export, largest_difference, load_step, write_export
 from models.export.program import play, run_onnx, run_pt2, trace, write_onnx, write_pt2
-from models.export.wskp import BoxWindows
 from models.filters import neighbours
 from models.history.geometry import GBuffer, to_previous_camera
 from models.history.reprojection import reproject
-from models.networks.affinity import plain_level
+from models.networks.one import plain_level
 from models.registry import create
 from models.spec import load
 from models.weights import save_weights
@@ -192,12 +192,10 @@ def test_reprojection_equals_that_of_the_history(height, width, motion, seed):
     surfaces = replace(GBuffer.of(frame), mesh_id=meshes[1].float())
     history = torch.rand(1, 4, height, width)
     expected, has_history = reproject(frame, history, surfaces)
-    pixels = pixel_coordinates(height, width)
     previous = GraphGBuffer(surfaces.depth, surfaces.normal, surfaces.mesh_id, *camera_of(frame.previous))
     now = GraphGBuffer(frame.depth, frame.normal, frame.mesh_id.int(), *camera_of(frame.now))
     matrices = to_previous_camera(frame.now, frame.previous, 0).float()
-    table = reprojection_table(history, previous, pixels)
-    actual = reprojected(table, expected_surfaces(now, matrices, pixels), frame.motion, pixels)
+    actual = reprojected(history, now, previous, matrices, frame.motion)
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
     assert not actual[~has_history.expand_as(actual)].any()
 
@@ -211,7 +209,7 @@ def test_windows_are_exact_for_any_logits(spread):
     mixture = torch.randn_like(importance)
     surface = (torch.rand(1, 1, 23, 31) > 0.3).float()
     with torch.no_grad():
-        output = BoxWindows(WINDOWS)(image, importance, mixture, surface)
+        output = wskp.fuse(image, importance, mixture, surface)
     expected = unfold_fuse(image.double(), importance.double(), mixture.double(), surface=surface)
     torch.testing.assert_close(output.double(), expected, rtol=1e-5, atol=1e-6)
 
@@ -304,7 +302,7 @@ def test_extreme_logits_take_the_slower_branch_in_files(weights, tmp_path):
         denoiser.network[-1].merged.weight[:6] *= 300
         if hasattr(denoiser.network[-1].merged, "pair"):
             denoiser.network[-1].merged.pair()
-    step = step_of(copy.deepcopy(denoiser), "outside")
+    step = wskp.WSKPStep(copy.deepcopy(denoiser), "outside")
     for compute in files_of(step, tmp_path):
         check_equal(step, denoiser, sequence((40, 56), frames=3), compute, 10 * TOLERANCE)
 

@@ -7,8 +7,7 @@ import torch
 from torch.nn import functional as F
 
 from files import read_json
-from models.fastest import bfloat16_is_faster
-from models.spec import fastest_precision
+from models.spec import bfloat16_is_faster, fastest_precision
 
 
 @pytest.fixture(autouse=True)

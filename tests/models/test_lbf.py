@@ -10,9 +10,7 @@ from torch import Tensor
 from models import registry
 from models.compiled.cross_bilateral import FEATURE_GROUPS
 from models.history.running_scale import running_scale
-from models.networks.cross_bilateral import Pixels, cross_bilateral
-from models.networks.lbf import features_of, remove_spikes
-from models.networks.secondary_features import secondary_features
+from models.networks.lbf import Pixels, cross_bilateral, features_of, remove_spikes, secondary_features
 from tests.helpers.frames import flat_frame
 
 both_implementations = pytest.mark.usefixtures("implementation")

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from models import compiled, registry
-from models.networks.bilateral_grid import grid_mean, grid_shape
-from models.networks.nbgd import SPACINGS
+from models.networks.nbgd import SPACINGS, grid_mean, grid_shape
 
 
 def random_inputs(seed: int, height: int, width: int, share: float = 0.7) -> tuple[Tensor, Tensor, Tensor]:
