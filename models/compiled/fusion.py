@@ -314,12 +314,3 @@ def fuse(
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
         compiled_fuse_strips()(*images, *maps, np.array(windows), *scratch)
     return fused
-
-
-def fuse_on_gpu(
-    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
-) -> Tensor:
-    """The same for CUDA devices, by Triton, which is imported here because it takes long and is not everywhere."""
-    from models.compiled.fusion_triton import fuse
-
-    return fuse(image, importance, mixture, windows, surface)
