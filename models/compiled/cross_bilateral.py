@@ -1,6 +1,6 @@
 """models.networks.cross_bilateral for the CPU, with its gradient: rows in parallel, loops along them vectorised."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, TypeAlias
 
 import numba
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 from models.compiled.affinity import pull_weights, scale_gradient
 from models.compiled.arrays import Image, Index, Row, Rows, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.jit import jit_in_any_order, jit_parallel, run_items
 from models.compiled.lines import (
     add_product,
     add_square,
@@ -32,16 +32,8 @@ COLOUR_SHARPNESS = 1 / (2 * 7**2)  # 1 / 2 β²
 MAX_EXPONENT = -MIN_EXPONENT
 GROUP_COUNT = len(FEATURE_GROUPS)
 FIRST_OF_GROUP = tuple(np.cumsum((0, *FEATURE_GROUPS)).tolist())  # channel of each group, and beyond the last
-
-
-class Planes(NamedTuple):
-    """What is filtered of one item, see models.networks.cross_bilateral."""
-
-    image: Image
-    variance: Image
-    features: Image
-    surface: Image
-    sharpness: Image
+# Of one item: image, variance, features and surface of models.networks.cross_bilateral.Pixels, and sharpness.
+Planes: TypeAlias = tuple[Image, Image, Image, Image, Image]
 
 
 @jit_in_any_order
@@ -84,6 +76,7 @@ def weigh_tap(
 @jit_parallel
 def filter_image(out: Image, total: Image, planes: Planes) -> None:
     """Add to out (3, H, W) and total (1, H, W), which are 0."""
+    image, surface = planes[0], planes[3]
     _, height, width = out.shape
     for number in numba.prange(height):
         row = np.int64(number)
@@ -91,21 +84,16 @@ def filter_image(out: Image, total: Image, planes: Planes) -> None:
         for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
             lines = scratch[:, : right - left]
             weigh_tap(lines[0], lines[1], lines[2:], planes, row, left, dx, dy)
-            there = triple(planes.image, row + dy, left + dx, right + dx)
+            there = triple(image, row + dy, left + dx, right + dx)
             add_weighted(triple(out, row, left, right), total[0, row, left:right], lines[0], there)
-        scale_line(total[0, row], planes.surface[0, row])
+        scale_line(total[0, row], surface[0, row])
         normalise(triple(out, row, 0, width), total[0, row])
-
-
-def planes_of(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
-    return Planes(*(array(tensor[item]) for tensor in (*pixels, sharpness)))
 
 
 def weighted_mean(pixels: "Pixels", sharpness: Tensor) -> tuple[Tensor, Tensor]:
     out = torch.zeros_like(pixels.image, memory_format=torch.contiguous_format)
     total = torch.zeros_like(pixels.surface, memory_format=torch.contiguous_format)
-    for item in range(len(out)):
-        filter_image(out[item].numpy(), total[item].numpy(), planes_of(pixels, sharpness, item))
+    run_items(filter_image, [out, total], [(*pixels, sharpness)])
     return out, total
 
 
@@ -134,7 +122,7 @@ def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes:
             lines = scratch[:, : right - left]
             weight, exponent, pull, distances = lines[0], lines[1], lines[2], lines[3:]
             weigh_tap(weight, exponent, distances, planes, row, left, dx, dy)
-            there = triple(planes.image, row + dy, left + dx, right + dx)
+            there = triple(planes[0], row + dy, left + dx, right + dx)
             pull_weights(pull, weight, triple_of_lines(scaled, left, right), dots[left:right], there)
             pull_exponent(pull, exponent)
             for s in range(1 + GROUP_COUNT):
@@ -143,7 +131,5 @@ def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes:
 
 def pull_sharpness(gradient: Tensor, pixels: "Pixels", sharpness: Tensor, out: Tensor, total: Tensor) -> Tensor:
     pulled = torch.zeros_like(sharpness, memory_format=torch.contiguous_format)
-    for item in range(len(pulled)):
-        planes = planes_of(pixels, sharpness, item)
-        pull_image(pulled[item].numpy(), array(gradient[item]), array(out[item]), array(total[item]), planes)
+    run_items(pull_image, [pulled], [gradient, out, total, (*pixels, sharpness)])
     return pulled

@@ -4,7 +4,7 @@ Networks take and give pixels with their channels side by side; all other loops 
 """
 
 import itertools
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numba
 import numpy as np
@@ -15,7 +15,7 @@ from datasets.frame import Frame
 from models.compiled.affinity import four
 from models.compiled.arrays import RGB, Image, Index, Matrix, Row, Rows, Scalar, f32
 from models.compiled.exponential import MIN_EXPONENT, exp, log
-from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
+from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel, run_items
 from models.compiled.lines import copy_line, scale_depth, scale_line, transpose, triple
 from models.history.running_scale import RunningScale
 
@@ -83,18 +83,12 @@ ROOM = CHUNK + 16  # for a line: lines that begin a power of two apart would fal
 AT_ONCE = 4  # inputs of a layer that two outputs are summed from in one pass
 
 
-class LinearLayer(NamedTuple):
-    """A linear layer, padded to an even number of outputs and a multiple of AT_ONCE inputs."""
-
-    weight: Matrix  # (outputs, inputs)
-    bias: Row  # (outputs)
-
-    @staticmethod
-    def of(layer: nn.Linear) -> "LinearLayer":
-        outputs, inputs = layer.weight.shape
-        bias = np.zeros(outputs, np.float32) if layer.bias is None else array(layer.bias)
-        weight = np.pad(array(layer.weight), ((0, outputs % 2), (0, -inputs % AT_ONCE)))
-        return LinearLayer(weight, np.pad(bias, (0, outputs % 2)))
+def padded(layer: nn.Linear) -> tuple[Matrix, Row]:
+    """Weight (outputs, inputs) and bias (outputs), with 0 for an even number of outputs and AT_ONCE inputs or more."""
+    outputs, inputs = layer.weight.shape
+    bias = np.zeros(outputs, np.float32) if layer.bias is None else array(layer.bias)
+    weight = np.pad(array(layer.weight), ((0, outputs % 2), (0, -inputs % AT_ONCE)))
+    return weight, np.pad(bias, (0, outputs % 2))
 
 
 @jit_inlined_in_any_order
@@ -151,56 +145,38 @@ def relu(line: Row, sums: Row) -> None:
         line[x] = max(sums[x], f32(0))
 
 
-class PixelArrays(NamedTuple):
-    """models.networks.one.PixelInputs of one item."""
-
-    noisy: Image
-    mean_3x3: Image
-    mean_9x9: Image
-    deviation: Image
-    history: Image
-    has_history: Image
-
-
-class SurfaceArrays(NamedTuple):
-    """What else the network's inputs of one item are computed from."""
-
-    albedo: Image
-    normal: Image
-    depth: Image
-    roughness: Image
-    gain: Row  # (3): exposure times the frame's gain
-    samples: Scalar
-    to_view: Matrix  # (3, 3)
-    depth_scale: Scalar
+# Of one item of models.networks.one.PixelInputs: noisy, mean_3x3, mean_9x9, deviation, history, has_history.
+PixelArrays: TypeAlias = tuple[Image, Image, Image, Image, Image, Image]
+# Of one item: albedo, normal, depth, roughness; exposure times the frame's gain (3), samples (1), to_view (3, 3), depth
+# scale (1).
+SurfaceArrays: TypeAlias = tuple[Image, Image, Image, Image, Row, Row, Matrix, Row]
 
 
 @jit_in_any_order
 def fill_lines(lines: Rows, pixels: PixelArrays, surfaces: SurfaceArrays, y: Index, x: Index, n: int) -> None:
     """The network's inputs (C, ·) of n pixels of a row from x on, in the order of ONE_INPUTS."""
     row = slice(x, x + n)
-    noisy, _, mean_9x9, _, history, _ = pixels
-    valid = pixels.has_history[0, y, row]
+    noisy, mean_3x3, mean_9x9, deviation, history, has_history = pixels
+    valid = has_history[0, y, row]
+    albedo, normal, depth, roughness, gain, samples, to_view, depth_scale = surfaces
     for c in range(3):
-        gain = surfaces.gain[c]
-        log_exposed(lines[NOISY + c, :n], noisy[c, y, row], gain)
-        log_exposed(lines[MEAN_3X3 + c, :n], pixels.mean_3x3[c, y, row], gain)
-        log_exposed(lines[MEAN_9X9 + c, :n], mean_9x9[c, y, row], gain)
-        log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], mean_9x9[c, y, row], gain)
-        log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], noisy[c, y, row], gain)
-    log_exposed(lines[DEVIATION, :n], pixels.deviation[0, y, row], f32(1))
-    lines[NEWEST, :n] = f32(1) / surfaces.samples
-    reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, surfaces.samples)
+        log_exposed(lines[NOISY + c, :n], noisy[c, y, row], gain[c])
+        log_exposed(lines[MEAN_3X3 + c, :n], mean_3x3[c, y, row], gain[c])
+        log_exposed(lines[MEAN_9X9 + c, :n], mean_9x9[c, y, row], gain[c])
+        log_exposed_history(lines[OUTPUT + c, :n], valid, history[c, y, row], mean_9x9[c, y, row], gain[c])
+        log_exposed_history(lines[ACCUMULATED + c, :n], valid, history[3 + c, y, row], noisy[c, y, row], gain[c])
+    log_exposed(lines[DEVIATION, :n], deviation[0, y, row], f32(1))
+    lines[NEWEST, :n] = f32(1) / samples[0]
+    reciprocal_length(lines[OLDEST, :n], history[6, y, row], valid, samples[0])
     copy_line(lines[HAS_HISTORY, :n], valid)
     for c in range(LATENT):
         copy_line(lines[LATENT_INPUT + c, :n], history[7 + c, y, row])
         scale_line(lines[LATENT_INPUT + c, :n], valid)
-    normal = triple(surfaces.normal, y, x, x + n)
     for c in range(3):
-        copy_line(lines[ALBEDO + c, :n], surfaces.albedo[c, y, row])
-        dot(lines[VIEW_NORMAL + c, :n], normal, surfaces.to_view[c])
-    scale_depth(lines[DEPTH, :n], surfaces.depth[0, y, row], surfaces.depth_scale)
-    copy_line(lines[ROUGHNESS, :n], surfaces.roughness[0, y, row])
+        copy_line(lines[ALBEDO + c, :n], albedo[c, y, row])
+        dot(lines[VIEW_NORMAL + c, :n], triple(normal, y, x, x + n), to_view[c])
+    scale_depth(lines[DEPTH, :n], depth[0, y, row], depth_scale[0])
+    copy_line(lines[ROUGHNESS, :n], roughness[0, y, row])
 
 
 @jit_in_any_order
@@ -213,15 +189,15 @@ def write_patches(patches: Matrix, y: Index, x: Index, lines: Rows, n: int) -> N
 
 @jit_parallel
 def write_inputs(
-    patches: Matrix, hidden: Image, pixels: PixelArrays, surfaces: SurfaceArrays, layer: LinearLayer
+    patches: Matrix, hidden: Image, pixels: PixelArrays, surfaces: SurfaceArrays, weight: Matrix, bias: Row
 ) -> None:
     """Patches (H / 2, W / 2, 2, 2, C), borders repeated, and hidden (c, h, w): ReLU of the layer of each pixel."""
-    _, height, width = pixels.noisy.shape
+    _, height, width = hidden.shape
     for row in numba.prange(2 * patches.shape[0]):
         bottom = np.int64(row)
         y = min(bottom, height - 1)
-        lines = np.zeros((layer.weight.shape[1], ROOM), np.float32)
-        sums = np.empty((layer.weight.shape[0], ROOM), np.float32)
+        lines = np.zeros((weight.shape[1], ROOM), np.float32)
+        sums = np.empty((weight.shape[0], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
             fill_lines(lines, pixels, surfaces, y, x, n)
@@ -229,8 +205,8 @@ def write_inputs(
             if bottom > y:
                 continue
             for c in range(sums.shape[0]):
-                sums[c, :n][:] = layer.bias[c]
-            add_layer(sums, lines, layer.weight, n)
+                sums[c, :n][:] = bias[c]
+            add_layer(sums, lines, weight, n)
             for c in range(hidden.shape[0]):
                 relu(hidden[c, y, x : x + n], sums[c, :n])
         last = lines[:, (width - 1) % CHUNK :]
@@ -246,16 +222,10 @@ def network_inputs(
     rows, columns = (SIDE_MULTIPLE * -(-size // SIDE_MULTIPLE) // 2 for size in (height, width))
     out = torch.empty(batch, rows, columns, 2, 2, hidden.in_features)
     sums = torch.empty(batch, hidden.out_features, height, width)
-    gains = array((scale.exposure() * frame.gain).flatten(1))
-    depth_scales = array(scale.log_depth.value.exp())
-    to_view = array(frame.to_view)
-    for item in range(batch):
-        pixels = PixelArrays(*(array(image[item]) for image in inputs))
-        albedo, normal = array(frame.albedo[item]), array(frame.normal[item])
-        depth, roughness = array(frame.depth[item]), array(frame.roughness[item])
-        numbers = gains[item], np.float32(frame.samples[item].item()), to_view[item], depth_scales[item]
-        surfaces = SurfaceArrays(albedo, normal, depth, roughness, *numbers)
-        write_inputs(out[item].numpy(), sums[item].numpy(), pixels, surfaces, LinearLayer.of(hidden))
+    gains = (scale.exposure() * frame.gain).flatten(1)
+    numbers = gains, frame.samples.flatten(1), frame.to_view, scale.log_depth.value.exp()[:, None]
+    surfaces = frame.albedo, frame.normal, frame.depth, frame.roughness, *numbers
+    run_items(write_inputs, [out, sums], [inputs, surfaces], *padded(hidden))
     return out.flatten(3).permute(0, 3, 1, 2), sums
 
 
@@ -313,60 +283,53 @@ def lerp(line: Row, past: Row, new: Row, alpha: Row) -> None:
         line[x] = alpha[x] * new[x] + (f32(1) - alpha[x]) * past[x]
 
 
-class DecodedImages(NamedTuple):
-    """models.networks.one.Decoded of one image."""
-
-    features: Image
-    sharpness: Image
-    logits: Image  # centre and importance
-    alpha: Image
-    latent: Image
-    accumulated: Image
-    length: Image
+# Of one item of models.networks.one.Decoded: features, sharpness, centre and importance in one, alpha, latent,
+# accumulated, length.
+DecodedArrays: TypeAlias = tuple[Image, Image, Image, Image, Image, Image, Image]
 
 
 @jit_in_any_order
 def decode_lines(
-    decoded: DecodedImages, lines: Rows, inputs: PixelArrays, samples: Scalar, y: Index, x: Index, n: int
+    decoded: DecodedArrays, lines: Rows, inputs: PixelArrays, samples: Scalar, y: Index, x: Index, n: int
 ) -> None:
     """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of head_channels."""
-    levels = decoded.sharpness.shape[0]
+    features, sharpness, logits, alphas, latent, accumulated, length = decoded
+    noisy, _, _, _, history, has_history = inputs
+    levels = sharpness.shape[0]
+    row = slice(x, x + n)
     k = FEATURES + 3 * levels
     for c in range(FEATURES):
-        copy_line(decoded.features[c, y, x : x + n], lines[c, :n])
+        copy_line(features[c, y, row], lines[c, :n])
     for c in range(levels):
-        softplus(decoded.sharpness[c, y, x : x + n], lines[FEATURES + c, :n])
+        softplus(sharpness[c, y, row], lines[FEATURES + c, :n])
     for c in range(2 * levels):
-        clamp_logit(decoded.logits[c, y, x : x + n], lines[FEATURES + levels + c, :n])
-    valid = inputs.has_history[0, y, x : x + n]
-    length = inputs.history[6, y, x : x + n]
-    alpha = decoded.alpha[0, y, x : x + n]
-    accumulation_alpha(alpha, lines[k, :n], valid, length, samples)
-    sigmoid(decoded.alpha[1, y, x : x + n], lines[k + 1, :n], valid)
+        clamp_logit(logits[c, y, row], lines[FEATURES + levels + c, :n])
+    valid, past_length, alpha = has_history[0, y, row], history[6, y, row], alphas[0, y, row]
+    accumulation_alpha(alpha, lines[k, :n], valid, past_length, samples)
+    sigmoid(alphas[1, y, row], lines[k + 1, :n], valid)
     for c in range(LATENT):
-        tanh(decoded.latent[c, y, x : x + n], lines[k + 2 + c, :n])
-    effective_length(decoded.length[0, y, x : x + n], length, alpha, samples)
+        tanh(latent[c, y, row], lines[k + 2 + c, :n])
+    effective_length(length[0, y, row], past_length, alpha, samples)
     for c in range(3):
-        past, noisy = inputs.history[3 + c, y, x : x + n], inputs.noisy[c, y, x : x + n]
-        lerp(decoded.accumulated[c, y, x : x + n], past, noisy, alpha)
+        lerp(accumulated[c, y, row], history[3 + c, y, row], noisy[c, y, row], alpha)
 
 
 @jit_parallel
 def decode_images(
-    decoded: DecodedImages, head: Image, hidden: Image, layer: LinearLayer, inputs: PixelArrays, samples: Scalar
+    decoded: DecodedArrays, head: Image, hidden: Image, weight: Matrix, inputs: PixelArrays, samples: Scalar
 ) -> None:
-    """Decode the U-Net's outputs, head (H, W, C), plus the layer of hidden (c, H, W)."""
+    """Decode the U-Net's outputs, head (H, W, C), plus weight (C, c) times hidden (c, H, W)."""
     height, width, _ = head.shape
     for row in numba.prange(height):
         y = np.int64(row)
-        lines = np.empty((layer.weight.shape[0], ROOM), np.float32)
-        columns = np.empty((layer.weight.shape[1], ROOM), np.float32)
+        lines = np.empty((weight.shape[0], ROOM), np.float32)
+        columns = np.empty((weight.shape[1], ROOM), np.float32)
         for x in range(0, width, CHUNK):
             n = min(CHUNK, width - x)
             transpose(lines, head[y, x : x + n])
             for c in range(hidden.shape[0]):
                 copy_line(columns[c, :n], hidden[c, y, x : x + n])
-            add_layer(lines, columns, layer.weight, n)
+            add_layer(lines, columns, weight, n)
             decode_lines(decoded, lines, inputs, samples, y, x, n)
 
 
@@ -378,8 +341,8 @@ def decode_head(
     counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     for item in range(batch):
-        decoded = DecodedImages(*(each[item].numpy() for each in out))
-        pixels = PixelArrays(*(array(image[item]) for image in inputs))
+        decoded = tuple(each[item].numpy() for each in out)
+        pixels = tuple(array(image[item]) for image in inputs)
         head_and_hidden = head[item].movedim(0, -1).numpy(), array(hidden[item])
-        decode_images(decoded, *head_and_hidden, LinearLayer.of(last), pixels, np.float32(samples[item].item()))
+        decode_images(decoded, *head_and_hidden, padded(last)[0], pixels, np.float32(samples[item].item()))
     return out[0], out[1], *out[2].split(levels, dim=1), *out[3:]
