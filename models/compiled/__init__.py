@@ -1,9 +1,9 @@
 """Kernels compiled at first use: fast versions of functions that models/ has in PyTorch.
 
 `by` puts a kernel beside the PyTorch function of the same name and signature, whose docstring is for both, and decides
-which of them runs. Numba compiles kernels for the CPU and keeps them on disk from run to run. `with_gradients` is for
-kernels with gradients of their own. What no kernel can compute (other gradients, half precision, nearly everything on
-GPUs) runs in PyTorch; tests hold kernels to that.
+which of them runs; where kernels have gradients of their own, `usable` does. Numba compiles kernels for the CPU and
+keeps them on disk from run to run. What no kernel can compute (other gradients, half precision, anything on GPUs) runs
+in PyTorch; tests hold kernels to that.
 
 The constants of a paper stand at the top of its kernel file, as Python numbers, from where the PyTorch version takes
 them; kernels round them with `f32`. Limits that several share are in models.operators.
@@ -11,7 +11,7 @@ them; kernels round them with `f32`. Limits that several share are in models.ope
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -48,42 +48,29 @@ def tensors_among(values: Iterable[object]) -> Iterator[Tensor]:
             yield from tensors_among(value)
 
 
-def kernel_device(tensors: Sequence[Tensor]) -> str | None:
-    """The type of device whose kernels can run on the tensors ("cpu", "cuda"); None where PyTorch must.
-
-    Kernels have no gradients and take images in float32, of which the first tensor is one.
-    """
-    differentiates = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if not enabled or differentiates or tensors[0].dtype != torch.float32:
-        return None
-    types = {tensor.device.type for tensor in tensors}
-    return types.pop() if len(types) == 1 else None
-
-
-def with_gradients(image: Tensor) -> bool:
-    """Whether kernels with gradients of their own can run on an image; then on as many threads as PyTorch."""
+def usable(image: Tensor) -> bool:
+    """Whether kernels can run on an image; then on as many threads as PyTorch."""
     possible = enabled and image.device.type == "cpu" and image.dtype == torch.float32
     if possible:
         match_threads()
     return possible
 
 
-def by(cpu: Callable[P, R], gpu: Callable[P, R] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A decorator that runs kernels in place of a PyTorch function wherever they can: see `kernel_device`.
+def by(kernel: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A decorator that runs a kernel in place of a PyTorch function wherever it can.
 
-    `cpu` and `gpu` have the function's signature and return the same, but for rounding.
+    The kernel has the function's signature and returns the same, but for rounding. It has no gradients, and takes
+    tensors on the CPU, of which the first is an image in float32.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)
         def choose(*args: P.args, **kwargs: P.kwargs) -> R:
-            device = kernel_device([*tensors_among((*args, *kwargs.values()))])
-            if device == "cpu":
-                match_threads()
-                return cpu(*args, **kwargs)
-            if device == "cuda" and gpu is not None:
-                return gpu(*args, **kwargs)
-            return function(*args, **kwargs)
+            tensors = [*tensors_among((*args, *kwargs.values()))]
+            differentiates = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+            if differentiates or any(tensor.device.type != "cpu" for tensor in tensors) or not usable(tensors[0]):
+                return function(*args, **kwargs)
+            return kernel(*args, **kwargs)
 
         return choose
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from models.compiled.arrays import Image, Index, Row, Signals, f32
 from models.compiled.exponential import exp
-from models.compiled.jit import array, jit_in_any_order, jit_parallel
+from models.compiled.jit import jit_in_any_order, jit_parallel, run_items
 from models.compiled.lines import add_line, add_product, columns_with_tap, divide_line, triple_of_lines
 
 DIFFUSE_BAND = 2.8  # band limit of what diffuse surfaces reflect, times the distance of that
@@ -83,7 +83,5 @@ def filter_image(out: Signals, image: Signals, width: Image, max_width: Image, g
 
 def filter_lines(image: Tensor, width: Tensor, max_width: Tensor, geometry: Tensor, down: bool) -> Tensor:
     out = image.clone(memory_format=torch.contiguous_format)
-    for item in range(len(image)):
-        images = array(image[item]), array(width[item, :, 0]), array(max_width[item, :, 0]), array(geometry[item, 0])
-        filter_image(out[item].numpy(), *images, down)
+    run_items(filter_image, [out], [image, width[:, :, 0], max_width[:, :, 0], geometry[:, 0]], down)
     return out

@@ -16,12 +16,13 @@ MIN_ALPHA = 0.2  # SVGF §4.1: weight of the newest frame in a long history
 
 
 @jit_with_reciprocals
-def weigh(alpha: Row, length: Row, past_length: Row, valid: Row) -> None:
-    """The weight of the newest frame, max(0.2, 1 / (n + 1)), and the new length n + 1 of the history."""
+def weigh(alpha: Row, length: Row, past_length: Row, change: Row, valid: Row) -> None:
+    """The weight of the newest frame and the new history length, (W), where `change` of the history is dropped."""
     for x in range(alpha.size):
-        longer = past_length[x] + f32(1)
-        alpha[x] = max(f32(1) / longer, f32(MIN_ALPHA)) if valid[x] > 0 else f32(1)
-        length[x] = longer if valid[x] > 0 else f32(1)
+        kept = f32(1) - change[x]
+        newest = kept * max(f32(MIN_ALPHA), f32(1) / (past_length[x] + f32(1))) + change[x]
+        alpha[x] = newest if valid[x] > 0 else f32(1)
+        length[x] = past_length[x] * kept + f32(1) if valid[x] > 0 else f32(1)
 
 
 @jit_with_reciprocals
@@ -41,10 +42,11 @@ def accumulate_image(
         taps = new_taps(width)
         gathered = np.empty(width, np.float32)
         alpha = np.empty(width, np.float32)
+        none = np.zeros(width, np.float32)
         for y in rows_of_block(block, height):
             find_taps(taps, y, pair)
             gather(gathered, past_length, y, taps)
-            weigh(alpha, length[y], gathered, taps.valid)
+            weigh(alpha, length[y], gathered, none, taps.valid)
             for c in range(3):
                 gather(gathered, past_irradiance[c], y, taps)
                 blend(irradiance[c, y], gathered, alpha, noisy[c, y])

@@ -7,7 +7,7 @@ A level filters with 3 x 3 taps q, `step` pixels apart, of each pixel p that sho
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numba
 import numpy as np
@@ -43,21 +43,11 @@ class TapLayout(NamedTuple):
     inside: Rows  # (3, N), whether taps to the left, above or below, and to the right are inside, for whole rows
 
 
-class Filtered(NamedTuple):
-    """The output of a level (B, 3, N), its sums of weights (B, N), and the gradient of the output (B, 3, N)."""
-
-    out: Image
-    total: Rows
-    gradient: Image
-
-
-class Taps(NamedTuple):
-    """Pixels `low` to `high` - 1, which have their taps `offset` pixels further in the image's rows."""
-
-    offset: Index
-    low: Index
-    high: Index
-    column: int  # 0: the taps are to the left, 1: above, below or the pixels themselves, 2: to the right
+# The output of a level (B, 3, N), its sums of weights (B, N), and the gradient of the output (B, 3, N).
+Filtered: TypeAlias = tuple[Image, Rows, Image]
+# (offset, low, high, column): pixels `low` to `high` - 1, which have their taps `offset` pixels further in the image's
+# rows: in column 0, to the left, 1, above, below or the pixels themselves, or 2, to the right.
+Taps: TypeAlias = tuple[Index, Index, Index, int]
 
 
 @jit_inlined
@@ -123,7 +113,7 @@ def taps_of_block(layout: TapLayout, first: Index, last: Index) -> Iterator[Taps
         low = max(first, -offset)
         high = min(last, pixels - offset)
         if low < high and (offset == 0) == (tap == 4):
-            yield Taps(offset, low, high, tap % 3)
+            yield offset, low, high, tap % 3
 
 
 @jit_with_memory
@@ -235,12 +225,13 @@ def pull_block(
 ) -> None:
     """Add to the gradients `to` those by the outputs of pixels `first` to `last` - 1."""
     n = last - first
+    out, total, gradient = filtered
     weights, distances, pulls = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     dots = np.zeros(n, np.float32)
     scaled = np.empty((3, n), np.float32)
     for c in range(3):
-        gradient, out = filtered.gradient[item, c, first:last], filtered.out[item, c, first:last]
-        scale_gradient(scaled[c], dots, gradient, out, filtered.total[item, first:last])
+        to_out, filtered_colour = gradient[item, c, first:last], out[item, c, first:last]
+        scale_gradient(scaled[c], dots, to_out, filtered_colour, total[item, first:last])
     for taps in taps_of_block(layout, first, last):
         offset, low, high, _ = taps
         here = slice(low - first, high - first)
@@ -265,9 +256,9 @@ def pull_block(
 @jit_parallel
 def pull_items(to: Level, level: Level, layout: TapLayout, filtered: Filtered) -> None:
     """The gradients of a level, added to `to`; items in parallel, for the blocks of one share pixels."""
-    pixels = filtered.total.shape[1]
+    batch, pixels = layout.surface.shape
     block = block_size(layout.width)
-    for item in numba.prange(len(filtered.total)):
+    for item in numba.prange(batch):
         for first in range(0, pixels, block):
             pull_block(to, level, layout, filtered, np.int64(item), first, min(first + block, pixels))
 
@@ -278,6 +269,6 @@ def pull_level(
     """The gradients of the `inputs`: image, features, sharpness, own and importance."""
     match_threads()
     pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs]
-    filtered = Filtered(flat(out), flat(total)[:, 0], flat(gradient))
+    filtered = flat(out), flat(total)[:, 0], flat(gradient)
     pull_items(level_of(pulled), level_of(inputs), layout_of(surface, step), filtered)
     return tuple(pulled)

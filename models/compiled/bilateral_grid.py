@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, Scalar, f32
-from models.compiled.jit import array, jit_in_order, jit_inlined, jit_parallel, jit_with_memory
+from models.compiled.jit import jit_in_order, jit_inlined, jit_parallel, jit_with_memory, run_items
 from models.compiled.lines import triple
 
 GUIDES = 256  # values of a guide (Meng et al. 2020), which cells of a grid divide as they divide pixels
@@ -141,6 +141,5 @@ def filter_image(out: Image, image: Image, guide: Plane, surface: Plane, spacing
 def grid_mean(image: Tensor, guide: Tensor, spacing: int, surface: Tensor | None = None) -> Tensor:
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     surface = torch.ones_like(guide) if surface is None else surface
-    for item in range(len(image)):
-        filter_image(out[item].numpy(), array(image[item]), array(guide[item, 0]), array(surface[item, 0]), spacing)
+    run_items(filter_image, [out], [image, guide[:, 0], surface[:, 0]], spacing)
     return out

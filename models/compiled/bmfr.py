@@ -1,6 +1,6 @@
 """models.filters.bmfr for the CPU: blocks in parallel, each with its matrix in the cache, column by column."""
 
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numba
 import numpy as np
@@ -17,16 +17,7 @@ PIXELS = BLOCK_SIDE**2
 COLUMNS = REGRESSORS + 3  # of the augmented matrix: features and colours
 POSITION = 4  # the first column of positions
 SQUARE = 7  # and of their squares
-
-
-class RegressionInputs(NamedTuple):
-    """One item of what models.filters.bmfr.regress takes."""
-
-    irradiance: Image
-    normal: Image
-    depth: Plane
-    axes: Doubles  # (3, 3): rays in the camera's frame are x axes[:, 0] + y axes[:, 1] + axes[:, 2]
-    noise: Doubles  # (10, P), added to the features
+Images: TypeAlias = tuple[Image, Image, Image]  # of one item: irradiance, normal, depth (1, H, W)
 
 
 @jit_in_any_order
@@ -51,18 +42,18 @@ def add_multiple(a: Doubles, b: Doubles, factor: float) -> None:
 
 
 @jit_in_any_order
-def gather_block(columns: Doubles, light: Doubles, inputs: RegressionInputs, top: Index, left: Index) -> bool:
+def gather_block(columns: Doubles, light: Doubles, images: Images, axes: Doubles, top: Index, left: Index) -> bool:
     """Fill columns (10, P), but positions unscaled, and light (3, P), with 0 off surfaces.
 
     The block begins at row `top` and column `left` of the image. Returns whether it shows any surface.
     """
-    irradiance, normal, depth, axes, _ = inputs
-    height, width = depth.shape
+    irradiance, normal, depth = images
+    _, height, width = depth.shape
     count = 0.0
     for p in range(PIXELS):
         y = mirror(top + p // BLOCK_SIDE, height)
         x = mirror(left + p % BLOCK_SIDE, width)
-        d = np.float64(depth[y, x])
+        d = np.float64(depth[0, y, x])
         surface = d > 0
         columns[0, p] = 1.0 if surface else 0.0
         count += columns[0, p]
@@ -142,9 +133,12 @@ def write_block(plane: Plane, values: Doubles, top: Index, left: Index) -> None:
 
 
 @jit_parallel
-def regress_image(fitted: Image, inputs: RegressionInputs, above: int, before: int) -> None:
-    """fitted (3, H, W), by blocks of which the first begins `above` and `before` the image."""
-    height, width = inputs.depth.shape
+def regress_image(fitted: Image, images: Images, axes: Doubles, noise: Doubles, above: int, before: int) -> None:
+    """fitted (3, H, W), by blocks of which the first begins `above` and `before` the image.
+
+    Rays in the camera's frame are x axes[:, 0] + y axes[:, 1] + axes[:, 2]; noise (10, P) is added to the features.
+    """
+    _, height, width = fitted.shape
     down = (height + above + BLOCK_SIDE - 1) // BLOCK_SIDE
     across = (width + before + BLOCK_SIDE - 1) // BLOCK_SIDE
     for block in numba.prange(down * across):
@@ -154,9 +148,9 @@ def regress_image(fitted: Image, inputs: RegressionInputs, above: int, before: i
         matrix = np.empty((COLUMNS, PIXELS))
         coefficients = np.empty((3, REGRESSORS))
         light = matrix[REGRESSORS:]
-        if gather_block(columns, light, inputs, top, left):
+        if gather_block(columns, light, images, axes, top, left):
             scale_positions(columns)
-            matrix[:REGRESSORS] = columns + inputs.noise
+            matrix[:REGRESSORS] = columns + noise
             triangularise(matrix)
             substitute(coefficients, matrix)
             for c in range(3):
@@ -173,7 +167,6 @@ def regress(
     fitted = torch.empty_like(irradiance, memory_format=torch.contiguous_format)
     doubles = noise.T.contiguous().numpy()
     for item in range(len(irradiance)):
-        images = array(irradiance[item]), array(normal[item]), array(depth[item, 0])
-        inputs = RegressionInputs(*images, axes[item].contiguous().numpy(), doubles)
-        regress_image(fitted[item].numpy(), inputs, *offset)
+        images = array(irradiance[item]), array(normal[item]), array(depth[item])
+        regress_image(fitted[item].numpy(), images, axes[item].contiguous().numpy(), doubles, *offset)
     return fitted

@@ -1,7 +1,6 @@
 """network_features of models.networks.wskp for the CPU: in one pass, in the order of memory that convolutions want."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -10,26 +9,15 @@ from torch import Tensor
 
 from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
-from models.compiled.arrays import Image, Plane, Row, Scalar, f32
+from models.compiled.arrays import Image, Row, Scalar, f32
 from models.compiled.exponential import exp, log
-from models.compiled.jit import array, jit_parallel, jit_with_reciprocals
+from models.compiled.jit import jit_parallel, jit_with_reciprocals, run_items
 from models.compiled.lines import block_count, rows_of_block, scale_depth, transpose
 from models.history.running_scale import RunningScale
 
 FEATURE_CHANNELS = {"colour": 3, "albedo": 3, "normal": 3, "depth": 1}  # inputs' channels (Fan et al. 2021, §5.1)
 GAMMA = 2.2  # of the display transform before the network (§5.1)
 MIN_EXPOSED = 1e-30  # its power is 0 as far as a network can tell, and its logarithm is finite
-
-
-class FeatureArrays(NamedTuple):
-    """What the features of one item are made of."""
-
-    irradiance: Image
-    albedo: Image
-    normal: Image
-    depth: Plane
-    exposure: Row  # (3,)
-    scale: Scalar  # of the depth
 
 
 @jit_with_reciprocals
@@ -40,27 +28,24 @@ def display(line: Row, irradiance: Row, albedo: Row, exposure: Scalar) -> None:
         line[x] = exp(f32(1 / GAMMA) * log(min(max(exposed, f32(MIN_EXPOSED)), f32(1))))
 
 
-@jit_with_reciprocals
-def scale_normal(line: Row, normal: Row) -> None:
-    for x in range(line.size):
-        line[x] = normal[x] * f32(0.5) + f32(0.5)
-
-
 @jit_parallel
-def feature_image(out: Image, arrays: FeatureArrays, with_albedo: bool, with_normal: bool) -> None:
-    """out (H, W, C), C = 10, and 3 less without albedo and without normal."""
-    height, width = arrays.depth.shape
+def feature_image(
+    out: Image, images: tuple[Image, ...], exposure: Row, scale: Row, with_albedo: bool, with_normal: bool
+) -> None:
+    """out (H, W, C), C = 10, and 3 less without albedo and without normal; exposure (3), scale (1) of the depth."""
+    irradiance, albedo, normal, depth = images
+    _, height, width = depth.shape
     after_albedo = 6 if with_albedo else 3
     for block in numba.prange(block_count(height)):
         lines = np.empty((out.shape[2], width), np.float32)
         for y in rows_of_block(block, height):
             for c in range(3):
-                display(lines[c], arrays.irradiance[c, y], arrays.albedo[c, y], arrays.exposure[c])
+                display(lines[c], irradiance[c, y], albedo[c, y], exposure[c])
                 if with_albedo:
-                    lines[3 + c] = arrays.albedo[c, y]
+                    lines[3 + c] = albedo[c, y]
                 if with_normal:
-                    scale_normal(lines[after_albedo + c], arrays.normal[c, y])
-            scale_depth(lines[out.shape[2] - 1], arrays.depth[y], arrays.scale)
+                    lines[after_albedo + c] = normal[c, y] * f32(0.5) + f32(0.5)
+            scale_depth(lines[out.shape[2] - 1], depth[0, y], scale[0])
             transpose(out[y], lines)
 
 
@@ -68,11 +53,9 @@ def network_features(
     frame: Frame, irradiance: Tensor, scale: RunningScale, names: Sequence[str] = tuple(FEATURE_CHANNELS)
 ) -> Tensor:
     """See models.networks.wskp.network_features; channels come last in memory."""
-    exposure = array((scale.exposure() * frame.gain).flatten(1))
-    depth_scale = array(scale.log_depth.value.exp())
+    exposure = (scale.exposure() * frame.gain).flatten(1)
+    depth_scale = scale.log_depth.value.exp()[:, None]
     out = torch.empty(len(irradiance), *frame.size, sum(FEATURE_CHANNELS[name] for name in names))
-    for item in range(len(out)):
-        albedo, normal, depth = array(frame.albedo[item]), array(frame.normal[item]), array(frame.depth[item, 0])
-        arrays = FeatureArrays(array(irradiance[item]), albedo, normal, depth, exposure[item], depth_scale[item])
-        feature_image(out[item].numpy(), arrays, "albedo" in names, "normal" in names)
+    images = irradiance, frame.albedo, frame.normal, frame.depth
+    run_items(feature_image, [out], [images, exposure, depth_scale], "albedo" in names, "normal" in names)
     return out.permute(0, 3, 1, 2)

@@ -6,7 +6,7 @@ end, and slices of several dimensions might have any stride. Neither is vectoris
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numba
 import numpy as np
@@ -28,14 +28,9 @@ THREAD_ROWS = 32  # rows that a thread fuses at once
 CHUNK_PIXELS = 256  # of all maps, they fit into the fastest cache
 
 
-class Strip(NamedTuple):
-    """A window's part of a strip of rows from `start` on."""
-
-    logits: Plane  # (rows, W), from row `low` on, cover the windows of the strip
-    shares: Plane  # (strip, W), the window's weight in each pixel
-    radius: Index
-    start: Index
-    low: Index
+# (logits, shares, radius, start, low): a window's part of a strip of rows from `start` on. Logits (rows, W), from row
+# `low` on, cover the windows of the strip; shares (strip, W) are the window's weight in each pixel.
+Strip: TypeAlias = tuple[Plane, Plane, Index, Index, Index]
 
 
 # --- Rows of W pixels -------------------------------------------------------------------------------------------------
@@ -282,7 +277,7 @@ def fuse_strips(
             low = max(start - radius, 0)
             entries = my_logits[i, low - first : min(stop + radius, height) - first]
             bottom, top = logit_range(entries)
-            strip = Strip(entries, my_shares[i, : stop - start], radius, start, low)
+            strip = (entries, my_shares[i, : stop - start], radius, start, low)
             if top - bottom <= f32(SAFE_RANGE):
                 filter_strip(fused, image, strip, (bottom + top) / f32(2), my_weighted)
             else:
@@ -314,12 +309,3 @@ def fuse(
         maps = importance[item].detach().float().numpy(), mixture[item].detach().float().numpy()
         compiled_fuse_strips()(*images, *maps, np.array(windows), *scratch)
     return fused
-
-
-def fuse_on_gpu(
-    image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
-) -> Tensor:
-    """The same for CUDA devices, by Triton, which is imported here because it takes long and is not everywhere."""
-    from models.compiled.fusion_triton import fuse
-
-    return fuse(image, importance, mixture, windows, surface)

@@ -2,7 +2,7 @@
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -53,6 +53,19 @@ jit_parallel = numba.njit(cache=True, parallel=True, error_model="numpy")
 def array(tensor: Tensor) -> NDArray[np.float32]:
     """A tensor's values as a contiguous numpy array of float32, without a copy where it is that already."""
     return tensor.detach().float().contiguous().numpy()
+
+
+def run_items(
+    kernel: Callable[..., None], outputs: Sequence[Tensor], inputs: Iterable[Tensor | Sequence[Tensor]], *settings: Any
+) -> None:
+    """Run a kernel on each item of a batch: on arrays of the `outputs`, to fill, and of the `inputs`, as tuples too."""
+    inputs = tuple(inputs)
+    for item in range(len(outputs[0])):
+        given = (
+            array(each[item]) if isinstance(each, Tensor) else tuple(array(tensor[item]) for tensor in each)
+            for each in inputs
+        )
+        kernel(*(output[item].numpy() for output in outputs), *given, *settings)
 
 
 @jit_parallel

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from datasets.channels import ALBEDO_FLOOR
 from models.compiled.arrays import Image, Index, Indices, Plane, f32
-from models.compiled.jit import array, jit_in_order, jit_parallel
+from models.compiled.jit import array, jit_in_order, jit_parallel, run_items
 
 FILL_WINDOWS = ((1, True), (4, True), (13, True), (13, False))  # radius in pixels, and whether of the same mesh only
 
@@ -50,9 +50,7 @@ def light_of_samples(
     weighted: Tensor, samples: Tensor, wanted: Tensor, mesh_id: Tensor, albedo: Tensor, otherwise: Tensor
 ) -> Tensor:
     light = otherwise.clone(memory_format=torch.contiguous_format)
-    for item in range(len(light)):
-        inputs = [array(image[item]) for image in (weighted, samples[:, 0], wanted[:, 0], mesh_id[:, 0], albedo)]
-        fill(light[item].numpy(), *inputs)
+    run_items(fill, [light], [weighted, samples[:, 0], wanted[:, 0], mesh_id[:, 0], albedo])
     return light
 
 
@@ -75,22 +73,13 @@ def main_samples(
 ) -> tuple[Tensor, Tensor]:
     weighted = torch.empty_like(indirect, memory_format=torch.contiguous_format)
     samples = torch.empty_like(second_samples, memory_format=torch.contiguous_format)
-    for item in range(len(indirect)):
-        inputs = [array(image[item]) for image in (direct, indirect, second, second_samples[:, 0], albedo)]
-        weigh(weighted[item].numpy(), samples[item, 0].numpy(), *inputs)
+    run_items(weigh, [weighted, samples[:, 0]], [direct, indirect, second, second_samples[:, 0], albedo])
     return weighted, samples
 
 
 @jit_parallel
 def pool(
-    weighted: Image,
-    samples: Plane,
-    best: Plane,
-    chosen: Indices,
-    second: Image,
-    own: Plane,
-    share: Plane,
-    albedo: Image,
+    weighted: Image, samples: Plane, best: Plane, chosen: Indices, light: Image, own: Plane, share: Plane, albedo: Image
 ) -> None:
     """Sums over blocks of 2 x 2 pixels; `best` is the largest share in a block, `chosen` the index of its pixel."""
     height, width = share.shape
@@ -104,7 +93,7 @@ def pool(
                 for column in range(2 * x, min(2 * x + 2, width)):
                     samples[y, x] += own[row, column]
                     for c in range(3):
-                        weighted[c, y, x] += second[c, row, column] / max(albedo[c, row, column], f32(ALBEDO_FLOOR))
+                        weighted[c, y, x] += light[c, row, column] / max(albedo[c, row, column], f32(ALBEDO_FLOOR))
                     if share[row, column] > best[y, x]:
                         best[y, x] = share[row, column]
                         chosen[y, x] = row * width + column
@@ -117,9 +106,8 @@ def second_samples(
     size = -(-height // 2), -(-width // 2)
     weighted, pooled, best = (torch.empty(batch, channels, *size) for channels in (3, 1, 1))
     chosen = torch.empty(batch, 1, *size, dtype=torch.int64)
-    for item in range(batch):
-        outputs = [image[item].numpy() for image in (weighted, pooled[:, 0], best[:, 0], chosen[:, 0])]
-        pool(*outputs, *(array(image[item]) for image in (second, samples[:, 0], share[:, 0], albedo)))
+    outputs = weighted, pooled[:, 0], best[:, 0], chosen[:, 0]
+    run_items(pool, outputs, [second, samples[:, 0], share[:, 0], albedo])
     return weighted, pooled, best, chosen
 
 
@@ -152,6 +140,5 @@ def add(out: Image, main: Image, irradiance: Image, share: Plane, albedo: Image,
 
 def composed(main: Tensor, irradiance: Tensor, share: Tensor, albedo: Tensor, emission: Tensor) -> Tensor:
     out = torch.empty_like(main, memory_format=torch.contiguous_format)
-    for item in range(len(main)):
-        add(out[item].numpy(), *(array(image[item]) for image in (main, irradiance, share[:, 0], albedo, emission)))
+    run_items(add, [out], [main, irradiance, share[:, 0], albedo, emission])
     return out

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from models.compiled.arrays import RGB, Image, Index, Plane, Row, f32
-from models.compiled.jit import array, jit_in_any_order, jit_parallel, jit_with_memory
+from models.compiled.jit import jit_in_any_order, jit_parallel, jit_with_memory, run_items
 from models.compiled.lines import add_line, add_product, divide_line, luminance, triple, window_taps
 from models.operators import MAX_LUMINANCE
 
@@ -92,8 +92,7 @@ def sum_taps(sums: Image, image: Image, mesh: Plane, step: int) -> None:
 
 def mesh_sums(image: Tensor, mesh_id: Tensor, step: int) -> Tensor:
     sums = torch.empty_like(image, memory_format=torch.contiguous_format)
-    for item in range(len(image)):
-        sum_taps(sums[item].numpy(), array(image[item]), array(mesh_id[item, 0]), step)
+    run_items(sum_taps, [sums], [image, mesh_id[:, 0]], step)
     return sums
 
 
@@ -101,9 +100,7 @@ def mesh_means(image: Tensor, mesh_id: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     mean_3x3 = torch.empty_like(image, memory_format=torch.contiguous_format)
     mean_9x9 = torch.empty_like(mean_3x3)
     deviation = torch.empty_like(mesh_id, memory_format=torch.contiguous_format)
-    sums = np.empty((SUMS, *image.shape[2:]), np.float32)
-    for item in range(len(image)):
-        mesh = array(mesh_id[item, 0])
-        sum_colours(sums, array(image[item]), mesh)
-        average(mean_3x3[item].numpy(), mean_9x9[item].numpy(), deviation[item, 0].numpy(), sums, mesh)
+    sums = image.new_empty(len(image), SUMS, *image.shape[2:])
+    run_items(sum_colours, [sums], [image, mesh_id[:, 0]])
+    run_items(average, [mean_3x3, mean_9x9, deviation[:, 0]], [sums, mesh_id[:, 0]])
     return mean_3x3, mean_9x9, deviation

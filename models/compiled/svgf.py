@@ -6,7 +6,7 @@ vectorises a loop only where few comparisons show that no output overlaps an inp
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, TypeAlias
 
 import numba
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
+from models.compiled.accumulation import weigh
 from models.compiled.arrays import RGB, Image, Index, Mask, Plane, Row, Scalar, Signals, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel, jit_with_reciprocals
@@ -25,7 +26,6 @@ from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 if TYPE_CHECKING:
     from models.filters.svgf import Integrated
 
-ALPHA = 0.2  # §4.1: weight of the newest sample
 SPATIAL_RADIUS = 3  # §4.2: windows of 7 x 7
 SIGMA_Z = 1.0  # §4.4
 SIGMA_L = 4.0
@@ -48,12 +48,8 @@ SPATIAL_BLOCK = 64  # px; the spatial estimate is made for all of a block where 
 # --- Temporal integration ---------------------------------------------------------------------------------------------
 
 
-class IntegratedArrays(NamedTuple):
-    """One item of models.filters.svgf.Integrated."""
-
-    colour: Signals  # (S, 3, H, W)
-    moments: Signals  # (S, 2, H, W)
-    length: Plane
+# Of one item of models.filters.svgf.Integrated: colour (S, 3, H, W), moments (S, 2, H, W), length (H, W).
+IntegratedArrays: TypeAlias = tuple[Signals, Signals, Plane]
 
 
 @jit_with_reciprocals
@@ -67,15 +63,6 @@ def luminance_moments(first: Row, second: Row, colour: RGB) -> None:
 
 
 @jit_with_reciprocals
-def weigh(alpha: Row, length: Row, past_length: Row, change: Row, valid: Row) -> None:
-    """The weight of the newest frame and the new history length, (W), where `change` of the history is dropped."""
-    for x in range(alpha.size):
-        kept = f32(1) - change[x]
-        alpha[x] = kept * max(f32(ALPHA), f32(1) / (past_length[x] + f32(1))) + change[x]
-        length[x] = past_length[x] * kept + f32(1) if valid[x] > 0 else f32(1)
-
-
-@jit_with_reciprocals
 def blend(line: Row, past: Row, new: Row, alpha: Row, valid: Row) -> None:
     for x in range(line.size):
         line[x] = past[x] + alpha[x] * (new[x] - past[x]) if valid[x] > 0 else new[x]
@@ -86,6 +73,8 @@ def integrate_image(
     out: IntegratedArrays, noisy: Signals, past: IntegratedArrays, change: Plane, pair: FramePair
 ) -> None:
     """`change` (H, W) of the history is dropped; it is empty for none."""
+    colour, moments, length = out
+    past_colour, past_moments, past_length = past
     signals, _, height, width = noisy.shape
     for block in numba.prange(block_count(height)):
         taps = new_taps(width)
@@ -95,16 +84,16 @@ def integrate_image(
         none = np.zeros(width, np.float32)
         for y in rows_of_block(block, height):
             find_taps(taps, y, pair)
-            gather(gathered, past.length, y, taps)
-            weigh(alpha, out.length[y], gathered, change[y] if change.size > 0 else none, taps.valid)
+            gather(gathered, past_length, y, taps)
+            weigh(alpha, length[y], gathered, change[y] if change.size > 0 else none, taps.valid)
             for s in range(signals):
                 for c in range(3):
-                    gather(gathered, past.colour[s, c], y, taps)
-                    blend(out.colour[s, c, y], gathered, noisy[s, c, y], alpha, taps.valid)
+                    gather(gathered, past_colour[s, c], y, taps)
+                    blend(colour[s, c, y], gathered, noisy[s, c, y], alpha, taps.valid)
                 luminance_moments(new[0], new[1], triple(noisy[s], y, 0, width))
                 for c in range(2):
-                    gather(gathered, past.moments[s, c], y, taps)
-                    blend(out.moments[s, c, y], gathered, new[c], alpha, taps.valid)
+                    gather(gathered, past_moments[s, c], y, taps)
+                    blend(moments[s, c, y], gathered, new[c], alpha, taps.valid)
 
 
 def integrate_samples(
@@ -113,11 +102,10 @@ def integrate_samples(
     images = noisy, previous.moments, previous.length
     colour, moments, length = (torch.empty_like(image, memory_format=torch.contiguous_format) for image in images)
     for item in range(len(noisy)):
-        out = IntegratedArrays(colour[item].numpy(), moments[item].numpy(), length[item, 0].numpy())
-        past = (array(image) for image in (previous.colour[item], previous.moments[item], previous.length[item, 0]))
-        pair = FramePair.of(frame, previous.gbuffer, item)
+        out = colour[item].numpy(), moments[item].numpy(), length[item, 0].numpy()
+        past = array(previous.colour[item]), array(previous.moments[item]), array(previous.length[item, 0])
         dropped = np.empty((0, 0), np.float32) if change is None else array(change[item, 0])
-        integrate_image(out, array(noisy[item]), IntegratedArrays(*past), dropped, pair)
+        integrate_image(out, array(noisy[item]), past, dropped, FramePair.of(frame, previous.gbuffer, item))
     return colour, moments, length
 
 
@@ -225,14 +213,9 @@ def geometry_weights(weights: Row, geometry: Image, row: Index, left: Index, dx:
 # a margin of background, which has no weight, so that no tap has to be tested for being inside the image.
 
 
-class TapRow(NamedTuple):
-    """The pixels `first` to `first + size` - 1 of a row, whose taps are in the row `to`, `step` pixels apart."""
-
-    row: Index
-    to: Index
-    step: int
-    first: Index
-    size: Index
+# (row, to, step, first, size): pixels `first` to `first + size` - 1 of a row, whose taps are in the row `to`, `step`
+# pixels apart.
+TapRow: TypeAlias = tuple[Index, Index, int, Index, Index]
 
 
 @jit_in_any_order
@@ -320,7 +303,7 @@ def filter_image(filtered: Signals, signals: Signals, surfaces: Image, margin: i
                 h[:] = SPLINE[j + RADIUS] * SPLINE
                 if j == 0:
                     h[RADIUS] = 0  # the pixel itself, which divide_sums adds
-                taps = TapRow(row, to, step, first, count)
+                taps = (row, to, step, first, count)
                 weigh_taps(weights, h, surfaces, taps)
                 for s in range(count_signals):
                     add_taps(sums[s], weights, signals, s, taps)

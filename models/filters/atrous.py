@@ -52,26 +52,15 @@ def offset_taps(size: Sequence[int], down: Iterable[int], across: Iterable[int])
                 yield Tap(dx, dy, p, q)
 
 
-class WindowSum:
-    """Weighted sums of an image over the window of every pixel, starting with `centre` times the pixel itself."""
-
-    def __init__(self, image: Tensor, centre: float):
-        self.image = image
-        self.sum = centre * image
-
-    def add(self, tap: Tap, weight: Tensor) -> None:
-        self.sum[tap.p].addcmul_(weight, self.image[tap.q])
-
-
 def window_mean(image: Tensor, centre: float, taps: Iterable[Tap], weight: Callable[[Tap], Tensor]) -> Tensor:
     """Means of an image (..., C, H, W) over windows, of `centre` times the pixel itself and `weight` (..., 1, h, w)."""
-    total = WindowSum(torch.ones_like(image[..., :1, :, :]), centre)
-    weighted = WindowSum(image, centre)
+    total = torch.full_like(image[..., :1, :, :], centre)
+    weighted = centre * image
     for tap in taps:
         tap_weight = weight(tap)
-        total.add(tap, tap_weight)
-        weighted.add(tap, tap_weight)
-    return weighted.sum / total.sum
+        total[tap.p].add_(tap_weight)
+        weighted[tap.p].addcmul_(tap_weight, image[tap.q])
+    return weighted / total
 
 
 def b3_spline(tap: Tap, step: int) -> float:

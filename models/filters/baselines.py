@@ -36,6 +36,7 @@ class AccumulatedState(State):
 class Accumulating(Denoiser):
     """A denoiser whose input is accumulated irradiance; models.wrappers.adaptive replaces `accumulation`."""
 
+    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     accumulation: Callable[[Frame, Tensor, Accumulation | None], Accumulation] = staticmethod(accumulate)
 
     def accumulated(self, frame: Frame, previous: AccumulatedState | None) -> Accumulation:
@@ -46,7 +47,6 @@ class Accumulating(Denoiser):
 class Accumulated(Accumulating):
     """Temporal accumulation of irradiance along motion vectors (SVGF §4.1), without a spatial filter."""
 
-    reads: tuple[str, ...] = ("direct", "indirect", "emission", "albedo", "normal", "depth", "mesh_id", "motion")
     refuses = CLASSICAL
     convex = True
     baseline_for: tuple[Signal, ...] = ("total", "indirect")

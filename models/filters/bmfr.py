@@ -30,7 +30,7 @@ from models import compiled
 from models.compiled import bmfr as kernels
 from models.compiled.bmfr import BLOCK_SIDE, MIN_RELATIVE_EXTENT, REGRESSORS
 from models.denoiser import CLASSICAL, State, matching_state
-from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 from models.history.geometry import positions_around_eye, ray_axes
 from models.history.reprojection import reproject
 
@@ -122,7 +122,6 @@ class BMFR(Accumulating):
     """Fits accumulated irradiance in blocks of 32 x 32 pixels, and accumulates the fits."""
 
     made_from = "code"
-    reads = Accumulated.reads
     refuses = CLASSICAL
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:

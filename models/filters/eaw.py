@@ -14,7 +14,7 @@ from models import compiled
 from models.compiled import eaw as kernels
 from models.denoiser import CLASSICAL, State, matching_state
 from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, Tap, b3_spline, strip_taps, window_mean
-from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 from models.history.geometry import frame_rays
 from models.history.running_scale import RunningScale, running_scale
 
@@ -55,7 +55,6 @@ class EAW(Accumulating):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
     made_from = "accounts"
-    reads = Accumulated.reads
     refuses = CLASSICAL
     convex = True
 

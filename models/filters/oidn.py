@@ -9,7 +9,7 @@ from torch import Tensor
 from datasets.frame import Frame, Signal
 from errors import BadInput
 from models.denoiser import Denoiser, State, matching_state
-from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 
 OIDNQuality = Literal["high", "balanced", "fast"]
 
@@ -104,18 +104,14 @@ class OIDN(Denoiser):
         super().prepare(precision)
         open_device(torch.get_num_threads()).release()
 
-    def filter_for(self, height: int, width: int) -> RayTracingFilter:
-        """The filter of the last frame, or a new one if size or threads have changed: creating one is slow."""
-        key = (height, width, torch.get_num_threads())
-        if key != self.key:
-            self.filter = RayTracingFilter(*key, self.quality)
-            self.key = key
-        return self.filter
-
     def denoise(self, frame: Frame, radiance: Tensor, albedo: Tensor) -> Tensor:
         """The denoised image of radiance (B, 3, H, W) with `albedo` (B, 3, H, W) as the auxiliary image."""
+        key = (*frame.size, torch.get_num_threads())
+        if key != self.key:  # creating a filter is slow
+            self.filter = RayTracingFilter(*key, self.quality)
+            self.key = key
         inputs = (radiance.clamp(min=0), albedo.clamp(0, 1), frame.normal.clamp(-1, 1))
-        return torch.stack([*map(self.filter_for(*frame.size), *inputs)])
+        return torch.stack([*map(self.filter, *inputs)])
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return self.denoise(frame, frame.radiance(self.signal), frame.albedo), State(frame.moment)
@@ -152,7 +148,6 @@ class OIDNIrradiance(OIDN):
 class OIDNAccumulated(Accumulating, OIDN):
     """Denoises temporally accumulated radiance. The history is not filtered."""
 
-    reads = Accumulated.reads
     has_kernels = True
     baseline_for = ()
     evaluated_with = ("adaptive",)

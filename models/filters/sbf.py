@@ -31,7 +31,7 @@ from datasets.frame import Frame
 from models import compiled
 from models.compiled import sbf as kernels
 from models.denoiser import CLASSICAL, State, matching_state
-from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 from models.filters.neighbours import mesh_variance
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR
 
@@ -107,7 +107,6 @@ class SBF(Accumulating):
     """Filters accumulated irradiance within its [min, max] since the last reset."""
 
     made_from = "accounts, code"
-    reads = Accumulated.reads
     refuses = CLASSICAL
     convex = True
 

@@ -25,9 +25,10 @@ from torch.nn import functional as F
 from datasets.frame import Frame, Signal
 from models import compiled
 from models.compiled import svgf as kernels
-from models.compiled.svgf import ALPHA, EPSILON_L, EPSILON_Z, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
+from models.compiled.accumulation import MIN_ALPHA
+from models.compiled.svgf import EPSILON_L, EPSILON_Z, SIGMA_L, SIGMA_Z, SPATIAL_RADIUS, SQUARINGS
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
-from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, WindowSum, b3_spline, strip_taps
+from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, b3_spline, strip_taps
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.operators import MAX_LUMINANCE, MIN_DIVISOR, image_luminance
@@ -59,7 +60,7 @@ def integrate_samples(
     history, has_history = reproject(frame, torch.cat(past, dim=1), previous.gbuffer)
     change = torch.zeros_like(previous.length) if change is None else change
     colour, moments, length = history.split([image.shape[1] for image in past], dim=1)
-    newest = (1 / (length + 1)).clamp(min=ALPHA)
+    newest = (1 / (length + 1)).clamp(min=MIN_ALPHA)
     alpha = torch.where(has_history, (1 - change) * newest + change, 1)
     return (
         torch.lerp(colour.view_as(noisy), noisy, alpha[:, None]),
@@ -119,18 +120,18 @@ def spatial_variance(variance: Tensor, mean: Tensor, geometry: Tensor, where: Te
     `variance` and `mean` (B, S, 1, H, W) are those of the integrated moments. The estimate is the mean of the variances
     plus the variance of the means about the window's centre: that of the averaged moments, without their cancellation.
     """
-    total = WindowSum(torch.ones_like(geometry[:, :, :1]), 1)
-    variances = WindowSum(variance, 1)
+    total = torch.ones_like(geometry[:, :, :1])
+    variances = variance.clone()
     first = torch.zeros_like(mean)
     second = torch.zeros_like(mean)
     for tap in strip_taps(mean.shape[-2:], SPATIAL_RADIUS):
         weight = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
         difference = mean[tap.q] - mean[tap.p]
-        total.add(tap, weight)
-        variances.add(tap, weight)
+        total[tap.p].add_(weight)
+        variances[tap.p].addcmul_(weight, variance[tap.q])
         first[tap.p].addcmul_(weight, difference)
         second[tap.p].addcmul_(weight, difference.square_())
-    estimate = (variances.sum + second) / total.sum - (first / total.sum).square()
+    estimate = (variances + second) / total - (first / total).square()
     return torch.where(where[:, None], estimate.clamp(min=0), variance)
 
 
@@ -148,30 +149,31 @@ def estimate_variance(integrated: Integrated, geometry: Tensor) -> Tensor:
 
 def edge_scale(variance: Tensor, surface: Tensor) -> Tensor:
     """1 / (σ_l √(g₃ₓ₃(Var) + ε)) of Eq. 5, (B, S, 1, H, W); g covers pixels that show a `surface` (B, 1, 1, H, W)."""
-    total = WindowSum(surface.to(variance), 1 / 4)
-    mean = WindowSum(variance * surface, 1 / 4)
+    surfaces = surface.to(variance)
+    variances = variance * surface
+    total, mean = surfaces / 4, variances / 4
     for tap in strip_taps(variance.shape[-2:], 1):
-        weight = variance.new_tensor(1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy)))
-        total.add(tap, weight)
-        mean.add(tap, weight)
-    return 1 / (SIGMA_L * (mean.sum / total.sum.clamp(min=1 / 16) + EPSILON_L).sqrt())
+        weight = 1 / 4 / 2 ** (abs(tap.dx) + abs(tap.dy))
+        total[tap.p].add_(surfaces[tap.q], alpha=weight)
+        mean[tap.p].add_(variances[tap.q], alpha=weight)
+    return 1 / (SIGMA_L * (mean / total.clamp(min=1 / 16) + EPSILON_L).sqrt())
 
 
 def svgf_level(colour: Tensor, variance: Tensor, geometry: Tensor, step: int) -> tuple[Tensor, Tensor]:
     """Colour (B, S, 3, H, W) and variance (B, S, 1, H, W) after a level (§4.3) with taps `step` pixels apart."""
     y = image_luminance(colour.flatten(0, 1)).view_as(variance)
     scale = edge_scale(variance, geometry[:, :, 3:4] > 0)
-    total = WindowSum(torch.ones_like(variance), CENTRE)
-    mean = WindowSum(colour, CENTRE)
-    variances = WindowSum(variance, CENTRE**2)
+    total = torch.full_like(variance, CENTRE)
+    mean = CENTRE * colour
+    variances = CENTRE**2 * variance
     for tap in strip_taps(variance.shape[-2:], RADIUS, step):
         w_l = (y[tap.p] - y[tap.q]).abs_().mul_(scale[tap.p]).neg_().exp_()
         w_zn = geometry_weight(geometry[tap.p], geometry[tap.q], tap.dx, tap.dy)
         weight = w_l.mul_(w_zn.mul_(b3_spline(tap, step)))
-        total.add(tap, weight)
-        mean.add(tap, weight)
-        variances.add(tap, weight.square_())
-    return mean.sum / total.sum, variances.sum / total.sum.square()
+        total[tap.p].add_(weight)
+        mean[tap.p].addcmul_(weight, colour[tap.q])
+        variances[tap.p].addcmul_(weight.square_(), variance[tap.q])
+    return mean / total, variances / total.square()
 
 
 @compiled.by(kernels.svgf_levels)

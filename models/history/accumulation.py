@@ -41,7 +41,6 @@ def accumulate(frame: Frame, irradiance: Tensor, previous: Accumulation | None) 
     """
     length = torch.ones_like(irradiance[:, :1])
     if previous is not None:
-        irradiance, length = accumulate_samples(
-            frame, irradiance, previous.irradiance, previous.length, previous.gbuffer
-        )
+        past = previous.irradiance, previous.length, previous.gbuffer
+        irradiance, length = accumulate_samples(frame, irradiance, *past)
     return Accumulation(irradiance, length, GBuffer.of(frame))

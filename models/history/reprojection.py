@@ -111,7 +111,7 @@ def reproject(frame: Frame, image: Tensor, gbuffer: GBuffer) -> tuple[Tensor, Te
 
     `image` (B, C, H, W) and `gbuffer` are the previous frame's. The frame needs depth, normal, mesh_id and motion.
     """
-    if compiled.with_gradients(image):
+    if compiled.usable(image):
         return cast(tuple[Tensor, Tensor], CompiledReprojection.apply(image, frame, gbuffer))
     fetched = [Reprojection(frame, image, gbuffer, item).fetch() for item in range(len(image))]
     return torch.stack([history for history, _ in fetched]), torch.stack([valid for _, valid in fetched])

@@ -5,7 +5,6 @@ the ratio of two box sums. No kernel is materialised, and the cost hardly grows 
 """
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -116,7 +115,7 @@ def fuse_whole(
     return torch.stack([share * part for share, part in zip(shares, filtered, strict=True)]).sum(dim=0)
 
 
-@compiled.by(kernels.fuse, gpu=kernels.fuse_on_gpu if find_spec("triton") else None)
+@compiled.by(kernels.fuse)
 def fuse(
     image: Tensor, importance: Tensor, mixture: Tensor, windows: Sequence[int] = WINDOWS, surface: Tensor | None = None
 ) -> Tensor:

@@ -176,7 +176,7 @@ def affinity_level(
     image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """
-    level = AffinityLevel.apply if compiled.with_gradients(image) else plain_level
+    level = AffinityLevel.apply if compiled.usable(image) else plain_level
     return cast(Tensor, level(image, features, sharpness, own, importance, surface, step))
 
 

@@ -24,7 +24,7 @@ from errors import BadInput
 from models.compiled.accumulation import MIN_ALPHA
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.asvgf import repeat_strata, strata_centres, strata_sums
-from models.filters.atrous import Tap, WindowSum, strip_taps
+from models.filters.atrous import Tap, strip_taps
 from models.filters.baselines import AccumulatedState, Accumulating
 from models.filters.svgf import geometry_weight, pack_geometry
 from models.history.accumulation import Accumulation
@@ -59,10 +59,11 @@ class SurfaceNeighbourhoods:
 
     def sums(self, image: Tensor, power: int = 1) -> Tensor:
         """Sums (B, C, h, w) over each window of an image (B, C, H, W), weighted by w^power."""
-        window = WindowSum(strata_sums(image), 1)
+        strata = strata_sums(image)
+        total = strata.clone()
         for tap, weight in self.taps:
-            window.add(tap, weight**power)
-        return window.sum
+            total[tap.p].addcmul_(weight**power, strata[tap.q])
+        return total
 
     def means(self, image: Tensor) -> Tensor:
         """Means (B, C, H, W) over the members of each window of an image (B, C, H, W), weighted by w; 0 off members."""

@@ -1,9 +1,5 @@
 """Weight-shared kernel fusion against unfold and softmax in float64, at every extreme of the logits."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -82,31 +78,3 @@ def test_gradients_equal_plain_autograd_of_the_naive_version(scale, background):
     for a, b in zip(mine, exact, strict=True):
         torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-4, atol=1e-5)
         assert torch.isfinite(a.grad).all()
-
-
-ON_GPU = """
-import torch
-import models.networks.fusion as PyTorch
-from tests.helpers.unfold import unfold_fuse
-from models.compiled.fusion_triton import fuse
-
-device = "cuda" if torch.cuda.is_available() else "cpu"
-for scale in (1.0, 1e4):
-    torch.manual_seed(0)
-    inputs = [torch.rand(2, 3, 3, 135), scale * torch.randn(2, 3, 3, 135), scale * torch.randn(2, 3, 3, 135)]
-    expected = unfold_fuse(*(t.double() for t in inputs), (3, 5, 13))
-    fused = fuse(*(t.to(device) for t in inputs), (3, 5, 13)).cpu()
-    torch.testing.assert_close(fused.double(), expected, rtol=1e-5, atol=0)
-    surface = (torch.rand(2, 1, 3, 135) < 0.02).float()
-    inputs[1] = torch.where(surface > 0, inputs[1], inputs[1] + 1e4)
-    expected = PyTorch.fuse(*(t.double() for t in inputs), (3, 5, 13), surface.double())
-    fused = fuse(*(t.to(device) for t in inputs), (3, 5, 13), surface.to(device)).cpu()
-    torch.testing.assert_close(fused.double(), expected, rtol=1e-5, atol=1e-30)
-"""
-
-
-def test_triton_kernel_is_exact():
-    """On a GPU where there is one, else through Triton's interpreter, which must be chosen before the import."""
-    pytest.importorskip("triton")
-    environment = os.environ | ({} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"})
-    subprocess.run([sys.executable, "-W", "ignore", "-c", ON_GPU], env=environment, check=True)
