@@ -24,8 +24,8 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,sketch,release,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, small rooms, the release (days), scenes of glass, "
+        metavar="{tiny,quick,release,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), scenes of glass, "
         "or N small rooms with references of S spp",
     ),
 ]
@@ -170,16 +170,15 @@ def report(
     print(f"open {page} in a browser")
 
 
-def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metavar="PNG")] = None) -> None:
-    """Print the contents of a dataset: clips, their difficulty, channels, sizes, noise floors, render times.
+def info(data: Path = Path("data/quick")) -> None:
+    """Print the contents of a dataset: clips, channels, sizes, noise floors, render times.
 
     Args:
         data: the dataset.
-        plot: also draw a histogram of the clips' difficulty.
     """
     from datasets.info import summarise
 
-    print(summarise(data, plot))
+    print(summarise(data))
 
 
 def verify(data: Path = Path("data/quick")) -> None:
