@@ -77,10 +77,8 @@ def channel_table(clips: list[Clip]) -> str:
 
 def step_table(clips: list[Clip], timings: list[SecondsByStep]) -> str:
     """Seconds by step, and what channels not rendered have saved, by the mean time per pixel of those that were."""
-    seconds: SecondsByStep = {}
-    for timing in timings:
-        for step, spent in timing.items():
-            seconds[step] = seconds.get(step, 0.0) + spent
+    steps = dict.fromkeys(step for timing in timings for step in timing)
+    seconds = {step: sum(timing.get(step, 0.0) for timing in timings) for step in steps}
     pixels = [clip.frames * clip.height * clip.width for clip in clips]
     saved: dict[str, str] = {}
     for step in OPTIONAL_STEPS:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 import torch
@@ -99,18 +100,15 @@ def motion_convention(
             raise BadInput(f"--motion {given}: the motion layer has {components} components, there is no ZW")
         return given, f"{given.description()} (as given)"
     detector = ConventionDetector(components)
-    count = 0
-    for shot in shots:
-        before: Image | None = None
-        for files in shot:
-            if count == FRAMES or detector.pairs == MAX_PAIRS:
-                break
-            frame, _ = read_foreign_frame(files, sources)
-            now = guides(frame)
-            if before is not None:
-                detector.add(now, before, frame.arrays["motion"])
-            before = now
-            count += 1
+    before: Image | None = None
+    for index, files in islice(((i, files) for shot in shots for i, files in enumerate(shot)), FRAMES):
+        if detector.pairs == MAX_PAIRS:
+            break
+        frame, _ = read_foreign_frame(files, sources)
+        now = guides(frame)
+        if index and before is not None:
+            detector.add(now, before, frame.arrays["motion"])
+        before = now
     detection = detector.detection()
     remedy = "" if detection.certain else "; set it by --motion if that is wrong"
     return detection.convention, detection.reason + remedy

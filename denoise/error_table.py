@@ -12,8 +12,6 @@ from errors import BadInput
 from files import write_csv
 from models.wrappers.error_estimate import ErrorEstimate
 
-ERROR_FILE = "error.csv"
-
 
 @dataclass(frozen=True)
 class FrameError:
@@ -35,7 +33,7 @@ class ErrorTable:
     """The rows of a folder's frames, written after each. Raises BadInput where the file there is damaged."""
 
     def __init__(self, folder: Path):
-        self.path = folder / ERROR_FILE
+        self.path = folder / "error.csv"
         self.rows: dict[int, FrameError] = {}
         if self.path.exists():
             try:

@@ -1,18 +1,14 @@
 """The log of a training: metrics.csv, TensorBoard and the newest sample picture."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 from torch import Tensor
 
 from extras import can_draw
 from files import replacing
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
 
 METRICS_CSV = "metrics.csv"
 SAMPLE_FILE = "sample.png"
@@ -27,15 +23,6 @@ def read_metrics(path: Path) -> list[LogRow]:
     return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(lines)]
 
 
-def open_board(folder: Path, done: int) -> "SummaryWriter | None":
-    """TensorBoard's log from step `done` on; None where TensorBoard is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ModuleNotFoundError:
-        return None
-    return SummaryWriter(str(folder), purge_step=done)
-
-
 class Log:
     """Means over every so many steps, as rows of metrics.csv and points in TensorBoard.
 
@@ -45,41 +32,37 @@ class Log:
     def __init__(self, folder: Path, done: int, total: int):
         self.path = folder / METRICS_CSV
         self.every = max(1, total // MAX_ROWS)
-        self.board = open_board(folder, done)
-        self.pending: list[LogRow] = []
-        self.truncate(done)
+        try:
+            from torch.utils.tensorboard import SummaryWriter
 
-    def truncate(self, done: int) -> None:
-        """Keep the rows of metrics.csv up to step `done`."""
+            self.board: SummaryWriter | None = SummaryWriter(str(folder), purge_step=done)
+        except ModuleNotFoundError:  # TensorBoard is not installed
+            self.board = None
+        self.pending: list[LogRow] = []
         rows = [row for row in read_metrics(self.path) if row["step"] <= done] if self.path.exists() else []
-        if not rows:
-            self.path.unlink(missing_ok=True)
-            return
-        with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
-            writer = self.writer(file, rows[0])
-            writer.writeheader()
-            writer.writerows({**row, "step": int(row["step"])} for row in rows)
+        with replacing(self.path) as temporary:
+            self.append(temporary, [{**row, "step": int(row["step"])} for row in rows])
 
     @staticmethod
-    def writer(file: TextIO, row: LogRow) -> "csv.DictWriter[str]":
-        return csv.DictWriter(file, [*(name for name in row if name != "val_loss"), "val_loss"], lineterminator="\n")
+    def append(path: Path, rows: Sequence[LogRow]) -> None:
+        """Append rows to a CSV file, which begins with the names in them."""
+        with path.open("a", newline="") as file:
+            for row in rows:
+                names = [*(name for name in row if name != "val_loss"), "val_loss"]
+                writer = csv.DictWriter(file, names, lineterminator="\n")
+                if not file.tell():
+                    writer.writeheader()
+                writer.writerow(row)
 
-    def step(self, row: LogRow) -> None:
+    def add(self, step: int, row: LogRow, val_loss: float | None = None) -> None:
+        """Log the mean of the steps since the last row, if those are enough or there is a loss on validation clips."""
         self.pending.append(row)
-
-    def write(self, step: int, extra: Mapping[str, float] | None = None) -> None:
-        """Log the mean of the steps since the last row, if those are enough or there is something `extra` to log."""
-        if not self.pending or (len(self.pending) < self.every and extra is None):
+        if len(self.pending) < self.every and val_loss is None:
             return
         means = {name: float(np.mean([row[name] for row in self.pending])) for name in self.pending[0]}
-        row = {"step": step, **means, **(extra or {})}
+        row = {"step": step, **means, **({} if val_loss is None else {"val_loss": val_loss})}
         self.pending = []
-        new = not self.path.exists()
-        with self.path.open("a", newline="") as file:
-            writer = self.writer(file, row)
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+        self.append(self.path, [row])
         if self.board:
             for name, value in row.items():
                 self.board.add_scalar(name, value, step)

@@ -225,7 +225,7 @@ class Training:
     def update(self, loss: float) -> float:
         """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision.
 
-        Returns the norm of the gradients before clipping.
+        Returns the norm of the gradients before clipping. Raises BadInput after too many skipped steps in a row.
         """
         parameters = list(self.loss.parameters())
         norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
@@ -239,20 +239,16 @@ class Training:
                 decay = average_decay(updates, self.recipe.average * self.total)
                 update_average(self.judged, self.loss.module, decay)
         else:
-            self.skip_step()
+            self.position.skipped += 1
+            self.position.skipped_in_a_row += 1
+            if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+                raise BadInput(
+                    f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the "
+                    f"data with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
+                    "--precision float32"
+                )
         self.optimiser.zero_grad()
         return float(norm)
-
-    def skip_step(self) -> None:
-        """Count a step whose loss or gradient was not finite. Raises BadInput after too many in a row."""
-        self.position.skipped += 1
-        self.position.skipped_in_a_row += 1
-        if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
-            raise BadInput(
-                f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the data "
-                f"with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
-                "--precision float32"
-            )
 
     @torch.no_grad()
     def validate(self) -> float:

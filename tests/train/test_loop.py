@@ -189,8 +189,7 @@ def test_training_shows_what_it_does(trained_runs):
 def test_a_log_averages_and_forgets_what_a_kill_left(tmp_path):
     with closing(Log(tmp_path, done=0, total=6000)) as log:  # three steps a row
         for step in range(1, 8):
-            log.step({"loss": float(step)})
-            log.write(step, {"val_loss": 9.0} if step == 7 else None)
+            log.add(step, {"loss": float(step)}, 9.0 if step == 7 else None)
     assert [(r["step"], r["loss"]) for r in read_metrics(log.path)] == [(3, 2.0), (6, 5.0), (7, 7.0)]
     assert read_metrics(log.path)[-1]["val_loss"] == 9.0
     with log.path.open("a") as file:
