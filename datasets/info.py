@@ -28,33 +28,29 @@ def summarise(root: Path) -> str:
     clips: list[Clip] = []
     timings: list[SecondsByStep] = []
     for path in tqdm(dataset.planned(), "info", unit="clip", leave=False):
-        label = str(path.relative_to(root))
+        rows.append({"clip": str(path.relative_to(root)), "frames": "missing"})
         if not is_clip(path):
-            rows.append({"clip": label, "frames": "missing"})
             continue
-        clips.append(Clip(path))
+        clip = Clip(path)
+        clips.append(clip)
         timings.append(read_json(path / "timing.json"))
-        rows.append({"clip": label, **clip_row(clips[-1], sum(timings[-1].values()))})
+        rows[-1] |= {
+            "frames": clip.frames,
+            "size": f"{clip.height}x{clip.width}",
+            "noisy": clip.realisations,
+            "reference spp": clip.facts["reference_spp"],
+            "floor dB": f"{psnr(clip.facts['floor_mse']):.1f}",
+            "exposure": f"{clip.exposure:.3g}",
+            "bad values": sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values()),
+            "MB": megabytes(size_of(path)),
+            "seconds": f"{sum(timings[-1].values()):.1f}",
+        }
     facts = dataset.facts
     title = f"{root}: profile {facts['profile']}, seed {facts['seed']}, {megabytes(size_of(root))} MB"
     parts = [title, tabulate(rows, "keys")]
     if clips:
         parts += [channel_table(clips), step_table(clips, timings)]
     return "\n\n".join(parts)
-
-
-def clip_row(clip: Clip, seconds: float) -> dict[str, object]:
-    return {
-        "frames": clip.frames,
-        "size": f"{clip.height}x{clip.width}",
-        "noisy": clip.realisations,
-        "reference spp": clip.facts["reference_spp"],
-        "floor dB": f"{psnr(clip.facts['floor_mse']):.1f}",
-        "exposure": f"{clip.exposure:.3g}",
-        "bad values": sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values()),
-        "MB": megabytes(size_of(clip.path)),
-        "seconds": f"{seconds:.1f}",
-    }
 
 
 def channel_table(clips: list[Clip]) -> str:

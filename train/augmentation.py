@@ -99,8 +99,7 @@ class Draw:
     def apply(self, frame: Frame, time: int) -> Frame:
         """Frame `time` of the sequence, augmented."""
         if self.edge is not None:
-            light = self.edge.light(time, *frame.size)
-            frame = lit(frame, light)
+            frame = lit(frame, self.edge.light(time, *frame.size))
         for _ in range(self.turns):
             frame = rotated(frame)
         return frame if self.gain is None else replace(frame, colour_gain=self.gain)

@@ -11,11 +11,6 @@ from train.losses.network_loss import Loss, Parts, surface_mean
 from train.protocols import FilteringNetwork
 
 
-def smape(x: Tensor, reference: Tensor, epsilon: float) -> Tensor:
-    """|x - r| / (|x| + |r| + epsilon) of every pixel and channel (WSKP Eq. 6), in [0, 1)."""
-    return (x - reference).abs() / (x.abs() + reference.abs() + epsilon)
-
-
 @dataclass(frozen=True)
 class CropLoss(Loss):
     """The mean `error` of radiance, emission included, scaled by the causal exposure."""
@@ -36,12 +31,13 @@ class CropLoss(Loss):
 
 @dataclass(frozen=True)
 class SMAPELoss(CropLoss):
-    """SMAPE of HDR radiance (WSKP §5.2, Eq. 6). By the exposure, epsilon means the same in whatever units are used."""
+    """SMAPE of HDR radiance (WSKP §5.2). By the exposure, epsilon means the same in whatever units are used."""
 
     epsilon: float = 0.01
 
     def error(self, output: Tensor, reference: Tensor) -> Tensor:
-        return smape(output, reference, self.epsilon)
+        """|x - r| / (|x| + |r| + epsilon) (WSKP Eq. 6), in [0, 1)."""
+        return (output - reference).abs() / (output.abs() + reference.abs() + self.epsilon)
 
 
 @dataclass(frozen=True)
