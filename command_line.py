@@ -139,8 +139,7 @@ def evaluate(
     data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="datasets; by default data/BUDGET")] = (),
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    processes: Annotated[int, arg(metavar="N", help="evaluate at most this many clips in parallel")] = os.cpu_count()
-    or 1,
+    processes: Annotated[int, arg(metavar="N", help="clips to evaluate in parallel, at most")] = os.cpu_count() or 1,
     device: Device = "cpu",
     first_hits: Annotated[bool, arg(help="describe mirrors and glass by themselves, not by what they show")] = False,
     where: Annotated[bool, arg(help="print where the squared error is instead: edges, roughness, scale")] = False,
@@ -254,7 +253,7 @@ def bench_denoisers(
     size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")] = ("1280x720",),
     threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default as many as PyTorch uses")] = (),
     every_way: Annotated[
-        bool, FlagCreatePairsOff, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
+        Flag, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
     ] = False,
 ) -> None:
     """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers as `onespp eval` runs them."""

@@ -6,10 +6,9 @@ from typing import Any
 from errors import BadInput
 from train.augmentation import Augmentation
 from train.losses.displayed import DisplayedLoss
-from train.losses.lbf import LBFLoss
 from train.losses.ntd import NTDLoss
 from train.losses.rae import RAELoss
-from train.losses.wskp import NBGDLoss, SMAPELoss
+from train.losses.wskp import LBFLoss, NBGDLoss, SMAPELoss
 from train.recipe import Recipe
 
 RAE_RECIPE = Recipe(

@@ -1,7 +1,7 @@
 """Training sequences: random crops of consecutive frames, augmented, read through memory maps."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -58,6 +58,7 @@ class WholeFrames:
         return self.measured[key]
 
 
+@dataclass(eq=False)
 class TrainingSequences(TorchDataset[list[Frame]]):
     """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
 
@@ -67,30 +68,24 @@ class TrainingSequences(TorchDataset[list[Frame]]):
     crop.
     """
 
-    def __init__(
-        self,
-        clips: Sequence[Clip],
-        reads: Sequence[str],
-        length: int,
-        crop: int | None,
-        augmentation: Augmentation,
-        seed: int,
-        signal: Signal | None = None,
-    ):
-        check_fits(clips, length, crop)
-        self.clips = clips
-        self.channels = tuple(dict.fromkeys([*reads, *REFERENCE_CHANNELS]))
+    clips: Sequence[Clip]
+    reads: Sequence[str]
+    length: int
+    crop: int | None
+    augmentation: Augmentation
+    seed: int
+    signal: Signal | None = None
+    epoch: int = 0  # that whose sequences come next
+
+    def __post_init__(self) -> None:
+        check_fits(self.clips, self.length, self.crop)
+        self.channels = tuple(dict.fromkeys([*self.reads, *REFERENCE_CHANNELS]))
         self.sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
-        self.length = length
-        self.crop = crop
-        self.augmentation = augmentation
-        self.seed = seed
-        self.whole_frames = WholeFrames(signal) if signal else None
-        self.epoch = 0  # that whose sequences come next
-        pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
+        self.whole_frames = WholeFrames(self.signal) if self.signal else None
+        pixels = np.array([clip.frames * clip.height * clip.width for clip in self.clips])
         self.probabilities = pixels / pixels.sum()
-        area = crop * crop if crop else pixels.sum() / sum(clip.frames for clip in clips)
-        self.count = max(1, round(pixels.sum() / (length * area)))
+        area = self.crop * self.crop if self.crop else pixels.sum() / sum(clip.frames for clip in self.clips)
+        self.count = max(1, round(pixels.sum() / (self.length * area)))
 
     def __len__(self) -> int:
         return self.count

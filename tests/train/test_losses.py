@@ -21,11 +21,10 @@ from tests.helpers.training import predict_as
 from train.crops import Crops
 from train.data import items, loader
 from train.losses.displayed import DisplayedLoss, block_means, tone
-from train.losses.lbf import LBFLoss
 from train.losses.network_loss import NetworkLoss, surface_mean
 from train.losses.ntd import NTDLoss, masked_mean
 from train.losses.rae import RAELoss, edges, laplacian_of_gaussian
-from train.losses.wskp import SMAPELoss
+from train.losses.wskp import LBFLoss, SMAPELoss
 from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 from train.sequences import Batch
