@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
@@ -58,8 +57,22 @@ class WholeFrames:
         return self.measured[key]
 
 
+class Batch:
+    """A batch of sequences: one Frame of all of them for each time step.
+
+    It is not a list, because Fabric converts the tensors in collections, and cameras must stay float64.
+    """
+
+    def __init__(self, frames: list[Frame]):
+        self.frames = frames
+
+    def to(self, device: torch.device | str) -> "Batch":
+        """The batch with all tensors on `device`."""
+        return Batch([frame.to(device) for frame in self.frames])
+
+
 @dataclass(eq=False)
-class TrainingSequences(TorchDataset[list[Frame]]):
+class TrainingSequences:
     """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
 
     References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
@@ -113,21 +126,6 @@ class TrainingSequences(TorchDataset[list[Frame]]):
             frames.append(draw.apply(frame, time))
         return frames
 
-
-class Batch:
-    """A batch of sequences: one Frame of all of them for each time step.
-
-    It is not a list, because Fabric converts the tensors in collections, and cameras must stay float64.
-    """
-
-    def __init__(self, frames: list[Frame]):
-        self.frames = frames
-
-    def to(self, device: torch.device | str) -> "Batch":
-        """The batch with all tensors on `device`."""
-        return Batch([frame.to(device) for frame in self.frames])
-
-
-def collate(sequences: list[list[Frame]]) -> Batch:
-    """One batch of several sequences of equal length."""
-    return Batch([Frame.stack(step) for step in zip(*sequences, strict=True)])
+    def batch(self, numbers: Sequence[int]) -> Batch:
+        """One batch of the items with these numbers."""
+        return Batch([Frame.stack(step) for step in zip(*(self[number] for number in numbers), strict=True)])

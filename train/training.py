@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from files import write_file
 from models.weights import save_weights
 from provenance import file_digest
 from train.crops import AnyBatch
-from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
+from train.data import equal_parts, items, largest_micro_batch, load_ahead, micro_batches
 from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
 from train.made_by import MadeBy, made_by_here
@@ -148,8 +149,8 @@ class Training:
             return kept
         if wanted:
             return wanted
-        first = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)[:1]
-        return fastest_precision(loss, next(iter(loader(self.items, first))), fabric.device.type)
+        first, *_ = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)
+        return fastest_precision(loss, self.items.batch(first), fabric.device.type)
 
     def resume(self, saved: Checkpoint) -> None:
         if saved.get("facts") != self.facts:
@@ -185,8 +186,9 @@ class Training:
             epoch, first = divmod(self.position.done, self.per_epoch)
             self.items.epoch = epoch
             batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.micro_batch, rank, world)
-            for batch in in_parts(loader(self.items, batches), self.parts):
-                row = self.step(batch)
+            loaded = load_ahead(self.items, batches)
+            for _ in range(len(batches) // self.parts):
+                row = self.step(islice(loaded, self.parts))
                 self.position.done += 1
                 yield row
 
@@ -258,9 +260,10 @@ class Training:
         batches = batches[self.fabric.global_rank :: self.fabric.world_size]
         network = self.judged.eval()  # not through DDP: processes may have different numbers of batches
         total = torch.zeros(2, device=self.fabric.device)
-        for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
+        for chosen in batches:
+            batch = self.val_items.batch(chosen).to(self.fabric.device)
             with self.fabric.autocast():
-                loss, _ = network(batch.to(self.fabric.device))
+                loss, _ = network(batch)
             total += len(chosen) * torch.stack([loss, torch.ones_like(loss)])
         network.train()
         total = self.reduce(total, "sum")

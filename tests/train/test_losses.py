@@ -19,7 +19,7 @@ from models.networks.wskp import WSKP
 from models.registry import create
 from tests.helpers.training import predict_as
 from train.crops import Crops
-from train.data import items, loader
+from train.data import items
 from train.losses.displayed import DisplayedLoss, block_means, tone
 from train.losses.network_loss import NetworkLoss, surface_mean
 from train.losses.ntd import NTDLoss, masked_mean
@@ -41,7 +41,7 @@ def batch_of(tiny, tmp_path_factory) -> Callable[..., Any]:
     def make(name: str, count: int = 1, **changes: Any) -> Batch | Crops:
         recipe: Recipe = replace(recipe_for(name, "tiny"), **changes)
         data = items(Dataset(tiny).clips("val"), recipe, create(name), False, 0, cache)
-        return next(iter(loader(data, [list(range(count))])))
+        return data.batch(range(count))
 
     return make
 
