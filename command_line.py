@@ -224,8 +224,7 @@ def show(
     """
     from eval.figures.show import show as draw
 
-    for path in draw(clip, out, runs, budget, names):
-        print(path)
+    print(*draw(clip, out, runs, budget, names), sep="\n")
 
 
 def export(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -110,17 +111,13 @@ class TrainingSequences:
         window = random_window(clip, self.crop, rng)
         stopped = len(set(playback)) < self.length
         draw = self.augmentation.draw(clip.realisations, self.length, stopped, rng)
+        read = partial(read_frame, clip, window=window, in_layers=False)
         frames = []
         for time, position in enumerate(playback):
             first, *others = draw.realisations(time)
-            frame = read_frame(
-                clip, position, self.channels, first, playback[max(time - 1, 0)], window, in_layers=False
-            )
+            frame = read(position, self.channels, first, playback[max(time - 1, 0)])
             if others:
-                more = [
-                    read_frame(clip, position, self.sampled, other, window=window, in_layers=False) for other in others
-                ]
-                frame = averaged([frame, *more])
+                frame = averaged([frame, *(read(position, self.sampled, other) for other in others)])
             if self.whole_frames is not None:
                 frame = replace(frame, whole=self.whole_frames(clip, position, first))
             frames.append(draw.apply(frame, time))
