@@ -16,10 +16,9 @@ from tqdm import tqdm
 from datasets.frame import Frame
 from datasets.tonemap import clip_exposure, display, luminance
 from denoise.analysis import Analysis, analyse
-from denoise.comparison import compare, radiance
-from denoise.error_table import ErrorTable, FrameError
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import open_passes, read_foreign_frame
+from denoise.frame_errors import ErrorTable, FrameError, compare, radiance
 from denoise.frames import FrameBuilder, OwnFrameBuilder
 from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers

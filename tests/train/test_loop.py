@@ -24,9 +24,8 @@ from errors import BadInput
 from files import locked
 from tests.helpers.training import as_command, folder_of, metadata, same_weights, short_task, start_training, tensors
 from timing import thread_count
-from train.log import METRICS_CSV, Log, read_metrics
+from train.log import METRICS_CSV, Log, read_metrics, smooth
 from train.loop import alone_in, train_network
-from train.pictures import smooth
 from train.precision import FLOAT32
 from train.task import WEIGHTS_FILE
 from train.training import CHECKPOINT_FILE, Training
