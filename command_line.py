@@ -123,8 +123,7 @@ def train(
     """
     from models.registry import require_shipped
     from train.loop import train_network
-    from train.recipes import trained_by_default
-    from train.registry import task_for
+    from train.recipes import task_for, trained_by_default
 
     folder = data_folder(data, budget)
     file = Path(from_) if from_ else None

@@ -11,8 +11,8 @@ from models.denoiser import Denoiser
 from train.augmentation import Augmentation
 from train.crops import AccumulatedCrops, AnyBatch
 from train.protocols import FilteringNetwork
-from train.recipe import Recipe
 from train.sequences import TrainingSequences
+from train.task import Recipe
 
 Items = TrainingSequences | AccumulatedCrops
 

@@ -25,9 +25,9 @@ from train.losses.network_loss import NetworkLoss, surface_mean
 from train.losses.ntd import NTDLoss, masked_mean
 from train.losses.rae import RAELoss, edges, laplacian_of_gaussian
 from train.losses.wskp import LBFLoss, SMAPELoss
-from train.recipe import Recipe
 from train.recipes import TRAINABLE, recipe_for
 from train.sequences import Batch
+from train.task import Recipe
 
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = {"direct", "indirect", "direct_reference", "indirect_reference"}

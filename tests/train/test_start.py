@@ -18,7 +18,7 @@ from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
 from train.loop import train_network
-from train.registry import task_for
+from train.recipes import task_for
 from train.task import WEIGHTS_FILE, Task
 from train.training import Training
 
