@@ -59,7 +59,3 @@ class Job:
         passes = {COLOUR: colour, "half": self.half, "albedo": self.alb, "normal": self.nrm, "motion": self.mv}
         passes |= {"depth": self.depth, "position": self.pos, "id": self.ids}
         return {name: patterns for name, patterns in passes.items() if patterns}
-
-    @property
-    def estimates_error(self) -> bool:
-        return self.error or self.until is not None

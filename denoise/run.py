@@ -56,7 +56,8 @@ def denoise(job: Job) -> None:
     name = parse_name(job.denoiser)
     spec = DenoiserSpec(name, "total", fastest_precision(name, job.device), job.weights, device=job.device)
     denoiser = build(spec, job.quality)
-    estimator = error_estimator(job, denoiser, sources, first[COLOUR]) if job.estimates_error else None
+    estimates = job.error or job.until is not None
+    estimator = error_estimator(job, denoiser, sources, first[COLOUR]) if estimates else None
     sequence = SequenceDenoiser(job, spec, denoiser, estimator, shots, sources, first[COLOUR])
     print(sequence.introduction())
     check_settings(job.out, sequence.settings())

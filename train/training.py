@@ -106,8 +106,7 @@ class Training:
 
         self.precision: str = fabric.broadcast(self.choose_precision(loss, saved, fabric))
         self.fabric = fabric_here(self.precision)
-        rate = self.recipe.learning_rate(0)
-        optimiser = torch.optim.Adam(denoiser.parameters(), lr=rate, betas=self.recipe.betas)
+        optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
         self.judged: NetworkLoss = self.loss.module
         if self.recipe.average:
