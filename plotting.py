@@ -13,7 +13,8 @@ with requires_extra("report"):
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot as plt  # "as" marks what other modules import from here
+    # "X as X" marks what other modules import from here.
+    from matplotlib import pyplot
     from matplotlib import ticker as ticker
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
@@ -21,6 +22,7 @@ with requires_extra("report"):
     from PIL import ImageDraw as ImageDraw
     from PIL import ImageFont as ImageFont
 
+plt = pyplot
 DPI = 100
 TWO_LINE_CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px, the longer side of an image
