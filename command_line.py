@@ -18,14 +18,15 @@ from errors import BadInput
 from process import set_up_process
 
 Data = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/PROFILE")]
+RenderedData = Annotated[Path, arg(help="the dataset")]
 DataOfBudget = Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/BUDGET")]
 Device = Annotated[Literal["cpu", "cuda"], arg(help="where to compute")]
 Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results")]
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,sketch,release,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, small rooms, the release (days), scenes of glass, "
+        metavar="{tiny,quick,release,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), scenes of glass, "
         "or N small rooms with references of S spp",
     ),
 ]
@@ -114,13 +115,14 @@ def train(
         from_: fine-tune these weights of the same network, "weights" meaning the shipped ones; use another --runs.
         specialise: remove network inputs that are constant in this dataset, such as a white albedo.
     """
+    from models.registry import require_shipped
     from train.loop import train_network
-    from train.recipes import trained_by_default
-    from train.registry import start_file, task_for
+    from train.recipes import task_for, trained_by_default
 
     folder = data_folder(data, budget)
+    file = Path(from_) if from_ else None
     for name in names or trained_by_default(budget):
-        start = start_file(name, from_)
+        start = require_shipped(name) if from_ == "weights" else file
         task = replace(task_for(name, folder, runs, budget), seed=seed, precision=precision, start=start)
         train_network(replace(task, micro_batch=micro_batch, specialised=specialise))
 
@@ -130,8 +132,7 @@ def evaluate(
     data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="datasets; by default data/BUDGET")] = (),
     runs: Runs = RUNS,
     budget: Budget = "quick",
-    processes: Annotated[int, arg(metavar="N", help="evaluate at most this many clips in parallel")] = os.cpu_count()
-    or 1,
+    processes: Annotated[int, arg(metavar="N", help="clips to evaluate in parallel, at most")] = os.cpu_count() or 1,
     device: Device = "cpu",
     first_hits: Annotated[bool, arg(help="describe mirrors and glass by themselves, not by what they show")] = False,
     where: Annotated[bool, arg(help="print where the squared error is instead: edges, roughness, scale")] = False,
@@ -164,30 +165,19 @@ def report(
     print(f"open {page} in a browser")
 
 
-def info(data: Path = Path("data/quick"), plot: Annotated[Path | None, arg(metavar="PNG")] = None) -> None:
-    """Print the contents of a dataset: clips, their difficulty, channels, sizes, noise floors, render times.
-
-    Args:
-        data: the dataset.
-        plot: also draw a histogram of the clips' difficulty.
-    """
+def info(data: RenderedData = Path("data/quick")) -> None:
+    """Print the contents of a dataset: clips, channels, sizes, noise floors, render times."""
     from datasets.info import summarise
 
-    print(summarise(data, plot))
+    print(summarise(data))
 
 
-def verify(data: Path = Path("data/quick")) -> None:
-    """Check every file of a dataset against its checksum and shape.
-
-    Args:
-        data: the dataset.
-    """
+def verify(data: RenderedData = Path("data/quick")) -> None:
+    """Check every file of a dataset against its checksum and shape."""
     from datasets.info import find_problems
 
-    problems = find_problems(data)
-    for problem in problems:
-        print(problem)
-    if problems:
+    if problems := find_problems(data):
+        print(*problems, sep="\n")
         raise BadInput(f"{data}: {len(problems)} problems; delete the clips named above and rerun `onespp dataset`")
     print(f"{data}: all files are intact")
 
@@ -227,8 +217,7 @@ def show(
     """
     from eval.figures.show import show as draw
 
-    for path in draw(clip, out, runs, budget, names):
-        print(path)
+    print(*draw(clip, out, runs, budget, names), sep="\n")
 
 
 def export(
@@ -256,7 +245,7 @@ def bench_denoisers(
     size: Annotated[tuple[str, ...], arg(metavar="WxH...", help="size of the images")] = ("1280x720",),
     threads: Annotated[tuple[int, ...], arg(metavar="N...", help="by default as many as PyTorch uses")] = (),
     every_way: Annotated[
-        bool, FlagCreatePairsOff, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
+        Flag, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
     ] = False,
 ) -> None:
     """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers as `onespp eval` runs them."""
@@ -371,16 +360,18 @@ def main(arguments: list[str] | None = None) -> None:
     set_up_process()
     try:
         run(words)
+        return
     except BadInput as error:
-        sys.exit(complain(str(error)))
+        code, message = 2, f"onespp: {error}"
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "make room" if full else "correct that or choose another folder"
-        sys.exit(complain(f"{where}{error.strerror or error}; {remedy} and run it again"))
+        code, message = 2, f"onespp: {where}{error.strerror or error}; {remedy} and run it again"
     except KeyboardInterrupt:
-        print("\ninterrupted; run the same command again to resume", file=sys.stderr)
-        sys.exit(130)
+        code, message = 130, "\ninterrupted; run the same command again to resume"
+    print(message, file=sys.stderr)
+    sys.exit(code)
 
 
 def run(words: list[str]) -> None:
@@ -416,9 +407,3 @@ def overview(path: str, groups: dict[str, Commands]) -> Iterator[str]:
             yield from (f"{'':<{MARGIN}}{line}" for line in rest)
         yield ""
     yield f"`{path} COMMAND --help` shows the options of each."
-
-
-def complain(message: str) -> int:
-    """Print what the user can correct. Returns the exit code."""
-    print(f"onespp: {message}", file=sys.stderr)
-    return 2

@@ -13,27 +13,16 @@ with requires_extra("report"):
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib import ticker
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from PIL import Image, ImageDraw, ImageFont
+    # "X as X" marks what other modules import from here.
+    from matplotlib import pyplot
+    from matplotlib import ticker as ticker
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+    from PIL import Image as Image
+    from PIL import ImageDraw as ImageDraw
+    from PIL import ImageFont as ImageFont
 
-__all__ = [
-    "DPI",
-    "SMALLEST_PANEL",
-    "TWO_LINE_CAPTION",
-    "Axes",
-    "Figure",
-    "Image",
-    "ImageDraw",
-    "ImageFont",
-    "enlargement",
-    "plt",
-    "save_figure",
-    "ticker",
-]
-
+plt = pyplot
 DPI = 100
 TWO_LINE_CAPTION = 0.45  # inches
 SMALLEST_PANEL = 256  # px, the longer side of an image

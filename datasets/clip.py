@@ -220,8 +220,7 @@ class Dataset:
     def clips(self, split: str, first_hits: bool = False) -> list[Clip]:
         """All clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
         paths = self.planned([split])
-        missing = [path for path in paths if not is_clip(path)]
-        if missing:
+        if missing := [path for path in paths if not is_clip(path)]:
             raise BadInput(
                 f"{self.path}: {len(missing)} of {len(paths)} clips of '{split}' are missing, first {missing[0]}; "
                 "finish them with `onespp dataset`"

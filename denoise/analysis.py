@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 import torch
@@ -54,36 +55,31 @@ def analyse(
 def derived_and_missing(
     first: ForeignFrame, sources: Sources, conventions: InputConventions, reads: Sequence[str]
 ) -> Report:
-    report = []
-    if conventions.normals_are_encoded:
-        report.append(("normal", "scaled from [0, 1] to [-1, 1]"))
-    if conventions.cameras:
-        origin = "the positions" if conventions.cameras == "positions" else "worldToNDC"
-        report.append(("cameras", f"from {origin}"))
-    else:
-        report.append(("cameras", "none; history is tested on normals and on depth along one axis"))
-    if conventions.in_camera_space:
-        moved = "moved to the world by worldToCamera" if conventions.cameras else "and no worldToCamera to move them"
-        report.append(("positions", f"in the camera's own space, {moved}"))
-    if not sources.has("albedo"):
-        report.append(("albedo", "none: radiance is filtered"))
-    if not sources.has("normal"):
-        report.append(("normal", "derived from depth" if conventions.cameras else "none: as if all faced the viewer"))
-    if conventions.cameras == "positions":
-        report.append(("depth", "derived from the positions, along the viewing axis"))
-    elif not sources.has("depth", "distance", "position"):
-        report.append(("depth", "none: 1 for every surface"))
-    elif not sources.has("depth") and not conventions.cameras:
-        report.append(("depth", "distances, taken as if along the viewing axis"))
-    if conventions.motion is None:
-        derived = "derived from positions or depth and cameras, as if nothing but the camera moved"
-        report.append(("motion", derived if conventions.has_history else "none: no history, every frame by itself"))
-    if "dual_motion" in reads:
-        report.append(("dual motion", "none: motion in its place"))
-    if "roughness" in reads and not sources.has("roughness"):
-        report.append(("roughness", "none: 1"))
+    has = sources.has
+    cameras = conventions.cameras
+    moved = "moved to the world by worldToCamera" if cameras else "and no worldToCamera to move them"
+    faced = "derived from depth" if cameras else "none: as if all faced the viewer"
+    distances_only = has("distance", "position") and not has("depth")
+    derived = "derived from positions or depth and cameras, as if nothing but the camera moved"
+    motion = derived if conventions.has_history else "none: no history, every frame by itself"
     background = 100 * (1 - first.surface.mean())
-    return [*report, ("background", f"{background:.1f} % of the first frame, left as it is")]
+    lines = [
+        ("normal", "scaled from [0, 1] to [-1, 1]", conventions.normals_are_encoded),
+        ("cameras", "from the positions", cameras == "positions"),
+        ("cameras", "from worldToNDC", cameras == "header"),
+        ("cameras", "none; history is tested on normals and on depth along one axis", cameras is None),
+        ("positions", f"in the camera's own space, {moved}", conventions.in_camera_space),
+        ("albedo", "none: radiance is filtered", not has("albedo")),
+        ("normal", faced, not has("normal")),
+        ("depth", "derived from the positions, along the viewing axis", cameras == "positions"),
+        ("depth", "none: 1 for every surface", not has("depth", "distance", "position")),
+        ("depth", "distances, taken as if along the viewing axis", distances_only and cameras is None),
+        ("motion", motion, conventions.motion is None),
+        ("dual motion", "none: motion in its place", "dual_motion" in reads),
+        ("roughness", "none: 1", "roughness" in reads and not has("roughness")),
+        ("background", f"{background:.1f} % of the first frame, left as it is", True),
+    ]
+    return [(quantity, origin) for quantity, origin, applies in lines if applies]
 
 
 def motion_convention(
@@ -99,18 +95,15 @@ def motion_convention(
             raise BadInput(f"--motion {given}: the motion layer has {components} components, there is no ZW")
         return given, f"{given.description()} (as given)"
     detector = ConventionDetector(components)
-    count = 0
-    for shot in shots:
-        before: Image | None = None
-        for files in shot:
-            if count == FRAMES or detector.pairs == MAX_PAIRS:
-                break
-            frame, _ = read_foreign_frame(files, sources)
-            now = guides(frame)
-            if before is not None:
-                detector.add(now, before, frame.arrays["motion"])
-            before = now
-            count += 1
+    before: Image | None = None
+    for index, files in islice(((i, files) for shot in shots for i, files in enumerate(shot)), FRAMES):
+        if detector.pairs == MAX_PAIRS:
+            break
+        frame, _ = read_foreign_frame(files, sources)
+        now = guides(frame)
+        if index and before is not None:
+            detector.add(now, before, frame.arrays["motion"])
+        before = now
     detection = detector.detection()
     remedy = "" if detection.certain else "; set it by --motion if that is wrong"
     return detection.convention, detection.reason + remedy

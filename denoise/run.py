@@ -16,10 +16,9 @@ from tqdm import tqdm
 from datasets.frame import Frame
 from datasets.tonemap import clip_exposure, display, luminance
 from denoise.analysis import Analysis, analyse
-from denoise.comparison import compare, radiance
-from denoise.error_table import ErrorTable, FrameError
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import open_passes, read_foreign_frame
+from denoise.frame_errors import ErrorTable, FrameError, compare, radiance
 from denoise.frames import FrameBuilder, OwnFrameBuilder
 from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers
@@ -52,13 +51,14 @@ def denoise(job: Job) -> None:
     references = reference_files(job, frames)
     check_names(job.out, frames)
     shots = split_at_cuts(frames, job.reset_at)
-    sources = find_sources(open_passes(frames[0], header_only=True), parse_layers(job.layers))
+    first = open_passes(frames[0], header_only=True)
+    sources = find_sources(first, parse_layers(job.layers))
     name = parse_name(job.denoiser)
     spec = DenoiserSpec(name, "total", fastest_precision(name, job.device), job.weights, device=job.device)
     denoiser = build(spec, job.quality)
-    if job.estimates_error:
-        check_error_estimate(job, denoiser, sources, frames[0])
-    sequence = SequenceDenoiser(job, spec, denoiser, shots, sources)
+    estimates = job.error or job.until is not None
+    estimator = error_estimator(job, denoiser, sources, first[COLOUR]) if estimates else None
+    sequence = SequenceDenoiser(job, spec, denoiser, estimator, shots, sources, first[COLOUR])
     print(sequence.introduction())
     check_settings(job.out, sequence.settings())
     nonfinite = list(sequence.play())
@@ -83,15 +83,15 @@ def build(spec: DenoiserSpec, quality: OIDNQuality | None) -> Denoiser:
     return denoiser
 
 
-def check_error_estimate(job: Job, denoiser: Denoiser, sources: Sources, first: FrameFiles) -> None:
-    """Raise BadInput for a denoiser or frames that do not allow an error estimate, and for an error out of range."""
+def error_estimator(job: Job, denoiser: Denoiser, sources: Sources, first: ExrImage) -> JamesStein:
+    """The denoiser, if it and the frames allow an error estimate. Raises BadInput where not, or for --until <= 0."""
     if not isinstance(denoiser, JamesStein):
         raise BadInput(f"{job.denoiser} does not estimate its error: use {job.denoiser}+js")
-    image = ExrImage(first.passes[COLOUR], header_only=True)
-    if not (has_two_buffers(image) if sources.is_ours else sources.has("half")):
+    if not (has_two_buffers(first) if sources.is_ours else sources.has("half")):
         raise BadInput("--error and --until need two sample buffers: name buffer B by --half")
     if job.until is not None and not 0 < job.until < math.inf:
         raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
+    return denoiser
 
 
 def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
@@ -122,8 +122,7 @@ def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
         write_json(path, dict(settings))
         return
     present = read_json(path)
-    changed = [key for key in sorted(settings.keys() | present.keys()) if settings.get(key) != present.get(key)]
-    if changed:
+    if changed := [key for key in sorted(settings.keys() | present.keys()) if settings.get(key) != present.get(key)]:
         raise BadInput(f"{out} has frames denoised with other settings ({', '.join(changed)}): choose another --out")
 
 
@@ -137,8 +136,10 @@ class SequenceDenoiser:
     job: Job
     spec: DenoiserSpec
     denoiser: Denoiser
+    estimator: JamesStein | None  # the denoiser, where it is to estimate its error
     shots: list[list[FrameFiles]]
     sources: Sources
+    first: ExrImage  # the header of the first frame's colour
 
     @cached_property
     def analysis(self) -> Analysis:
@@ -199,13 +200,11 @@ class SequenceDenoiser:
 
     def is_finished(self, files: FrameFiles) -> bool:
         """Whether a frame's outputs, and its error if requested, are there and no older than its inputs."""
-        outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.png else [])]
-        if not all(path.exists() for path in outputs):
-            return False
         if self.estimator and not self.errors.has(files.number, self.job.until):
             return False
+        outputs = [self.job.out / files.name, *([self.preview(files)] if self.job.png else [])]
         newest = max(path.stat().st_mtime for path in files.passes.values())
-        return all(path.stat().st_mtime >= newest for path in outputs)
+        return all(path.exists() and path.stat().st_mtime >= newest for path in outputs)
 
     def preview(self, files: FrameFiles) -> Path:
         return (self.job.out / files.name).with_suffix(".png")
@@ -219,7 +218,7 @@ class SequenceDenoiser:
             needs_state = has_history and (index == 0 or type(state) is not State)
             if start < len(shot) and (needs_state or index >= start):
                 image, frame, nonfinite = self.read(files, builder)
-                if frame.size != self.size:
+                if frame.size != (self.first.height, self.first.width):
                     size = f"{image.width}x{image.height}"
                     raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
                 output, state = self.step(files, image, frame.to(self.denoiser.device), state, index >= start)
@@ -241,26 +240,14 @@ class SequenceDenoiser:
         return output, state
 
     @cached_property
-    def estimator(self) -> JamesStein | None:
-        """The denoiser, where it is to estimate its error."""
-        return self.denoiser if self.job.estimates_error and isinstance(self.denoiser, JamesStein) else None
-
-    @cached_property
     def errors(self) -> ErrorTable:
         return ErrorTable(self.job.out)
-
-    @cached_property
-    def size(self) -> tuple[int, int]:
-        """(H, W) of the first frame."""
-        first = ExrImage(self.shots[0][0].passes[COLOUR], header_only=True)
-        return first.height, first.width
 
     def builder(self) -> FrameBuilder | OwnFrameBuilder:
         """What makes the Frames of a shot."""
         if self.sources.is_ours:
             return OwnFrameBuilder(self.denoiser.reads)
-        source = str(self.shots[0][0].passes[COLOUR])
-        return FrameBuilder(self.analysis.conventions, self.denoiser.reads, source, self.job.spp)
+        return FrameBuilder(self.analysis.conventions, self.denoiser.reads, str(self.first.path), self.job.spp)
 
     def read(self, files: FrameFiles, builder: FrameBuilder | OwnFrameBuilder) -> tuple[ExrImage, Frame, int]:
         """The image to write, the next Frame of a shot, and how many pixels were not finite."""

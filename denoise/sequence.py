@@ -59,8 +59,7 @@ def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = Non
         available = list(passes[COLOUR])
         raise BadInput(f"there is no frame within --frames {numbers}: there are {available[0]} to {available[-1]}")
     for name, files in passes.items():
-        missing = [number for number in chosen if number not in files]
-        if missing:
+        if missing := [number for number in chosen if number not in files]:
             lacking = f"'{' '.join(patterns[name])}' ({name}) lacks frame {missing[0]}"
             raise BadInput(f"{lacking}: render it, or use --frames")
     return [FrameFiles(number, {name: files[number] for name, files in passes.items()}) for number in chosen]
@@ -83,8 +82,7 @@ def gaps(frames: Sequence[FrameFiles]) -> list[int]:
 
 def split_at_cuts(frames: Sequence[FrameFiles], resets: Sequence[int]) -> list[list[FrameFiles]]:
     """The frames, cut before the numbers `resets` and after missing ones. Raises BadInput for a number of no frame."""
-    unknown = set(resets) - {frame.number for frame in frames}
-    if unknown:
+    if unknown := set(resets) - {frame.number for frame in frames}:
         raise BadInput(f"--reset-at {min(unknown)}: there is no such frame")
     cuts = {*resets, *gaps(frames)}
     parts: list[list[FrameFiles]] = []

@@ -42,15 +42,10 @@ class Augmentation:
         gain = torch.from_numpy(rng.uniform(0, 2, (1, 3, 1, 1)).astype(np.float32)) if self.gain else None
         if self.exposure:
             gain = torch.full((1, 3, 1, 1), 2 ** float(rng.uniform(-1.5, 1.5)))
-        together = number_of_samples(realisations, rng) if self.samples and not stopped else 1
+        doublings = int(np.log2(realisations)) if self.samples and not stopped else 0
+        together = 2 ** int(rng.integers(1, doublings + 1)) if doublings and rng.random() >= 0.7 else 1
         edge = LightEdge.random(rng, length) if self.light and rng.random() < 0.3 else None
         return Draw(deal, together, turns, gain, edge)
-
-
-def number_of_samples(realisations: int, rng: np.random.Generator) -> int:
-    """1 in seven of ten cases, else 2, 4, 8, ... of `realisations`."""
-    doublings = int(np.log2(realisations))
-    return 2 ** int(rng.integers(1, doublings + 1)) if doublings and rng.random() >= 0.7 else 1
 
 
 @dataclass(frozen=True)
@@ -99,8 +94,7 @@ class Draw:
     def apply(self, frame: Frame, time: int) -> Frame:
         """Frame `time` of the sequence, augmented."""
         if self.edge is not None:
-            light = self.edge.light(time, *frame.size)
-            frame = lit(frame, light)
+            frame = lit(frame, self.edge.light(time, *frame.size))
         for _ in range(self.turns):
             frame = rotated(frame)
         return frame if self.gain is None else replace(frame, colour_gain=self.gain)

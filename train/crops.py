@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset as TorchDataset
 from tqdm import tqdm
 
 from datasets.channels import REFERENCE_CHANNELS
@@ -38,18 +37,11 @@ class Crops:
     def to(self, device: torch.device | str) -> "Crops":
         return Crops(self.frame.to(device), self.irradiance.to(device), self.log_scale.to(device))
 
-    @staticmethod
-    def stack(crops: "Sequence[Crops]") -> "Crops":
-        """One batch of all crops' batches."""
-        irradiance = torch.cat([crop.irradiance for crop in crops])
-        log_scale = torch.cat([crop.log_scale for crop in crops])
-        return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, log_scale)
-
 
 AnyBatch = Batch | Crops
 
 
-class AccumulatedCrops(TorchDataset[Crops]):
+class AccumulatedCrops:
     """Crops of `crop` x `crop` pixels (None: whole frames); item i of epoch e depends on (seed, e, i) only.
 
     An epoch has `count` crops for every frame of the clips, at random places. Accumulated frames are kept in the
@@ -87,3 +79,10 @@ class AccumulatedCrops(TorchDataset[Crops]):
         log_scale = torch.from_numpy(self.scales[item][position, realisation])[None]
         frame = read_frame(clip, position, self.channels, realisation, window=window, in_layers=False)
         return Crops(frame, irradiance, log_scale)
+
+    def batch(self, numbers: Sequence[int]) -> Crops:
+        """One batch of the items with these numbers."""
+        crops = [self[number] for number in numbers]
+        irradiance = torch.cat([crop.irradiance for crop in crops])
+        log_scale = torch.cat([crop.log_scale for crop in crops])
+        return Crops(Frame.stack([crop.frame for crop in crops]), irradiance, log_scale)

@@ -1,27 +1,20 @@
 """Batches of sequences or of accumulated crops, and which process reads which."""
 
-import gc
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch.utils.data import DataLoader
 
 from datasets.clip import Clip
 from models.denoiser import Denoiser
 from train.augmentation import Augmentation
-from train.crops import AccumulatedCrops, Crops
+from train.crops import AccumulatedCrops, AnyBatch
 from train.protocols import FilteringNetwork
-from train.recipe import Recipe
-from train.sequences import TrainingSequences, collate
+from train.sequences import TrainingSequences
+from train.task import Recipe
 
 Items = TrainingSequences | AccumulatedCrops
-
-# A forked worker must not collect its parent's garbage: Dr.Jit's would wait for ever for threads that it does not have.
-os.register_at_fork(before=gc.freeze, after_in_parent=gc.unfreeze)
 
 PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, by default
 
@@ -64,26 +57,14 @@ def micro_batches(first: int, stop: int, batch: int, largest: int, rank: int = 0
     return [[start + i for i in part] for start in starts for part in equal_parts(share, largest)]
 
 
-def loader(items: Items, batches: Sequence[list[int]], workers: int = 0) -> DataLoader[Any]:
-    """Yields Batches or Crops with these item numbers."""
-    together: Any = Crops.stack if isinstance(items, AccumulatedCrops) else collate
-    return DataLoader(items, batch_sampler=batches, collate_fn=together, num_workers=workers)
-
-
-def in_parts(loader: DataLoader[Any], parts: int) -> Iterator[Iterator[Any]]:
-    """The batches of a loader, `parts` at a time."""
-    batches = ahead(iter(loader))
-    for _ in range(len(loader) // parts):
-        yield (next(batches) for _ in range(parts))
-
-
-def ahead(batches: Iterator[Any]) -> Iterator[Any]:
-    """The same batches, each loaded by a thread while the one before it is worked on."""
+def load_ahead(items: Items, batches: Iterable[list[int]]) -> Iterator[AnyBatch]:
+    """The batches of these item numbers, each loaded by a thread while the one before it is worked on."""
     # PyTorch gives the number of threads that the loading thread sets to all threads that have not read theirs yet:
     # read it now, or a training that has done no large operation so far continues with one.
     torch.get_num_threads()
+    loaded: Iterator[AnyBatch] = map(items.batch, batches)
     with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as thread:
-        loading = thread.submit(next, batches, None)
+        loading = thread.submit(next, loaded, None)
         while (batch := loading.result()) is not None:
-            loading = thread.submit(next, batches, None)
+            loading = thread.submit(next, loaded, None)
             yield batch

@@ -12,9 +12,8 @@ from tqdm import tqdm
 from errors import BadInput
 from extras import can_draw
 from files import locked
-from train.log import Log, LogRow
+from train.log import Log, loss_curve, sample_picture
 from train.made_by import differences
-from train.pictures import loss_curve, sample_picture
 from train.precision import fabric_here
 from train.task import WEIGHTS_FILE, Task
 from train.training import BEST_FILE, Training, load_checkpoint
@@ -97,28 +96,17 @@ def take_steps(training: Training, save_seconds: float) -> None:
         tqdm(total=training.total, initial=position.done, desc=label, unit="step") as bar,
     ):
         for row in training.steps():
-            log.step({**row, "skipped": position.skipped})
-            bar.set_postfix_str(progress_text(training, row), refresh=False)
+            skipped = f", skipped {position.skipped}" if position.skipped else ""
+            losses = f"loss {row['loss']:.4f}, best on validation {position.best:.4f}"
+            bar.set_postfix_str(f"{losses}, {row['step_ms']:.0f} ms{skipped}", refresh=False)
             bar.update()
-            if training.validates:
-                validate_and_show(training, log)
-            log.write(position.done)
+            validation = training.validate() if training.validates else None
+            log.add(position.done, {**row, "skipped": position.skipped}, validation)
+            if validation is not None:
+                training.keep_best(validation)
+                with training.fabric.autocast():
+                    picture = sample_picture(training.judged.denoiser, training.clips["val"][0], training.fabric.device)
+                log.picture(position.done, picture)
             if time.monotonic() - saved > save_seconds or training.finished:
                 training.save()
                 saved = time.monotonic()
-
-
-def progress_text(training: Training, row: LogRow) -> str:
-    position = training.position
-    text = f"loss {row['loss']:.4f}, best on validation {position.best:.4f}, {row['step_ms']:.0f} ms"
-    return f"{text}, skipped {position.skipped}" if position.skipped else text
-
-
-def validate_and_show(training: Training, log: Log) -> None:
-    """Validate, keep the weights if they are the best, and draw a sample."""
-    validation = training.validate()
-    training.keep_best(validation)
-    log.write(training.position.done, {"val_loss": validation})
-    with training.fabric.autocast():
-        picture = sample_picture(training.judged.denoiser, training.clips["val"][0], training.fabric.device)
-    log.picture(training.position.done, picture)

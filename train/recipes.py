@@ -1,16 +1,19 @@
-"""The recipes of the papers as data, each number with its section; and what budgets change."""
+"""The recipes of the papers as data, each number with its section; what budgets change; trainings by their names."""
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+from datasets.clip import Dataset
 from errors import BadInput
+from models.registry import create
 from train.augmentation import Augmentation
 from train.losses.displayed import DisplayedLoss
-from train.losses.lbf import LBFLoss
 from train.losses.ntd import NTDLoss
 from train.losses.rae import RAELoss
-from train.losses.wskp import NBGDLoss, SMAPELoss
-from train.recipe import Recipe
+from train.losses.wskp import LBFLoss, NBGDLoss, SMAPELoss
+from train.task import Recipe, Task, run_folder
 
 RAE_RECIPE = Recipe(
     loss=RAELoss(),  # §4.4
@@ -142,3 +145,16 @@ def recipe_for(name: str, budget: str) -> Recipe:
         budgets = [each for network, each in RECIPES if network == name]
         raise BadInput(f"unknown budget '{budget}'; the budgets of '{name}' are {', '.join(budgets)}")
     return RECIPES[name, budget]
+
+
+def task_for(name: str, data: Path, runs: Path, budget: str) -> Task:
+    """The training of a denoiser in a budget. Raises BadInput for an unknown name or budget, or no data."""
+    return Task(
+        name=name,
+        create=partial(create, name),
+        recipe=recipe_for(name, budget),
+        budget=budget,
+        data=Dataset(data),
+        folder=run_folder(runs, name, budget),
+        cache=runs / "accumulated",
+    )

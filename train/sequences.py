@@ -1,12 +1,12 @@
 """Training sequences: random crops of consecutive frames, augmented, read through memory maps."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset as TorchDataset
 
 from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
@@ -58,67 +58,6 @@ class WholeFrames:
         return self.measured[key]
 
 
-class TrainingSequences(TorchDataset[list[Frame]]):
-    """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
-
-    References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
-    have together as many pixels as the clips. Frames name the scale of the frames that they are crops of in the noisy
-    light of `signal`, unless that is None. Raises BadInput where a clip is shorter than a sequence or smaller than a
-    crop.
-    """
-
-    def __init__(
-        self,
-        clips: Sequence[Clip],
-        reads: Sequence[str],
-        length: int,
-        crop: int | None,
-        augmentation: Augmentation,
-        seed: int,
-        signal: Signal | None = None,
-    ):
-        check_fits(clips, length, crop)
-        self.clips = clips
-        self.channels = tuple(dict.fromkeys([*reads, *REFERENCE_CHANNELS]))
-        self.sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
-        self.length = length
-        self.crop = crop
-        self.augmentation = augmentation
-        self.seed = seed
-        self.whole_frames = WholeFrames(signal) if signal else None
-        self.epoch = 0  # that whose sequences come next
-        pixels = np.array([clip.frames * clip.height * clip.width for clip in clips])
-        self.probabilities = pixels / pixels.sum()
-        area = crop * crop if crop else pixels.sum() / sum(clip.frames for clip in clips)
-        self.count = max(1, round(pixels.sum() / (length * area)))
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> list[Frame]:
-        rng = np.random.default_rng([self.seed, self.epoch, index])
-        clip = self.clips[rng.choice(len(self.clips), p=self.probabilities)]
-        playback = self.augmentation.playback(clip.frames, self.length, rng)
-        window = random_window(clip, self.crop, rng)
-        stopped = len(set(playback)) < self.length
-        draw = self.augmentation.draw(clip.realisations, self.length, stopped, rng)
-        frames = []
-        for time, position in enumerate(playback):
-            first, *others = draw.realisations(time)
-            frame = read_frame(
-                clip, position, self.channels, first, playback[max(time - 1, 0)], window, in_layers=False
-            )
-            if others:
-                more = [
-                    read_frame(clip, position, self.sampled, other, window=window, in_layers=False) for other in others
-                ]
-                frame = averaged([frame, *more])
-            if self.whole_frames is not None:
-                frame = replace(frame, whole=self.whole_frames(clip, position, first))
-            frames.append(draw.apply(frame, time))
-        return frames
-
-
 class Batch:
     """A batch of sequences: one Frame of all of them for each time step.
 
@@ -133,6 +72,57 @@ class Batch:
         return Batch([frame.to(device) for frame in self.frames])
 
 
-def collate(sequences: list[list[Frame]]) -> Batch:
-    """One batch of several sequences of equal length."""
-    return Batch([Frame.stack(step) for step in zip(*sequences, strict=True)])
+@dataclass(eq=False)
+class TrainingSequences:
+    """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
+
+    References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
+    have together as many pixels as the clips. Frames name the scale of the frames that they are crops of in the noisy
+    light of `signal`, unless that is None. Raises BadInput where a clip is shorter than a sequence or smaller than a
+    crop.
+    """
+
+    clips: Sequence[Clip]
+    reads: Sequence[str]
+    length: int
+    crop: int | None
+    augmentation: Augmentation
+    seed: int
+    signal: Signal | None = None
+    epoch: int = 0  # that whose sequences come next
+
+    def __post_init__(self) -> None:
+        check_fits(self.clips, self.length, self.crop)
+        self.channels = tuple(dict.fromkeys([*self.reads, *REFERENCE_CHANNELS]))
+        self.sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
+        self.whole_frames = WholeFrames(self.signal) if self.signal else None
+        pixels = np.array([clip.frames * clip.height * clip.width for clip in self.clips])
+        self.probabilities = pixels / pixels.sum()
+        area = self.crop * self.crop if self.crop else pixels.sum() / sum(clip.frames for clip in self.clips)
+        self.count = max(1, round(pixels.sum() / (self.length * area)))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> list[Frame]:
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        clip = self.clips[rng.choice(len(self.clips), p=self.probabilities)]
+        playback = self.augmentation.playback(clip.frames, self.length, rng)
+        window = random_window(clip, self.crop, rng)
+        stopped = len(set(playback)) < self.length
+        draw = self.augmentation.draw(clip.realisations, self.length, stopped, rng)
+        read = partial(read_frame, clip, window=window, in_layers=False)
+        frames = []
+        for time, position in enumerate(playback):
+            first, *others = draw.realisations(time)
+            frame = read(position, self.channels, first, playback[max(time - 1, 0)])
+            if others:
+                frame = averaged([frame, *(read(position, self.sampled, other) for other in others)])
+            if self.whole_frames is not None:
+                frame = replace(frame, whole=self.whole_frames(clip, position, first))
+            frames.append(draw.apply(frame, time))
+        return frames
+
+    def batch(self, numbers: Sequence[int]) -> Batch:
+        """One batch of the items with these numbers."""
+        return Batch([Frame.stack(step) for step in zip(*(self[number] for number in numbers), strict=True)])

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from files import write_file
 from models.weights import save_weights
 from provenance import file_digest
 from train.crops import AnyBatch
-from train.data import equal_parts, in_parts, items, largest_micro_batch, loader, micro_batches
+from train.data import equal_parts, items, largest_micro_batch, load_ahead, micro_batches
 from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
 from train.made_by import MadeBy, made_by_here
@@ -105,8 +106,7 @@ class Training:
 
         self.precision: str = fabric.broadcast(self.choose_precision(loss, saved, fabric))
         self.fabric = fabric_here(self.precision)
-        rate = self.recipe.learning_rate(0)
-        optimiser = torch.optim.Adam(denoiser.parameters(), lr=rate, betas=self.recipe.betas)
+        optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
         self.judged: NetworkLoss = self.loss.module
         if self.recipe.average:
@@ -148,8 +148,8 @@ class Training:
             return kept
         if wanted:
             return wanted
-        first = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)[:1]
-        return fastest_precision(loss, next(iter(loader(self.items, first))), fabric.device.type)
+        first, *_ = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)
+        return fastest_precision(loss, self.items.batch(first), fabric.device.type)
 
     def resume(self, saved: Checkpoint) -> None:
         if saved.get("facts") != self.facts:
@@ -185,8 +185,9 @@ class Training:
             epoch, first = divmod(self.position.done, self.per_epoch)
             self.items.epoch = epoch
             batches = micro_batches(first, self.per_epoch, self.recipe.batch, self.micro_batch, rank, world)
-            for batch in in_parts(loader(self.items, batches), self.parts):
-                row = self.step(batch)
+            loaded = load_ahead(self.items, batches)
+            for _ in range(len(batches) // self.parts):
+                row = self.step(islice(loaded, self.parts))
                 self.position.done += 1
                 yield row
 
@@ -225,7 +226,7 @@ class Training:
     def update(self, loss: float) -> float:
         """Apply the gradients, unless they or the loss are not finite. Every process comes to the same decision.
 
-        Returns the norm of the gradients before clipping.
+        Returns the norm of the gradients before clipping. Raises BadInput after too many skipped steps in a row.
         """
         parameters = list(self.loss.parameters())
         norm = get_total_norm([parameter.grad for parameter in parameters if parameter.grad is not None])
@@ -239,20 +240,16 @@ class Training:
                 decay = average_decay(updates, self.recipe.average * self.total)
                 update_average(self.judged, self.loss.module, decay)
         else:
-            self.skip_step()
+            self.position.skipped += 1
+            self.position.skipped_in_a_row += 1
+            if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+                raise BadInput(
+                    f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the "
+                    f"data with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
+                    "--precision float32"
+                )
         self.optimiser.zero_grad()
         return float(norm)
-
-    def skip_step(self) -> None:
-        """Count a step whose loss or gradient was not finite. Raises BadInput after too many in a row."""
-        self.position.skipped += 1
-        self.position.skipped_in_a_row += 1
-        if self.position.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
-            raise BadInput(
-                f"loss or gradient was not finite in {self.position.skipped_in_a_row} steps in a row: check the data "
-                f"with `onespp verify` and `onespp info`, or delete {self.task.folder} and train with "
-                "--precision float32"
-            )
 
     @torch.no_grad()
     def validate(self) -> float:
@@ -262,9 +259,10 @@ class Training:
         batches = batches[self.fabric.global_rank :: self.fabric.world_size]
         network = self.judged.eval()  # not through DDP: processes may have different numbers of batches
         total = torch.zeros(2, device=self.fabric.device)
-        for batch, chosen in zip(loader(self.val_items, batches), batches, strict=True):
+        for chosen in batches:
+            batch = self.val_items.batch(chosen).to(self.fabric.device)
             with self.fabric.autocast():
-                loss, _ = network(batch.to(self.fabric.device))
+                loss, _ = network(batch)
             total += len(chosen) * torch.stack([loss, torch.ones_like(loss)])
         network.train()
         total = self.reduce(total, "sum")

@@ -56,12 +56,6 @@ DATA_PROFILES = {
             "test": TEST_OF_SMALL_ROOMS,
         },
     ),
-    # Rooms as those of release, small and short, to measure in minutes how hard they are.
-    "sketch": DataProfile(
-        size=(4, 64, 64),
-        rooms={"train": 64, "val": 8},
-        quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=64)),
-    ),
     # Whole rooms, and parts of others with the resolution of large images.
     "release": DataProfile(
         size=(12, 128, 128),

@@ -20,8 +20,8 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.exr import export_clip
 from datasets.frame import Frame, read_frame
-from denoise.error_table import ErrorTable
 from denoise.exr_image import ExrImage
+from denoise.frame_errors import ErrorTable
 from denoise.job import Job
 from denoise.run import denoise
 from errors import BadInput

@@ -23,7 +23,7 @@ from models.registry import create
 from models.weights import save_weights
 from train.loop import train_network
 from train.precision import FLOAT32
-from train.registry import task_for
+from train.recipes import task_for
 from train.task import WEIGHTS_FILE, Task, run_folder
 
 # Two to ten steps of the tiny budget.

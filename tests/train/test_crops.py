@@ -13,7 +13,7 @@ from tests.helpers.training import full_disk
 from train import accumulation
 from train.accumulation import accumulate_clip, accumulation_digest
 from train.crops import AccumulatedCrops
-from train.data import in_parts, loader, micro_batches
+from train.data import load_ahead, micro_batches
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +119,9 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(clips, tmp_path):
 
 def test_crops_stack_and_come_in_parts(clips, cache):
     data = crops(clips, cache)
-    steps = list(map(list, in_parts(loader(data, micro_batches(0, 2, 4, 2)), 2)))
-    assert [[len(part.irradiance) for part in step] for step in steps] == [[2, 2], [2, 2]]
-    batch = steps[1][0]
+    parts = list(load_ahead(data, micro_batches(0, 2, 4, 2)))
+    assert [len(part.irradiance) for part in parts] == [2, 2, 2, 2]
+    batch = parts[2]
     assert torch.equal(batch.irradiance[1:], data[5].irradiance)
     assert torch.equal(batch.frame.albedo[1:], data[5].frame.albedo)
     assert torch.equal(batch.scale.exposure()[1:], data[5].scale.exposure())

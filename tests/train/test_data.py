@@ -1,17 +1,13 @@
 """Who reads which items, in what parts."""
 
-import gc
-import os
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.utils.data import DataLoader
 
 from timing import thread_count
-from train.data import ahead, equal_parts, micro_batches
+from train.data import equal_parts, load_ahead, micro_batches
 
 
 @given(count=st.integers(1, 200), largest=st.integers(1, 250))
@@ -37,35 +33,11 @@ def test_processes_share_the_items_of_a_single_process(world, largest, first):
         assert sorted(items) == expected
 
 
-class Trap:
-    """Garbage that writes down in which process it was collected."""
+class Counted:
+    """Batches of one item, a number."""
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.itself = self  # so that only the garbage collector finds it
-
-    def __del__(self) -> None:
-        (self.folder / str(os.getpid())).touch()
-
-
-class Collecting(list):
-    """Items that are read beside the garbage collector."""
-
-    def __getitem__(self, index):
-        gc.collect()
-        return index
-
-
-def test_workers_leave_the_garbage_of_their_parent_alone(tmp_path):
-    """Its destructors may wait for threads that a forked process does not have."""
-    gc.disable()
-    try:
-        Trap(tmp_path)
-        assert [list(batch) for batch in DataLoader(Collecting([0, 1]), collate_fn=list, num_workers=1)] == [[0], [1]]
-    finally:
-        gc.enable()
-    gc.collect()
-    assert [path.name for path in tmp_path.iterdir()] == [str(os.getpid())]
+    def batch(self, numbers):
+        return numbers[0]
 
 
 def test_loading_ahead_leaves_the_number_of_threads():
@@ -73,7 +45,7 @@ def test_loading_ahead_leaves_the_number_of_threads():
 
     def threads_after_loading() -> int:
         torch.set_num_threads(3)
-        assert list(ahead(iter([1, 2]))) == [1, 2]
+        assert list(load_ahead(Counted(), [[1], [2]])) == [1, 2]
         return torch.get_num_threads()
 
     with thread_count(torch.get_num_threads()), ThreadPoolExecutor(1) as thread:

@@ -24,9 +24,8 @@ from errors import BadInput
 from files import locked
 from tests.helpers.training import as_command, folder_of, metadata, same_weights, short_task, start_training, tensors
 from timing import thread_count
-from train.log import METRICS_CSV, Log, read_metrics
+from train.log import METRICS_CSV, Log, read_metrics, smooth
 from train.loop import alone_in, train_network
-from train.pictures import smooth
 from train.precision import FLOAT32
 from train.task import WEIGHTS_FILE
 from train.training import CHECKPOINT_FILE, Training
@@ -189,8 +188,7 @@ def test_training_shows_what_it_does(trained_runs):
 def test_a_log_averages_and_forgets_what_a_kill_left(tmp_path):
     with closing(Log(tmp_path, done=0, total=6000)) as log:  # three steps a row
         for step in range(1, 8):
-            log.step({"loss": float(step)})
-            log.write(step, {"val_loss": 9.0} if step == 7 else None)
+            log.add(step, {"loss": float(step)}, 9.0 if step == 7 else None)
     assert [(r["step"], r["loss"]) for r in read_metrics(log.path)] == [(3, 2.0), (6, 5.0), (7, 7.0)]
     assert read_metrics(log.path)[-1]["val_loss"] == 9.0
     with log.path.open("a") as file:

@@ -19,16 +19,15 @@ from models.networks.wskp import WSKP
 from models.registry import create
 from tests.helpers.training import predict_as
 from train.crops import Crops
-from train.data import items, loader
+from train.data import items
 from train.losses.displayed import DisplayedLoss, block_means, tone
-from train.losses.lbf import LBFLoss
 from train.losses.network_loss import NetworkLoss, surface_mean
 from train.losses.ntd import NTDLoss, masked_mean
 from train.losses.rae import RAELoss, edges, laplacian_of_gaussian
-from train.losses.wskp import smape
-from train.recipe import Recipe
+from train.losses.wskp import LBFLoss, SMAPELoss
 from train.recipes import TRAINABLE, recipe_for
 from train.sequences import Batch
+from train.task import Recipe
 
 LOG_NORM = (2 * np.pi * 1.5**6) ** -0.5  # of the continuous LoG: the square root of its integral squared
 LIGHT = {"direct", "indirect", "direct_reference", "indirect_reference"}
@@ -42,7 +41,7 @@ def batch_of(tiny, tmp_path_factory) -> Callable[..., Any]:
     def make(name: str, count: int = 1, **changes: Any) -> Batch | Crops:
         recipe: Recipe = replace(recipe_for(name, "tiny"), **changes)
         data = items(Dataset(tiny).clips("val"), recipe, create(name), False, 0, cache)
-        return next(iter(loader(data, [list(range(count))])))
+        return data.batch(range(count))
 
     return make
 
@@ -117,10 +116,10 @@ def test_smape_is_that_of_the_paper_and_of_torchmetrics():
     by_hand = sum(abs(a - b) / (abs(a) + abs(b) + 0.01) for a, b in zip(r.flat, t.flat, strict=True)) / r.size
     r = torch.from_numpy(r)
     t = torch.from_numpy(t)
-    assert smape(r, t, 0.01).mean().item() == pytest.approx(by_hand, rel=1e-12)
+    assert SMAPELoss(0.01).error(r, t).mean().item() == pytest.approx(by_hand, rel=1e-12)
     torchmetrics = symmetric_mean_absolute_percentage_error(r, t).item() / 2
-    assert smape(r, t, 0.0).mean().item() == pytest.approx(torchmetrics, rel=1e-9)
-    assert (smape(r, r, 0.01) == 0).all()
+    assert SMAPELoss(0.0).error(r, t).mean().item() == pytest.approx(torchmetrics, rel=1e-9)
+    assert (SMAPELoss(0.01).error(r, r) == 0).all()
 
 
 def shown(x):

@@ -29,9 +29,9 @@ def test_the_code_that_counts_is_that_of_network_loss_loop_and_data(name):
     """And not that of all networks and recipes, or of evaluation."""
     modules = code_of(name)
     assert modules >= {type(create(name)).__module__, type(recipe_for(name, "tiny").loss).__module__}
-    assert modules >= {f"train.{part}" for part in ("loop", "training", "data", "crops", "accumulation", "recipe")}
+    assert modules >= {f"train.{part}" for part in ("loop", "training", "data", "crops", "accumulation", "task")}
     assert modules >= {"datasets.clip", "datasets.frame", "train.sequences", "datasets.channels", "scenes.camera"}
-    assert not modules & {"models.registry", "train.registry", "train.recipes", "onespp"}
+    assert not modules & {"models.registry", "train.recipes", "onespp"}
     assert not {module for module in modules if module.startswith("eval")}
 
 

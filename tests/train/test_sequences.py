@@ -17,8 +17,7 @@ from errors import BadInput
 from models.registry import create
 from train import sequences as module
 from train.augmentation import Augmentation, LightEdge, averaged, rotated
-from train.data import loader
-from train.sequences import TrainingSequences, WholeFrames, collate
+from train.sequences import TrainingSequences, WholeFrames
 
 FORWARD_ALONE = tuple(name for name, channel in CHANNELS.items() if channel.is_temporal and name != "motion")
 IMAGE_CHANNELS = tuple(name for name in USUAL_CHANNELS if CHANNELS[name].is_image and name not in FORWARD_ALONE)
@@ -145,17 +144,6 @@ def are_equal(a: Frame, b: Frame) -> bool:
     )
 
 
-def test_batches_are_the_same_whatever_the_number_of_workers(clips):
-    data = sequences(clips, AUGMENTATIONS["all"])
-    data.epoch = 4
-    numbers = list(range(len(data)))
-    batches = [numbers[first : first + 2] for first in range(0, len(data), 2)]
-    alone, shared = (list(loader(data, batches, workers)) for workers in (0, 2))
-    assert len(alone) == len(shared) > 1
-    for a, b in zip(alone, shared, strict=True):
-        assert all(are_equal(x, y) for x, y in zip(a.frames, b.frames, strict=True))
-
-
 def test_an_item_depends_on_seed_epoch_and_index_only(clips):
     a = sequences(clips, AUGMENTATIONS["all"])
     b = sequences(clips, AUGMENTATIONS["all"])
@@ -229,7 +217,7 @@ def test_gains_are_random_per_sequence_and_exposures_do_not_change_colours(clips
 
 def test_batches_stack_sequences_and_pad_meshes(clips):
     data = sequences(clips)
-    batch = collate([data[0], data[1]])
+    batch = data.batch([0, 1])
     assert len(batch.frames) == 5 and batch.frames[0].direct.shape == (2, 3, 32, 32)
     assert batch.frames[0].direct_reference.shape == (2, 2, 3, 32, 32)
     torch.testing.assert_close(batch.frames[2].albedo[1:], data[1][2].albedo)
@@ -376,7 +364,7 @@ def test_each_frame_is_measured_once(clips, monkeypatch):
 
 def test_the_scale_of_whole_frames_survives_batches(clips):
     data = TrainingSequences(clips, ("indirect", "depth"), 2, 32, Augmentation(), 0, "indirect")
-    batch = collate([data[0], data[1]]).to("cpu")
+    batch = data.batch([0, 1]).to("cpu")
     assert torch.equal(batch.frames[1].whole, torch.cat([data[0][1].whole, data[1][1].whole]))
     assert batch.frames[0].whole.shape == (2, 2)
 

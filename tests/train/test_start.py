@@ -18,7 +18,7 @@ from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
 from train.loop import train_network
-from train.registry import start_file, task_for
+from train.recipes import task_for
 from train.task import WEIGHTS_FILE, Task
 from train.training import Training
 
@@ -88,8 +88,6 @@ def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, gen
 
 def test_it_may_begin_with_what_is_shipped(capsys, tiny, tmp_path, shipped):
     ours = fresh_weights("wskp3", shipped / "wskp3.safetensors", seed=5)
-    assert start_file("wskp3", "weights") == ours
-    assert start_file("wskp3", "weights.safetensors") == Path("weights.safetensors") and start_file("rae", None) is None
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny", "--from", "weights"]
     assert "no weights of 'rae' are shipped; those are wskp3" in fails(capsys, "train", "rae", *there)
     assert not (tmp_path / "runs").exists()
