@@ -29,7 +29,7 @@ from provenance import DENOISING, code_digest, versions
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 NOISE_FLOOR = "reference"  # the folder of the noise floors
 FLOOR = "(noise floor)"  # their name in tables
-MAX_SHOWN_ERROR = 0.25  # of exposed radiance
+MAX_SHOWN_ERROR = 0.25  # of exposed radiance, white in error maps
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
 FRAMES_FILE = "frames.csv"
@@ -58,21 +58,12 @@ def error_path(folder: Path, index: int) -> Path:
     return folder / f"error-{index:04d}.webp"
 
 
-def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
-    """Store an image (H, W, 3) in [0, 1], rounded to 8 bits; does nothing without the extra `report`."""
-    save_bytes(picture_path(folder, index), 255 * image + 0.5)
-
-
-def save_error(folder: Path, index: int, error: NDArray[np.floating]) -> None:
-    """Store an error map (H, W) in exposed radiance, white from MAX_SHOWN_ERROR on."""
-    save_bytes(error_path(folder, index), 255 * (error / MAX_SHOWN_ERROR).clip(0, 1) + 0.5)
-
-
-def save_bytes(path: Path, values: NDArray[np.floating]) -> None:
+def save_picture(path: Path, image: NDArray[np.floating]) -> None:
+    """Store an image (H, W, 3) or (H, W) in [0, 1], rounded to 8 bits; does nothing without the extra `report`."""
     if can_draw():
         from plotting import Image
 
-        Image.fromarray(values.astype(np.uint8)).save(path, lossless=True, method=2)
+        Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(path, lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:
@@ -180,10 +171,6 @@ class ClipResults:
     reference: Result
 
     @property
-    def noisy_spp(self) -> int:
-        return ClipKind.of(self.clip).noisy_spp
-
-    @property
     def name(self) -> str:
         return f"{self.scene}/{self.clip}" + ("" if self.signal == "total" else f" ({self.signal} light)")
 
@@ -215,7 +202,7 @@ def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
 
 def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
     """The clips without those such as 000-4spp, which show the same frames with other input."""
-    return [clip for clip in clips if clip.noisy_spp == 1]
+    return [clip for clip in clips if ClipKind.of(clip.clip).noisy_spp == 1]
 
 
 def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
@@ -234,12 +221,11 @@ def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     content = read_json(path, ("schema", "dataset", "device", "versions", "rows"))
     results = []
     for row in content["rows"]:
-        facts = {name: row[name] for name in KEYS}
-        folders = [
-            folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in (row["denoiser"], NOISE_FLOOR)
-        ]
-        ours, reference = (load_result(folder) for folder in folders)
+        names = row["denoiser"], NOISE_FLOOR
+        folders = [folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in names]
+        ours, reference = map(load_result, folders)
         if ours.metrics != row["metrics"]:
+            facts = {name: row[name] for name in KEYS}
             raise BadInput(f"{folders[0]} differs from {path} for {facts}: run `onespp eval` again")
         if reference not in results:
             results.append(reference)

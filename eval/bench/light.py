@@ -14,7 +14,6 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display, psnr
-from eval.bench.sizes import bench_folder
 from eval.selection import evaluated
 from files import write_file, write_json
 from models.denoiser import Denoiser, State
@@ -131,7 +130,7 @@ def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     specs = evaluated(names, runs, budget)
-    folder = bench_folder(runs) / "light"
+    folder = runs / "bench" / "light"
     clips = {change: clip_of(change, folder) for change in BEFORE}
     exposure = clips[STEADY].exposure  # of all clips
     lags = []

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,15 +16,56 @@ from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, Signal, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.figures.panel_grid import Column, Panel, draw_grid
 from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.registry import create
-from plotting import save_figure
+from plotting import DPI, TWO_LINE_CAPTION, Figure, enlargement, plt, save_figure
 
 SHOWN_FRAMES = 4  # including the first and the last of the clip
 BRIGHTEST_DIFFERENCE = 0.25  # of displayed values; larger ones have the same colour
+# The longer side of an image, in pixels.
+SMALLEST_IMAGE = 192
+LARGEST_IMAGE = 480
+COLOUR_BAR = 0.7  # inches beside an image
+
+
+class Panel(NamedTuple):
+    """A captioned image: (H, W, 3) in [0, 1], or numbers (H, W), coloured from `low` to `high`."""
+
+    image: NDArray[np.floating]
+    caption: str
+    low: float = 0.0
+    high: float = 1.0
+
+
+Column = list[Panel]
+
+
+def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
+    """Panels of one size, those of numbers with colour bars; a row name for each panel of a column."""
+    height, width = columns[0][0].image.shape[:2]
+    zoom = min(LARGEST_IMAGE / max(height, width), enlargement(height, width, SMALLEST_IMAGE)) / DPI
+    has_bars = any(column[0].image.ndim == 2 for column in columns)
+    size = (
+        len(columns) * (width * zoom + COLOUR_BAR * has_bars) + TWO_LINE_CAPTION,
+        len(row_names) * (height * zoom + TWO_LINE_CAPTION),
+    )
+    figure, axes = plt.subplots(
+        len(row_names), len(columns), figsize=size, dpi=DPI, squeeze=False, layout="constrained"
+    )
+    panels = [panel for column in columns for panel in column]
+    for axis, panel in zip(axes.T.flat, panels, strict=True):
+        drawn = axis.imshow(panel.image, cmap="viridis", vmin=panel.low, vmax=panel.high)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(panel.caption, fontsize=8, pad=2)
+        if panel.image.ndim == 2:
+            figure.colorbar(drawn, ax=axis, fraction=0.05, pad=0.02).ax.tick_params(labelsize=7)
+    margin = TWO_LINE_CAPTION / 2 / size[0]
+    figure.get_layout_engine().set(rect=(margin, 0, 1 - margin, 1))  # type: ignore
+    for axis, name in zip(axes[:, 0], row_names, strict=True):
+        axis.set_ylabel(name, fontsize=8)
+    return figure
 
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
@@ -48,11 +90,6 @@ class DenoiserView:
     differences: Column = field(default_factory=list)  # from the reference; empty where the clip has none
     # of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W)
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
-
-    def step(self, frame: Frame) -> Tensor:
-        """Denoise the next frame: radiance (1, 3, H, W)."""
-        output, self.state = self.denoiser(frame, self.state)
-        return output
 
     def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
         """Add the panels of `frame`, which was denoised to `output`."""
@@ -111,7 +148,7 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
         wanted = channels | {*REFERENCE_CHANNELS, "albedo", "depth"} if has_reference and index in shown else channels
         frame = read_frame(clip, index, sorted(wanted))
         for view in views:
-            output = view.step(frame)
+            output, view.state = view.denoiser(frame, view.state)
             if index in shown:
                 view.keep(output, frame, clip.exposure)
         if has_reference and index in shown:

@@ -1,41 +1,28 @@
-"""The data of a clip on the report page: pictures as data URIs, curves, crops."""
+"""The data of the report page: pictures of a clip as data URIs, its curves and crops; quality against time."""
 
 import base64
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from eval.means import scores_of
 from eval.metrics import METRICS, flip_map
-from eval.results import ClipResults, error_path, folders_of, load_picture, picture_path
+from eval.results import ClipResults, by_signal, error_path, folders_of, load_picture, of_one_spp, picture_path
+from eval.tradeoff.trades import Times, dominated_by_name
+from models.spec import DenoiserSpec
 from plotting import Image
 from timing import thread_count, threads_for
 
 WITH_FLIP_MAPS = 1.4  # bytes of images and their FLIP maps over those of images
 BASE64 = 4 / 3  # bytes of text over those that it encodes
 MOST_CROPS = 3  # a clip
-
-
-@dataclass(frozen=True)
-class PageClip:
-    """A clip on the page."""
-
-    name: str
-    count: int  # number of its frames
-    frames: list[int]  # those with pictures
-    height: int
-    width: int
-    images: dict[str, list[str]]  # data URIs of the pictures of each denoiser and of the reference
-    flips: dict[str, list[str]]  # data URIs of each denoiser's FLIP maps
-    errors: dict[str, list[str]]  # data URIs of the maps of estimated errors, of denoisers that have them
-    # each metric in all frames, of each denoiser, and as the reference's its noise floor
-    curves: dict[str, dict[str, list[float | None]]]
-    crops: list[dict[str, int]]  # the windows with most disocclusions
+PLOTTED = ("flip", "rmse", "ssim", "psnr", "temporal_error")  # against time; the page opens with the first
 
 
 def data_uri(content: bytes, kind: str) -> str:
@@ -71,19 +58,14 @@ def chosen_crops(clip: ClipResults, frames: Sequence[int]) -> list[dict[str, int
 
 
 def curves_of(clip: ClipResults) -> dict[str, dict[str, list[float | None]]]:
-    """The values of all denoisers and the noise floors, for each metric that is defined in any frame."""
-    defined = [
-        metric
-        for metric in METRICS
-        if any(values.get(metric) is not None for result in clip.results for values in result.frames)
-    ]
-    return {
-        metric: {
-            result.denoiser: [four_digits(values.get(metric)) for values in result.frames]
-            for result in (*clip.results, clip.reference)
-        }
-        for metric in defined
-    }
+    """The values of all denoisers and, as the reference's, the noise floors, by metrics that any frame defines."""
+    curves = {}
+    for metric in METRICS:
+        values = {r.denoiser: [four_digits(frame.get(metric)) for frame in r.frames] for r in clip.results}
+        if any(value is not None for frames in values.values() for value in frames):
+            floors = [four_digits(frame.get(metric)) for frame in clip.reference.frames]
+            curves[metric] = values | {clip.reference.denoiser: floors}
+    return curves
 
 
 def error_maps(folder: Path, frames: Sequence[int]) -> list[str]:
@@ -92,7 +74,7 @@ def error_maps(folder: Path, frames: Sequence[int]) -> list[str]:
     return [data_uri(path.read_bytes(), "webp") for path in paths] if all(path.exists() for path in paths) else []
 
 
-def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
+def page_clip(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
     """The data of a clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
     folders = folders_of(runs, clip)
     count = len(clip.reference.frames)
@@ -109,15 +91,41 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
             for name, maps in flips.items():
                 errors = flip_map(load_picture(folders[name], index) / 255, reference / 255)
                 maps.append(webp_uri((255 * errors + 0.5).astype(np.uint8)))
-    return PageClip(
-        name=clip.name,
-        count=count,
-        frames=[*frames],
-        height=height,
-        width=width,
-        images=images,
-        flips=flips,
-        errors={name: maps for name, folder in folders.items() if (maps := error_maps(folder, frames))},
-        curves=curves_of(clip),
-        crops=chosen_crops(clip, frames),
-    )
+    return {
+        "name": clip.name,
+        "count": count,
+        "frames": [*frames],  # those with pictures, of all `count`
+        "height": height,
+        "width": width,
+        "images": images,  # by denoiser, and that of the reference
+        "flips": flips,
+        "errors": {name: maps for name, folder in folders.items() if (maps := error_maps(folder, frames))},
+        "curves": curves_of(clip),
+        "crops": chosen_crops(clip, frames),
+    }
+
+
+def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, Any]]:
+    """Plots of the mean of a metric against milliseconds, for each signal and metric, over the clips of 1 spp.
+
+    Denoisers count with the time of the precision in which they were evaluated; those without a time or value are
+    `missing`. Points are sorted, fastest first. `by` is the name that dominates a point; None on the Pareto front.
+    """
+    height, width = times.size
+    plots = []
+    for signal, ours in by_signal(of_one_spp(clips)).items():
+        specs = {
+            r.denoiser: DenoiserSpec.named(r.denoiser, signal=signal, precision=r.precision) for r in ours[0].results
+        }
+        ms = {name: times.of(spec) for name, spec in specs.items()}
+        scores = {name: scores_of(ours, name) for name in specs}
+        for metric in PLOTTED:
+            by = dominated_by_name({name: (ms[name], scores[name].compared(metric)) for name in specs}, metric)
+            points = [
+                {"name": name, "ms": ms[name], "quality": scores[name].means[metric], "by": by[name]}
+                for name in sorted(by, key=ms.__getitem__)
+            ]
+            missing = [name for name in specs if name not in by]
+            plot = {"signal": signal, "metric": metric, "points": points, "missing": missing}
+            plots += [plot | {"size": f"{width} × {height}"}] if points else []
+    return plots

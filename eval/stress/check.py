@@ -1,7 +1,7 @@
 """One denoiser in one stress case: its errors, and the requirements that it breaks."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +10,22 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.bench.timed import network_of
-from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, StressCase
-from eval.stress.changes import FrameChange, PixelChange, unchanged
-from eval.stress.irradiance_range import ROUNDING, range_violation
+from eval.bench.denoisers import network_of
+from eval.stress.cases import (
+    NOISE_PERIOD,
+    RECOVERY_LIMIT,
+    SPOILED_FRAME,
+    FrameChange,
+    PixelChange,
+    StressCase,
+    unchanged,
+)
 from models.denoiser import Denoiser
+from models.operators import finite
 from models.spec import PRECISIONS
 
+ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
+MIN_LIMIT = 1e-30  # ends of the range of irradiance below it are not divided by
 MAX_RESIDUE = 1e-3  # of the brightest pixel: smaller changes count as none
 ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by its power of 5 alone
 ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
@@ -44,8 +53,7 @@ def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
 
 def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
     """Where all the named channels, and both buffers of each, are finite, (H, W)."""
-    finite = [torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]
-    return torch.cat(finite).all(dim=0)
+    return torch.cat([torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]).all(dim=0)
 
 
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
@@ -56,13 +64,54 @@ def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[T
 
 def largest_finite(errors: Iterable[Tensor]) -> float | None:
     """The largest finite value; None without any."""
-    finite = [error[torch.isfinite(error)] for error in errors]
-    return max((float(error.max()) for error in finite if len(error)), default=None)
+    values = [error[torch.isfinite(error)] for error in errors]
+    return max((float(each.max()) for each in values if len(each)), default=None)
 
 
-def max_residue(precision: str) -> float:
-    """The largest change, relative to the brightest pixel, that counts as none in a precision of PRECISIONS."""
-    return max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
+class IrradianceRange:
+    """The range of surfaces' irradiance since the first frame, for each colour.
+
+    For a filter that `separates_lights`, the limits are the sums of those of direct and indirect light.
+    """
+
+    def __init__(self, separates_lights: bool):
+        self.separate = separates_lights
+        self.low = torch.tensor(torch.inf)
+        self.high = torch.tensor(-torch.inf)
+
+    def add(self, frame: Frame) -> None:
+        parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
+        irradiance = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
+        surface = frame.depth > 0
+        self.low = torch.minimum(self.low, torch.where(surface, irradiance, torch.inf).amin((2, 3)))
+        self.high = torch.maximum(self.high, torch.where(surface, irradiance, -torch.inf).amax((2, 3)))
+
+    def violation(self, frame: Frame, output: Tensor) -> float:
+        """How far radiance `output` (3, H, W) of surfaces is outside, relative to the limit; at most 0 inside."""
+        irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, frame.depth[0, 0] > 0]
+        if irradiance.numel() == 0:
+            return 0.0
+        low = self.low.sum(dim=0)
+        high = self.high.sum(dim=0)
+        above = (irradiance.amax(dim=1) - high) / high.clamp(min=MIN_LIMIT)
+        below = (low - irradiance.amin(dim=1)) / low.clamp(min=MIN_LIMIT)
+        return float(torch.maximum(above, below).max())
+
+
+def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
+    """The largest distance of `outputs` (3, H, W) from their range; 0 inside.
+
+    Relative to the range's end for a convex filter; for others the absolute value below 0. Values that are not finite
+    count as 0.
+    """
+    if not denoiser.convex:
+        return max(0.0, *(-float(finite(output).min()) for output in outputs))
+    irradiance_range = IrradianceRange(denoiser.separates_lights)
+    largest = 0.0
+    for frame, output in zip(frames, outputs, strict=True):
+        irradiance_range.add(frame.finite())
+        largest = max(largest, irradiance_range.violation(frame.finite(), output))
+    return largest
 
 
 def last_layers(denoiser: Denoiser) -> list[nn.Module]:
@@ -74,11 +123,8 @@ def last_layers(denoiser: Denoiser) -> list[nn.Module]:
 
 
 @contextmanager
-def largest_logits(denoiser: Denoiser, size: float | None) -> Iterator[None]:
-    """Scale the logits so that the largest of each frame is `size`, unless that is None."""
-    if size is None:
-        yield
-        return
+def largest_logits(denoiser: Denoiser, size: float) -> Iterator[None]:
+    """Scale the logits so that the largest of each frame is `size`."""
 
     def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
         logits = output.float()  # the factor may overflow half precision
@@ -117,7 +163,7 @@ class StressCheck:
         self.case = case
         self.denoiser = build(case.precision)
         self.frames = list(case.frames())
-        with largest_logits(self.denoiser, case.logits):
+        with nullcontext() if case.logits is None else largest_logits(self.denoiser, case.logits):
             self.outputs = denoise(self.denoiser, self.frames)
 
     def errors(self) -> list[Tensor]:
@@ -145,7 +191,7 @@ class StressCheck:
 
     def recovery(self, errors: Sequence[Tensor]) -> int | None:
         """Frames from the bad pixel until its last effect; None for more than RECOVERY_LIMIT."""
-        limit = max_residue(self.case.precision)
+        limit = max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[self.case.precision]).eps)
         changed = [index for index, error in enumerate(errors) if not (error <= limit).all()]  # NaN is a change, too
         frames = changed[-1] + 1 - SPOILED_FRAME if changed else 0
         return frames if frames <= RECOVERY_LIMIT else None

@@ -12,12 +12,18 @@ from PIL import Image
 
 from command_line import main
 from errors import BadInput
-from eval.stress.cases import LONG_CASE, NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
-from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
-from eval.stress.check import FRESH, MAX_RESIDUE, StressCheck, StressRow, largest_logits, last_layers
-from eval.stress.irradiance_range import IrradianceRange
-from eval.stress.run import applies, cases_in, check_all, stressed, weights_label
-from eval.stress.tables import heat_map, verdict_text
+from eval.stress.cases import (
+    LIGHT_CHANNELS,
+    LONG_CASE,
+    NOISE_PERIOD,
+    RECOVERY_LIMIT,
+    SPOILED_FRAME,
+    STRESS_CASES,
+    SURFACE_CHANNELS,
+    StressCase,
+)
+from eval.stress.check import FRESH, MAX_RESIDUE, IrradianceRange, StressCheck, StressRow, largest_logits, last_layers
+from eval.stress.run import applies, cases_in, check_all, heat_map, stressed, verdict_text, weights_label
 from models import registry
 from models.denoiser import Denoiser, State
 from models.spec import DenoiserSpec

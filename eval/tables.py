@@ -1,16 +1,33 @@
-"""The report's table: means over clips and each clip, with noise floors."""
+"""Results as tables: means over clips and each clip, with noise floors; values within their noise floor are marked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from tabulate import tabulate
+
 from errors import BadInput
-from eval.means import mean_floor, scores_of
+from eval.means import AGES, mean_floor, means_by_age, scores_of
 from eval.metrics import METRICS, Values, within_floor
 from eval.results import FLOOR, ClipResults, by_signal, of_one_spp, results_of
-from eval.text_table import floor_cell, value_cell
 from models.registry import prototype
 
+PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
+NEAR_FLOOR = "≈"
+LEGEND = f"{NEAR_FLOOR} within the noise floor: as close to the truth as the reference; differences are not significant"
 MEAN = "mean of clips of 1 spp"  # instead of a clip's name
+
+
+def value_cell(metric: str, value: float | None, floor: float | None = None) -> str:
+    """A number, marked if it is within its noise floor."""
+    if value is None:
+        return "-"
+    mark = NEAR_FLOOR if within_floor(metric, value, floor) else ""
+    return mark + METRICS[metric].form.format(value)
+
+
+def with_legend(table: str) -> str:
+    """The table, with an explanation of the marks below it if there are any."""
+    return f"{table}\n{LEGEND}" if NEAR_FLOOR in table else table
 
 
 @dataclass(frozen=True)
@@ -42,8 +59,12 @@ class TableRow:
             return "-"
 
     def text(self, metric: str) -> str:
+        """The value, marked if it is within its noise floor, or a noise floor that is a standard error."""
         value = self.values.get(metric)
-        return floor_cell(metric, value) if self.is_floor else value_cell(metric, value, self.floors.get(metric))
+        if not self.is_floor:
+            return value_cell(metric, value, self.floors.get(metric))
+        mark = "±" if METRICS[metric].floor_is_error and value is not None else ""
+        return mark + value_cell(metric, value)
 
     def near(self, metric: str) -> bool:
         """Whether the value is within its noise floor."""
@@ -91,3 +112,24 @@ def best_denoisers(rows: Sequence[TableRow], metric: str) -> set[str]:
     best = {name for name, rank in ranks.items() if rank == min(ranks.values())}
     near = {row.denoiser for row in rows if row.near(metric)}
     return best | near if best & near else best
+
+
+def results_table(clips: Sequence[ClipResults]) -> str:
+    """One row per clip, signal and denoiser, with the noise floor below each signal."""
+    lines = [
+        [row.clip, row.denoiser, row.signal, *map(row.text, PRINTED), "" if row.is_floor else row.nonfinite]
+        for clip in clips
+        for row in clip_rows(clip)
+    ]
+    head = ["clip", "denoiser", "signal", *(METRICS[metric].title for metric in PRINTED), "non-finite"]
+    return with_legend(tabulate(lines, head, disable_numparse=True))
+
+
+def table_by_age(clips: Sequence[ClipResults]) -> str:
+    """PSNR by the age of the history, the mean over clips, of each signal."""
+    tables = []
+    for signal, ours in by_signal(clips).items():
+        rows = means_by_age(ours)
+        lines = [[name, signal, *(value_cell("psnr", value) for value in row.values())] for name, row in rows.items()]
+        tables.append(tabulate(lines, ["PSNR dB", "signal", *AGES], disable_numparse=True))
+    return "\n\n".join(tables)
