@@ -16,9 +16,8 @@ from datasets.clip import Clip
 from datasets.frame import Frame, Signal, disoccluded, read_frame, to_tensor
 from datasets.tonemap import display
 from eval.comparison import Comparison, Luminances
-from eval.means import mean_floor, means
-from eval.metrics import Values, measure, noise_floors, temporal_error_floor
-from eval.results import MAX_SHOWN_ERROR, NOISE_FLOOR, Result, error_path, picture_path, result_key, save_picture
+from eval.metrics import Values, mean_floor, means, measure, noise_floors, temporal_error_floor
+from eval.results import MAX_SHOWN_ERROR, NOISE_FLOOR, Result, picture_path, result_key, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.wrappers.error_estimate import denoise_with_error
@@ -41,10 +40,6 @@ class NamedDenoiser:
     name: str
     saves_error: bool = False  # whether to store error maps, where it is a NAME+js and frames have two sample buffers
 
-    @property
-    def signal(self) -> Signal:
-        return self.spec.returns
-
     @cached_property
     def denoiser(self) -> Denoiser:
         """Built on first use: only if results are missing."""
@@ -58,7 +53,7 @@ class NamedDenoiser:
         """A digest of everything that determines its result on a clip."""
         facts = {
             "name": self.name,
-            "signal": self.signal,
+            "signal": self.spec.returns,
             "precision": self.spec.precision,
             "weights": self.weights_digest,
             "device": self.spec.device,
@@ -83,7 +78,7 @@ class DenoiserRun:
 
     @property
     def signal(self) -> Signal:
-        return self.evaluated.signal
+        return self.evaluated.spec.returns
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -195,4 +190,4 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
             image = display(finite(output), clip.exposure)
             save_picture(picture_path(folder, index), image[0].permute(1, 2, 0).numpy())
             if isinstance(run, DenoiserRun) and run.error is not None:
-                save_picture(error_path(folder, index), (run.error[0].numpy() / MAX_SHOWN_ERROR).clip(0, 1))
+                save_picture(picture_path(folder, index, "error-"), (run.error[0].numpy() / MAX_SHOWN_ERROR).clip(0, 1))

@@ -28,7 +28,6 @@ from eval.results import (
     is_finished,
     load_picture,
     load_result,
-    signal_label,
     write_results,
 )
 from eval.selection import evaluated, with_indirect_baselines
@@ -61,7 +60,7 @@ def named_denoisers(specs: Sequence[DenoiserSpec]) -> list[NamedDenoiser]:
 
 def runs_through(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path) -> dict[Path, Run]:
     """The runs of all denoisers, and of the references with which they are compared, by the folder of their results."""
-    present = {denoiser.signal for denoiser in denoisers}
+    present = {denoiser.spec.returns for denoiser in denoisers}
     all_runs: list[Run] = [DenoiserRun(denoiser) for denoiser in denoisers]
     all_runs += [ReferenceRun(signal) for signal in SIGNALS if signal in present]
     return {folder_of(runs, clip.scene, clip.name, run.name, run.signal): run for run in all_runs}
@@ -114,10 +113,8 @@ def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs
     work = partial(evaluate_in_worker, specs, runs, max(1, torch.get_num_threads() // processes))
     jobs = [(clip.path, clip.first_hits) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
-        for _ in tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"):
-            pass
-        for _ in tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"):
-            pass
+        list(tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"))
+        list(tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"))
 
 
 def strip(runs: Path, results: ClipResults) -> "Figure":
@@ -143,8 +140,7 @@ def save_strips(runs: Path, clips: Iterable[ClipResults]) -> None:
     from plotting import save_figure
 
     for clip in clips:
-        name = signal_label(f"{clip.scene}-{clip.clip}", clip.signal)
-        save_figure(runs / "eval" / f"{name}.png", strip(runs, clip))
+        save_figure(runs / "eval" / f"{clip.file_name}.png", strip(runs, clip))
 
 
 def evaluate(

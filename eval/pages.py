@@ -5,9 +5,10 @@ The text of a page between `<!-- measured: NAME ARGUMENT... -->` and `<!-- end -
 only rewrites the pages.
 """
 
+import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -16,11 +17,10 @@ from tabulate import tabulate
 
 from errors import BadInput
 from eval.bench.denoisers import BASELINE
-from eval.means import means, means_by_age
-from eval.metrics import METRICS, Values
+from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, by_signal, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, value_cell
+from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, means_by_age, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -35,13 +35,9 @@ SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
 # --- Extracts ---------------------------------------------------------------------------------------------------------
 
 
-def rounded(values: Any) -> Any:
+def rounded(content: Any) -> Any:
     """JSON content with numbers of nine digits: no second rounding changes what is printed."""
-    if isinstance(values, dict):
-        return {key: rounded(value) for key, value in values.items()}
-    if isinstance(values, list | tuple):
-        return [rounded(value) for value in values]
-    return float(f"{values:.9g}") if isinstance(values, float) else values
+    return json.loads(json.dumps(content), parse_float=lambda text: float(f"{float(text):.9g}"))
 
 
 def extract_eval(runs: Path) -> dict[str, Any]:
@@ -120,16 +116,17 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
 }
 
 
-def collect(runs: Path) -> Iterator[Path]:
-    """Extract what RUNS holds of EXTRACTS into docs/measured; yields the files."""
+def collect(runs: Path) -> None:
+    """Extract what RUNS holds of EXTRACTS into docs/measured; prints the files."""
     for name, (_, extract) in EXTRACTS.items():
         try:
             content = extract(runs)
         except BadInput as missing:
             print(f"{name}: not collected, {missing}")
             continue
-        write_json(MEASURED / f"{name}.json", rounded(content))
-        yield MEASURED / f"{name}.json"
+        path = MEASURED / f"{name}.json"
+        write_json(path, rounded(content))
+        print(path)
 
 
 # --- Tables and numbers -----------------------------------------------------------------------------------------------
@@ -330,8 +327,7 @@ def generated(page: str) -> str:
 
 def main(arguments: list[str]) -> None:
     for runs in arguments:
-        for path in collect(Path(runs)):
-            print(path)
+        collect(Path(runs))
     for page in PAGES:
         text = page.read_text()
         if (new := generated(text)) != text:

@@ -12,8 +12,9 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +51,9 @@ def folder_of(runs: Path, scene: str, clip: str, name: str, signal: str) -> Path
     return runs / "eval" / "clips" / f"{scene}-{clip}" / signal_label(name, signal)
 
 
-def picture_path(folder: Path, index: int) -> Path:
-    return folder / f"{index:04d}.webp"
-
-
-def error_path(folder: Path, index: int) -> Path:
-    return folder / f"error-{index:04d}.webp"
+def picture_path(folder: Path, index: int, kind: Literal["", "error-"] = "") -> Path:
+    """The file of a frame as displayed, or of its estimated error."""
+    return folder / f"{kind}{index:04d}.webp"
 
 
 def save_picture(path: Path, image: NDArray[np.floating]) -> None:
@@ -144,12 +142,12 @@ def write_results(
         "versions": versions(DENOISING),
         "rows": rows,
     }
-    write_file(runs / "eval" / FRAMES_FILE, frames_csv(results).encode())
+    write_frames(runs / "eval" / FRAMES_FILE, results)
     write_json(runs / "eval" / RESULTS_FILE, content)
     return content
 
 
-def frames_csv(results: list[Result]) -> str:
+def write_frames(path: Path, results: list[Result]) -> None:
     """One line per frame of each result; noise floors are the values of a denoiser named "(noise floor)"."""
     text = io.StringIO()
     lines = csv.DictWriter(text, [*KEYS, "frame", *METRICS], extrasaction="ignore", lineterminator="\n")
@@ -157,7 +155,7 @@ def frames_csv(results: list[Result]) -> str:
     for result in results:
         facts = {name: getattr(result, name) for name in KEYS} | ({"denoiser": FLOOR} if result.floor else {})
         lines.writerows(facts | {"frame": index} | values for index, values in enumerate(result.frames))
-    return text.getvalue()
+    write_file(path, text.getvalue().encode())
 
 
 @dataclass
@@ -169,6 +167,11 @@ class ClipResults:
     signal: Signal
     results: list[Result]  # of the denoisers
     reference: Result
+
+    @property
+    def file_name(self) -> str:
+        """Its name in those of files."""
+        return signal_label(f"{self.scene}-{self.clip}", self.signal)
 
     @property
     def name(self) -> str:
@@ -183,15 +186,11 @@ def folders_of(runs: Path, clip: ClipResults) -> dict[str, Path]:
 
 def by_clip(results: list[Result]) -> Iterator[ClipResults]:
     """The results of each clip and signal, in their order."""
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for result in results:
-        groups.setdefault((result.scene, result.clip), []).append(result)
-    for (scene, clip), group in groups.items():
-        for signal in SIGNALS:
-            ours = [result for result in group if result.signal == signal]
-            if references := [result for result in ours if result.floor]:
-                denoisers = [result for result in ours if not result.floor]
-                yield ClipResults(scene, clip, signal, denoisers, references[0])
+    for (scene, clip), signal in product(dict.fromkeys((result.scene, result.clip) for result in results), SIGNALS):
+        ours = [result for result in results if (result.scene, result.clip, result.signal) == (scene, clip, signal)]
+        if references := [result for result in ours if result.floor]:
+            denoisers = [result for result in ours if not result.floor]
+            yield ClipResults(scene, clip, signal, denoisers, references[0])
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:

@@ -1,13 +1,13 @@
-"""Results as tables: means over clips and each clip, with noise floors; values within their noise floor are marked."""
+"""Means of results over clips, and tables of results, in which values within their noise floor are marked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 
 from tabulate import tabulate
 
 from errors import BadInput
-from eval.means import AGES, mean_floor, means_by_age, scores_of
-from eval.metrics import METRICS, Values, within_floor
+from eval.metrics import METRICS, Values, mean_floor, means, within_floor
 from eval.results import FLOOR, ClipResults, by_signal, of_one_spp, results_of
 from models.registry import prototype
 
@@ -15,6 +15,60 @@ PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "di
 NEAR_FLOOR = "≈"
 LEGEND = f"{NEAR_FLOOR} within the noise floor: as close to the truth as the reference; differences are not significant"
 MEAN = "mean of clips of 1 spp"  # instead of a clip's name
+# A recurrent denoiser has no history in the first frame, some in the fifth, and is steady from the 16th on.
+AGES = {"first frame": slice(0, 1), "fifth": slice(4, 5), "from the 16th on": slice(15, None)}
+
+
+def means_by_age(clips: Sequence[ClipResults], metric: str = "psnr") -> dict[str, dict[str, float | None]]:
+    """A metric of each denoiser by AGES, the mean over clips of one signal; None where no clip is that long."""
+    rows: dict[str, dict[str, float | None]] = {}
+    for denoiser in dict.fromkeys(result.denoiser for clip in clips for result in clip.results):
+        results = results_of(clips, denoiser)
+        for age, frames in AGES.items():
+            chosen = [means(result.frames[frames])[metric] for result in results if result.frames[frames]]
+            values = [value for value in chosen if value is not None]
+            rows.setdefault(denoiser, {})[age] = fmean(values) if values else None
+    return rows
+
+
+@dataclass(frozen=True)
+class ClipScores:
+    """A denoiser's metrics on several clips, and the noise floors of these."""
+
+    values: list[Values]
+    floors: list[Values]
+
+    @property
+    def means(self) -> Values:
+        return means(self.values)
+
+    @property
+    def joint_floor(self) -> Values:
+        """Noise floors of the means; None unless every clip is within its own floor."""
+
+        def near(metric: str) -> bool:
+            pairs = ((v.get(metric), f.get(metric)) for v, f in zip(self.values, self.floors, strict=True))
+            return all(within_floor(metric, value, floor) for value, floor in pairs if value is not None)
+
+        return {metric: floor if near(metric) else None for metric, floor in mean_floor(self.floors).items()}
+
+    def compared(self, metric: str) -> float | None:
+        """The mean, in the digits shown, by which denoisers are ranked.
+
+        The value of a clip within its noise floor is replaced by the floor's edge. None where it is never defined.
+        """
+        values = []
+        for value, floor in ((c[metric], f.get(metric)) for c, f in zip(self.values, self.floors, strict=True)):
+            if value is not None:
+                near = floor is not None and within_floor(metric, value, floor)
+                values.append(METRICS[metric].edge(floor) if near else value)  # type: ignore[arg-type]
+        return float(METRICS[metric].form.format(fmean(values))) if values else None
+
+
+def scores_of(clips: Sequence[ClipResults], denoiser: str) -> ClipScores:
+    """The denoiser's scores on those of the clips, all of one signal, that have results of it."""
+    pairs = [(result, clip.reference) for clip in clips for result in clip.results if result.denoiser == denoiser]
+    return ClipScores([result.metrics for result, _ in pairs], [reference.metrics for _, reference in pairs])
 
 
 def value_cell(metric: str, value: float | None, floor: float | None = None) -> str:
@@ -75,7 +129,11 @@ def table_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
     """Means over the clips of 1 spp, if there are several, then the rows of each clip."""
     groups = [mean_rows(ours) for ours in by_signal(of_one_spp(clips)).values() if len(ours) > 1]
     groups += [clip_rows(clip) for clip in clips]
-    return [row for rows in groups for row in with_best(rows)]
+    marked = []
+    for rows in groups:
+        best = {metric: best_denoisers(rows, metric) for metric in METRICS}
+        marked += [replace(row, best=frozenset(key for key in METRICS if row.denoiser in best[key])) for row in rows]
+    return marked
 
 
 def clip_rows(clip: ClipResults) -> list[TableRow]:
@@ -96,12 +154,6 @@ def mean_rows(clips: Sequence[ClipResults]) -> list[TableRow]:
         rows.append(TableRow(MEAN, name, signal, scores.means, scores.joint_floor, nonfinite))
     floor = mean_floor([clip.reference.metrics for clip in clips])
     return [*rows, TableRow(MEAN, FLOOR, signal, floor, floor)]
-
-
-def with_best(rows: Sequence[TableRow]) -> list[TableRow]:
-    """The rows of one clip and signal, with `best` set."""
-    best = {metric: best_denoisers(rows, metric) for metric in METRICS}
-    return [replace(row, best=frozenset(key for key in METRICS if row.denoiser in best[key])) for row in rows]
 
 
 def best_denoisers(rows: Sequence[TableRow], metric: str) -> set[str]:

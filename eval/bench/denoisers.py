@@ -49,8 +49,7 @@ def parse_size(text: str) -> Size:
 
 def size_name(size: Size) -> str:
     """The inverse of parse_size: "1280x720" of (720, 1280)."""
-    height, width = size
-    return f"{width}x{height}"
+    return f"{size[1]}x{size[0]}"
 
 
 def thread_counts(threads: Sequence[int]) -> list[int]:
@@ -318,7 +317,6 @@ def measure_rows(
 
 
 def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
-    """The lines of the table."""
     baselines = {row.conditions: row.ms_median for row in rows if row.denoiser == BASELINE}
     for row in rows:
         baseline = baselines.get(row.conditions)

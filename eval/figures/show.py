@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
-from datasets.frame import Frame, Signal, read_frame
+from datasets.frame import Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
 from eval.selection import evaluated
@@ -70,13 +70,7 @@ def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
     """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    image: NDArray[np.floating] = display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
-    return image
-
-
-def reference_of(frame: Frame, signal: Signal) -> Tensor:
-    """Reference radiance (1, 3, H, W) of a signal: the mean of its buffers, with emission for "total"."""
-    return frame.remodulate(frame.reference_irradiance(signal), signal)
+    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
 
 
 @dataclass
@@ -97,7 +91,8 @@ class DenoiserView:
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
         if frame.channels.keys() >= set(REFERENCE_CHANNELS):
-            difference = image - as_displayed(reference_of(frame, signal), exposure)
+            reference = frame.remodulate(frame.reference_irradiance(signal), signal)
+            difference = image - as_displayed(reference, exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
             self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=BRIGHTEST_DIFFERENCE))
@@ -112,8 +107,7 @@ class DenoiserView:
         """A column for each picture of the state, with one colour scale for all frames."""
         columns = []
         for name, images in self.pictures.items():
-            low = float(np.min(images))
-            high = float(np.max(images))
+            low, high = float(np.min(images)), float(np.max(images))
             columns.append([Panel(image, name, low, high) for image in images])
         return columns
 
@@ -152,7 +146,8 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
             if index in shown:
                 view.keep(output, frame, clip.exposure)
         if has_reference and index in shown:
-            references.append(Panel(as_displayed(reference_of(frame, "total"), clip.exposure), "reference"))
+            reference = frame.remodulate(frame.reference_irradiance("total"), "total")
+            references.append(Panel(as_displayed(reference, clip.exposure), "reference"))
     return views, references
 
 

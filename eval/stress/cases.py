@@ -32,7 +32,7 @@ SURFACE_CHANNELS = channels_of("surface", "motion", "hit")
 LENGTHS = tuple(name for name in SURFACE_CHANNELS if CHANNELS[name].unit == LENGTH)
 
 
-def unchanged(frame: Frame) -> Frame:
+def as_is(frame: Frame) -> Frame:
     return frame
 
 
@@ -50,10 +50,8 @@ def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
     """Set channels to a constant; a tuple has one value per component."""
 
     def change(frame: Frame) -> Frame:
-        tensors = {name: torch.zeros_like(frame.channels[name]) for name in values}
-        for name, value in values.items():
-            tensors[name] += torch.tensor(value).view(-1, 1, 1)
-        return frame.with_channels(tensors)
+        constants = {name: torch.tensor(value).view(-1, 1, 1) for name, value in values.items()}
+        return frame.with_channels({name: torch.zeros_like(frame.channels[name]) + constants[name] for name in values})
 
     return change
 
@@ -61,11 +59,6 @@ def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
 def ramp(frame: Frame, low: float, high: float) -> Tensor:
     """(W,) values from `low` at the left to `high` at the right, evenly spaced in the logarithm."""
     return torch.logspace(math.log10(low), math.log10(high), frame.size[1])
-
-
-def dim_to_bright(frame: Frame) -> Frame:
-    """Irradiance from 1e-7 to 6e4 across the image."""
-    return scaled(frame, LIGHT_CHANNELS, ramp(frame, 1e-7, 6e4))
 
 
 def near_to_far(frame: Frame) -> Frame:
@@ -130,8 +123,8 @@ class StressCase:
     """
 
     name: str
-    surfaces: FrameChange = unchanged  # change of the surfaces before they are lit
-    change: FrameChange = unchanged  # change of the lit frames, of all or `only` of that index
+    surfaces: FrameChange = as_is  # change of the surfaces before they are lit
+    change: FrameChange = as_is  # change of the lit frames, of all or `only` of that index
     only: int | None = None
     size: Size = CASE_SIZE
     frame_count: int = CASE_FRAMES  # of the sequence; the first `even_frames` of them are free of noise
@@ -178,7 +171,7 @@ STRESS_CASES = (
     bad_pixel("a firefly of 65504", 65504, (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values())),
     StressCase("radiance 1e-7", change=light_times(1e-7), compare_with="own", gain=1e-7),
     StressCase("radiance 6e4", change=light_times(6e4), compare_with="own", gain=6e4),
-    StressCase("radiance 1e-7 to 6e4", change=dim_to_bright),
+    StressCase("radiance 1e-7 to 6e4", change=lambda frame: scaled(frame, LIGHT_CHANNELS, ramp(frame, 1e-7, 6e4))),
     bad_pixel("NaN in a pixel's light", math.nan, LIGHT_CHANNELS),
     bad_pixel("Inf in a pixel's light", math.inf, LIGHT_CHANNELS),
     bad_pixel("NaN in a pixel's surface", math.nan, SURFACE_CHANNELS),

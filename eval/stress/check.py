@@ -11,15 +11,7 @@ from tqdm import tqdm
 
 from datasets.frame import Frame
 from eval.bench.denoisers import network_of
-from eval.stress.cases import (
-    NOISE_PERIOD,
-    RECOVERY_LIMIT,
-    SPOILED_FRAME,
-    FrameChange,
-    PixelChange,
-    StressCase,
-    unchanged,
-)
+from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, FrameChange, PixelChange, StressCase, as_is
 from models.denoiser import Denoiser
 from models.operators import finite
 from models.spec import PRECISIONS
@@ -51,66 +43,35 @@ def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
     return outputs
 
 
-def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
-    """Where all the named channels, and both buffers of each, are finite, (H, W)."""
-    return torch.cat([torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]).all(dim=0)
-
-
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
     """Absolute differences (3, H, W), relative to the brightest expected pixel of the frame unless that is black."""
     pairs = zip(outputs, expected, strict=True)
     return [(a - b).abs() / (float(b.max()) if b.max() > BLACK_BELOW else 1) for a, b in pairs]
 
 
-def largest_finite(errors: Iterable[Tensor]) -> float | None:
-    """The largest finite value; None without any."""
-    values = [error[torch.isfinite(error)] for error in errors]
-    return max((float(each.max()) for each in values if len(each)), default=None)
-
-
-class IrradianceRange:
-    """The range of surfaces' irradiance since the first frame, for each colour.
-
-    For a filter that `separates_lights`, the limits are the sums of those of direct and indirect light.
-    """
-
-    def __init__(self, separates_lights: bool):
-        self.separate = separates_lights
-        self.low = torch.tensor(torch.inf)
-        self.high = torch.tensor(-torch.inf)
-
-    def add(self, frame: Frame) -> None:
-        parts = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
-        irradiance = torch.cat(parts if self.separate else [frame.irradiance("total")]).double()
-        surface = frame.depth > 0
-        self.low = torch.minimum(self.low, torch.where(surface, irradiance, torch.inf).amin((2, 3)))
-        self.high = torch.maximum(self.high, torch.where(surface, irradiance, -torch.inf).amax((2, 3)))
-
-    def violation(self, frame: Frame, output: Tensor) -> float:
-        """How far radiance `output` (3, H, W) of surfaces is outside, relative to the limit; at most 0 inside."""
-        irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, frame.depth[0, 0] > 0]
-        if irradiance.numel() == 0:
-            return 0.0
-        low = self.low.sum(dim=0)
-        high = self.high.sum(dim=0)
-        above = (irradiance.amax(dim=1) - high) / high.clamp(min=MIN_LIMIT)
-        below = (low - irradiance.amin(dim=1)) / low.clamp(min=MIN_LIMIT)
-        return float(torch.maximum(above, below).max())
-
-
 def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
-    """The largest distance of `outputs` (3, H, W) from their range; 0 inside.
+    """The largest distance of radiance `outputs` (3, H, W) from their range; 0 inside.
 
-    Relative to the range's end for a convex filter; for others the absolute value below 0. Values that are not finite
-    count as 0.
+    For convex filters, surfaces' irradiance stays within that of all frames so far, for each colour; where a filter
+    `separates_lights`, within the sums of the limits of direct and indirect light. The distance is relative to the
+    range's end. For others it is the absolute value below 0. Values that are not finite count as 0.
     """
     if not denoiser.convex:
         return max(0.0, *(-float(finite(output).min()) for output in outputs))
-    irradiance_range = IrradianceRange(denoiser.separates_lights)
+    low, high = torch.tensor(torch.inf), torch.tensor(-torch.inf)
     largest = 0.0
-    for frame, output in zip(frames, outputs, strict=True):
-        irradiance_range.add(frame.finite())
-        largest = max(largest, irradiance_range.violation(frame.finite(), output))
+    for frame, output in zip((frame.finite() for frame in frames), outputs, strict=True):
+        apart = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
+        noisy = torch.cat(apart if denoiser.separates_lights else [frame.irradiance("total")]).double()
+        surface = frame.depth > 0
+        low = torch.minimum(low, torch.where(surface, noisy, torch.inf).amin((2, 3)))
+        high = torch.maximum(high, torch.where(surface, noisy, -torch.inf).amax((2, 3)))
+        irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, surface[0, 0]]
+        if irradiance.numel():
+            least, most = low.sum(dim=0), high.sum(dim=0)
+            above = (irradiance.amax(dim=1) - most) / most.clamp(min=MIN_LIMIT)
+            below = (least - irradiance.amin(dim=1)) / least.clamp(min=MIN_LIMIT)
+            largest = max(largest, float(torch.maximum(above, below).max()))
     return largest
 
 
@@ -175,7 +136,7 @@ class StressCheck:
             half = len(self.outputs) // 2  # averages have converged by then
             return differences(self.outputs[-NOISE_PERIOD:], self.outputs[half - NOISE_PERIOD : half])
         other = self.denoiser if self.case.compare_with == "own" else self.build("float32")
-        expected = denoise(other, self.case.frames(unchanged))
+        expected = denoise(other, self.case.frames(as_is))
         return differences(self.outputs, [self.case.gain * output for output in expected])
 
     def spreads(self, pixel: PixelChange) -> bool:
@@ -184,7 +145,7 @@ class StressCheck:
         def spoiled_output(change: FrameChange) -> Tensor:
             return denoise(self.denoiser, list(self.case.frames(change))[: SPOILED_FRAME + 1])[-1]
 
-        clean = spoiled_output(unchanged)
+        clean = spoiled_output(as_is)
         depends = [(spoiled_output(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY_VALUES]
         changed = (self.outputs[SPOILED_FRAME] != clean).any(dim=0)  # NaN is a change, too
         return bool((changed & ~torch.stack(depends).any(dim=0)).any())
@@ -199,8 +160,10 @@ class StressCheck:
     def row(self, denoiser: str, weights: str | None) -> StressRow:
         """The results under the denoiser's name, with the file of its weights."""
         errors = self.errors()
+        finite_errors = torch.cat([error[torch.isfinite(error)] for error in errors])
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
-        good_input = [finite_pixels(frame, self.denoiser.reads) for frame in self.frames]
+        inputs = ([frame.channels[name][0].flatten(0, -3) for name in self.denoiser.reads] for frame in self.frames)
+        good_input = [torch.isfinite(torch.cat(tensors)).all(dim=0) for tensors in inputs]
         violation = range_violation(self.denoiser, self.frames, self.outputs)
         recovery = self.recovery(errors) if self.case.only is not None else None
         poison = self.case.poison
@@ -214,7 +177,7 @@ class StressCheck:
             denoiser,
             weights,
             self.case.name,
-            error=largest_finite(errors),
+            error=float(finite_errors.max()) if len(finite_errors) else None,
             nonfinite=sum(int(where.sum()) for where in bad),
             violation=violation,
             recovery=recovery,

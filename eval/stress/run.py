@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from eval.selection import cannot_run, choose, untrained, weights_file
 from eval.stress.cases import LONG_CASE, RECOVERY_LIMIT, STRESS_CASES, StressCase
 from eval.stress.check import FRESH, REQUIREMENTS, StressCheck, StressRow, last_layers
 from files import write_file, write_json
-from models.denoiser import Denoiser
 from models.registry import DENOISERS, DenoiserName, create
 from models.spec import DenoiserSpec, precisions_of
 from plotting import Figure, plt, save_figure
@@ -58,10 +57,6 @@ def cases_in(precision: str, long: bool) -> list[StressCase]:
     return [replace(case, precision=precision) for case in cases if case.compare_with != "float32"]
 
 
-def build_in(spec: DenoiserSpec, precision: str) -> Denoiser:
-    return replace(spec, precision=precision).build()
-
-
 @torch.no_grad()
 def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> list[StressRow]:
     """Run every denoiser in every case that applies to it, on one thread, for images are too small for more."""
@@ -69,7 +64,7 @@ def check_all(specs: Sequence[DenoiserSpec], cases: Sequence[StressCase]) -> lis
     rows = []
     with thread_count(1), tqdm(total=sum(map(len, applying.values())), desc="stress", leave=False) as progress:
         for spec, ours in applying.items():
-            build = cache(partial(build_in, spec))
+            build = cache(lambda precision, spec=spec: replace(spec, precision=precision).build())
             for case in ours:
                 progress.set_postfix_str(f"{spec.name}: {case.name}")
                 rows.append(StressCheck(build, case).row(spec.name, weights_label(spec)))
@@ -91,22 +86,16 @@ def recovery_time(row: StressRow, case: StressCase) -> str:
     return f"> {RECOVERY_LIMIT}" if row.recovery is None else str(row.recovery)
 
 
-def error_cell(row: StressRow | None) -> str:
-    """The largest error, with a ! where a requirement is broken; empty where the case does not apply."""
-    if row is None:
-        return ""
-    return short(row.error) + (" !" if row.broken else "")
-
-
 def error_table(rows: Sequence[StressRow], cases: Sequence[StressCase]) -> str:
-    """One column per denoiser: its error in each case, and a summary of the rest."""
+    """One column per denoiser: its error in each case that applies, ! where it breaks a requirement, and a summary."""
     weights = {row.denoiser: row.weights for row in rows}
     by_case = {(row.denoiser, row.extreme): row for row in rows}
+    errors = {key: short(row.error) + (" !" if row.broken else "") for key, row in by_case.items()}
     by_denoiser = {name: [row for row in rows if row.denoiser == name] for name in weights}
 
     cells = {None: "-", FRESH: FRESH}
     lines = [["weights", *(cells.get(file, "trained") for file in weights.values())]]
-    lines += [[case.name, *(error_cell(by_case.get((name, case.name))) for name in weights)] for case in cases]
+    lines += [[case.name, *(errors.get((name, case.name), "") for name in weights)] for case in cases]
     for case in cases:
         if case.only is not None:
             times = [recovery_time(by_case[name, case.name], case) for name in weights]

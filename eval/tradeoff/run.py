@@ -119,9 +119,8 @@ def results_by_spp(
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
-        results[spp] += evaluate_clip(
-            with_samples(clip, dataset, spp, folder / "data", with_buffers), denoisers, folder
-        )
+        fed = with_samples(clip, dataset, spp, folder / "data", with_buffers)
+        results[spp] += evaluate_clip(fed, denoisers, folder)
     return {spp: list(by_clip(ours)) for spp, ours in results.items()}
 
 

@@ -10,10 +10,9 @@ from tabulate import tabulate
 from datasets.frame import Signal
 from errors import BadInput
 from eval.bench.denoisers import Size, results_file, size_name
-from eval.means import scores_of
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.tables import value_cell, with_legend
+from eval.tables import scores_of, value_cell, with_legend
 from files import read_json
 from models.spec import DenoiserSpec
 

@@ -20,8 +20,7 @@ from errors import BadInput
 from eval.clip_run import densest_crop
 from eval.harness import evaluate_clip, named_denoisers
 from eval.metrics import METRICS, flip_map
-from eval.report.page import report
-from eval.report.page_data import page_clip
+from eval.report.page import page_clip, report
 from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_picture, load_result
 from eval.tables import TableRow, best_denoisers
 from eval.tradeoff.samples import with_samples

@@ -12,9 +12,9 @@ import torch
 from datasets.clip import Dataset
 from eval import clip_run, harness
 from eval.harness import evaluate
-from eval.means import means_by_age
 from eval.metrics import METRICS
 from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
+from eval.tables import means_by_age
 from models.registry import create
 from models.weights import save_weights
 from train.task import run_folder

@@ -11,10 +11,10 @@ from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from eval.harness import clips_of_one_spp
-from eval.means import ClipScores
 from eval.metrics import METRICS
-from eval.report.page_data import trade_plots
+from eval.report.page import trade_plots
 from eval.results import NOISE_FLOOR, ClipResults, Result
+from eval.tables import ClipScores
 from eval.tradeoff.run import candidates, check_levels, draw_samples, trade
 from eval.tradeoff.samples import fit_cost, rendered, sample_cost, scene_of, with_samples
 from eval.tradeoff.trades import Times, Trade, dominated_by_name, trades
