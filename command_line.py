@@ -306,13 +306,13 @@ def denoise(job: Annotated[Job, arg(name="")], runs: Runs = RUNS, threads: Threa
     Layers are recognised by common names, the motion vectors' convention by trial; both are printed first.
     """
     from denoise.run import denoise as denoise_sequence
-    from eval.bench.sizes import threads_or_all
+    from eval.bench.denoisers import thread_counts
     from eval.selection import weights_of
     from models.registry import parse_name
     from timing import thread_count
 
     weights = job.weights or weights_of(parse_name(job.denoiser), runs)
-    with thread_count(threads_or_all(threads)):
+    with thread_count(thread_counts(() if threads is None else (threads,))[-1]):
         denoise_sequence(replace(job, weights=weights))
 
 

@@ -1,10 +1,10 @@
 """Runs of denoisers and of the reference through one clip, measured frame by frame."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,9 +16,8 @@ from datasets.clip import Clip
 from datasets.frame import Frame, Signal, disoccluded, read_frame, to_tensor
 from datasets.tonemap import display
 from eval.comparison import Comparison, Luminances
-from eval.means import mean_floor, means
-from eval.metrics import Values, measure, noise_floors, temporal_error_floor
-from eval.results import NOISE_FLOOR, Result, result_key, save_error, save_picture
+from eval.metrics import Values, mean_floor, means, measure, noise_floors, temporal_error_floor
+from eval.results import MAX_SHOWN_ERROR, NOISE_FLOOR, Result, picture_path, result_key, save_picture
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.wrappers.error_estimate import denoise_with_error
@@ -41,10 +40,6 @@ class NamedDenoiser:
     name: str
     saves_error: bool = False  # whether to store error maps, where it is a NAME+js and frames have two sample buffers
 
-    @property
-    def signal(self) -> Signal:
-        return self.spec.returns
-
     @cached_property
     def denoiser(self) -> Denoiser:
         """Built on first use: only if results are missing."""
@@ -58,7 +53,7 @@ class NamedDenoiser:
         """A digest of everything that determines its result on a clip."""
         facts = {
             "name": self.name,
-            "signal": self.signal,
+            "signal": self.spec.returns,
             "precision": self.spec.precision,
             "weights": self.weights_digest,
             "device": self.spec.device,
@@ -83,7 +78,7 @@ class DenoiserRun:
 
     @property
     def signal(self) -> Signal:
-        return self.evaluated.signal
+        return self.evaluated.spec.returns
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -103,7 +98,8 @@ class DenoiserRun:
             output, self.state = denoiser(moved, self.state)
         output = output.cpu()
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
-        comparison = Comparison(output, reference_buffers, exposure, disocclusions(frame), self.before, still)
+        mask = disoccluded(frame.motion, frame.dual_motion)
+        comparison = Comparison(output, reference_buffers, exposure, mask, self.before, still)
         self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})
         self.before = comparison.luminances
         return output
@@ -113,17 +109,11 @@ class DenoiserRun:
         return result_of(self, clip, means(self.frames), nonfinite=self.nonfinite, precision=precision)
 
 
-class Crop(NamedTuple):
-    """A square window of an image, in pixels, and how many disoccluded pixels it contains."""
+def densest_crop(mask: Tensor) -> dict[str, int] | None:
+    """The square window with most pixels of a mask (H, W), centred on them within the image; None for an empty mask.
 
-    x: int
-    y: int
-    size: int
-    pixels: int
-
-
-def densest_crop(mask: Tensor) -> Crop | None:
-    """The window with most pixels of a mask (H, W), centred on them within the image; None for an empty mask."""
+    Its place `x` and `y` and its `size` are in pixels; it contains `pixels` of the mask.
+    """
     height, width = mask.shape
     shorter = min(height, width)
     size = min(shorter, max(SMALLEST_CROP, shorter // CROPS_A_SIDE))
@@ -135,7 +125,7 @@ def densest_crop(mask: Tensor) -> Crop | None:
     dy, dx = (inside.mean(dim=0) - (size - 1) / 2).round().int().tolist()
     y = min(max(0, y + dy), height - size)
     x = min(max(0, x + dx), width - size)
-    return Crop(x, y, size, int(mask[y : y + size, x : x + size].sum()))
+    return {"x": x, "y": y, "size": size, "pixels": int(mask[y : y + size, x : x + size].sum())}
 
 
 @dataclass
@@ -155,11 +145,11 @@ class ReferenceRun:
     def step(self, frame: Frame, reference_buffers: Tensor, exposure: float, still: bool) -> Tensor:
         """Measure one frame's reference. Returns the radiance (1, 3, H, W)."""
         reference = reference_buffers.mean(dim=0, keepdim=True)
-        mask = disocclusions(frame)
+        mask = disoccluded(frame.motion, frame.dual_motion)
         comparison = Comparison(reference, reference_buffers, exposure, mask, self.before, still)
         crop = densest_crop(mask[0, 0])
         if crop:
-            self.crops.append({"frame": len(self.frames)} | crop._asdict())
+            self.crops.append({"frame": len(self.frames)} | crop)
         self.frames.append(noise_floors(comparison))
         self.before = comparison.luminances
         return reference
@@ -176,11 +166,6 @@ def result_of(run: Run, clip: Clip, metrics: Values, **facts: Any) -> Result:
     return Result(run.key(clip), run.name, run.signal, clip.scene, clip.name, metrics, run.frames, **facts)
 
 
-def disocclusions(frame: Frame) -> Tensor:
-    """The pixels (1, 1, H, W) that were hidden in the previous frame."""
-    return disoccluded(frame.motion, frame.dual_motion)
-
-
 def is_still(clip: Clip) -> bool:
     """Whether neither the camera nor any mesh moves in the clip."""
     first = clip.view(0)
@@ -189,20 +174,20 @@ def is_still(clip: Clip) -> bool:
 
 
 @torch.no_grad()
-def run_clip(clip: Clip, runs: Sequence[Run], folders: Sequence[Path], quiet: bool = False) -> None:
+def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
     """Step all runs through a clip frame by frame and store their pictures, in memory independent of its length.
 
-    Each is compared with the reference of the signal that it returns.
+    `runs` are by the folder of their pictures. Each is compared with the reference of the signal that it returns.
     """
-    channels = sorted({*METRICS_CHANNELS, *(channel for run in runs for channel in run.reads)})
-    signals = {run.signal for run in runs}
+    channels = sorted({*METRICS_CHANNELS, *(channel for run in runs.values() for channel in run.reads)})
+    signals = {run.signal for run in runs.values()}
     still = is_still(clip)
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
         buffers = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
-        for run, folder in zip(runs, folders, strict=True):
+        for folder, run in runs.items():
             output = run.step(frame, buffers[run.signal], clip.exposure, still)
             image = display(finite(output), clip.exposure)
-            save_picture(folder, index, image[0].permute(1, 2, 0).numpy())
+            save_picture(picture_path(folder, index), image[0].permute(1, 2, 0).numpy())
             if isinstance(run, DenoiserRun) and run.error is not None:
-                save_error(folder, index, run.error[0].numpy())
+                save_picture(picture_path(folder, index, "error-"), (run.error[0].numpy() / MAX_SHOWN_ERROR).clip(0, 1))

@@ -4,6 +4,7 @@ Errors are those of displayed images. Their square is the product of the differe
 (x - A)(x - B), whose mean is the squared error without noise of the reference.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -81,20 +82,10 @@ def squared_errors(output: Tensor, buffers: Tensor, masks: Shares) -> Shares:
     return {key: product[mask].sum() for key, mask in masks.items()} | by_scale(a, b)
 
 
-def add(total: Shares, more: Shares) -> None:
-    for key, value in more.items():
-        total[key] = total.get(key, torch.zeros(())) + value
-
-
 def normalised(sums: Shares) -> Shares:
     """Sums over the total of their question."""
     totals = {question: sum(v for key, v in sums.items() if key[0] == question) for question, _ in sums}
     return {key: value / totals[key[0]] for key, value in sums.items()}
-
-
-def displayed_reference(clip: Clip, index: int, signal: Signal) -> Tensor:
-    """Both buffers (2, 3, H, W) of the reference, as displayed."""
-    return display(to_tensor(clip.reference(index, signal), has_buffers=True)[0], clip.exposure).double()
 
 
 @torch.no_grad()
@@ -104,25 +95,20 @@ def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]
     states = dict.fromkeys(denoisers)
     channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
     signals: set[Signal] = {"total", *(denoiser.signal for denoiser in denoisers.values())}
-    sums: dict[str, Shares] = {name: {} for name in ("pixels", *denoisers)}
+    sums: dict[str, Shares] = {name: defaultdict(lambda: torch.zeros(())) for name in ("pixels", *denoisers)}
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)
-        buffers = {signal: displayed_reference(clip, index, signal) for signal in signals}
+        references = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
+        buffers = {signal: display(pair, clip.exposure).double() for signal, pair in references.items()}
         masks = places(frame, buffers["total"].mean(dim=0, keepdim=True))
         for name, denoiser in denoisers.items():
             output, states[name] = denoiser(frame.to(denoiser.device), states[name])
             shown = display(finite(output.cpu()), clip.exposure).double()
-            add(sums[name], squared_errors(shown, buffers[denoiser.signal], masks))
-        add(sums["pixels"], {key: mask.sum() for key, mask in masks.items()})
+            for key, error in squared_errors(shown, buffers[denoiser.signal], masks).items():
+                sums[name][key] = sums[name][key] + error
+        for key, mask in masks.items():
+            sums["pixels"][key] = sums["pixels"][key] + mask.sum()
     return {name: normalised(shares) for name, shares in sums.items()}
-
-
-def table_of(clip: Clip, shares: dict[str, Shares]) -> str:
-    keys = dict.fromkeys(key for each in shares.values() for key in each)
-    lines = [
-        [*key, *(f"{100 * float(each[key]):.0f} %" if key in each else "" for each in shares.values())] for key in keys
-    ]
-    return f"{clip.scene}/{clip.name}\n" + tabulate(lines, ["", "", *shares], disable_numparse=True)
 
 
 def where(
@@ -130,5 +116,13 @@ def where(
 ) -> str:
     """A table for each test clip. Raises BadInput as `onespp eval` does."""
     specs = evaluated(names, runs, budget, device)
-    clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
-    return "\n\n".join(table_of(clip, error_shares(clip, specs)) for clip in clips)
+    tables = []
+    for clip in (clip for path in data for clip in Dataset(path).clips("test", first_hits)):
+        shares = error_shares(clip, specs)
+        keys = dict.fromkeys(key for each in shares.values() for key in each)
+        columns = shares.values()
+        lines = [
+            [*key, *(f"{100 * float(each[key]):.0f} %" if key in each else "" for each in columns)] for key in keys
+        ]
+        tables.append(f"{clip.scene}/{clip.name}\n" + tabulate(lines, ["", "", *shares], disable_numparse=True))
+    return "\n\n".join(tables)

@@ -6,10 +6,11 @@ import shutil
 import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from signal import SIG_IGN, SIGINT
 from signal import signal as on_signal
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tqdm import tqdm
@@ -27,11 +28,10 @@ from eval.results import (
     is_finished,
     load_picture,
     load_result,
-    signal_label,
     write_results,
 )
 from eval.selection import evaluated, with_indirect_baselines
-from eval.text_table import results_table, table_by_age
+from eval.tables import results_table, table_by_age
 from extras import can_draw
 from models.spec import DenoiserSpec
 from process import set_up_process
@@ -58,52 +58,38 @@ def named_denoisers(specs: Sequence[DenoiserSpec]) -> list[NamedDenoiser]:
     return [NamedDenoiser(spec, spec.name, saves_error=True) for spec in with_indirect_baselines(specs)]
 
 
-class Pass(NamedTuple):
-    """One run through a clip, the folder of its results, and whether these are complete."""
-
-    run: Run
-    folder: Path
-    finished: bool
-
-
-def passes(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path) -> list[Pass]:
-    """The passes of all denoisers, and of the references with which they are compared."""
-    present = {denoiser.signal for denoiser in denoisers}
+def runs_through(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path) -> dict[Path, Run]:
+    """The runs of all denoisers, and of the references with which they are compared, by the folder of their results."""
+    present = {denoiser.spec.returns for denoiser in denoisers}
     all_runs: list[Run] = [DenoiserRun(denoiser) for denoiser in denoisers]
     all_runs += [ReferenceRun(signal) for signal in SIGNALS if signal in present]
-    folders = [folder_of(runs, clip.scene, clip.name, run.name, run.signal) for run in all_runs]
-    return [
-        Pass(run, folder, is_finished(folder, run.key(clip))) for run, folder in zip(all_runs, folders, strict=True)
-    ]
+    return {folder_of(runs, clip.scene, clip.name, run.name, run.signal): run for run in all_runs}
+
+
+def unfinished(clip: Clip, all_runs: dict[Path, Run]) -> dict[Path, Run]:
+    """Those of the runs whose results are not complete."""
+    return {folder: run for folder, run in all_runs.items() if not is_finished(folder, run.key(clip))}
 
 
 def evaluate_clip(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path, quiet: bool = False) -> list[Result]:
     """The results of all denoisers and of their references; what is missing is evaluated and stored."""
-    all_passes = passes(clip, denoisers, runs)
-    missing = [each for each in all_passes if not each.finished]
-    for each in missing:
-        shutil.rmtree(each.folder, ignore_errors=True)
-        each.folder.mkdir(parents=True)
+    all_runs = runs_through(clip, denoisers, runs)
+    missing = unfinished(clip, all_runs)
+    for folder in missing:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
     if missing:
         with thread_count(threads_for(clip.height, clip.width)):
-            run_clip(clip, [each.run for each in missing], [each.folder for each in missing], quiet)
-    for each in missing:
-        each.run.result(clip).save(runs)
-    return [load_result(each.folder) for each in all_passes]
+            run_clip(clip, missing, quiet)
+    for run in missing.values():
+        run.result(clip).save(runs)
+    return [load_result(folder) for folder in all_runs]
 
 
-class ClipJob(NamedTuple):
-    """A clip to evaluate in a worker process."""
-
-    path: Path
-    first_hits: bool
-    specs: list[DenoiserSpec]
-    runs: Path
-    threads: int
-
-    def work(self) -> None:
-        torch.set_num_threads(self.threads)
-        evaluate_clip(Clip(self.path, self.first_hits), named_denoisers(self.specs), self.runs, quiet=True)
+def evaluate_in_worker(specs: list[DenoiserSpec], runs: Path, threads: int, clip: tuple[Path, bool]) -> None:
+    """Evaluate a clip, whose path and `first_hits` are given, in this process."""
+    torch.set_num_threads(threads)
+    evaluate_clip(Clip(*clip), named_denoisers(specs), runs, quiet=True)
 
 
 def start_worker() -> None:
@@ -124,18 +110,16 @@ def compile_kernels(spec: DenoiserSpec) -> None:
 
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
     """Evaluate clips in parallel, after compiling kernels in parallel: else each process would compile all of them."""
-    threads = max(1, torch.get_num_threads() // processes)
-    jobs = [ClipJob(clip.path, clip.first_hits, specs, runs, threads) for clip in clips]
+    work = partial(evaluate_in_worker, specs, runs, max(1, torch.get_num_threads() // processes))
+    jobs = [(clip.path, clip.first_hits) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
-        for _ in tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"):
-            pass
-        for _ in tqdm(pool.imap_unordered(ClipJob.work, jobs, chunksize=1), "clips", len(jobs), unit="clip"):
-            pass
+        list(tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"))
+        list(tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"))
 
 
 def strip(runs: Path, results: ClipResults) -> "Figure":
     """The outputs of all denoisers for a frame at three quarters of the clip, and its reference, side by side."""
-    from eval.figures.panel_grid import Panel, draw_grid
+    from eval.figures.show import Panel, draw_grid
 
     index = len(results.reference.frames) * 3 // 4
     columns = []
@@ -156,8 +140,7 @@ def save_strips(runs: Path, clips: Iterable[ClipResults]) -> None:
     from plotting import save_figure
 
     for clip in clips:
-        name = signal_label(f"{clip.scene}-{clip.clip}", clip.signal)
-        save_figure(runs / "eval" / f"{name}.png", strip(runs, clip))
+        save_figure(runs / "eval" / f"{clip.file_name}.png", strip(runs, clip))
 
 
 def evaluate(
@@ -182,7 +165,7 @@ def evaluate(
     specs = evaluated(names, runs, budget, device)
     denoisers = named_denoisers(specs)
     (runs / "eval").mkdir(parents=True, exist_ok=True)
-    missing = [clip for clip in clips if not all(each.finished for each in passes(clip, denoisers, runs))]
+    missing = [clip for clip in clips if unfinished(clip, runs_through(clip, denoisers, runs))]
     pixels = sum(clip.frames * clip.height * clip.width for clip in missing)
     processes = min(processes, len(missing), math.ceil(pixels / smallest_share))
     if processes > 1:
@@ -190,7 +173,7 @@ def evaluate(
     results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(device), results, weights)
-    save_strips(runs, by_clip(results))
     judged = list(by_clip(results))
+    save_strips(runs, judged)
     print(f"{results_table(judged)}\n\n{table_by_age(judged)}")
     return content

@@ -11,16 +11,21 @@ from dataclasses import KW_ONLY, dataclass
 
 import flip_evaluator
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.tonemap import psnr
 from eval.comparison import Comparison
-from eval.ssim import ssim, ssim_floor
 
 EPSILON = 0.01
 FLICKER_BLOCK = 16  # px
+# Of SSIM:
+WINDOW = 11  # px
+SIGMA = 1.5  # px
+C1 = 0.01**2  # for images in [0, 1]
+C2 = 0.03**2
 
 Values = dict[str, float | None]  # by metric; None where undefined
 
@@ -37,8 +42,6 @@ def root_two_times(floor: float) -> float:
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric."""
-
     title: str  # its heading in tables
     form: str  # the format of its values
     more_is_better: bool = False
@@ -51,11 +54,53 @@ class Metric:
     floor_is_error: bool = False  # the floor is a standard error around 0, because noise does not bias the metric
 
 
+def local_mean(images: Tensor) -> Tensor:
+    """Gaussian-weighted means (B, 3, H - 10, W - 10) of images (B, 3, H, W) over all windows inside the image."""
+    x = torch.arange(WINDOW, dtype=images.dtype) - WINDOW // 2
+    weights = torch.softmax(-(x**2) / (2 * SIGMA**2), dim=0)
+    height, width = (side - WINDOW + 1 for side in images.shape[-2:])
+    zero = torch.zeros((), dtype=images.dtype)
+    rows = sum((weight * images[..., i : height + i, :] for i, weight in enumerate(weights)), zero)
+    return sum((weight * rows[..., i : width + i] for i, weight in enumerate(weights)), zero)
+
+
+def ssim(x: Tensor, y: Tensor) -> float | None:
+    """Structural similarity (Wang et al. 2004), the mean over windows and RGB of displayed images (B, 3, H, W).
+
+    None for images smaller than a window.
+    """
+    if min(x.shape[-2:]) < WINDOW:
+        return None
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = (local_mean(image) for image in (x, y, x * x, y * y, x * y))
+    variances = mean_xx - mean_x**2 + mean_yy - mean_y**2
+    covariance = mean_xy - mean_x * mean_y
+    brightness = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    return float((brightness * (2 * covariance + C2) / (variances + C2)).mean())
+
+
+def ssim_floor(a: Tensor, b: Tensor) -> float | None:
+    """SSIM of the truth and the mean of two displayed sample buffers (1, 3, H, W).
+
+    None for images smaller than a window. The covariance of independent buffers is the variance of the truth, from
+    which SSIM follows with the variance of the noise. SSIM between the buffers, or of one of them and their mean, would
+    count noise as structure.
+    """
+    if min(a.shape[-2:]) < WINDOW:
+        return None
+    mean_a = local_mean(a)
+    mean_b = local_mean(b)
+    structure = (local_mean(a * b) - mean_a * mean_b).clamp(min=0)
+    brightness = mean_a * mean_b
+    shift = ((mean_a - mean_b) / 2).square()
+    spread = local_mean(((a - b) / 2).square()) - shift
+    similar = (2 * structure + C2) / (2 * structure + spread + C2)
+    return float((similar * (2 * brightness + C1) / (2 * brightness + shift + C1)).mean())
+
+
 def flip_map(x: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float32]:
     """LDR-FLIP (H, W) in [0, 1] (Andersson et al. 2020) of displayed images (H, W, 3), at its default distance."""
     images = (np.ascontiguousarray(image, dtype=np.float32) for image in (reference, x))
-    errors: NDArray[np.float32] = flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0]
-    return errors.reshape(x.shape[:2])
+    return flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[0].reshape(x.shape[:2])
 
 
 def flip(x: Tensor, reference: Tensor) -> float:
@@ -106,17 +151,25 @@ def relative_mse_floor(c: Comparison) -> float:
     return float((c.noise.square() / (reference.square() + EPSILON)).mean())
 
 
-def temporal_error(c: Comparison) -> float | None:
-    """Mean absolute difference between the change of luminance and the reference's; None on the first frame."""
-    return None if c.change is None else float((c.change.output - c.change.reference).abs().mean())
+def mean_change(change: Tensor, block: int) -> float:
+    """The mean absolute value of a change (1, 1, H, W), or of its means over blocks of `block` x `block` pixels."""
+    return float((F.avg_pool2d(change, block, ceil_mode=True) if block > 1 else change).abs().mean())
 
 
-def temporal_error_floor(c: Comparison) -> float | None:
+def temporal_error(c: Comparison, block: int = 1) -> float | None:
+    """Mean absolute difference between the change of luminance and the reference's; None on the first frame.
+
+    With `block`, that of the means over blocks: what is seen as blotches that come and go.
+    """
+    return None if c.change is None else mean_change(c.change.output - c.change.reference, block)
+
+
+def temporal_error_floor(c: Comparison, block: int = 1) -> float | None:
     """Half the temporal error between the buffers."""
     if c.change is None:
         return None
-    a, b = c.change.buffers
-    return float((a - b).abs().mean()) / 2
+    a, b = c.change.buffers.split(1)
+    return mean_change(a - b, block) / 2
 
 
 def flicker(c: Comparison) -> float | None:
@@ -149,22 +202,6 @@ def detail(c: Comparison) -> float | None:
     output, reference, buffers = c.luminances
     truth = gradient_product(*buffers.split(1))
     return gradient_product(output, reference) / truth if truth > 0 else None
-
-
-def block_flicker(c: Comparison) -> float | None:
-    """`temporal_error` of the means of blocks of 16 x 16 pixels: what is seen as blotches that come and go."""
-    return None if c.change is None else block_change(c.change.output - c.change.reference)
-
-
-def block_flicker_floor(c: Comparison) -> float | None:
-    if c.change is None:
-        return None
-    a, b = c.change.buffers.split(1)
-    return block_change(a - b) / 2
-
-
-def block_change(change: Tensor) -> float:
-    return float(F.avg_pool2d(change, FLICKER_BLOCK, ceil_mode=True).abs().mean())
 
 
 def where_disoccluded(c: Comparison, error: Tensor) -> float | None:
@@ -205,7 +242,12 @@ METRICS = {
     ),
     "energy": Metric("energy", "{:+.1%}", of=energy, floor=energy_error, edge=twice, floor_is_error=True),
     "detail": Metric("detail", "{:.3f}", more_is_better=True, of=detail, floor=None),
-    "block_flicker": Metric("block flicker", "{:.4f}", of=block_flicker, floor=block_flicker_floor),
+    "block_flicker": Metric(
+        "block flicker",
+        "{:.4f}",
+        of=lambda c: temporal_error(c, FLICKER_BLOCK),
+        floor=lambda c: temporal_error_floor(c, FLICKER_BLOCK),
+    ),
     "flicker": Metric("flicker", "{:.4f}", of=flicker, floor=None),
     "l1": Metric(
         "L1",
@@ -240,3 +282,19 @@ def within_floor(metric: str, value: float | None, floor: float | None) -> bool:
         return False
     edge = METRICS[metric].edge(floor)
     return value >= edge if METRICS[metric].more_is_better else abs(value) <= edge
+
+
+def means(frames: list[Values]) -> Values:
+    """Arithmetic means over the frames where a metric is defined, None where it never is."""
+    columns = {name: [row[name] for row in frames if row[name] is not None] for name in frames[0]}
+    return {name: float(np.mean(values)) if values else None for name, values in columns.items()}  # type: ignore[arg-type]
+
+
+def mean_floor(frames: list[Values]) -> Values:
+    """Noise floors of means over frames with independent noise: the squares of standard errors add up."""
+    floors = means(frames)
+    for name, metric in METRICS.items():
+        errors = [error for row in frames if (error := row.get(name)) is not None]
+        if metric.floor_is_error and errors:
+            floors[name] = float(np.linalg.norm(errors) / len(errors))
+    return floors

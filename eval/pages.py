@@ -5,9 +5,10 @@ The text of a page between `<!-- measured: NAME ARGUMENT... -->` and `<!-- end -
 only rewrites the pages.
 """
 
+import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -16,12 +17,10 @@ from tabulate import tabulate
 
 from errors import BadInput
 from eval.bench.denoisers import BASELINE
-from eval.means import means, means_by_age
-from eval.metrics import METRICS, Values
-from eval.report.table_rows import TableRow, clip_rows, mean_rows
+from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, by_signal, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.text_table import PRINTED, value_cell
+from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, means_by_age, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -36,27 +35,24 @@ SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
 # --- Extracts ---------------------------------------------------------------------------------------------------------
 
 
-def rounded(values: Any) -> Any:
+def rounded(content: Any) -> Any:
     """JSON content with numbers of nine digits: no second rounding changes what is printed."""
-    if isinstance(values, dict):
-        return {key: rounded(value) for key, value in values.items()}
-    if isinstance(values, list | tuple):
-        return [rounded(value) for value in values]
-    return float(f"{values:.9g}") if isinstance(values, float) else values
+    return json.loads(json.dumps(content), parse_float=lambda text: float(f"{float(text):.9g}"))
 
 
 def extract_eval(runs: Path) -> dict[str, Any]:
     """Clips with the metrics of all denoisers."""
     content, clips = read_results(runs)
+    clips = of_one_spp(clips)
     rows = [
         {
             **{"scene": clip.scene, "clip": clip.clip, "signal": clip.signal, "floors": kept(clip.reference.metrics)},
             "results": {result.denoiser: kept(result.metrics) for result in clip.results},
         }
-        for clip in of_one_spp(clips)
+        for clip in clips
     ]
     facts = {key: content[key] for key in ("device", "versions", "dataset")}
-    return facts | {"clips": rows, "ages": means_by_age(by_signal(of_one_spp(clips))["total"])}
+    return facts | {"clips": rows, "ages": means_by_age(by_signal(clips)["total"])}
 
 
 def kept(values: Values) -> Values:
@@ -65,7 +61,7 @@ def kept(values: Values) -> Values:
 
 def extract_bench(runs: Path) -> dict[str, Any]:
     content = read_json(runs / "bench" / "results.json")
-    return {"device": content["device"], "threads": content["threads"], "rows": content["rows"]}
+    return {key: content[key] for key in ("device", "threads", "rows")}
 
 
 def extract_trade(runs: Path) -> dict[str, Any]:
@@ -120,16 +116,17 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
 }
 
 
-def collect(runs: Path) -> Iterator[Path]:
-    """Extract what RUNS holds of EXTRACTS into docs/measured; yields the files."""
+def collect(runs: Path) -> None:
+    """Extract what RUNS holds of EXTRACTS into docs/measured; prints the files."""
     for name, (_, extract) in EXTRACTS.items():
         try:
             content = extract(runs)
         except BadInput as missing:
             print(f"{name}: not collected, {missing}")
             continue
-        write_json(MEASURED / f"{name}.json", rounded(content))
-        yield MEASURED / f"{name}.json"
+        path = MEASURED / f"{name}.json"
+        write_json(path, rounded(content))
+        print(path)
 
 
 # --- Tables and numbers -----------------------------------------------------------------------------------------------
@@ -260,7 +257,7 @@ def front() -> str:
 
 def glass() -> str:
     """PSNR of denoisers on scenes of glass, the mean of their clips, with either kind of guides; and temporal error."""
-    lines: dict[tuple[str, str], dict[str, str]] = {}
+    lines: dict[str, dict[str, dict[str, str]]] = {}  # by denoiser and guides
     for guides, clips in measured("glass")["clips"].items():
         scenes = list(dict.fromkeys(clip["scene"].split("-")[1] for clip in clips))
         for denoiser in clips[0]["results"]:
@@ -272,9 +269,8 @@ def glass() -> str:
             line = {"denoiser": FLOOR if floor else f"`{denoiser}`", "guides": "" if floor else guides}
             line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
             line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
-            lines[denoiser, line["guides"]] = line
-    order = list(dict.fromkeys(denoiser for denoiser, _ in lines))
-    return table([line for _, line in sorted(lines.items(), key=lambda item: order.index(item[0][0]))])
+            lines.setdefault(denoiser, {})[line["guides"]] = line
+    return table([line for alike in lines.values() for line in alike.values()])
 
 
 def stress() -> str:
@@ -306,23 +302,8 @@ def minutes(what: str) -> str:
 
 
 GENERATORS: dict[str, Callable[..., str]] = {
-    each.__name__: each
-    for each in (
-        ages,
-        clip,
-        quality,
-        value,
-        shipped,
-        times,
-        ratio,
-        samples,
-        front,
-        glass,
-        stress,
-        device,
-        size,
-        minutes,
-    )
+    f.__name__: f
+    for f in (ages, clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, size, minutes)
 }
 
 
@@ -346,8 +327,7 @@ def generated(page: str) -> str:
 
 def main(arguments: list[str]) -> None:
     for runs in arguments:
-        for path in collect(Path(runs)):
-            print(path)
+        collect(Path(runs))
     for page in PAGES:
         text = page.read_text()
         if (new := generated(text)) != text:

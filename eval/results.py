@@ -12,8 +12,9 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ from provenance import DENOISING, code_digest, versions
 SIGNALS: tuple[Signal, ...] = ("total", "indirect")
 NOISE_FLOOR = "reference"  # the folder of the noise floors
 FLOOR = "(noise floor)"  # their name in tables
-MAX_SHOWN_ERROR = 0.25  # of exposed radiance
+MAX_SHOWN_ERROR = 0.25  # of exposed radiance, white in error maps
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
 FRAMES_FILE = "frames.csv"
@@ -50,29 +51,17 @@ def folder_of(runs: Path, scene: str, clip: str, name: str, signal: str) -> Path
     return runs / "eval" / "clips" / f"{scene}-{clip}" / signal_label(name, signal)
 
 
-def picture_path(folder: Path, index: int) -> Path:
-    return folder / f"{index:04d}.webp"
+def picture_path(folder: Path, index: int, kind: Literal["", "error-"] = "") -> Path:
+    """The file of a frame as displayed, or of its estimated error."""
+    return folder / f"{kind}{index:04d}.webp"
 
 
-def error_path(folder: Path, index: int) -> Path:
-    return folder / f"error-{index:04d}.webp"
-
-
-def save_picture(folder: Path, index: int, image: NDArray[np.floating]) -> None:
-    """Store an image (H, W, 3) in [0, 1], rounded to 8 bits; does nothing without the extra `report`."""
-    save_bytes(picture_path(folder, index), 255 * image + 0.5)
-
-
-def save_error(folder: Path, index: int, error: NDArray[np.floating]) -> None:
-    """Store an error map (H, W) in exposed radiance, white from MAX_SHOWN_ERROR on."""
-    save_bytes(error_path(folder, index), 255 * (error / MAX_SHOWN_ERROR).clip(0, 1) + 0.5)
-
-
-def save_bytes(path: Path, values: NDArray[np.floating]) -> None:
+def save_picture(path: Path, image: NDArray[np.floating]) -> None:
+    """Store an image (H, W, 3) or (H, W) in [0, 1], rounded to 8 bits; does nothing without the extra `report`."""
     if can_draw():
         from plotting import Image
 
-        Image.fromarray(values.astype(np.uint8)).save(path, lossless=True, method=2)
+        Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(path, lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:
@@ -153,12 +142,12 @@ def write_results(
         "versions": versions(DENOISING),
         "rows": rows,
     }
-    write_file(runs / "eval" / FRAMES_FILE, frames_csv(results).encode())
+    write_frames(runs / "eval" / FRAMES_FILE, results)
     write_json(runs / "eval" / RESULTS_FILE, content)
     return content
 
 
-def frames_csv(results: list[Result]) -> str:
+def write_frames(path: Path, results: list[Result]) -> None:
     """One line per frame of each result; noise floors are the values of a denoiser named "(noise floor)"."""
     text = io.StringIO()
     lines = csv.DictWriter(text, [*KEYS, "frame", *METRICS], extrasaction="ignore", lineterminator="\n")
@@ -166,7 +155,7 @@ def frames_csv(results: list[Result]) -> str:
     for result in results:
         facts = {name: getattr(result, name) for name in KEYS} | ({"denoiser": FLOOR} if result.floor else {})
         lines.writerows(facts | {"frame": index} | values for index, values in enumerate(result.frames))
-    return text.getvalue()
+    write_file(path, text.getvalue().encode())
 
 
 @dataclass
@@ -180,8 +169,9 @@ class ClipResults:
     reference: Result
 
     @property
-    def noisy_spp(self) -> int:
-        return ClipKind.of(self.clip).noisy_spp
+    def file_name(self) -> str:
+        """Its name in those of files."""
+        return signal_label(f"{self.scene}-{self.clip}", self.signal)
 
     @property
     def name(self) -> str:
@@ -196,15 +186,11 @@ def folders_of(runs: Path, clip: ClipResults) -> dict[str, Path]:
 
 def by_clip(results: list[Result]) -> Iterator[ClipResults]:
     """The results of each clip and signal, in their order."""
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for result in results:
-        groups.setdefault((result.scene, result.clip), []).append(result)
-    for (scene, clip), group in groups.items():
-        for signal in SIGNALS:
-            ours = [result for result in group if result.signal == signal]
-            if references := [result for result in ours if result.floor]:
-                denoisers = [result for result in ours if not result.floor]
-                yield ClipResults(scene, clip, signal, denoisers, references[0])
+    for (scene, clip), signal in product(dict.fromkeys((result.scene, result.clip) for result in results), SIGNALS):
+        ours = [result for result in results if (result.scene, result.clip, result.signal) == (scene, clip, signal)]
+        if references := [result for result in ours if result.floor]:
+            denoisers = [result for result in ours if not result.floor]
+            yield ClipResults(scene, clip, signal, denoisers, references[0])
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
@@ -215,7 +201,7 @@ def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
 
 def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
     """The clips without those such as 000-4spp, which show the same frames with other input."""
-    return [clip for clip in clips if clip.noisy_spp == 1]
+    return [clip for clip in clips if ClipKind.of(clip.clip).noisy_spp == 1]
 
 
 def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
@@ -234,12 +220,11 @@ def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     content = read_json(path, ("schema", "dataset", "device", "versions", "rows"))
     results = []
     for row in content["rows"]:
-        facts = {name: row[name] for name in KEYS}
-        folders = [
-            folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in (row["denoiser"], NOISE_FLOOR)
-        ]
-        ours, reference = (load_result(folder) for folder in folders)
+        names = row["denoiser"], NOISE_FLOOR
+        folders = [folder_of(runs, row["scene"], row["clip"], name, row["signal"]) for name in names]
+        ours, reference = map(load_result, folders)
         if ours.metrics != row["metrics"]:
+            facts = {name: row[name] for name in KEYS}
             raise BadInput(f"{folders[0]} differs from {path} for {facts}: run `onespp eval` again")
         if reference not in results:
             results.append(reference)

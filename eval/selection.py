@@ -22,10 +22,11 @@ def choose(names: Sequence[str], default: Iterable[DenoiserName], *obstacles: Ob
     Raises BadInput where a named one is unknown or cannot run.
     """
     chosen: list[DenoiserName] = []
-    obstacles = obstacles if names else (*obstacles, takes_long)
     skipped: dict[str, list[DenoiserName]] = {}  # by the reason that they have in common
     for name in dict.fromkeys(map(parse_name, names) if names else default):
         reason = next(filter(None, (obstacle(name) for obstacle in obstacles)), None)
+        if not (reason or names) and prototype(name).offline:
+            reason = "it takes seconds a frame: name it to run it"
         if reason and names:
             raise BadInput(f"{name}: {reason}")
         if reason:
@@ -36,11 +37,6 @@ def choose(names: Sequence[str], default: Iterable[DenoiserName], *obstacles: Ob
         text = reason if len(alike) > 1 else reason.replace("NAME", str(alike[0]))
         print(f"{', '.join(map(str, alike))}: skipped, {text}")
     return chosen
-
-
-def takes_long(name: DenoiserName) -> str | None:
-    """Why a denoiser runs only if it is named; None where it takes less."""
-    return "it takes seconds a frame: name it to run it" if prototype(name).offline else None
 
 
 def cannot_run(name: DenoiserName) -> str | None:
@@ -70,8 +66,7 @@ def untrained(runs: Path, budget: str, name: DenoiserName) -> str | None:
 
 def weights_of(name: DenoiserName, runs: Path) -> Path | None:
     """The file of a denoiser's weights; None for one without weights. Raises BadInput where they are missing."""
-    reason = untrained(runs, USUAL_BUDGET, name)
-    if reason:
+    if reason := untrained(runs, USUAL_BUDGET, name):
         raise BadInput(f"{name}: {reason}")
     return weights_file(name, runs, USUAL_BUDGET)
 

@@ -1,7 +1,6 @@
 """`onespp weights`: the networks whose weights are shipped, and a model card of each, generated from its files."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,9 @@ from tabulate import tabulate
 
 from errors import BadInput
 from eval.metrics import METRICS
-from eval.report.table_rows import mean_rows
-from eval.results import FLOOR, RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
+from eval.results import RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
 from eval.selection import baselines
-from eval.text_table import LEGEND, PRINTED, floor_cell, value_cell
+from eval.tables import LEGEND, PRINTED, clip_rows, mean_rows
 from files import read_json, write_file, write_json
 from models.registry import require_shipped, shipped_names
 from models.weights import read_metadata
@@ -44,25 +42,23 @@ Means over the {count} test clips at 1 spp of `{dataset}`, {signal} radiance, in
 
 def table() -> str:
     """All networks with shipped weights as a text table."""
-    return tabulate([line(name) for name in shipped_names()], "keys", disable_numparse=True)
-
-
-def line(name: str) -> dict[str, Any]:
-    """The table's row of a network, by column title."""
-    path = require_shipped(name)
-    recipe = read_metadata(path)["recipe"]
-    data = recipe["data"]
-    return {
-        "network": name,
-        "parameters": recipe["parameters"],
-        "kB": round(path.stat().st_size / 1000),
-        "budget": recipe["budget"],
-        "trained on": f"{Path(data['profile']).name}, {len(data['scenes'])} scenes",
-        "step": recipe["step"],
-        "validation loss": f"{recipe['validation']:.4g}",
-        "SHA-256": file_digest(path)[:12],
-        "licence": WEIGHTS_LICENCE,
-    }
+    lines = []
+    for name in shipped_names():
+        path = require_shipped(name)
+        recipe = read_metadata(path)["recipe"]
+        line = {
+            "network": name,
+            "parameters": recipe["parameters"],
+            "kB": round(path.stat().st_size / 1000),
+            "budget": recipe["budget"],
+            "trained on": f"{Path(recipe['data']['profile']).name}, {len(recipe['data']['scenes'])} scenes",
+            "step": recipe["step"],
+            "validation loss": f"{recipe['validation']:.4g}",
+            "SHA-256": file_digest(path)[:12],
+            "licence": WEIGHTS_LICENCE,
+        }
+        lines.append(line)
+    return tabulate(lines, "keys", disable_numparse=True)
 
 
 def card_file(name: str) -> Path:
@@ -76,16 +72,11 @@ def measured_file(name: str) -> Path:
 
 
 def measure_card(name: str, runs: Path) -> Path:
-    """Extract a network's measurements from RUNS/eval to JSON and regenerate its card. Returns the card's path.
+    """Extract a network's measurements from RUNS/eval to JSON and regenerate what stands between its card's markers.
 
-    Raises BadInput if there is no card yet, or if RUNS/eval has no results of these weights.
+    Returns the card's path. Raises BadInput if there is no card yet, or if RUNS/eval has no results of these weights.
     """
     write_json(measured_file(name), measurements(name, runs))
-    return write_card(name)
-
-
-def write_card(name: str) -> Path:
-    """Regenerate what stands between a card's markers. Returns its path. Raises BadInput if there is no card yet."""
     path = card_file(name)
     text = path.read_text() if path.exists() else ""
     before, begin, rest = text.partition(BEGIN)
@@ -110,8 +101,14 @@ def measurements(name: str, runs: Path) -> dict[str, Any]:
         "precision": results_of(clips, name)[0].precision,
         "device": results["device"],
         "versions": version_list(results["versions"]),
-        "means": means_rows(alike),
-        "psnr": psnr_rows(clips),
+        "means": [
+            {"denoiser": row.denoiser} | {METRICS[metric].title: row.text(metric) for metric in PRINTED}
+            for row in mean_rows(alike)
+        ],
+        "psnr": [
+            {"clip": f"{clip.scene}/{clip.clip}"} | {row.denoiser: row.text("psnr") for row in clip_rows(clip)}
+            for clip in clips
+        ],
     }
 
 
@@ -158,31 +155,12 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     Raises BadInput unless the network was evaluated with the shipped weights as they are now.
     """
     weights = require_shipped(name)
+    wanted = (*baselines(), name)
     path = runs / "eval" / RESULTS_FILE
     content, clips = read_results(runs)
     evaluated = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
     if not of_one_spp(evaluated) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
-        command = f"onespp eval {' '.join((*baselines(), name))} --runs {runs}"
+        command = f"onespp eval {' '.join(wanted)} --runs {runs}"
         raise BadInput(f"{path} has no results of {weights} as it is now, on clips at 1 spp: run `{command}`")
-    wanted = (*baselines(), name)
     return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in evaluated]
-
-
-def means_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
-    """Means over the clips, a row per denoiser, and one of the noise floors."""
-    titles = {metric: METRICS[metric].title for metric in PRINTED}
-    return [
-        {"denoiser": row.denoiser} | {title: row.text(metric) for metric, title in titles.items()}
-        for row in mean_rows(clips)
-    ]
-
-
-def psnr_rows(clips: Sequence[ClipResults]) -> list[dict[str, str]]:
-    """PSNR of all denoisers, a row per clip."""
-    lines = []
-    for clip in clips:
-        floor = clip.reference.metrics["psnr"]
-        cells = {result.denoiser: value_cell("psnr", result.metrics["psnr"], floor) for result in clip.results}
-        lines.append({"clip": f"{clip.scene}/{clip.clip}", **cells, FLOOR: floor_cell("psnr", floor)})
-    return lines

@@ -1,39 +1,78 @@
 """`onespp bench denoisers`: milliseconds and memory per frame, next to OIDN in the same run."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tabulate import tabulate
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.bench.memory import alone, growth_mb
-from eval.bench.sizes import Size, bench_folder, parse_size, size_name, thread_counts
+from errors import BadInput
+from eval.bench.memory import alone, growth_mb, release_memory
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.bench.timed import TIMED_FRAMES, TimedDenoiser, Timing, network_of, time_in_turns
 from eval.selection import cannot_run, choose, with_indirect_baselines
 from files import read_json, write_json
+from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN
 from models.registry import DENOISERS, DenoiserName, parse_name
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory
 from provenance import DENOISING, code_digest, device_in_words, versions
-from timing import thread_count
+from timing import device_clock, take_turns, thread_count
 
 BASELINE = "oidn"  # the denoiser that times are divided by
 COUNTING_SIZE = 128  # px; a side that no network needs to pad
+WARM_UP_FRAMES = 2
+TIMED_FRAMES = 10
+FEWEST_FRAMES = 5  # timed, where all denoisers together take longer than
+MAX_SECONDS = 240.0
+
+Size = tuple[int, int]  # height, width
+
+
+def parse_size(text: str) -> Size:
+    """(height, width) in pixels of "1280x720". Raises BadInput for other text."""
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if not match:
+        raise BadInput(f"'{text}' is not a size such as 1280x720")
+    return int(match[2]), int(match[1])
+
+
+def size_name(size: Size) -> str:
+    """The inverse of parse_size: "1280x720" of (720, 1280)."""
+    return f"{size[1]}x{size[0]}"
+
+
+def thread_counts(threads: Sequence[int]) -> list[int]:
+    """The numbers of threads to measure with, rising; by default all of PyTorch's. Raises BadInput below 1."""
+    for count in threads:
+        if count < 1:
+            raise BadInput(f"{count} threads cannot work: name at least 1")
+    return sorted({*threads} or {torch.get_num_threads()})
 
 
 @dataclass(frozen=True)
-class DenoiserCost(Timing):
-    """A row of results.json: times, memory in MB, and the size of the network; None where undefined or not measured."""
+class DenoiserCost:
+    """A row of results.json. Memory and the size of the network are None where undefined or not measured."""
 
+    denoiser: str
+    height: int
+    width: int
+    dtype: str
+    threads: int
+    frames: int  # that were timed
+    ms_median: float  # milliseconds per frame, and their 10th and 90th percentile
+    ms_p10: float
+    ms_p90: float
     peak_mb: float | None  # growth of memory during two frames: the state and all intermediate tensors
     parameters: int | None  # of the network in its form for inference
     macs_per_pixel: float | None
@@ -68,9 +107,64 @@ def other_ways(spec: DenoiserSpec) -> list[DenoiserSpec]:
     return ways
 
 
+class TimedDenoiser:
+    """A denoiser, its state, and the seconds of each frame after warm-up."""
+
+    def __init__(self, spec: DenoiserSpec):
+        self.spec = spec
+        self.denoiser = spec.build()
+        self.state: State | None = None
+        self.seconds: list[float] = []
+
+    def step(self, frame: Frame) -> None:
+        """Denoise the next frame, which is on the device already."""
+        with self.spec.running():
+            _, self.state = self.denoiser(frame, self.state)
+
+
+@torch.inference_mode()
+def time_in_turns(
+    specs: Sequence[DenoiserSpec], size: Size, measured: int = TIMED_FRAMES, max_seconds: float = MAX_SECONDS
+) -> list[TimedDenoiser]:
+    """Time all specs, of one device, on one sequence: each frame by each of them in turn.
+
+    After `max_seconds` it stops before `measured` frames, but not before FEWEST_FRAMES.
+    """
+    release_memory()  # of earlier calls: the states of all denoisers at 1920 x 1080 fill most of 24 GB
+    denoisers = [TimedDenoiser(spec) for spec in specs]
+    device = specs[0].device
+    frame: Frame
+
+    def make_frame(index: int) -> None:
+        nonlocal frame
+        frame = synthetic_frame(index, *size).to(device)
+
+    def stepping(timed: TimedDenoiser) -> Callable[[], None]:
+        return lambda: timed.step(frame)
+
+    seconds = take_turns(
+        {f"{timed.spec.way} {timed.spec.precision}": stepping(timed) for timed in denoisers},
+        measured,
+        warm_up=WARM_UP_FRAMES,
+        before_round=make_frame,
+        fewest=FEWEST_FRAMES,
+        patience=max_seconds,
+        clock=partial(device_clock, device),
+        label=size_name(size),
+    )
+    for timed, spent in zip(denoisers, seconds.values(), strict=True):
+        timed.seconds = spent
+    return denoisers
+
+
 def is_usual(spec: DenoiserSpec) -> bool:
     """Whether `onespp eval` runs the denoiser in this way."""
     return spec.compiled and spec.precision == fastest_precision(spec.denoiser, spec.device)
+
+
+def network_of(denoiser: Denoiser) -> nn.Module | None:
+    network = getattr(unwrapped(denoiser), "network", None)
+    return network if isinstance(network, nn.Module) else None
 
 
 @torch.inference_mode()
@@ -103,7 +197,7 @@ def denoiser_peak_mb(spec: DenoiserSpec, frames: Sequence[Frame], threads: int) 
     """
     keep_freed_memory()  # as commands do
     torch.set_num_threads(threads)
-    timed = TimedDenoiser.of(spec)
+    timed = TimedDenoiser(spec)
     timed.step(synthetic_frame(0, COUNTING_SIZE, COUNTING_SIZE).to(spec.device))  # loads and compiles
     timed.state = None
     # Tensors from another process become resident when first read.
@@ -130,16 +224,20 @@ def peaks(specs: Sequence[DenoiserSpec], size: Size, threads: int) -> list[float
 
 def cost(timed: TimedDenoiser, size: Size, peak_mb: float | None) -> DenoiserCost:
     """The row of a denoiser that was timed, with its peak memory."""
+    p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(timed.seconds, (10, 50, 90)))
     return DenoiserCost(
-        **asdict(timed.timing(size)),
+        timed.spec.way,
+        *size,
+        dtype=timed.spec.precision,
+        threads=torch.get_num_threads(),
+        frames=len(timed.seconds),
+        ms_median=median,
+        ms_p10=p10,
+        ms_p90=p90,
         peak_mb=peak_mb,
         parameters=None if isinstance(unwrapped(timed.denoiser), OIDN) else timed.denoiser.parameter_count(),
         macs_per_pixel=macs_per_pixel(timed.spec),
     )
-
-
-def devices() -> list[str]:
-    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
 def results_file(runs: Path, device: str = "cpu") -> Path:
@@ -163,11 +261,13 @@ def bench_denoisers(
     """
     pixels = [parse_size(size) for size in dict.fromkeys(sizes)]
     counts = thread_counts(threads or ((1, torch.get_num_threads()) if every_way else ()))
-    specs = {device: timed_specs(names, device, every_way) for device in devices()}
+    devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+    specs = {device: timed_specs(names, device, every_way) for device in devices}
     tables = []
     for device, ours in specs.items():
         path = results_file(runs, device)
-        unfinished = bench_folder(runs) / f"unfinished-{path.name}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f"unfinished-{path.name}")
         timed = measure_rows(ours, pixels, counts if device == "cpu" else counts[-1:], unfinished, measured)
         rows = [*chain.from_iterable(timed)]
         content = {
@@ -217,7 +317,6 @@ def measure_rows(
 
 
 def table_lines(rows: Sequence[DenoiserCost]) -> Iterator[dict[str, Any]]:
-    """The lines of the table."""
     baselines = {row.conditions: row.ms_median for row in rows if row.denoiser == BASELINE}
     for row in rows:
         baseline = baselines.get(row.conditions)

@@ -1,8 +1,8 @@
 """`onespp bench light`: how many frames a denoiser lags after a light changes."""
 
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from datasets.channels import CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display, psnr
-from eval.bench.sizes import bench_folder
 from eval.selection import evaluated
 from files import write_file, write_json
 from models.denoiser import Denoiser, State
@@ -42,17 +41,13 @@ BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Lag:
-    """PSNR in dB of every frame of one denoiser, by the name of the change."""
+Lag = dict[str, list[float]]  # PSNR in dB of every frame of one denoiser, by the name of the change
 
-    denoiser: str
-    psnr: dict[str, list[float]]
 
-    def loss(self, after: int) -> float:
-        """The largest loss of PSNR against unchanged light, in dB, `after` frames after the change."""
-        frame = CHANGE + after
-        return max(self.psnr[STEADY][frame] - values[frame] for name, values in self.psnr.items() if name != STEADY)
+def loss(lag: Lag, after: int) -> float:
+    """The largest loss of PSNR against unchanged light, in dB, `after` frames after the change."""
+    frame = CHANGE + after
+    return max(lag[STEADY][frame] - psnr[frame] for change, psnr in lag.items() if change != STEADY)
 
 
 def stepped(before: Array, after: Array) -> Track:
@@ -98,24 +93,23 @@ def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[floa
     return values
 
 
-def lag_table(lags: Sequence[Lag]) -> str:
+def lag_table(lags: Mapping[str, Lag]) -> str:
     """One row per denoiser, sorted by the loss in the last column."""
     heads = ["denoiser", f"steady light, frame {LIGHT_CLIP_SIZE[0] - 1}", *(f"loss {n} frames after" for n in AFTER)]
     rows = [
-        [lag.denoiser, f"{lag.psnr[STEADY][-1]:.1f} dB", *(f"{lag.loss(n):.1f} dB" for n in AFTER)]
-        for lag in sorted(lags, key=lambda lag: lag.loss(AFTER[-1]))
+        [name, f"{lag[STEADY][-1]:.1f} dB", *(f"{loss(lag, n):.1f} dB" for n in AFTER)]
+        for name, lag in sorted(lags.items(), key=lambda item: loss(item[1], AFTER[-1]))
     ]
     return tabulate(rows, heads, tablefmt="github", disable_numparse=True)
 
 
-def lag_figure(lags: Sequence[Lag]) -> Figure:
+def lag_figure(lags: Mapping[str, Lag]) -> Figure:
     """PSNR of every frame, in a panel for each change."""
-    figure, axes = plt.subplots(
-        1, len(BEFORE), figsize=(3 * len(BEFORE), 4), dpi=DPI, layout="constrained", sharey=True
-    )
+    size = (3 * len(BEFORE), 4)
+    figure, axes = plt.subplots(1, len(BEFORE), figsize=size, dpi=DPI, layout="constrained", sharey=True)
     for axis, change in zip(axes, BEFORE, strict=True):
-        for lag in lags:
-            axis.plot(lag.psnr[change], label=lag.denoiser)
+        for name, lag in lags.items():
+            axis.plot(lag[change], label=name)
         axis.axvline(CHANGE, color="grey", lw=0.8, ls=":")
         axis.set(title=change, xlabel="frame")
         axis.grid(alpha=0.3)
@@ -130,17 +124,16 @@ def bench_light(runs: Path, names: Sequence[str], budget: str) -> str:
     Returns the table. Raises BadInput for an unknown denoiser and one that cannot run or is not trained.
     """
     specs = evaluated(names, runs, budget)
-    folder = bench_folder(runs) / "light"
+    folder = runs / "bench" / "light"
     clips = {change: clip_of(change, folder) for change in BEFORE}
     exposure = clips[STEADY].exposure  # of all clips
-    lags = []
+    lags = {}
     for spec in tqdm(specs, "denoisers", unit="denoiser"):
         denoiser = spec.build()
-        lags.append(Lag(spec.name, {name: psnr_of_frames(denoiser, clip, exposure) for name, clip in clips.items()}))
+        lags[spec.name] = {change: psnr_of_frames(denoiser, clip, exposure) for change, clip in clips.items()}
     save_figure(folder / "plot.png", lag_figure(lags))
     table = lag_table(lags)
     write_file(folder / "table.md", f"{table}\n".encode())
-    write_json(
-        folder / "results.json", {"schema": 1, "device": device_in_words(), "rows": [asdict(lag) for lag in lags]}
-    )
+    rows = [{"denoiser": name, "psnr": lag} for name, lag in lags.items()]
+    write_json(folder / "results.json", {"schema": 1, "device": device_in_words(), "rows": rows})
     return table

@@ -1,7 +1,6 @@
 """A procedural moving sequence for measuring speed, with shapes, motion and noise similar to rendered frames."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,8 @@ from datasets.channels import CHANNELS, SAMPLE_BUFFERS
 from datasets.frame import Frame, to_tensor
 from scenes.camera import Array, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
-# Normal n and offset d of each plane, n · p = d.
-GROUND = ((0, 1, 0), -1.5)
-BACK_WALL = ((0, 0, 1), -6.0)
-SIDE_WALL = ((1, 0, 0), -4.0)
-PLANES = (GROUND, BACK_WALL, SIDE_WALL)
+# Normal n and offset d, n · p = d, of the ground, the back wall and the side wall.
+PLANES = (((0, 1, 0), -1.5), ((0, 0, 1), -6.0), ((1, 0, 0), -4.0))
 WALL_HEIGHT = 1.7  # y at which the walls end; above them is sky
 SPHERES = 10
 TO_LIGHT = np.array([0.5, 0.8, 0.33])  # nearly of length 1
@@ -23,14 +19,6 @@ TO_LIGHT = np.array([0.5, 0.8, 0.33])  # nearly of length 1
 HIT_DIRECT = 0.5
 HIT_INDIRECT = 0.2
 SEED = 0
-
-
-class FirstHits(NamedTuple):
-    """The first hits of rays."""
-
-    depth: Array  # (...,), along the viewing axis, 0 for sky
-    mesh_id: NDArray[np.int64]  # (...,), 0 for sky
-    normal: Array  # (..., 3), in the world
 
 
 def spheres(index: int) -> tuple[Array, Array]:
@@ -53,8 +41,11 @@ def view(index: int, height: int, width: int) -> View:
     return View(intrinsics(70.0, height, width), look_at(eye, np.array([0.01 * index, 0.0, -3.0])), poses)
 
 
-def cast(pixels: Array, index: int, view: View) -> FirstHits:
-    """First hits of rays through `pixels` (..., 2) in frame `index`, whose view is `view`."""
+def cast(pixels: Array, index: int, view: View) -> tuple[Array, NDArray[np.int64], Array]:
+    """First hits of rays through `pixels` (..., 2) in frame `index`, whose view is `view`.
+
+    Their depth (...,) along the viewing axis and mesh ID (...,), both 0 for sky, and normal (..., 3) in the world.
+    """
     eye = view.camera_to_world[:3, 3]
     ray = directions(pixels, view)  # of length 1 along the viewing axis: t is the depth
     depth = np.full(ray.shape[:-1], np.inf)
@@ -78,10 +69,12 @@ def cast(pixels: Array, index: int, view: View) -> FirstHits:
             b = ray @ from_centre
             t = (-b - np.sqrt(b**2 - a * (from_centre @ from_centre - radius**2))) / a
             meet(mesh, t, (eye + t[..., None] * ray - centre) / radius)
-    return FirstHits(np.where(mesh_id > 0, depth, 0), mesh_id, normal)
+    return np.where(mesh_id > 0, depth, 0), mesh_id, normal
 
 
-def synthetic_dual_motion(pixels: Array, index: int, hits: FirstHits, motion: Array, now: View, before: View) -> Array:
+def synthetic_dual_motion(
+    pixels: Array, index: int, mesh_id: NDArray[np.int64], motion: Array, now: View, before: View
+) -> Array:
     """Dual motion vectors (H, W, 2) of NTD §3.2; `motion` where nothing was occluded.
 
     Where another surface was visible at y = x + motion in the previous frame, they point to x_prev = y + x - z, with z
@@ -89,12 +82,12 @@ def synthetic_dual_motion(pixels: Array, index: int, hits: FirstHits, motion: Ar
     """
     height, width = pixels.shape[:2]
     y = pixels + motion
-    covering = cast(y, index - 1, before)
+    covering_depth, covering_id, _ = cast(y, index - 1, before)
     # y + x - z - x, with z - y the forward vector of the surface visible at y.
-    dual = -motion_vectors(y, covering.depth, covering.mesh_id, before, now)
+    dual = -motion_vectors(y, covering_depth, covering_id, before, now)
     ends = np.stack([y, pixels + dual])
     inside = ((ends >= 0) & (ends <= (width, height))).all(axis=(0, -1))
-    return np.where((inside & (covering.mesh_id != hits.mesh_id))[..., None], dual, motion)
+    return np.where((inside & (covering_id != mesh_id))[..., None], dual, motion)
 
 
 def noisy(rng: np.random.Generator, mean: Array, share: float) -> Array:
@@ -114,48 +107,46 @@ def split_into_buffers(light: Mapping[str, Array], seed: tuple[int, ...]) -> dic
     return buffers
 
 
-def sampled_distances(rng: np.random.Generator, hit: NDArray[np.bool_], share: float) -> Array:
-    """Hit distances (H, W) of a `share` of the surfaces' samples; 0 for the others."""
-    return np.where(hit & (rng.random(hit.shape) < share), rng.lognormal(0.0, 0.5, hit.shape), 0)
-
-
 def synthetic_frame(index: int, height: int, width: int) -> Frame:
     """Frame `index` of an endless deterministic sequence, with all channels but references."""
     pixels = pixel_centres(height, width)
     now = view(index, height, width)
     before = view(max(index - 1, 0), height, width)
-    hits = cast(pixels, index, now)
-    motion = motion_vectors(pixels, hits.depth, hits.mesh_id, now, before)
-    dual = synthetic_dual_motion(pixels, index, hits, motion, now, before) if index else motion
+    depth, mesh_id, normal = cast(pixels, index, now)
+    motion = motion_vectors(pixels, depth, mesh_id, now, before)
+    dual = synthetic_dual_motion(pixels, index, mesh_id, motion, now, before) if index else motion
 
-    point = now.camera_to_world[:3, 3] + hits.depth[..., None] * directions(pixels, now)
-    centred = point - np.concatenate([np.zeros((1, 3)), now.object_to_world[:, :3, 3]])[hits.mesh_id]
+    point = now.camera_to_world[:3, 3] + depth[..., None] * directions(pixels, now)
+    centred = point - np.concatenate([np.zeros((1, 3)), now.object_to_world[:, :3, 3]])[mesh_id]
     checker = np.floor(3 * centred + 1e-6).sum(axis=-1) % 2
     rng = np.random.default_rng(SEED)
-    colour = rng.uniform(0.2, 0.9, (1 + len(now.object_to_world), 3))[hits.mesh_id]
-    hit = (hits.mesh_id > 0)[..., None]
+    colour = rng.uniform(0.2, 0.9, (1 + len(now.object_to_world), 3))[mesh_id]
+    hit = (mesh_id > 0)[..., None]
     albedo = np.where(hit, colour * (0.6 + 0.4 * checker[..., None]), 1)
-    lit = np.where(hit, albedo * (hits.normal @ TO_LIGHT).clip(0)[..., None], 0)
+    lit = np.where(hit, albedo * (normal @ TO_LIGHT).clip(0)[..., None], 0)
     rng = np.random.default_rng((SEED, index))
     direct = noisy(rng, 2 * lit, HIT_DIRECT)
     indirect = noisy(rng, np.where(hit, 0.3 * albedo, 0), HIT_INDIRECT)
+    distances = [
+        np.where(hit & (rng.random(hit.shape) < share), rng.lognormal(0.0, 0.5, hit.shape), 0) for share in (1.0, 0.3)
+    ]
     channels = {
         "direct": direct,
         "indirect": indirect,
         **split_into_buffers({"direct": direct, "indirect": indirect}, (SEED, index, 1)),
         "emission": np.where(hit, 0, [0.4, 0.6, 1.0]),
         "albedo": albedo,
-        "normal": hits.normal,
-        "depth": hits.depth[..., None],
-        "roughness": np.where(hits.mesh_id % 3 == 2, 0.2, 1.0)[..., None],
-        "mesh_id": hits.mesh_id[..., None],
+        "normal": normal,
+        "depth": depth[..., None],
+        "roughness": np.where(mesh_id % 3 == 2, 0.2, 1.0)[..., None],
+        "mesh_id": mesh_id[..., None],
         "motion": motion,
         "dual_motion": dual,
         "shadow_motion": motion,
         "reflection_motion": motion,
         "gradient": np.zeros_like(motion),
-        "hit_distance": np.stack([sampled_distances(rng, hit[..., 0], share) for share in (1.0, 0.3)], axis=-1),
-        "light_distance": np.zeros_like(hits.depth)[..., None],
+        "hit_distance": np.concatenate(distances, axis=-1),
+        "light_distance": np.zeros_like(depth)[..., None],
         "light_angle": np.where(hit, 0.05, 0),
     }
     tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,29 +13,64 @@ from tqdm import tqdm
 
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
-from datasets.frame import Frame, Signal, read_frame
+from datasets.frame import Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
-from eval.figures.panel_grid import Column, Panel, draw_grid
 from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
 from models.registry import create
-from plotting import save_figure
+from plotting import DPI, TWO_LINE_CAPTION, Figure, enlargement, plt, save_figure
 
 SHOWN_FRAMES = 4  # including the first and the last of the clip
 BRIGHTEST_DIFFERENCE = 0.25  # of displayed values; larger ones have the same colour
+# The longer side of an image, in pixels.
+SMALLEST_IMAGE = 192
+LARGEST_IMAGE = 480
+COLOUR_BAR = 0.7  # inches beside an image
+
+
+class Panel(NamedTuple):
+    """A captioned image: (H, W, 3) in [0, 1], or numbers (H, W), coloured from `low` to `high`."""
+
+    image: NDArray[np.floating]
+    caption: str
+    low: float = 0.0
+    high: float = 1.0
+
+
+Column = list[Panel]
+
+
+def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
+    """Panels of one size, those of numbers with colour bars; a row name for each panel of a column."""
+    height, width = columns[0][0].image.shape[:2]
+    zoom = min(LARGEST_IMAGE / max(height, width), enlargement(height, width, SMALLEST_IMAGE)) / DPI
+    has_bars = any(column[0].image.ndim == 2 for column in columns)
+    size = (
+        len(columns) * (width * zoom + COLOUR_BAR * has_bars) + TWO_LINE_CAPTION,
+        len(row_names) * (height * zoom + TWO_LINE_CAPTION),
+    )
+    figure, axes = plt.subplots(
+        len(row_names), len(columns), figsize=size, dpi=DPI, squeeze=False, layout="constrained"
+    )
+    panels = [panel for column in columns for panel in column]
+    for axis, panel in zip(axes.T.flat, panels, strict=True):
+        drawn = axis.imshow(panel.image, cmap="viridis", vmin=panel.low, vmax=panel.high)
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(panel.caption, fontsize=8, pad=2)
+        if panel.image.ndim == 2:
+            figure.colorbar(drawn, ax=axis, fraction=0.05, pad=0.02).ax.tick_params(labelsize=7)
+    margin = TWO_LINE_CAPTION / 2 / size[0]
+    figure.get_layout_engine().set(rect=(margin, 0, 1 - margin, 1))  # type: ignore
+    for axis, name in zip(axes[:, 0], row_names, strict=True):
+        axis.set_ylabel(name, fontsize=8)
+    return figure
 
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
     """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    image: NDArray[np.floating] = display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
-    return image
-
-
-def reference_of(frame: Frame, signal: Signal) -> Tensor:
-    """Reference radiance (1, 3, H, W) of a signal: the mean of its buffers, with emission for "total"."""
-    return frame.remodulate(frame.reference_irradiance(signal), signal)
+    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
 
 
 @dataclass
@@ -49,18 +85,14 @@ class DenoiserView:
     # of its state after each shown frame, by name: (H, W, 3) in [0, 1], or numbers (H, W)
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
-    def step(self, frame: Frame) -> Tensor:
-        """Denoise the next frame: radiance (1, 3, H, W)."""
-        output, self.state = self.denoiser(frame, self.state)
-        return output
-
     def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
         """Add the panels of `frame`, which was denoised to `output`."""
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
         if frame.channels.keys() >= set(REFERENCE_CHANNELS):
-            difference = image - as_displayed(reference_of(frame, signal), exposure)
+            reference = frame.remodulate(frame.reference_irradiance(signal), signal)
+            difference = image - as_displayed(reference, exposure)
             mse = float((difference**2).mean())
             caption += f"\nRMSE {mse**0.5:.4f}  {psnr(mse):.2f} dB"
             self.differences.append(Panel(np.abs(difference).mean(axis=2), caption, high=BRIGHTEST_DIFFERENCE))
@@ -75,8 +107,7 @@ class DenoiserView:
         """A column for each picture of the state, with one colour scale for all frames."""
         columns = []
         for name, images in self.pictures.items():
-            low = float(np.min(images))
-            high = float(np.max(images))
+            low, high = float(np.min(images)), float(np.max(images))
             columns.append([Panel(image, name, low, high) for image in images])
         return columns
 
@@ -111,11 +142,12 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
         wanted = channels | {*REFERENCE_CHANNELS, "albedo", "depth"} if has_reference and index in shown else channels
         frame = read_frame(clip, index, sorted(wanted))
         for view in views:
-            output = view.step(frame)
+            output, view.state = view.denoiser(frame, view.state)
             if index in shown:
                 view.keep(output, frame, clip.exposure)
         if has_reference and index in shown:
-            references.append(Panel(as_displayed(reference_of(frame, "total"), clip.exposure), "reference"))
+            reference = frame.remodulate(frame.reference_irradiance("total"), "total")
+            references.append(Panel(as_displayed(reference, clip.exposure), "reference"))
     return views, references
 
 

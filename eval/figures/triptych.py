@@ -1,5 +1,6 @@
 """One frame in three slanted strips: noisy, denoised, reference. `python -m eval.figures.triptych --help`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -40,7 +41,7 @@ def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
     return noisy, denoised
 
 
-def in_strips(pictures: tuple[Picture, Picture, Picture]) -> Picture:
+def in_strips(pictures: Sequence[Picture]) -> Picture:
     """The left, the middle and the right of three pictures (H, W, 3), separated by white lines."""
     height, width = pictures[0].shape[:2]
     x = np.arange(width) + SLANT * (np.arange(height)[:, None] - height / 2)
@@ -75,8 +76,7 @@ def triptych(
     posed = PosedFrame(Stage(scene, *size), frame)
     reflected = posed.reflected(seed, spp)
     exposure = clip_exposure(luminance(reflected))
-    shown = [display(image, exposure) for image in (noisy, denoised, reflected + posed.emission)]
-    picture = in_strips((shown[0], shown[1], shown[2]))
+    picture = in_strips([display(image, exposure) for image in (noisy, denoised, reflected + posed.emission)])
     with replacing(out) as temporary:
         Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(temporary, format="png", optimize=True)
 

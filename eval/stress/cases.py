@@ -1,29 +1,20 @@
 """The stress cases, as data: how each changes a moving scene under light of irradiance 1, or the denoiser."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from datasets.channels import CHANNELS, MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
+from datasets.cameras import Cameras
+from datasets.channels import CHANNELS, LENGTH, MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS, channels_of
 from datasets.frame import Frame, to_tensor
-from eval.bench.sizes import Size
+from eval.bench.denoisers import Size
 from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, split_into_buffers, synthetic_frame
-from eval.stress.changes import (
-    LIGHT_CHANNELS,
-    SURFACE_CHANNELS,
-    FrameChange,
-    PixelChange,
-    channels_at,
-    dim_to_bright,
-    lengths_times,
-    light_times,
-    near_to_far,
-    unchanged,
-)
 
 CASE_SIZE: Size = (32, 48)
 CASE_FRAMES = 10
@@ -34,9 +25,84 @@ LIGHT_SHARES = {"direct": 0.7, "indirect": 0.3}  # of the irradiance
 HIT_SHARES = {"direct": HIT_DIRECT, "indirect": HIT_INDIRECT}  # of the pixels whose one sample finds light
 NOISE_PERIOD = 100  # frames until the noise of a long sequence repeats
 
+FrameChange = Callable[[Frame], Frame]
 
-def lit(frame: Frame, seed: int | None) -> Frame:
-    """The frame under light of irradiance 1: with the noise of one sample per pixel, or without noise if no seed."""
+LIGHT_CHANNELS = channels_of("noisy", "buffers", "emission")
+SURFACE_CHANNELS = channels_of("surface", "motion", "hit")
+LENGTHS = tuple(name for name in SURFACE_CHANNELS if CHANNELS[name].unit == LENGTH)
+
+
+def as_is(frame: Frame) -> Frame:
+    return frame
+
+
+def scaled(frame: Frame, names: Sequence[str], factor: float | Tensor) -> Frame:
+    """The frame with the named channels times `factor`, a number or one for each column (W,)."""
+    return frame.with_channels({name: factor * frame.channels[name] for name in names})
+
+
+def light_times(factor: float) -> FrameChange:
+    """Multiply all light by `factor`."""
+    return lambda frame: scaled(frame, LIGHT_CHANNELS, factor)
+
+
+def channels_at(**values: float | tuple[float, ...]) -> FrameChange:
+    """Set channels to a constant; a tuple has one value per component."""
+
+    def change(frame: Frame) -> Frame:
+        constants = {name: torch.tensor(value).view(-1, 1, 1) for name, value in values.items()}
+        return frame.with_channels({name: torch.zeros_like(frame.channels[name]) + constants[name] for name in values})
+
+    return change
+
+
+def ramp(frame: Frame, low: float, high: float) -> Tensor:
+    """(W,) values from `low` at the left to `high` at the right, evenly spaced in the logarithm."""
+    return torch.logspace(math.log10(low), math.log10(high), frame.size[1])
+
+
+def near_to_far(frame: Frame) -> Frame:
+    """Depth from 1e-4 to 1e6 across the image, without changing the cameras: reprojection meets other depths."""
+    return frame.with_channels({"depth": torch.where(frame.depth > 0, ramp(frame, 1e-4, 1e6), 0)})
+
+
+def lengths_times(factor: float) -> FrameChange:
+    """Change units of length: multiply depth and the positions of cameras and meshes by `factor`."""
+
+    def cameras(at: Cameras) -> Cameras:
+        factors = torch.ones(4, 4, dtype=torch.float64)
+        factors[:3, 3] = factor
+        return Cameras(at.K, at.camera_to_world * factors, at.object_to_world * factors)
+
+    def change(frame: Frame) -> Frame:
+        moved = replace(frame, now=cameras(frame.now), previous=cameras(frame.previous))
+        return scaled(moved, LENGTHS, factor)
+
+    return change
+
+
+@dataclass(frozen=True)
+class PixelChange:
+    """Set the pixel in the middle of the image to `value`, in all components of the named channels."""
+
+    value: float
+    channels: tuple[str, ...]
+
+    def __call__(self, frame: Frame) -> Frame:
+        height, width = frame.size
+        tensors = {name: frame.channels[name].clone() for name in self.channels}
+        for tensor in tensors.values():
+            tensor[..., height // 2, width // 2] = self.value
+        return frame.with_channels(tensors)
+
+
+@lru_cache(maxsize=4 * NOISE_PERIOD)
+def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -> Frame:
+    """Frame `index` of the synthetic sequence, with surfaces changed before they are under light of irradiance 1.
+
+    With the noise of one sample per pixel, or without noise if no seed.
+    """
+    frame = surfaces(synthetic_frame(index, *size))
     reflected = (frame.divisor * (frame.depth > 0))[0].permute(1, 2, 0).double().numpy()
     light = {name: share * reflected for name, share in LIGHT_SHARES.items()}
     if seed is not None:
@@ -45,15 +111,8 @@ def lit(frame: Frame, seed: int | None) -> Frame:
         buffers = split_into_buffers(light, (seed, 1))
     else:
         buffers = {SAMPLE_BUFFERS[name]: np.stack([mean, mean]) for name, mean in light.items()}
-    channels = light | buffers
-    tensors = {name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels.items()}
-    return replace(frame, channels=frame.channels | tensors)
-
-
-@lru_cache(maxsize=4 * NOISE_PERIOD)
-def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -> Frame:
-    """Frame `index` of the synthetic sequence, with surfaces changed before they are lit."""
-    return lit(surfaces(synthetic_frame(index, *size)), seed)
+    channels = (light | buffers).items()
+    return frame.with_channels({name: to_tensor(array, CHANNELS[name].has_buffers) for name, array in channels})
 
 
 @dataclass(frozen=True)
@@ -64,8 +123,8 @@ class StressCase:
     """
 
     name: str
-    surfaces: FrameChange = unchanged  # change of the surfaces before they are lit
-    change: FrameChange = unchanged  # change of the lit frames, of all or `only` of that index
+    surfaces: FrameChange = as_is  # change of the surfaces before they are lit
+    change: FrameChange = as_is  # change of the lit frames, of all or `only` of that index
     only: int | None = None
     size: Size = CASE_SIZE
     frame_count: int = CASE_FRAMES  # of the sequence; the first `even_frames` of them are free of noise
@@ -112,7 +171,7 @@ STRESS_CASES = (
     bad_pixel("a firefly of 65504", 65504, (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values())),
     StressCase("radiance 1e-7", change=light_times(1e-7), compare_with="own", gain=1e-7),
     StressCase("radiance 6e4", change=light_times(6e4), compare_with="own", gain=6e4),
-    StressCase("radiance 1e-7 to 6e4", change=dim_to_bright),
+    StressCase("radiance 1e-7 to 6e4", change=lambda frame: scaled(frame, LIGHT_CHANNELS, ramp(frame, 1e-7, 6e4))),
     bad_pixel("NaN in a pixel's light", math.nan, LIGHT_CHANNELS),
     bad_pixel("Inf in a pixel's light", math.inf, LIGHT_CHANNELS),
     bad_pixel("NaN in a pixel's surface", math.nan, SURFACE_CHANNELS),

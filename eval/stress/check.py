@@ -1,7 +1,7 @@
 """One denoiser in one stress case: its errors, and the requirements that it breaks."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +10,14 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from datasets.frame import Frame
-from eval.bench.timed import network_of
-from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, StressCase
-from eval.stress.changes import FrameChange, PixelChange, unchanged
-from eval.stress.irradiance_range import ROUNDING, range_violation
+from eval.bench.denoisers import network_of
+from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, FrameChange, PixelChange, StressCase, as_is
 from models.denoiser import Denoiser
+from models.operators import finite
 from models.spec import PRECISIONS
 
+ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
+MIN_LIMIT = 1e-30  # ends of the range of irradiance below it are not divided by
 MAX_RESIDUE = 1e-3  # of the brightest pixel: smaller changes count as none
 ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by its power of 5 alone
 ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
@@ -42,27 +43,36 @@ def denoise(denoiser: Denoiser, frames: Iterable[Frame]) -> list[Tensor]:
     return outputs
 
 
-def finite_pixels(frame: Frame, channels: Iterable[str]) -> Tensor:
-    """Where all the named channels, and both buffers of each, are finite, (H, W)."""
-    finite = [torch.isfinite(frame.channels[name])[0].flatten(0, -3) for name in channels]
-    return torch.cat(finite).all(dim=0)
-
-
 def differences(outputs: Iterable[Tensor], expected: Iterable[Tensor]) -> list[Tensor]:
     """Absolute differences (3, H, W), relative to the brightest expected pixel of the frame unless that is black."""
     pairs = zip(outputs, expected, strict=True)
     return [(a - b).abs() / (float(b.max()) if b.max() > BLACK_BELOW else 1) for a, b in pairs]
 
 
-def largest_finite(errors: Iterable[Tensor]) -> float | None:
-    """The largest finite value; None without any."""
-    finite = [error[torch.isfinite(error)] for error in errors]
-    return max((float(error.max()) for error in finite if len(error)), default=None)
+def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequence[Tensor]) -> float:
+    """The largest distance of radiance `outputs` (3, H, W) from their range; 0 inside.
 
-
-def max_residue(precision: str) -> float:
-    """The largest change, relative to the brightest pixel, that counts as none in a precision of PRECISIONS."""
-    return max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[precision]).eps)
+    For convex filters, surfaces' irradiance stays within that of all frames so far, for each colour; where a filter
+    `separates_lights`, within the sums of the limits of direct and indirect light. The distance is relative to the
+    range's end. For others it is the absolute value below 0. Values that are not finite count as 0.
+    """
+    if not denoiser.convex:
+        return max(0.0, *(-float(finite(output).min()) for output in outputs))
+    low, high = torch.tensor(torch.inf), torch.tensor(-torch.inf)
+    largest = 0.0
+    for frame, output in zip((frame.finite() for frame in frames), outputs, strict=True):
+        apart = [frame.direct / frame.divisor, frame.indirect / frame.divisor]
+        noisy = torch.cat(apart if denoiser.separates_lights else [frame.irradiance("total")]).double()
+        surface = frame.depth > 0
+        low = torch.minimum(low, torch.where(surface, noisy, torch.inf).amin((2, 3)))
+        high = torch.maximum(high, torch.where(surface, noisy, -torch.inf).amax((2, 3)))
+        irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, surface[0, 0]]
+        if irradiance.numel():
+            least, most = low.sum(dim=0), high.sum(dim=0)
+            above = (irradiance.amax(dim=1) - most) / most.clamp(min=MIN_LIMIT)
+            below = (least - irradiance.amin(dim=1)) / least.clamp(min=MIN_LIMIT)
+            largest = max(largest, float(torch.maximum(above, below).max()))
+    return largest
 
 
 def last_layers(denoiser: Denoiser) -> list[nn.Module]:
@@ -74,11 +84,8 @@ def last_layers(denoiser: Denoiser) -> list[nn.Module]:
 
 
 @contextmanager
-def largest_logits(denoiser: Denoiser, size: float | None) -> Iterator[None]:
-    """Scale the logits so that the largest of each frame is `size`, unless that is None."""
-    if size is None:
-        yield
-        return
+def largest_logits(denoiser: Denoiser, size: float) -> Iterator[None]:
+    """Scale the logits so that the largest of each frame is `size`."""
 
     def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
         logits = output.float()  # the factor may overflow half precision
@@ -117,7 +124,7 @@ class StressCheck:
         self.case = case
         self.denoiser = build(case.precision)
         self.frames = list(case.frames())
-        with largest_logits(self.denoiser, case.logits):
+        with nullcontext() if case.logits is None else largest_logits(self.denoiser, case.logits):
             self.outputs = denoise(self.denoiser, self.frames)
 
     def errors(self) -> list[Tensor]:
@@ -129,7 +136,7 @@ class StressCheck:
             half = len(self.outputs) // 2  # averages have converged by then
             return differences(self.outputs[-NOISE_PERIOD:], self.outputs[half - NOISE_PERIOD : half])
         other = self.denoiser if self.case.compare_with == "own" else self.build("float32")
-        expected = denoise(other, self.case.frames(unchanged))
+        expected = denoise(other, self.case.frames(as_is))
         return differences(self.outputs, [self.case.gain * output for output in expected])
 
     def spreads(self, pixel: PixelChange) -> bool:
@@ -138,14 +145,14 @@ class StressCheck:
         def spoiled_output(change: FrameChange) -> Tensor:
             return denoise(self.denoiser, list(self.case.frames(change))[: SPOILED_FRAME + 1])[-1]
 
-        clean = spoiled_output(unchanged)
+        clean = spoiled_output(as_is)
         depends = [(spoiled_output(replace(pixel, value=value)) != clean).any(dim=0) for value in ORDINARY_VALUES]
         changed = (self.outputs[SPOILED_FRAME] != clean).any(dim=0)  # NaN is a change, too
         return bool((changed & ~torch.stack(depends).any(dim=0)).any())
 
     def recovery(self, errors: Sequence[Tensor]) -> int | None:
         """Frames from the bad pixel until its last effect; None for more than RECOVERY_LIMIT."""
-        limit = max_residue(self.case.precision)
+        limit = max(MAX_RESIDUE, ROUNDINGS * torch.finfo(PRECISIONS[self.case.precision]).eps)
         changed = [index for index, error in enumerate(errors) if not (error <= limit).all()]  # NaN is a change, too
         frames = changed[-1] + 1 - SPOILED_FRAME if changed else 0
         return frames if frames <= RECOVERY_LIMIT else None
@@ -153,8 +160,10 @@ class StressCheck:
     def row(self, denoiser: str, weights: str | None) -> StressRow:
         """The results under the denoiser's name, with the file of its weights."""
         errors = self.errors()
+        finite_errors = torch.cat([error[torch.isfinite(error)] for error in errors])
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
-        good_input = [finite_pixels(frame, self.denoiser.reads) for frame in self.frames]
+        inputs = ([frame.channels[name][0].flatten(0, -3) for name in self.denoiser.reads] for frame in self.frames)
+        good_input = [torch.isfinite(torch.cat(tensors)).all(dim=0) for tensors in inputs]
         violation = range_violation(self.denoiser, self.frames, self.outputs)
         recovery = self.recovery(errors) if self.case.only is not None else None
         poison = self.case.poison
@@ -168,7 +177,7 @@ class StressCheck:
             denoiser,
             weights,
             self.case.name,
-            error=largest_finite(errors),
+            error=float(finite_errors.max()) if len(finite_errors) else None,
             nonfinite=sum(int(where.sum()) for where in bad),
             violation=violation,
             recovery=recovery,

@@ -12,16 +12,14 @@ from tqdm import tqdm
 from datasets.channels import SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.bench.sample_cost import RENDERER, Cost, sample_cost
-from eval.bench.sizes import parse_size
+from eval.bench.denoisers import parse_size
 from eval.clip_run import NamedDenoiser
 from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.metrics import METRICS
 from eval.results import ClipResults, Result, by_clip
 from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
-from eval.tradeoff.resampled_clips import scene_of, with_samples
-from eval.tradeoff.times import Times
-from eval.tradeoff.trades import Trade, front_table, samples_table, trades
+from eval.tradeoff.samples import RENDERER, Cost, sample_cost, scene_of, with_samples
+from eval.tradeoff.trades import Times, Trade, front_table, samples_table, trades
 from files import write_json
 from models.registry import DENOISERS, DenoiserName, shipped_names
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
@@ -121,9 +119,8 @@ def results_by_spp(
     results: dict[int, list[Result]] = {spp: [] for spp in levels}
     jobs = [(clip, spp) for clip in clips for spp in levels]
     for clip, spp in tqdm(jobs, "samples a pixel", unit="clip"):
-        results[spp] += evaluate_clip(
-            with_samples(clip, dataset, spp, folder / "data", with_buffers), denoisers, folder
-        )
+        fed = with_samples(clip, dataset, spp, folder / "data", with_buffers)
+        results[spp] += evaluate_clip(fed, denoisers, folder)
     return {spp: list(by_clip(ours)) for spp, ours in results.items()}
 
 

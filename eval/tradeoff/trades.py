@@ -1,21 +1,80 @@
-"""Quality against time: the rows of trade.json and their tables."""
+"""Quality against time: times from `onespp bench denoisers`, Pareto fronts, the rows of trade.json, their tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 from tabulate import tabulate
 
 from datasets.frame import Signal
-from eval.means import scores_of
+from errors import BadInput
+from eval.bench.denoisers import Size, results_file, size_name
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.text_table import LEGEND, NEAR_FLOOR, value_cell
-from eval.tradeoff.pareto import Point, dominated_by_name
-from eval.tradeoff.times import Times
+from eval.tables import scores_of, value_cell, with_legend
+from files import read_json
 from models.spec import DenoiserSpec
 
 TRADED = ("psnr", "ssim", "rmse")
+
+
+class Times:
+    """Milliseconds per frame of `size`, measured with `threads`, by default the most of the bench.
+
+    `device` is "cpu" or "cuda". Raises BadInput where the bench has no such rows.
+    """
+
+    def __init__(self, runs: Path, size: Size, threads: int | None = None, device: str = "cpu"):
+        path = results_file(runs, device)
+        self.size = size
+        self.name = size_name(size)
+        self.command = f"onespp bench denoisers --size {self.name} --runs {runs}"
+        if not path.exists():
+            raise BadInput(f"there are no times at {path}: measure them with `{self.command}`")
+        bench = read_json(path, ("device", "threads", "rows"))
+        self.device: str = bench["device"]
+        self.threads: int = threads or bench["threads"]
+        # By the bench's name of the denoiser, and precision.
+        self.ms: dict[tuple[str, str], float] = {
+            (row["denoiser"], row["dtype"]): row["ms_median"]
+            for row in bench["rows"]
+            if (row["height"], row["width"], row["threads"]) == (*size, self.threads)
+        }
+        if not self.ms:
+            raise BadInput(
+                f"{path} has no times of {self.name} with {self.threads} threads: measure them with "
+                f"`{self.command} --threads {self.threads}`"
+            )
+
+    def of(self, spec: DenoiserSpec) -> float | None:
+        """Milliseconds a frame; None where that was not measured."""
+        return self.ms.get((spec.way, spec.precision))
+
+
+def times_of_first_size(runs: Path) -> Times | None:
+    """The times on the CPU at the bench's first size; None without any."""
+    path = results_file(runs)
+    rows = read_json(path, ("rows",))["rows"] if path.exists() else []
+    return Times(runs, (rows[0]["height"], rows[0]["width"])) if rows else None
+
+
+def dominated_by_name(points: Mapping[str, tuple[float | None, float | None]], metric: str) -> dict[str, str | None]:
+    """For every name, the best of those that are no slower and no worse, and better in one; None on the front.
+
+    `points` are milliseconds and values of the metric. Names without either are left out.
+    """
+    sign = -1 if METRICS[metric].more_is_better else 1
+    costs = {name: (sign * value, ms) for name, (ms, value) in points.items() if ms is not None and value is not None}
+    best_first = sorted(costs, key=costs.__getitem__)
+
+    def dominates(a: tuple[float, float], b: tuple[float, float]) -> bool:
+        return a[0] <= b[0] and a[1] <= b[1] and a != b
+
+    return {
+        name: next((other for other in best_first if dominates(costs[other], cost)), None)
+        for name, cost in costs.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -80,7 +139,7 @@ def trades(
         rows.append(row)
     for signal, metric in product(dict.fromkeys(row.signal for row in rows), TRADED):
         alike = [row for row in rows if row.signal == signal]
-        beaten = dominated_by_name({row.name: Point.of(row.ms, row.compared[metric]) for row in alike}, metric)
+        beaten = dominated_by_name({row.name: (row.ms, row.compared[metric]) for row in alike}, metric)
         for row in alike:
             row.dominated_by[metric] = beaten.get(row.name)
     return rows
@@ -94,8 +153,7 @@ def front_table(rows: Sequence[Trade]) -> str:
         line |= {METRICS[metric].title: row.cell(metric) for metric in TRADED}
         line |= {f"dominated in {METRICS[metric].title.split()[0]} by": row.standing(metric) for metric in TRADED}
         lines.append(line)
-    text = tabulate(lines, "keys", disable_numparse=True)
-    return f"{text}\n{LEGEND}" if NEAR_FLOOR in text else text
+    return with_legend(tabulate(lines, "keys", disable_numparse=True))
 
 
 def psnr_front(rows: Sequence[Trade], signal: Signal) -> list[tuple[float, Trade]]:

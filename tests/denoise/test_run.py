@@ -25,7 +25,7 @@ from denoise.frame_errors import ErrorTable
 from denoise.job import Job
 from denoise.run import denoise
 from errors import BadInput
-from eval.tradeoff.resampled_clips import with_samples
+from eval.tradeoff.samples import with_samples
 from models.registry import create
 from models.spec import load
 from models.weights import save_weights

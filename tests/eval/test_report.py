@@ -17,14 +17,13 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.clip_run import Crop, densest_crop
+from eval.clip_run import densest_crop
 from eval.harness import evaluate_clip, named_denoisers
 from eval.metrics import METRICS, flip_map
-from eval.report.page import report
-from eval.report.page_data import page_clip
-from eval.report.table_rows import TableRow, best_denoisers
+from eval.report.page import page_clip, report
 from eval.results import FLOOR, MAX_SHOWN_ERROR, by_clip, folder_of, load_picture, load_result
-from eval.tradeoff.resampled_clips import with_samples
+from eval.tables import TableRow, best_denoisers
+from eval.tradeoff.samples import with_samples
 from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import denoise_with_error
 
@@ -149,8 +148,8 @@ def test_estimated_errors_have_their_own_view(tiny, page, tmp_path):
     specs = [DenoiserSpec.named("noisy"), DenoiserSpec.named("eaw+js")]
     (results,) = by_clip(evaluate_clip(fed, named_denoisers(specs), tmp_path))
     shown = page_clip(tmp_path, results, 3)
-    assert list(shown.errors) == ["eaw+js"] and len(shown.errors["eaw+js"]) == len(shown.frames)
-    shade = pixels(shown.errors["eaw+js"][1])[..., 0]
+    assert list(shown["errors"]) == ["eaw+js"] and len(shown["errors"]["eaw+js"]) == len(shown["frames"])
+    shade = pixels(shown["errors"]["eaw+js"][1])[..., 0]
     denoiser = specs[1].build()
     state = None
     for index in range(4):
@@ -249,10 +248,10 @@ def test_densest_crop():
     assert densest_crop(mask) is None
     mask[40:44, 30:36] = True
     window = densest_crop(mask)
-    assert window.size == 20 and window.pixels == 24
-    assert abs(window.x + 9.5 - 32.5) <= 1 and abs(window.y + 9.5 - 41.5) <= 1
+    assert window["size"] == 20 and window["pixels"] == 24
+    assert abs(window["x"] + 9.5 - 32.5) <= 1 and abs(window["y"] + 9.5 - 41.5) <= 1
     mask[:] = False
     mask[0, 79] = True
-    assert densest_crop(mask) == Crop(60, 0, 20, 1)
-    assert densest_crop(torch.ones(3, 50, dtype=torch.bool)).size == 3
-    assert densest_crop(torch.ones(1, 1, dtype=torch.bool)) == Crop(0, 0, 1, 1)
+    assert densest_crop(mask) == {"x": 60, "y": 0, "size": 20, "pixels": 1}
+    assert densest_crop(torch.ones(3, 50, dtype=torch.bool))["size"] == 3
+    assert densest_crop(torch.ones(1, 1, dtype=torch.bool)) == {"x": 0, "y": 0, "size": 1, "pixels": 1}

@@ -12,9 +12,9 @@ import torch
 from datasets.clip import Dataset
 from eval import clip_run, harness
 from eval.harness import evaluate
-from eval.means import means_by_age
 from eval.metrics import METRICS
 from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
+from eval.tables import means_by_age
 from models.registry import create
 from models.weights import save_weights
 from train.task import run_folder
@@ -54,9 +54,9 @@ def played(monkeypatch):
     calls = []
     run_clip = harness.run_clip
 
-    def watched(clip, tracks, folders, quiet=False):
-        calls.append((clip.scene, sorted(track.name for track in tracks)))
-        run_clip(clip, tracks, folders, quiet)
+    def watched(clip, tracks, quiet=False):
+        calls.append((clip.scene, sorted(track.name for track in tracks.values())))
+        run_clip(clip, tracks, quiet)
 
     monkeypatch.setattr(harness, "run_clip", watched)
     return calls
@@ -137,11 +137,11 @@ def test_an_interrupted_evaluation_resumes_to_equal_results(once, tiny, tmp_path
     frames = []
     save = clip_run.save_picture
 
-    def killed(folder, index, image):
-        frames.append(index)
+    def killed(path, image):
+        frames.append(path)
         if len(frames) > frame * (len(NAMES) + 1) + 1:
             raise KeyboardInterrupt
-        save(folder, index, image)
+        save(path, image)
 
     runs = tmp_path / "runs"
     shutil.copytree(once / "train", runs / "train")

@@ -13,8 +13,7 @@ from matplotlib import image as png
 from command_line import main
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.figures.panel_grid import Panel, draw_grid
-from eval.figures.show import grids_of, show, view_clip
+from eval.figures.show import Panel, draw_grid, grids_of, show, view_clip
 from models.denoiser import Denoiser, State
 from models.registry import create
 from plotting import save_figure

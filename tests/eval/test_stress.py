@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +13,18 @@ from PIL import Image
 
 from command_line import main
 from errors import BadInput
-from eval.stress.cases import LONG_CASE, NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, STRESS_CASES, StressCase
-from eval.stress.changes import LIGHT_CHANNELS, SURFACE_CHANNELS
-from eval.stress.check import FRESH, MAX_RESIDUE, StressCheck, StressRow, largest_logits, last_layers
-from eval.stress.irradiance_range import IrradianceRange
-from eval.stress.run import applies, cases_in, check_all, stressed, weights_label
-from eval.stress.tables import heat_map, verdict_text
+from eval.stress.cases import (
+    LIGHT_CHANNELS,
+    LONG_CASE,
+    NOISE_PERIOD,
+    RECOVERY_LIMIT,
+    SPOILED_FRAME,
+    STRESS_CASES,
+    SURFACE_CHANNELS,
+    StressCase,
+)
+from eval.stress.check import FRESH, MAX_RESIDUE, StressCheck, StressRow, largest_logits, last_layers, range_violation
+from eval.stress.run import applies, cases_in, check_all, heat_map, stressed, verdict_text, weights_label
 from models import registry
 from models.denoiser import Denoiser, State
 from models.spec import DenoiserSpec
@@ -370,10 +377,10 @@ def test_the_range_of_each_colour_and_of_separate_lights():
     }
     frame = replace(frame, channels=tensors)
     for separates_lights, low, high in ((False, 3.0, 3.0), (True, 1.0, 5.0)):
-        limits = IrradianceRange(separates_lights)
-        limits.add(frame)
+        denoiser = SimpleNamespace(convex=True, separates_lights=separates_lights)
         for level, outside in ((low, 0), (high, 0), (high * 1.01, 0.01), (low * 0.99, 0.01)):
-            assert max(0, limits.violation(frame, torch.full((3, 1, 2), level))) == pytest.approx(outside, abs=1e-6)
+            output = torch.full((3, 1, 2), level)
+            assert range_violation(denoiser, [frame], [output]) == pytest.approx(outside, abs=1e-6)
         red = torch.full((3, 1, 2), low)
         red[0] = 2 * high
-        assert limits.violation(frame, red) == pytest.approx(1)
+        assert range_violation(denoiser, [frame], [red]) == pytest.approx(1)

@@ -10,16 +10,14 @@ import pytest
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
-from eval.bench.sample_cost import fit_cost, sample_cost
 from eval.harness import clips_of_one_spp
-from eval.means import ClipScores
-from eval.report.trade_plot import trade_plot
+from eval.metrics import METRICS
+from eval.report.page import trade_plots
 from eval.results import NOISE_FLOOR, ClipResults, Result
-from eval.tradeoff.pareto import Point, dominated_by_name
-from eval.tradeoff.resampled_clips import rendered, scene_of, with_samples
+from eval.tables import ClipScores
 from eval.tradeoff.run import candidates, check_levels, draw_samples, trade
-from eval.tradeoff.times import Times
-from eval.tradeoff.trades import Trade, trades
+from eval.tradeoff.samples import fit_cost, rendered, sample_cost, scene_of, with_samples
+from eval.tradeoff.trades import Times, Trade, dominated_by_name, trades
 from files import read_json, write_json
 from models.registry import create
 from models.spec import DenoiserSpec
@@ -55,8 +53,8 @@ def test_fronts_by_brute_force(metric, sign):
     rng = np.random.default_rng(0)
     ms = rng.integers(1, 9, 40)  # with ties
     values = rng.integers(20, 30, 40)
-    points = {str(i): Point.of(float(a), float(b)) for i, (a, b) in enumerate(zip(ms, values, strict=True))}
-    found = dominated_by_name(points | {"untimed": Point.of(None, 0.0), "undefined": Point.of(0.0, None)}, metric)
+    points = {str(i): (float(a), float(b)) for i, (a, b) in enumerate(zip(ms, values, strict=True))}
+    found = dominated_by_name(points | {"untimed": (None, 0.0), "undefined": (0.0, None)}, metric)
     assert not {"untimed", "undefined"} & found.keys() and None in found.values() and len(set(found.values())) > 1
     for i, (a, b) in enumerate(zip(ms, values, strict=True)):
         better = {
@@ -99,15 +97,8 @@ def clip_results(**psnr: float) -> ClipResults:
     """Results of total light on a clip, by denoiser."""
 
     def result(name: str, value: float) -> Result:
-        return Result(
-            "",
-            name,
-            "total",
-            "cornell_box",
-            "000",
-            {"psnr": value, "ssim": None, "rmse": None, "mse_unbiased": 0.0},
-            [],
-        )
+        metrics = dict.fromkeys(METRICS) | {"psnr": value, "mse_unbiased": 0.0}
+        return Result("", name, "total", "cornell_box", "000", metrics, [])
 
     return ClipResults(
         "cornell_box", "000", "total", [result(*pair) for pair in psnr.items()], result(NOISE_FLOOR, 99.0)
@@ -132,10 +123,10 @@ def test_samples_can_cost_more_than_they_gain(tmp_path):
 
 def test_two_trainings_of_a_network_are_two_points(tmp_path):
     bench_of(tmp_path, ["noisy", "rae"], threads=(1,))
-    plot = trade_plot(Times(tmp_path, SIZE), [clip_results(**{"noisy": 20.0, "rae": 30.0, "rae@tiny": 28.0})], "psnr")
-    points = {point.name: (point.ms, point.quality, point.by) for point in plot.points}
+    (plot,) = trade_plots(Times(tmp_path, SIZE), [clip_results(**{"noisy": 20.0, "rae": 30.0, "rae@tiny": 28.0})])
+    points = {point["name"]: (point["ms"], point["quality"], point["by"]) for point in plot["points"]}
     assert points == {"noisy": (1.0, 20.0, None), "rae": (2.0, 30.0, None), "rae@tiny": (2.0, 28.0, "rae")}
-    assert plot.missing == []
+    assert plot["metric"] == "psnr" and plot["missing"] == []
 
 
 # --- Samples ----------------------------------------------------------------------------------------------------------

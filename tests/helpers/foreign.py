@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame
-from eval.bench.sizes import parse_size
+from eval.bench.denoisers import parse_size
 from eval.bench.synthetic_frames import synthetic_frame
 from scenes.camera import View, inverse_pose, pixel_centres, unproject
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from datasets.channels import SECOND
 from datasets.frame import Frame
-from eval.stress.irradiance_range import ROUNDING
+from eval.stress.check import ROUNDING
 from models import compiled, layers, registry
 from models.denoiser import LayeredState
 from models.registry import DENOISERS

@@ -7,7 +7,7 @@ import torch
 from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame
-from eval.stress.irradiance_range import ROUNDING, range_violation
+from eval.stress.check import ROUNDING, range_violation
 from models import registry
 from models.registry import DENOISERS, channels_read
 from render.clip import Sampling, write_clip

@@ -20,7 +20,7 @@ from datasets.frame import Frame, read_frame
 from datasets.tonemap import display, psnr
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.stress.irradiance_range import ROUNDING, range_violation
+from eval.stress.check import ROUNDING, range_violation
 from models import compiled, registry
 from tests.helpers.frames import chain, flat_frame, play, run
 

@@ -9,7 +9,7 @@ import pytest
 from command_line import main
 from datasets.clip import Dataset
 from errors import BadInput
-from eval.tradeoff.resampled_clips import scene_of
+from eval.tradeoff.samples import scene_of
 from render.job.profiles import SamplingQuality, own_profile, profile_of
 from render.scene_file.load import own_scene
 from tests.helpers.datasets import digest

@@ -1,9 +1,12 @@
-"""Clips with more samples per pixel: a dataset's clips with other noisy input, rendered and stored."""
+"""More samples per pixel: a dataset's clips with other noisy input, rendered and stored; and what samples cost."""
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +16,20 @@ from datasets.channels import CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from errors import BadInput
 from files import locked, read_json, write_json
+from render.backend import VARIANT, dr
 from render.clip import Options, Sampling, render_clip
 from render.job.generate import check_versions
 from render.job.plan import GENERATOR, scene_of_clip
 from render.job.profiles import profile_of, source_of
+from render.path import PathTracer
 from render.sampler import CYCLE
+from render.stage import Stage
 from scenes.animation import Scene
+from timing import take_turns
+
+RENDERER = VARIANT.partition("_")[0].replace("llvm", "cpu")  # the device that renders: cpu or cuda
+TIMED_SPP = (1, 2, 4, 8)
+TIMED_FRAMES_EACH = 3  # after a first one, which compiles kernels
 
 NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS (H, W, 3), of SAMPLE_BUFFERS (2, H, W, 3)
 
@@ -91,12 +102,43 @@ def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dic
         array = np.stack([frame[name] for frame in frames])[:, None].astype("<f4")
         file = path / f"{name}.npy"
         np.save(file, array)
-        crc32 = f"{zlib.crc32(file.read_bytes()):08x}"
-        entries[name] = {
-            "file": file.name,
-            "dtype": "<f4",
-            "shape": list(array.shape),
-            "unit": CHANNELS[name].unit,
-            "crc32": crc32,
-        }
+        entry = {"file": file.name, "dtype": "<f4", "shape": list(array.shape), "unit": CHANNELS[name].unit}
+        entries[name] = entry | {"crc32": f"{zlib.crc32(file.read_bytes()):08x}"}
     write_json(path / "clip.json", clip.facts | facts | {"channels": entries})
+
+
+class Cost(NamedTuple):
+    """Milliseconds of a frame: a constant part (rays, first hits) and a part per sample."""
+
+    frame_ms: float
+    sample_ms: float
+
+    def of(self, spp: int) -> float:
+        return self.frame_ms + self.sample_ms * spp
+
+
+def fit_cost(spp: Sequence[int], ms: Sequence[float]) -> Cost:
+    """The line through measured times, by least squares; neither part is below 0."""
+    sample_ms, frame_ms = np.polyfit(spp, ms, 1)
+    return Cost(max(0.0, float(frame_ms)), max(0.0, float(sample_ms)))
+
+
+def sample_cost(scene: Scene, height: int, width: int, threads: int, options: Options) -> Cost:
+    """The cost of the scene's first frame, without its G-buffer, whose time does not depend on samples."""
+    stage = Stage(scene, height, width)
+    stage.pose(0)
+    ray = stage.rays(stage.view(0))
+    tracer = PathTracer(stage, *options)
+    seeds = count()  # a different one for every call
+
+    def trace(spp: int) -> None:
+        tracer.radiance(ray, next(seeds), spp)
+
+    before = dr.thread_count()
+    dr.set_thread_count(threads)
+    try:
+        work = {f"{spp} spp": partial(trace, spp) for spp in TIMED_SPP}
+        seconds = take_turns(work, TIMED_FRAMES_EACH, label="samples")
+    finally:
+        dr.set_thread_count(before)
+    return fit_cost(TIMED_SPP, [1e3 * median(spent) for spent in seconds.values()])
