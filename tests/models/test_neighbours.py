@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.filters.neighbours import mesh_means, mesh_min, mesh_sums
+from models.filters.neighbours import mesh_means, mesh_min, mesh_sums, mesh_variance
 from tests.helpers.windows import mesh_window
 
 pytestmark = pytest.mark.usefixtures("implementation")
@@ -12,11 +12,12 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 9), (9, 5), (7, 40)])
-def test_means_are_over_the_same_mesh(height: int, width: int) -> None:
+def test_means_and_variances_are_over_the_same_mesh(height: int, width: int) -> None:
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(2, 3, height, width, generator=generator)
     mesh_id = torch.randint(0, 3, (2, 1, height, width), generator=generator).float()
     mean_3x3, mean_9x9, deviation = mesh_means(image, mesh_id)
+    variance = mesh_variance(image, mesh_id)
     for item in range(2):
         pixels = image[item].permute(1, 2, 0).numpy().astype(float)
         mesh = mesh_id[item, 0].numpy()
@@ -26,6 +27,7 @@ def test_means_are_over_the_same_mesh(height: int, width: int) -> None:
             spread = (wide @ LUMINANCE).std() / (wide @ LUMINANCE).mean()
             np.testing.assert_allclose(mean_3x3[item, :, *p], np.mean(close, axis=0), rtol=1e-5)
             np.testing.assert_allclose(mean_9x9[item, :, *p], wide.mean(axis=0), rtol=1e-5)
+            np.testing.assert_allclose(variance[item, :, *p], wide.var(axis=0), rtol=1e-4, atol=1e-6)
             assert deviation[item, 0, *p].item() == pytest.approx(spread, abs=2e-3)
 
 

@@ -8,7 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.filters.neighbours import mesh_variance
 from models.filters.sbf import BANK, best_filtered, filter_with_risk, guides
 from tests.helpers.frames import flat_frame
 
@@ -92,17 +91,6 @@ def test_the_risk_is_the_squared_error_on_average():
     off = (risk - (filtered - truth).square()).double()
     standard_error = off.std(dim=0) / math.sqrt(count)
     assert (off.mean(dim=0).abs() < 5 * standard_error).all()
-
-
-def test_variance_is_that_of_the_same_mesh():
-    rng = np.random.default_rng(0)
-    image = rng.random((3, 14, 11))
-    mesh = np.zeros((14, 11))
-    mesh[:, 5:] = 1
-    mesh[7, 2] = 2
-    variance = mesh_variance(to_torch(image), to_torch(mesh[None]))[0]
-    np.testing.assert_allclose(variance[:, 6, 9], image[:, 2:11, 5:].var(axis=(1, 2)), rtol=1e-4)
-    assert (variance[:, 7, 2] == 0).all()
 
 
 def test_features_are_in_units_of_the_paper_s_deviations():
