@@ -7,17 +7,17 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
-import trimesh
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
 from eval.harness import compile_kernels
 from models import registry
-from models.registry import DENOISERS, channels_read, prototype
+from models.registry import DENOISERS, prototype
 from models.spec import DenoiserSpec
-from render.job.generate import generate
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
 from scenes.registry import build_scene
+from tests.helpers.datasets import generate_tiny
+from tests.helpers.mirrors import panel
 
 # For tests without a number of examples of their own; `make test-all` takes the thorough profile.
 hypothesis.settings.register_profile("quick", max_examples=10)
@@ -45,7 +45,7 @@ def kernels() -> None:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of profile `tiny`. Read only: tests that damage it copy it first."""
     root = tmp_path_factory.mktemp("data") / "tiny"
-    generate(root, "tiny", seed=0, reads=channels_read())
+    generate_tiny(root)
     return root
 
 
@@ -77,9 +77,8 @@ def moving() -> Stage:
 @pytest.fixture(scope="session")
 def square() -> Scene:
     """A grey unit square, 3 units before a camera that looks along -z, half its width in view; black sky around it."""
-    mesh = trimesh.Trimesh(np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]) / 2, [[0, 1, 2], [0, 2, 3]])
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
-    shape = Shape("square", mesh, grey, radiance=Track.constant([1.0, 2.0, 3.0]))
+    shape = Shape("square", panel(1, 1), grey, radiance=Track.constant([1.0, 2.0, 3.0]))
     fov = np.degrees(2 * np.arctan(1 / 3))  # two units wide at the square's distance
     camera = Camera(Track.constant([0.0, 0, 3]), Track.constant([0.0, 0, 0]), Track.constant(fov))
     return Scene((shape,), camera)

@@ -3,7 +3,6 @@
 import hashlib
 import sys
 import time
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,9 @@ def dataset_command(root: Path) -> list[str]:
     return [sys.executable, "-m", "onespp", "dataset", "--profile", "tiny", "--data", str(root), *everybody]
 
 
-@cache  # it creates every denoiser
-def channels_read_by_all() -> tuple[str, ...]:
-    return channels_read()
-
-
 def generate_tiny(root: Path, **arguments: Any) -> int:
     """What `dataset_command` does, in this process. `arguments` are further ones of render.job.generate.generate."""
-    return generate(root, "tiny", seed=0, reads=channels_read_by_all(), **arguments)
+    return generate(root, "tiny", seed=0, reads=channels_read(), **arguments)
 
 
 def digest(root: Path) -> dict[str, str]:

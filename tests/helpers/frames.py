@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from datasets.cameras import Cameras
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
+from models import registry
 from models.denoiser import Denoiser, State
 
 FOCAL_LENGTH = 10.0  # px
@@ -65,6 +66,14 @@ def chain(frames: list[Frame]) -> list[Frame]:
         now = replace(frame.now, camera_to_world=last.camera_to_world @ step)
         chained.append(replace(frame, now=now, previous=replace(last, K=frame.previous.K)))
     return chained
+
+
+def prepared(name: str, signal: Signal | None = None) -> Denoiser:
+    """A denoiser in the form for inference, with the same random weights every time."""
+    torch.manual_seed(0)
+    denoiser = registry.create(name, signal)
+    denoiser.prepare()
+    return denoiser
 
 
 @torch.no_grad()

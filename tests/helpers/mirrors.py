@@ -35,18 +35,16 @@ EYE = Track(np.array([[1.2, 0.3, 3.0], [1.5, 0.2, 2.8]]), last=FRAMES - 1.0)
 CAMERA = Camera(EYE, Track.constant([0.0, 0, 0]), Track.constant(60.0))
 
 
-def slanted() -> trimesh.Trimesh:
-    """A wall behind the camera that the mirror shows everywhere, at a slant."""
-    wall = placed(panel(50, 50), [0, 0, 6])
-    wall.apply_transform(trimesh.transformations.rotation_matrix(np.pi + 0.2, [0, 1, 0], [0, 0, 6]))
-    return wall
-
-
 def room(surface: Bsdf) -> Scene:
-    """A picture on the wall of which is `surface`, a box that glides along it and a slanted wall behind the camera."""
+    """A picture on the wall of which is `surface`, a box that glides along it and a slanted wall behind the camera.
+
+    The picture, if it is a mirror, shows that wall everywhere.
+    """
+    slanted = placed(panel(50, 50), [0, 0, 6])
+    slanted.apply_transform(trimesh.transformations.rotation_matrix(np.pi + 0.2, [0, 1, 0], [0, 0, 6]))
     shapes = (
         Shape("picture", panel(5, 5), surface),
         Shape("box", BOX, painted(0.2), motion=RigidMotion(GLIDE, Track.constant(0.0))),
-        Shape("wall", slanted(), painted(0.7), radiance=Track.constant([1.0, 1.0, 1.0])),
+        Shape("wall", slanted, painted(0.7), radiance=Track.constant([1.0, 1.0, 1.0])),
     )
     return Scene(shapes, CAMERA)

@@ -5,6 +5,7 @@ import contextlib
 import pytest
 import torch
 
+from datasets.clip import Clip, Dataset
 from models import compiled
 
 IMPLEMENTATIONS = {"kernels": contextlib.nullcontext, "PyTorch": compiled.disabled}
@@ -17,6 +18,12 @@ def implementation(request):
     """The test runs with compiled kernels, and again in PyTorch alone."""
     with IMPLEMENTATIONS[request.param]():
         yield request.param
+
+
+@pytest.fixture(scope="session")
+def moving_clip(tiny) -> Clip:
+    """Eight rendered frames in which a mesh and the camera move."""
+    return Dataset(tiny).clips("test")[1]
 
 
 @pytest.fixture(scope="class")

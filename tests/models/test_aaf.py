@@ -13,7 +13,7 @@ from datasets.channels import HIT_CHANNELS
 from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
 from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, positions, widths
-from scenes.camera import View, pixel_centres, unproject
+from tests.helpers import foreign
 from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
 
@@ -56,16 +56,6 @@ def test_the_penumbra_from_rendered_samples():
     np.testing.assert_allclose(penumbra(frame)[0, 0].numpy()[on_wall], expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("height", [0.1, 1.0, 1.9])
-def test_a_penumbra_is_as_wide_as_by_similar_triangles(height):
-    """Of a blocker's edge at `height` over the wall, below a square lamp at 2."""
-    lamp = 2.0
-    side = 0.3
-    across = side * height / (lamp - height)  # of the penumbra
-    width = penumbra(lit_frame(blocked=height, light=lamp, angle=side / math.sqrt(12) / lamp))
-    torch.testing.assert_close(width, torch.full_like(width, across / math.sqrt(12)))  # also of uniform light
-
-
 def test_the_sun_s_penumbra_grows_with_the_distance_of_the_blocker():
     width = penumbra(lit_frame(blocked=3.0, light=0.0, angle=0.01))
     torch.testing.assert_close(width, torch.full_like(width, 0.03))
@@ -106,31 +96,12 @@ def test_the_nearest_hit_of_the_same_mesh_counts():
 
 def test_positions_are_where_the_camera_s_rays_end():
     frame = synthetic_frame(7, 20, 30)
-    view = View(*(getattr(frame.now, name)[0].numpy() for name in View._fields))
-    points = unproject(pixel_centres(20, 30), frame.depth[0, 0].numpy().astype(float), view)
-    expected = np.moveaxis(points - view.camera_to_world[:3, 3], -1, 0)
+    expected = np.moveaxis(foreign.positions(frame) - foreign.view(frame).camera_to_world[:3, 3], -1, 0)
     hit = frame.depth[0, 0].numpy() > 0
     np.testing.assert_allclose(positions(frame)[0].numpy()[:, hit], expected[:, hit], atol=1e-5)
 
 
 # --- The filter -------------------------------------------------------------------------------------------------------
-
-
-def test_on_a_wall_two_passes_are_one_gaussian():
-    """A Gaussian of constant width is separable: against its sum over a square, away from the borders."""
-    size, sigma = 31, 3.0
-    rng = np.random.default_rng(0)
-    image = rng.random((3, size, size))
-    filtered = torch.from_numpy(np.float32(image))[None, None]
-    width = torch.full((1, 1, 1, size, size), sigma * PIXEL)
-    for down in (False, True):
-        filtered = filter_lines(filtered, width, width, pack_geometry(flat_frame(size, size, depth=DEPTH)), down)
-    reach = math.floor(math.sqrt(8) * sigma)
-    offset = np.arange(-reach, reach + 1)
-    kernel = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma**2))
-    for y, x in ((15, 15), (reach, size - 1 - reach)):
-        window = image[:, y - reach : y + reach + 1, x - reach : x + reach + 1]
-        np.testing.assert_allclose(filtered[0, 0, :, y, x], (window * kernel).sum((1, 2)) / kernel.sum(), rtol=1e-5)
 
 
 def naive_weight(geometry, width, p, q):

@@ -1,4 +1,4 @@
-"""Temporal accumulation on static walls, and the running scale of exposure and depth, by hand."""
+"""Temporal accumulation before and after a denoiser, and the running scale of exposure and depth, by hand."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ import torch
 from models.history.accumulation import Accumulation, accumulate
 from models.history.geometry import GBuffer
 from models.history.running_scale import running_scale
-from tests.helpers.frames import flat_frame
+from models.registry import create
+from tests.helpers.frames import flat_frame, play, run
 
 
 def test_accumulation_averages_five_frames_then_moves_on():
@@ -39,6 +40,24 @@ def test_accumulation_starts_anew_where_disoccluded():
     torch.testing.assert_close(history.irradiance[..., :3], torch.full((1, 3, 4, 3), 0.4))
 
 
+@pytest.mark.parametrize("suffix", ["", "+adaptive"])
+def test_accumulation_commutes_with_a_denoiser_that_does_nothing(suffix):
+    """Before or after, an unfiltered frame is the same; emission is not noise."""
+    generator = torch.Generator().manual_seed(0)
+    frames = [flat_frame(12, 12, irradiance=torch.rand(1, 3, 12, 12, generator=generator)) for _ in range(7)]
+    for frame in frames:
+        frame.emission[..., 4:] = 7.0
+    after, before = (run(create(f"{name}{suffix}"), frames) for name in ("noisy+accumulated", "accumulated"))
+    torch.testing.assert_close(after, before)
+
+
+def test_the_denoiser_inside_keeps_its_own_history():
+    frames = [flat_frame(6, 8)] * 3
+    (_, state), (_, own) = (play(create(name), frames) for name in ("svgf+accumulated", "svgf"))
+    torch.testing.assert_close(state.inner.history.length, own.history.length)
+    assert state.pictures().keys() > own.pictures().keys() - {"history length"}
+
+
 def test_running_scale_by_hand():
     """Constant luminance y: exposure 0.18 / y. The logarithm averages evenly at first. Black and sky change nothing."""
     grey = torch.full((1, 3, 32, 40), 0.5)
@@ -58,11 +77,3 @@ def test_running_scale_by_hand():
     light = running_scale(grey, depth, black)
     assert light.exposure().item() == pytest.approx(0.36)
     assert light.normalised_depth(depth)[0, 0, 0, 0].item() == pytest.approx(0.5)
-
-
-def test_running_scale_of_sparse_noise_is_near_that_of_its_mean():
-    """One pixel in sixteen lit, as 1-spp images are: blocks keep the logarithm from collapsing."""
-    generator = torch.Generator().manual_seed(0)
-    lit = (torch.rand(1, 1, 128, 128, generator=generator) < 1 / 16).float() * 16 * 0.3
-    scale = running_scale(lit.repeat(1, 3, 1, 1), torch.ones(1, 1, 128, 128), None)
-    assert scale.exposure().item() == pytest.approx(0.18 / 0.3, rel=0.1)

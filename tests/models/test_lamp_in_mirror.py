@@ -2,17 +2,15 @@
 
 import numpy as np
 import pytest
-import torch
 
 from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip
 from datasets.frame import Frame, read_frame
 from eval.stress.check import ROUNDING, range_violation
-from models import registry
 from models.registry import DENOISERS, channels_read
 from render.clip import Sampling, write_clip
 from scenes.animation import Scene, Shape, Track
-from tests.helpers.frames import run
+from tests.helpers.frames import prepared, run
 from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, panel, placed, room
 
 RADIANCE = 60.0
@@ -41,8 +39,7 @@ def test_its_light_is_emission(frames):
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_no_denoiser_spreads_it(frames, name):
-    torch.manual_seed(0)
-    denoiser = registry.create(name).eval()
+    denoiser = prepared(name)
     given = frames[:1] if denoiser.offline else frames
     outputs = run(denoiser, given)
     brightest = max(float(frame.irradiance("total").max()) for frame in frames)

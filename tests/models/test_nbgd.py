@@ -77,40 +77,6 @@ def test_gradients_are_those_of_finite_differences(spacing):
     assert torch.autograd.gradcheck(lambda i, g: grid_mean(i, g, spacing, surface), (image, guide))
 
 
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_with_one_guide_everywhere_it_is_a_mean_over_tents_interpolated(spacing):
-    """It does not depend on the guide then, and is the same along both axes of the image."""
-    image, _, _ = random_inputs(2, 29, 38)
-
-    def line_filter(length: int):
-        places = (np.arange(length)[:, None] + 0.5) / spacing - np.arange(-(-length // spacing)) - 0.5
-        weights = tent(places)
-        return weights / weights.sum(axis=1, keepdims=True) @ (weights / weights.sum(axis=0)).T
-
-    expected = line_filter(29) @ image.double().numpy() @ line_filter(38).T
-    for value in (0.0, 0.3, 1.0):
-        filtered = grid_mean(image, torch.full((2, 1, 29, 38), value), spacing)
-        np.testing.assert_allclose(filtered, expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_pixels_whose_guides_are_far_apart_do_not_mix(spacing):
-    guide = torch.zeros(1, 1, 20, 24)
-    guide[..., ::3] = 0.5
-    image = (100 * guide + 1).expand(1, 3, 20, 24)
-    torch.testing.assert_close(grid_mean(image, guide, spacing), image)
-
-
-def test_what_lies_behind_background_does_not_matter():
-    image, guide, surface = random_inputs(3, 21, 30)
-    other_image = torch.where(surface > 0, image, 1e6)
-    other_guide = torch.where(surface > 0, guide, torch.rand_like(guide))
-    for spacing in SPACINGS:
-        filtered = grid_mean(image, guide, spacing, surface)
-        assert torch.equal(filtered, grid_mean(other_image, other_guide, spacing, surface))
-        assert (filtered * (1 - surface) == 0).all()
-
-
 def test_the_kernel_reads_its_own_memory_alone():
     image, _, _ = random_inputs(4, 9, 9)
     for value in (torch.nan, torch.inf, -1e30, 1e30):

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.filters.nfor import NFOR, checkerboard_buffers, features_of, nfor, nl_means, patch_distances, regress
-from tests.helpers.frames import flat_frame, run
+from models.filters.nfor import checkerboard_buffers, features_of, nfor, nl_means, patch_distances, regress
+from tests.helpers.frames import flat_frame
+from tests.helpers.windows import window
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 6))
 EXAMPLES = settings(max_examples=8, deadline=None)
@@ -18,17 +19,13 @@ EXAMPLES = settings(max_examples=8, deadline=None)
 # --- Slow versions ----------------------------------------------------------------------------------------------------
 
 
-def inside(size, p, radius):
-    """The pixels of the window around p that are in the image."""
-    return [q for q in np.ndindex(size) if max(abs(p[0] - q[0]), abs(p[1] - q[1])) <= radius]
-
-
 def naive_distance(guide, variance, surface, p, q, radius):
     """Of the patches around p and q, over pixels that are in the image and show surfaces in both."""
     apart = []
-    for n in inside(surface.shape, p, radius):
+    there = window(surface.shape, q, radius)
+    for n in window(surface.shape, p, radius):
         m = n[0] + q[0] - p[0], n[1] + q[1] - p[1]
-        if m in inside(surface.shape, q, radius) and surface[n] and surface[m]:
+        if m in there and surface[n] and surface[m]:
             v, w = variance[:, *n], variance[:, *m]
             apart += list(((guide[:, *n] - guide[:, *m]) ** 2 - v - np.minimum(v, w)) / (v + w))
     return max(np.mean(apart), 0)
@@ -40,7 +37,7 @@ def naive_weights(guide, variance, surface, radius, k):
     return {
         p: {
             q: math.exp(-naive_distance(guide, variance, surface, p, q, radius) / k**2)
-            for q in inside(size, p, 9)
+            for q in window(size, p, 9)
             if surface[q]
         }
         for p in np.ndindex(size)
@@ -186,27 +183,6 @@ def test_buffers_average_within_a_mesh():
     colour = mesh.repeat(1, 3, 1, 1)
     assert (checkerboard_buffers(colour, mesh) == colour[:, None]).all()  # the only pixel of mesh 3 is in both
     assert checkerboard_buffers(torch.ones(1, 3, 1, 1), torch.ones(1, 1, 1, 1)).eq(1).all()
-
-
-def test_noise_is_reduced_tenfold():
-    """Noise on an image of features and of a shadow that no feature shows."""
-    generator = torch.Generator().manual_seed(0)
-    features = torch.zeros(1, 7, 40, 48)
-    features[:, 0] = torch.rand(40, 48, generator=generator)
-    truth = 1 + features[:, :1].repeat(1, 3, 1, 1)
-    truth[..., 20:, :] *= 0.3
-    buffers = truth[:, None] + 0.4 * torch.randn(1, 2, 3, 40, 48, generator=generator)
-    denoised = nfor(buffers, torch.full_like(truth, 0.08), features, torch.ones(1, 1, 40, 48))
-    noise = (buffers.mean(dim=1) - truth).square().mean()
-    assert (denoised - truth).square().mean() < 0.1 * noise
-
-
-# --- The denoiser -----------------------------------------------------------------------------------------------------
-
-
-def test_even_light_stays_even():
-    (output,) = run(NFOR(), [flat_frame(24, 33, irradiance=torch.full((1, 3, 24, 33), 7.0))])
-    torch.testing.assert_close(output, torch.full_like(output, 7.0))
 
 
 def test_features_stay_within_one():

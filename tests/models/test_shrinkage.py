@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from datasets.frame import Frame
@@ -14,8 +13,9 @@ from models import registry
 from models.denoiser import Denoiser, State
 from models.wrappers import shrinkage
 from models.wrappers.shrinkage import RARE_PIXELS, SCARCE_SAMPLES, STANDARD_ERRORS, JamesStein
-from tests.helpers.buffers import noisy_buffers, with_buffers
-from tests.helpers.frames import flat_frame, play
+from tests.helpers.buffers import any_images, noisy_buffers, with_buffers
+from tests.helpers.frames import flat_frame, run
+from tests.helpers.windows import mesh_window
 
 SIZE = (24, 40)
 COLOUR = torch.tensor([1.0, 0.5, 0.25])[None, :, None, None]
@@ -35,22 +35,16 @@ def shrunk_to(image: Tensor, frame: Frame) -> Tensor:
     """The output for a denoiser that returns this irradiance."""
     inner = FixedImage()
     inner.image = image
-    return play(JamesStein(inner), [frame])[0][0]
+    return run(JamesStein(inner), [frame])[0]
 
 
 def slow_rho(difference: np.ndarray, variance: np.ndarray, mesh: np.ndarray, samples: float) -> np.ndarray:
     """ρ of one colour, pixel by pixel: windows of 3 x 3 taps of 3 x 3 sums, and so on, all of the same mesh."""
-    height, width = mesh.shape
 
     def sums(image: np.ndarray, step: int) -> np.ndarray:
         out = np.zeros_like(image)
-        for y in range(height):
-            for x in range(width):
-                for dy in (-step, 0, step):
-                    for dx in (-step, 0, step):
-                        inside = 0 <= y + dy < height and 0 <= x + dx < width
-                        if inside and mesh[y + dy, x + dx] == mesh[y, x]:
-                            out[..., y, x] += image[..., y + dy, x + dx]
+        for p in np.ndindex(mesh.shape):
+            out[:, *p] = sum(image[:, *q] for q in mesh_window(mesh, p, 1, step))
         return out
 
     counted = np.stack([difference**2 - variance, difference**2, 2 * variance**2, variance, np.ones_like(variance)])
@@ -124,16 +118,8 @@ def test_it_is_no_worse_than_the_better_of_noise_and_denoiser(deviation):
 def test_without_buffers_it_is_the_denoiser():
     frame = flat_frame(*SIZE, irradiance=torch.rand(1, 3, *SIZE))
     for name in ("svgf", "eaw+taa"):
-        torch.testing.assert_close(
-            play(registry.create(name + "+js"), [frame])[0], play(registry.create(name), [frame])[0], rtol=0, atol=0
-        )
-
-
-def test_its_attributes_are_those_of_the_denoiser():
-    prototype = registry.prototype("ntd+js")
-    assert prototype.signal == "indirect" and prototype.is_network
-    assert "indirect_halves" in prototype.reads and "direct_halves" not in prototype.reads
-    assert registry.prototype("nfor+js").offline
+        shrunk, plain = (run(registry.create(each), [frame]) for each in (f"{name}+js", name))
+        torch.testing.assert_close(shrunk, plain, rtol=0, atol=0)
 
 
 def test_a_few_black_samples_do_not_count_as_the_truth():
@@ -160,16 +146,9 @@ def test_a_firefly_in_one_buffer_is_suppressed():
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    height=st.integers(1, 12),
-    width=st.integers(1, 12),
-    levels=st.lists(st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20, 1e34]), min_size=3, max_size=3),
-)
-def test_any_buffers_end_between_noise_and_denoiser(seed, height, width, levels):
-    generator = torch.Generator().manual_seed(seed)
-    a, b, denoised = (level * torch.rand(1, 3, height, width, generator=generator) for level in levels)
-    mesh = torch.randint(0, 3, (1, 1, height, width), generator=generator).float()
+@given(images=any_images(3, [0.0, 1e-30, 1e-4, 1.0, 6e4, 1e20, 1e34]))
+def test_any_buffers_end_between_noise_and_denoiser(images):
+    mesh, a, b, denoised = images
     output = shrunk_to(denoised, with_buffers(a, b, mesh_id=mesh, depth=mesh + 1))
     noisy = (a + b) / 2
     assert torch.isfinite(output).all()

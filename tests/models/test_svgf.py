@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 
 from eval.bench.synthetic_frames import synthetic_frame
 from models.filters import eaw, svgf
-from models.filters.baselines import Accumulated
-from models.filters.bmfr import BMFR
 from models.filters.eaw import EAW
 from models.filters.svgf import SVGF, Integrated
+from models.history.accumulation import accumulate
 from models.history.geometry import GBuffer
 from models.history.running_scale import running_scale
-from tests.helpers.frames import flat_frame, play, run
+from models.operators import image_luminance
+from tests.helpers.frames import play, run
+from tests.helpers.windows import window
 
 H = np.array([1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16])
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -24,12 +25,17 @@ both_implementations = pytest.mark.usefixtures("implementation")
 
 
 def surfaces(rng, height, width):
-    """Depth, normal and mesh id (numpy, float64) of tilted, rough planes of two meshes beside sky."""
+    """Depth, normal and mesh id (numpy, float64) of tilted, rough planes of two meshes beside sky.
+
+    One half of each mesh is farther away; normals are of any length, and some point away.
+    """
     y, x = np.mgrid[0:height, 0:width]
     mesh = rng.integers(0, 3, (height // 4 + 1, width // 4 + 1)).repeat(4, 0).repeat(4, 1)[:height, :width]
-    depth = np.float32(np.where(mesh > 0, 2 + mesh + 0.01 * x - 0.02 * y + 0.005 * rng.random((height, width)), 0))
+    plane = 2 + mesh + 1.5 * (x > width // 2) + 0.01 * x - 0.02 * y + 0.005 * rng.random((height, width))
+    depth = np.float32(np.where(mesh > 0, plane, 0))
     normal = np.array([0, 0, -1.0])[:, None, None] + 0.1 * rng.standard_normal((3, height, width))
-    return depth.astype(float), np.float32(normal * (mesh > 0)).astype(float), mesh
+    normal *= rng.choice([1.0, 1.0, 7.0, -1.0], (height, width)) * (mesh > 0)
+    return depth.astype(float), np.float32(normal).astype(float), mesh
 
 
 def to_torch(array, *shape):
@@ -70,18 +76,13 @@ def naive_geometry_weight(depth, normal, mesh, p, q):
     return w_z * max(0.0, a @ b) ** 128
 
 
-def window(p, size, radius, step=1):
-    """Pixels q in the image with their offsets in steps, p included."""
-    for j in range(-radius, radius + 1):
-        for i in range(-radius, radius + 1):
-            q = p[0] + j * step, p[1] + i * step
-            if 0 <= q[0] < size[0] and 0 <= q[1] < size[1]:
-                yield q, j, i
+def b3_spline(p, q, step):
+    return H[np.subtract(q, p) // step + 2].prod()
 
 
 def naive_edge_scale(variance, depth, p):
     """sigma_l sqrt(g(Var)) of Eq. 5, sigma_l = 4, of the surfaces around p."""
-    g = {q: 2.0 ** -(abs(j) + abs(i)) for q, j, i in window(p, variance.shape, 1) if depth[q] > 0}
+    g = {q: 2.0 ** -np.abs(np.subtract(p, q)).sum() for q in window(variance.shape, p, 1) if depth[q] > 0}
     return 4 * math.sqrt(sum(w * variance[q] for q, w in g.items()) / sum(g.values())) if g else 1.0
 
 
@@ -93,8 +94,8 @@ def naive_level(colour, variance, depth, normal, mesh, step):
     for p in np.ndindex(variance.shape):
         total = 0.0
         scale = naive_edge_scale(variance, depth, p)
-        for q, j, i in window(p, variance.shape, 2, step):
-            w = H[j + 2] * H[i + 2]
+        for q in window(variance.shape, p, 2, step):
+            w = b3_spline(p, q, step)
             if q != p:
                 w *= naive_geometry_weight(depth, normal, mesh, p, q) * math.exp(-abs(y[p] - y[q]) / scale)
             total += w
@@ -108,10 +109,8 @@ def naive_level(colour, variance, depth, normal, mesh, step):
 def naive_spatial_variance(moments, depth, normal, mesh):
     out = np.zeros(depth.shape)
     for p in np.ndindex(depth.shape):
-        total = 0.0
-        mean = 0.0
-        square = 0.0
-        for q, _, _ in window(p, depth.shape, 3):
+        total = mean = square = 0.0
+        for q in window(depth.shape, p, 3):
             w = 1.0 if q == p else naive_geometry_weight(depth, normal, mesh, p, q)
             total += w
             mean += w * moments[0][q]
@@ -127,42 +126,21 @@ EXAMPLES = settings(max_examples=15, deadline=None)
 # --- Temporal filtering (§4.1) and variance (§4.2) --------------------------------------------------------------------
 
 
-def wall(direct, indirect, **kwargs):
-    """A flat wall's 4 x 6 frame with grey direct and indirect irradiance."""
-    frame = flat_frame(4, 6, irradiance=torch.full((1, 3, 4, 6), direct), **kwargs)
-    frame.channels["indirect"] = torch.full((1, 3, 4, 6), indirect)
-    return frame
-
-
-def test_samples_and_moments_are_means_and_later_integrated_with_alpha_a_fifth():
-    """C' = α C + (1 - α) C' with α = max(1/5, 1/n) for the n-th sample: of colour, luminance and its square alike."""
-    values = [(3.0, 1.0), (1.0, 2.0), (4.0, 0.0), (1.0, 7.0), (2.0, 2.0), (9.0, 1.0), (0.0, 3.0)]
+@both_implementations
+def test_samples_and_moments_are_accumulated_as_irradiance_is():
+    """By C' = α C + (1 - α) C': of direct and indirect light, the colour, its luminance and the square of that."""
     history = None
-    expected = None
-    for n, both in enumerate(values):
-        frame = wall(*both)
-        history = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
-        new = np.array([(v, v, v * v) for v in both])
-        alpha = max(0.2, 1 / (n + 1))
-        expected = new if expected is None else alpha * new + (1 - alpha) * expected
-        for s in range(2):
-            torch.testing.assert_close(history.colour[0, s], torch.full((3, 4, 6), expected[s, 0]))
-            torch.testing.assert_close(history.moments[0, s, 0], torch.full((4, 6), expected[s, 1]))
-            torch.testing.assert_close(history.moments[0, s, 1], torch.full((4, 6), expected[s, 2]))
-        assert (history.length == n + 1).all()
-
-
-def test_disoccluded_pixels_begin_with_their_sample():
-    mesh = torch.ones(1, 1, 4, 6)
-    mesh[..., 3:] = 2
-    before = wall(5.0, 5.0, mesh_id=mesh)
-    history = svgf.integrate(before, svgf.irradiances(before, "total"), None)._replace(length=torch.full_like(mesh, 7))
-    frame = wall(2.0, 1.0)
-    now = svgf.integrate(frame, svgf.irradiances(frame, "total"), history)
-    # Column 3 has mesh 1 beside it, within the 3 x 3 box of the second try.
-    assert (now.length[..., 4:] == 1).all() and (now.length[..., :4] == 8).all()
-    assert (now.colour[0, 0, ..., 4:] == 2).all() and (now.moments[0, 1, :, :, 4:] == 1).all()
-    torch.testing.assert_close(now.colour[0, 0, ..., :4], torch.full((3, 4, 4), 0.2 * 2 + 0.8 * 5))
+    expected = [None] * 4
+    for frame in (synthetic_frame(index, 24, 32) for index in range(8)):
+        samples = svgf.irradiances(frame, "total")
+        history = svgf.integrate(frame, samples, history)
+        y = [image_luminance(colour) for colour in samples.unbind(1)]
+        images = [*samples.unbind(1), *(torch.cat([mean, mean.square(), mean], dim=1) for mean in y)]
+        expected = [accumulate(frame, *each) for each in zip(images, expected, strict=True)]
+        parts = [*history.colour.unbind(1), *history.moments.unbind(1)]
+        for part, accumulated in zip(parts, expected, strict=True):
+            torch.testing.assert_close(part, accumulated.irradiance[:, : part.shape[1]])
+            torch.testing.assert_close(history.length, accumulated.length)
 
 
 def integrated(rng, depth, lengths):
@@ -190,66 +168,6 @@ def test_variance_is_temporal_from_four_frames_on_and_spatial_before(size, seed)
         spatial = naive_spatial_variance(moments, depth, normal, mesh) * 4 / np.round(lengths)  # of a few samples
         expected = np.where(lengths < 3.5, spatial, temporal)
         np.testing.assert_allclose(variance[s], expected, rtol=1e-4, atol=1e-5)
-
-
-# --- Edge-stopping functions (§4.4) -----------------------------------------------------------------------------------
-
-
-def weight(geometry, p, dy, dx):
-    """w_z · w_n between p and p + (dy, dx)."""
-    y, x = p
-    here = geometry[..., y : y + 1, x : x + 1]
-    there = geometry[..., y + dy : y + dy + 1, x + dx : x + dx + 1]
-    return svgf.geometry_weight(here, there, dx, dy).item()
-
-
-def plane(height, width, across=0.0, down=0.0):
-    y, x = np.mgrid[0:height, 0:width]
-    depth = 50 + across * x + down * y
-    return depth, np.array([0, 0, -1.0])[:, None, None] * np.ones_like(depth), np.ones((height, width))
-
-
-@pytest.mark.parametrize("across, down", [(3.0, 0.0), (0.0, -2.0), (2.0, 1.0), (-1.0, 3.0)])
-@both_implementations
-def test_on_a_tilted_plane_the_depth_weight_is_1_over_e(across, down):
-    """|z(p) - z(q)| is what ∇z · (p - q) expects: w_z = exp(-1), but for ε."""
-    geometry = packed(*plane(9, 9, across, down))
-    for dy, dx in [(0, 1), (2, 0), (-3, 4), (-1, -1), (4, 3)]:
-        expected = abs(across * dx + down * dy)
-        z = geometry[0, 0, 3, 4, 4].item()
-        assert weight(geometry, (4, 4), dy, dx) == pytest.approx(math.exp(-expected / (expected + 1e-3 * z)), rel=1e-4)
-
-
-@both_implementations
-def test_a_wall_that_faces_the_camera_is_one_surface_and_a_step_in_depth_an_edge():
-    depth, normal, mesh = plane(5, 8)
-    assert weight(packed(depth, normal, mesh), (2, 2), 2, -2) == pytest.approx(1, abs=1e-4)
-    depth[:, 4:] += 2
-    same_mesh = packed(depth, normal, mesh)
-    other_mesh = packed(depth, normal, mesh + (np.arange(8) > 3))
-    for geometry in (same_mesh, other_mesh):  # the slope is that to the neighbour nearer in depth
-        for x, dx in [(3, 1), (4, -1), (2, 3)]:
-            assert weight(geometry, (2, x), 0, dx) < 1e-10
-        assert weight(geometry, (2, 3), 0, -2) == pytest.approx(1, abs=1e-4)
-
-
-@both_implementations
-def test_slopes_ignore_other_meshes_and_the_outside():
-    depth, normal, mesh = plane(1, 4, across=1.0)
-    mesh[0] = [1, 1, 2, 0]
-    depth[0] = [5, 6, 100, 0]
-    geometry = packed(depth, normal, mesh)[0, 0]
-    assert geometry[4, 0].tolist() == [1, 1, 0, 0]
-    assert geometry[5, 0].tolist() == [0, 0, 0, 0]
-
-
-@pytest.mark.parametrize("degrees", [0, 3, 8, 90, 180])
-@both_implementations
-def test_normals_weigh_by_the_128th_power_of_their_cosine(degrees):
-    depth, normal, mesh = plane(1, 2)
-    angle = math.radians(degrees)
-    normal[:, 0, 1] = 7 * np.array([math.sin(angle), 0, -math.cos(angle)])  # of any length
-    assert weight(packed(depth, normal, mesh), (0, 0), 0, 1) == pytest.approx(max(0, math.cos(angle)) ** 128, rel=1e-3)
 
 
 # --- The à-trous transform (§4.3) -------------------------------------------------------------------------------------
@@ -300,19 +218,6 @@ def test_five_levels_and_the_first_is_the_history(monkeypatch):
     assert [*state.pictures()] == ["history length", "variance direct", "variance indirect"]
 
 
-# --- The whole --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("denoiser, share", [(SVGF, 0.3), (EAW, 0.3), (BMFR, 0.02)])
-def test_noise_on_a_wall_is_gone(denoiser, share):
-    """Of the error after accumulation alone."""
-    generator = torch.Generator().manual_seed(0)
-    lights = [4.0 * (torch.rand(1, 1, 48, 30, generator=generator) < 0.25).repeat(1, 3, 1, 1) for _ in range(8)]
-    frames = [flat_frame(48, 30, irradiance=light) for light in lights]
-    filtered, accumulated = ((run(d, frames)[-1] - 1).square().mean() for d in (denoiser(), Accumulated()))
-    assert filtered < share * accumulated
-
-
 # --- EAW --------------------------------------------------------------------------------------------------------------
 
 
@@ -327,8 +232,8 @@ def test_a_level_of_eaw(size, step, seed):
     for p in np.ndindex(size):
         total = 0.0
         sums = np.zeros(3)
-        for q, j, i in window(p, size, 2, step):
-            w = H[j + 2] * H[i + 2] * math.exp(-np.square(features[:, *p] - features[:, *q]).sum())
+        for q in window(size, p, 2, step):
+            w = b3_spline(p, q, step) * math.exp(-np.square(features[:, *p] - features[:, *q]).sum())
             total += w
             sums += w * colour[:, *q]
         np.testing.assert_allclose(out[:, *p], sums / total, rtol=1e-5)
