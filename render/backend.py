@@ -31,9 +31,8 @@ def installed_llvms() -> list[tuple[int, str]]:
         # The version is part of the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or of its folder (llvm-19).
         resolved = Path(path).resolve()
         name = re.fullmatch(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so|dylib)(?:\.(\d+)[\d.]*)?", resolved.name)
-        folder = re.search(r"llvm[-@/]?(\d+)", str(resolved.parent))
-        version = name and (name[1] or name[2] or (folder and folder[1]))
-        if version:
+        versioned = re.search(r"llvm[-@/]?(\d+)", str(resolved.parent))
+        if name and (version := name[1] or name[2] or (versioned[1] if versioned else "")):
             found.append((int(version), path))
     return found
 

@@ -182,7 +182,7 @@ def affinity_level(
 
 def carried(
     decoded: Decoded, past: Tensor, surface: Tensor, steps: Sequence[int], level: Callable[..., Tensor] = affinity_level
-) -> tuple[Tensor, ...]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`."""
     image = decoded.accumulated
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
@@ -260,8 +260,8 @@ class One(Denoiser):
         has_history = torch.zeros_like(surface)
         history = has_history.expand(-1, sum(HISTORY), -1, -1)
         if before is not None:
-            images = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
-            history, valid = reproject(frame, images, before.gbuffer)
+            past = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
+            history, valid = reproject(frame, past, before.gbuffer)
             has_history = valid.to(noisy) * surface
         inputs = PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
         first, _, last = cast(Sequence[nn.Linear], self.network.detail)  # ReLU in between

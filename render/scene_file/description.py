@@ -24,11 +24,11 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame
 Even = Annotated[int, Meta(ge=2, multiple_of=2)]
 
 
-class Table(msgspec.Struct, forbid_unknown_fields=True):
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A table of the TOML."""
 
 
-class CameraKey(Table):
+class CameraKey(Table, frozen=True):
     """The camera at a time; `fov` is horizontal, in degrees."""
 
     time: Fraction
@@ -38,7 +38,7 @@ class CameraKey(Table):
     fov: Annotated[float, Meta(gt=0, lt=180)] | None = None
 
 
-class PoseKey(Table):
+class PoseKey(Table, frozen=True):
     """The pose of a shape at a time, relative to the file; rotations in degrees about x, then y, then z."""
 
     time: Fraction
@@ -46,19 +46,19 @@ class PoseKey(Table):
     rotation: Vector = (0.0, 0.0, 0.0)
 
 
-class GainKey(Table):
+class GainKey(Table, frozen=True):
     """The brightness of a light at a time, relative to the file."""
 
     time: Fraction
     gain: Annotated[float, Meta(ge=0, le=LARGEST)]
 
 
-class Motion(Table):
+class Motion(Table, frozen=True):
     shape: str
     keyframes: Annotated[list[PoseKey], Meta(min_length=1)]
 
 
-class LightChange(Table):
+class LightChange(Table, frozen=True):
     light: str
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
@@ -91,7 +91,7 @@ class Splits(Table, frozen=True):
     test: TestSplit = TestSplit()
 
 
-class Description(Table):
+class Description(Table, frozen=True):
     file: str  # a Mitsuba XML, glTF, OBJ or PLY; relative to the TOML
     resolution: tuple[Positive, Positive] = (256, 144)  # width, height
     frames: Positive = 16
@@ -111,7 +111,8 @@ def read_description(path: Path) -> Description:
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
     all_keys: list[Sequence[CameraKey | PoseKey | GainKey]] = [described.camera]
-    all_keys += [moving.keyframes for moving in (*described.motion, *described.light)]
+    all_keys += [motion.keyframes for motion in described.motion]
+    all_keys += [change.keyframes for change in described.light]
     for times in ([key.time for key in keys] for keys in all_keys):
         if times != sorted(set(times)):
             raise BadInput(f"{path}: the times {times} of keyframes do not increase: put them in order, each time once")
