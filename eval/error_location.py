@@ -99,7 +99,7 @@ def displayed_reference(clip: Clip, index: int, signal: Signal) -> Tensor:
 
 @torch.no_grad()
 def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
-    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip."""
+    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip that have a reference."""
     denoisers = {spec.name: spec.build() for spec in specs}
     states = dict.fromkeys(denoisers)
     channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
@@ -107,12 +107,16 @@ def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]
     sums: dict[str, Shares] = {name: {} for name in ("pixels", *denoisers)}
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)
+        outputs = {}
+        for name, denoiser in denoisers.items():
+            outputs[name], states[name] = denoiser(frame.to(denoiser.device), states[name])
+        if index not in clip.judged:
+            continue
         buffers = {signal: displayed_reference(clip, index, signal) for signal in signals}
         masks = places(frame, buffers["total"].mean(dim=0, keepdim=True))
-        for name, denoiser in denoisers.items():
-            output, states[name] = denoiser(frame.to(denoiser.device), states[name])
+        for name, output in outputs.items():
             shown = display(finite(output.cpu()), clip.exposure).double()
-            add(sums[name], squared_errors(shown, buffers[denoiser.signal], masks))
+            add(sums[name], squared_errors(shown, buffers[denoisers[name].signal], masks))
         add(sums["pixels"], {key: mask.sum() for key, mask in masks.items()})
     return {name: normalised(shares) for name, shares in sums.items()}
 

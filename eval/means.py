@@ -12,7 +12,8 @@ from eval.results import ClipResults
 
 def means(frames: list[Values]) -> Values:
     """Arithmetic means over the frames where a metric is defined, None where it never is."""
-    columns = {name: [row[name] for row in frames if row[name] is not None] for name in frames[0]}
+    names = dict.fromkeys(name for row in frames for name in row)
+    columns = {name: [row[name] for row in frames if row.get(name) is not None] for name in names}
     return {name: float(np.mean(values)) if values else None for name, values in columns.items()}  # type: ignore[arg-type]
 
 
@@ -36,7 +37,7 @@ def means_by_age(clips: Sequence[ClipResults], metric: str = "psnr") -> dict[str
     for denoiser in dict.fromkeys(result.denoiser for clip in clips for result in clip.results):
         results = [result for clip in clips for result in clip.results if result.denoiser == denoiser]
         for age, frames in AGES.items():
-            chosen = [means(result.frames[frames])[metric] for result in results if result.frames[frames]]
+            chosen = [means(result.frames[frames]).get(metric) for result in results]
             values = [value for value in chosen if value is not None]
             rows.setdefault(denoiser, {})[age] = fmean(values) if values else None
     return rows

@@ -218,12 +218,13 @@ def render_clip(
     sampling: Sampling,
     seed: int,
     channels: Collection[str] | None = None,
+    judged: Collection[int] = (),
 ) -> Iterator[tuple[Arrays, dict[str, float]]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
     `channels` are those to render, with what mirrors and glass show in a scene with these, in two layers if they name
     any of SECOND_LAYER; by default all but sample buffers. Sample buffers need an even number of noisy samples a pixel,
-    and change which samples are drawn.
+    and change which samples are drawn. References are rendered of the frames in `judged`, or of all if it is empty.
 
     Deterministic in its arguments for one Mitsuba variant and processor.
     """
@@ -238,6 +239,8 @@ def render_clip(
     wants_dual = "dual_motion" not in skipped
     for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, in_layers, timer):
         for step, maker in makers.items():
+            if step == "reference" and judged and frame.index not in judged:
+                continue
             frame.arrays |= maker(sampled, frame)
             timer.lap(step)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world

@@ -42,8 +42,8 @@ def save_animation(runs: Path, clip: ClipResults) -> Path:
     """
     names = panel_names(clip)
     folders = [folders_of(runs, clip)[name] for name in names]
-    count = min(MAX_FRAMES, len(clip.reference.frames))
-    frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in range(count))
+    shown = clip.reference.judged[:MAX_FRAMES]
+    frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in shown)
     path = runs / "report" / f"{signal_label(f'{clip.scene}-{clip.clip}', clip.signal)}.webp"
     first = next(frames)
     with replacing(path) as temporary:

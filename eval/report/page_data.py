@@ -95,9 +95,8 @@ def error_maps(folder: Path, frames: Sequence[int]) -> list[str]:
 def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
     """The data of a clip, with pictures of every `step`-th frame. Raises BadInput for missing and damaged pictures."""
     folders = folders_of(runs, clip)
-    count = len(clip.reference.frames)
-    frames = range(0, count, step)
-    height, width = load_picture(folders[clip.reference.denoiser], 0).shape[:2]
+    frames = clip.reference.judged[::step]
+    height, width = load_picture(folders[clip.reference.denoiser], frames[0]).shape[:2]
     images = {
         name: [data_uri(picture_path(folder, index).read_bytes(), "webp") for index in frames]
         for name, folder in folders.items()
@@ -111,8 +110,8 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> PageClip:
                 maps.append(webp_uri((255 * errors + 0.5).astype(np.uint8)))
     return PageClip(
         name=clip.name,
-        count=count,
-        frames=[*frames],
+        count=len(clip.reference.frames),
+        frames=frames,
         height=height,
         width=width,
         images=images,

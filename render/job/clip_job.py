@@ -76,7 +76,8 @@ def render_to_folder(
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     sampling = Sampling(quality.realisations, noisy_spp, spp, options)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
-    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), clock.read())
+    judged = profile.judged if split == "test" else ()
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), clock.read(), judged)
 
 
 def write_clip(
@@ -87,13 +88,14 @@ def write_clip(
     seed: int,
     channels: Sequence[str],
     seconds_before: dict[str, float] | None = None,
+    judged: Sequence[int] = (),
 ) -> None:
     """Render channels of a scene into a clip of `size` (frames, height, width), completely or not at all.
 
-    `seconds_before` rendering, by step, are recorded with those of rendering.
+    `seconds_before` rendering, by step, are recorded with those of rendering. `judged`: see render_clip.
     """
     split, scene_name, clip_name = folder.parts[-3:]
-    frames = render_clip(scene, *size, sampling, seed, channels)
+    frames = render_clip(scene, *size, sampling, seed, channels, judged)
     derived = {name: "camera" for name in channels if CHANNELS[name].is_camera_motion and not scene.moves()}
     with ClipWriter(folder) as writer:
         writer.timing = dict(seconds_before or {})

@@ -30,6 +30,7 @@ class DataProfile:
     rooms: dict[str, int] = field(default_factory=dict)  # rooms, of one clip each
     closeups: dict[str, int] = field(default_factory=dict)  # of further rooms, one clip each
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
+    judged: tuple[int, ...] = ()  # the frames of test clips that get a reference; empty for all
     own: Path | None = None  # the TOML of a user's own scene, the only one
 
 
@@ -110,7 +111,8 @@ def own_profile(path: Path) -> DataProfile:
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
     width, height = described.resolution
-    return DataProfile((described.frames, height, width), quality, special=clips, own=path)
+    judged = tuple(described.splits.get("test", SplitRequest()).judged)
+    return DataProfile((described.frames, height, width), quality, special=clips, judged=judged, own=path)
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:

@@ -69,6 +69,7 @@ class SplitRequest(Table):
     reference_spp: Even | None = None
     floor: Annotated[float, Meta(gt=0)] | None = None  # dB
     most_spp: Even | None = None
+    judged: list[Annotated[int, Meta(ge=0)]] = []  # frames of test clips that get a reference; by default all
 
 
 class Description(Table):
@@ -94,6 +95,7 @@ def read_description(path: Path) -> Description:
         json.dumps(msgspec.to_builtins(described), allow_nan=False)
     except ValueError:
         raise BadInput(f"{path}: a number is infinite or not a number") from None
+    check_judged(path, described)
     unknown = set(described.splits) - set(SPLITS)
     if unknown:
         raise BadInput(f"{path}: there is no split '{min(unknown)}': the splits are {', '.join(SPLITS)}")
@@ -109,6 +111,16 @@ def read_description(path: Path) -> Description:
     if any(split.camera == "keyframes" for split in described.splits.values()) and not described.camera:
         raise BadInput(f"{path}: a split's camera uses keyframes, but there are none: add [[camera]] tables")
     return described
+
+
+def check_judged(path: Path, described: Description) -> None:
+    """Raise BadInput unless the frames that are judged rise, exist and are of test clips."""
+    for split, request in described.splits.items():
+        frames = request.judged
+        if frames and split != "test":
+            raise BadInput(f"{path}: [splits.{split}] has `judged`: training and validation need references of all frames")
+        if frames != sorted({*frames}) or (frames and frames[-1] >= described.frames):
+            raise BadInput(f"{path}: judged = {frames}: list frames from 0 to {described.frames - 1} in rising order")
 
 
 def spline(values: Sequence[Vector] | Sequence[float], times: list[float], frames: int) -> KeyframedTrack:
