@@ -137,7 +137,8 @@ class Clip:
         """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) of two sample buffers.
 
         The array is the same whether the channel is stored in full, stored as one value or derived from others.
-        Raises BadInput where the channel was not rendered, its file is missing or damaged, or the frame has no reference.
+        Raises BadInput where the channel was not rendered or its file is missing or damaged, and for the reference of
+        a frame that is not judged.
         """
         rows, columns = window
         entry = self.entry(channel)

@@ -34,6 +34,8 @@ class DataProfile:
     own: Path | None = None  # the TOML of a user's own scene, the only one
 
 
+# The frames after a cut, and pairs of later ones: what changes in time needs two.
+JUDGED = (0, 4, 15, 16, 31, 32, 47, 48)
 TEST_OF_SMALL_ROOMS = SamplingQuality(1, reference_spp=64, floor=40, most_spp=256, skips_noisy_rooms=True)
 
 DATA_PROFILES = {
@@ -74,6 +76,13 @@ DATA_PROFILES = {
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
+    ),
+    # Scenes that no training uses, at a size at which people look, until the history is steady.
+    "benchmark": DataProfile(
+        size=(49, 360, 640),
+        quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048)),
+        special={"test": [f"{name}/000" for name in ("room-3000", "room-3001", "room-3002", "glass-table", "glass-vitrine")]},
+        judged=JUDGED,
     ),
     # Six scenes of glass: at rest, with a camera that moves, and with things that move.
     "glass": DataProfile(
