@@ -99,7 +99,7 @@ def displayed_reference(clip: Clip, index: int, signal: Signal) -> Tensor:
 
 @torch.no_grad()
 def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
-    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip that have a reference."""
+    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in the judged frames of a clip."""
     denoisers = {spec.name: spec.build() for spec in specs}
     states = dict.fromkeys(denoisers)
     channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})

@@ -10,11 +10,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from datasets.clip import Clip
+from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from datasets.tonemap import display
 from errors import BadInput
-from eval.harness import clips_of
 from eval.selection import evaluated
 from files import write_file
 from models.operators import finite
@@ -54,7 +53,8 @@ def write_page(names: Sequence[str], data: Sequence[Path], runs: Path, budget: s
             "height": clip.height,
             "videos": [video(clip, spec) for spec in specs],
         }
-        for clip in clips_of(data)
+        for folder in data
+        for clip in Dataset(folder).clips("test")
     ]
     content = json.dumps({"denoisers": [spec.name for spec in specs], "clips": clips})
     template = resources.files("eval.benchmark").joinpath("page.html").read_text()
