@@ -2,8 +2,8 @@
 
     python render_room.py OUT FRAMES WIDTHxHEIGHT REFERENCE_SPP
 
-OUT/noisy/0001.exr and so on have 1 sample per pixel, all passes that a denoiser wants, and as `Combined` what Blender's own
-OIDN makes of it; OUT/reference/0001.exr and so on are not denoised.
+OUT/noisy/0001.exr and so on have 1 sample per pixel, all passes that a denoiser wants, and as `Combined` what Blender's
+own OIDN makes of it; OUT/reference/0001.exr and so on are not denoised.
 """
 
 import math
