@@ -86,6 +86,8 @@ class Clip:
         self.frames: int = self.facts["frames"]
         self.height: int = self.facts["height"]
         self.width: int = self.facts["width"]
+        # The frames that have a reference, by default all.
+        self.judged: list[int] = self.facts.get("judged") or list(range(self.frames))
         self.exposure: float = self.facts["exposure"]  # multiplies radiance in pictures and metrics: clip_exposure
         self.scene = path.parent.name  # such as "room-3"
         self.name = path.name  # within its scene, such as "000" or "still"; see ClipKind
@@ -135,11 +137,16 @@ class Clip:
         """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) of two sample buffers.
 
         The array is the same whether the channel is stored in full, stored as one value or derived from others.
-        Raises BadInput where the channel was not rendered, or its file is missing or damaged.
+        Raises BadInput where the channel was not rendered or its file is missing or damaged, and for the reference of
+        a frame that is not judged.
         """
         rows, columns = window
         entry = self.entry(channel)
         spec = CHANNELS[channel]
+        if spec.kind == "reference":
+            if frame not in self.judged:
+                raise BadInput(f"{self.path} has no reference of frame {frame}: `judged` leaves it out")
+            frame = self.judged.index(frame)
         if "value" in entry:
             area = np.empty((self.height, self.width), bool)[rows, columns].shape
             buffers = (2,) if spec.has_buffers else ()

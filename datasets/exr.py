@@ -54,11 +54,12 @@ def write_file(path: Path, file: OpenEXR.File) -> None:
 def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     """Write one frame of a clip atomically.
 
-    Layers are all channels of the clip, in their stored precision, and the noisy beauty image as plain R, G, B
-    (float32). The header has `worldToCamera` (for row vectors, in the camera frame of docs/format.md), and the exact
-    cameras as JSON in `onespp`. Raises BadInput where it cannot be written.
+    Layers are all channels that the clip has of this frame, in their stored precision, and the noisy beauty image as
+    plain R, G, B (float32). The header has `worldToCamera` (for row vectors, in the camera frame of docs/format.md)
+    and the exact cameras as JSON in `onespp`. Raises BadInput where it cannot be written.
     """
-    names = [name for name in clip.channels if CHANNELS[name].is_image]
+    kinds = {name: CHANNELS[name].kind for name in clip.channels if CHANNELS[name].is_image}
+    names = [name for name, kind in kinds.items() if kind != "reference" or index in clip.judged]
     arrays = {name: clip.read(name, index, realisation=realisation) for name in names}
     planes = {key: plane for name, array in arrays.items() for key, plane in layers_of(name, array).items()}
     beauty = clip.noisy(index, realisation)

@@ -36,10 +36,10 @@ def export_dataset(root: Path, out: Path) -> int:
     for split, clip in tqdm(clips, "exr", unit="clip"):
         folder = out / SPLIT_FOLDERS[split]
         folder.mkdir(exist_ok=True)
-        for frame in range(clip.frames):
+        for frame in clip.judged:
             for realisation in range(clip.realisations):
                 write_group(folder, clip, frame, realisation)
-    return sum(clip.frames * clip.realisations for _, clip in clips)
+    return sum(len(clip.judged) * clip.realisations for _, clip in clips)
 
 
 def claim_folder(out: Path, dataset: Dataset) -> None:

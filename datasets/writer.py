@@ -104,6 +104,8 @@ class ClipWriter:
         self.folder = destination.with_name(f".{destination.name}.tmp")
         self.channels: dict[str, RawChannel] = {}
         self.luminances: list[NDArray[np.float32]] = []
+        self.frames = 0
+        self.judged: list[int] = []  # frames with a reference
         self.timing: dict[str, float] = {}
 
     def __enter__(self) -> "ClipWriter":
@@ -118,20 +120,27 @@ class ClipWriter:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def add(self, channels: dict[str, NDArray[Any]], seconds: dict[str, float]) -> None:
-        """Append one frame: arrays by channel, with the axes of the channel table but F, and seconds by step."""
-        if not self.channels:
-            self.channels = {name: RawChannel(self.folder, name) for name in channels}
-        added = {name: raw.add(channels[name]) for name, raw in self.channels.items()}
-        reference = sum(added[name].mean(axis=0) for name in REFERENCE_CHANNELS)
-        self.luminances.append(luminance(np.asarray(reference)).astype(np.float32))
+        """Append one frame: arrays by channel, with the axes of the channel table but F, and seconds by step.
+
+        All frames have the same channels, but a frame that is not to be judged lacks the reference's.
+        """
+        for name in channels:
+            if name not in self.channels:
+                self.channels[name] = RawChannel(self.folder, name)
+        added = {name: self.channels[name].add(array) for name, array in channels.items()}
+        if REFERENCE_CHANNELS[0] in added:
+            reference = sum(added[name].mean(axis=0) for name in REFERENCE_CHANNELS)
+            self.luminances.append(luminance(np.asarray(reference)).astype(np.float32))
+            self.judged.append(self.frames)
+        self.frames += 1
         for step, spent in seconds.items():
             self.timing[step] = self.timing.get(step, 0.0) + spent
 
     def noise_floor(self, exposure: float) -> float:
         """The squared error of references as displayed: mean over frames of mean((display A - display B)^2) / 4."""
         floors = []
-        for frame in range(len(self.luminances)):
-            buffers = sum(self.channels[name].read(frame) for name in REFERENCE_CHANNELS)
+        for index, frame in enumerate(self.judged):
+            buffers = sum(self.channels[name].read(index) for name in REFERENCE_CHANNELS)
             a, b = display((buffers + self.channels["emission"].read(frame)).astype(np.float64), exposure)
             floors.append(noise_of_mean(a, b))
         return float(np.mean(floors))
@@ -160,10 +169,12 @@ class ClipWriter:
         exposure = clip_exposure(np.stack(self.luminances))
         floor_mse = self.noise_floor(exposure)
         height, width = self.luminances[0].shape
+        judged = {} if len(self.judged) == self.frames else {"judged": self.judged}
         content = {
-            "frames": len(self.luminances),
+            "frames": self.frames,
             "height": height,
             "width": width,
+            **judged,
             **facts,
             "exposure": exposure,
             "channels": {name: raw.finish(derived.get(name)) for name, raw in self.channels.items()},

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.camera import Array, View, pixel_centres
+from scenes.camera import Array, View, pixel_centres, view_of
 
 POSITIONS = 1 << 14  # that a camera is fitted to
 DRAW_SIZE = 12  # of them that a first fit takes
@@ -15,28 +15,6 @@ MAX_ERROR = 1 / 200  # of the image: the median distance of fitted positions fro
 MIN_THICKNESS = 1e-4  # of the positions, relative to their extent: flatter ones do not determine the camera
 MAX_ORIGIN_DISTANCE = 0.01  # relative to the positions': a camera closer to (0, 0, 0) is taken to be there
 MAX_OBLONGNESS = 0.01  # by how much focal lengths may differ
-
-STILL = np.eye(4)[None]  # object_to_world: objects are taken not to move
-
-
-def view_of(projection: Array) -> View | None:
-    """The view of a projection (3, 4) from world to homogeneous pixels, of positive weight before the camera.
-
-    None where it is singular. World coordinates may be left-handed, and so is the camera's frame then.
-    """
-    if not np.isfinite(projection).all() or np.linalg.cond(projection[:, :3]) > 1e12:
-        return None
-    # RQ decomposition by a QR of the reversed matrix.
-    q, r = np.linalg.qr(projection[::-1, :3].T)
-    K = r.T[::-1, ::-1]
-    rotation = q.T[::-1]
-    signs = np.sign(np.diag(K)) * [-1, -1, 1]  # x left, y up, z forward; see scenes.camera
-    K = K * signs / (K[2, 2] * signs[2])
-    K[0, 1] = 0  # no camera here shears
-    camera_to_world = np.eye(4)
-    camera_to_world[:3, :3] = (signs[:, None] * rotation).T
-    camera_to_world[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    return View(K, camera_to_world, STILL)
 
 
 def view_of_positions(positions: NDArray[np.float32], surface: NDArray[np.bool_]) -> View | None:

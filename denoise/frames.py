@@ -16,12 +16,12 @@ from datasets.channels import CHANNELS
 from datasets.clip import second_layer_of, visible_channel
 from datasets.exr import FACTS_ATTRIBUTE, channels_in
 from datasets.frame import Frame, to_tensor
-from denoise.cameras import STILL, in_the_world, is_own_space, view_of_header, view_of_positions
+from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_positions
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import ForeignFrame, Image
 from denoise.motion_convention import MotionConvention
 from errors import BadInput
-from scenes.camera import Array, View, look_at, motion_vectors, pixel_centres, unproject
+from scenes.camera import STILL, Array, View, look_at, motion_vectors, pixel_centres, unproject
 
 # The previous camera where it is unknown which surfaces were in its image: no frame's history follows it.
 NOWHERE = View(np.full((3, 3), np.nan), np.full((4, 4), np.nan), np.full((1, 4, 4), np.nan))

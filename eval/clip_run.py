@@ -87,8 +87,8 @@ class DenoiserRun:
     def key(self, clip: Clip) -> str:
         return self.evaluated.key(clip)
 
-    def step(self, frame: Frame, reference_buffers: Tensor, exposure: float, still: bool) -> Tensor:
-        """Denoise one frame and measure it. Returns the radiance (1, 3, H, W)."""
+    def step(self, frame: Frame, reference_buffers: Tensor | None, exposure: float, still: bool) -> Tensor:
+        """Denoise one frame, and measure it where there is a reference. Returns the radiance (1, 3, H, W)."""
         denoiser = self.evaluated.denoiser
         moved = frame.to(denoiser.device)
         if self.evaluated.saves_error and isinstance(denoiser, JamesStein) and frame.has_buffers:
@@ -98,6 +98,10 @@ class DenoiserRun:
             output, self.state = denoiser(moved, self.state)
         output = output.cpu()
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
+        if reference_buffers is None:
+            self.frames.append({})
+            self.before = None
+            return output
         mask = disoccluded(frame.motion, frame.dual_motion)
         comparison = Comparison(output, reference_buffers, exposure, mask, self.before, still)
         self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})
@@ -142,8 +146,12 @@ class ReferenceRun:
     def key(self, clip: Clip) -> str:
         return result_key(clip, [__name__], {"name": self.name, "signal": self.signal})
 
-    def step(self, frame: Frame, reference_buffers: Tensor, exposure: float, still: bool) -> Tensor:
-        """Measure one frame's reference. Returns the radiance (1, 3, H, W)."""
+    def step(self, frame: Frame, reference_buffers: Tensor | None, exposure: float, still: bool) -> Tensor | None:
+        """Measure one frame's reference. Returns the radiance (1, 3, H, W); None where there is none."""
+        if reference_buffers is None:
+            self.frames.append({})
+            self.before = None
+            return None
         reference = reference_buffers.mean(dim=0, keepdim=True)
         mask = disoccluded(frame.motion, frame.dual_motion)
         comparison = Comparison(reference, reference_buffers, exposure, mask, self.before, still)
@@ -177,16 +185,20 @@ def is_still(clip: Clip) -> bool:
 def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
     """Step all runs through a clip frame by frame and store their pictures, in memory independent of its length.
 
-    `runs` are by the folder of their pictures. Each is compared with the reference of the signal that it returns.
+    `runs` are by the folder of their pictures. Each is compared with the reference of the signal that it returns, and
+    where there is none has no picture.
     """
     channels = sorted({*METRICS_CHANNELS, *(channel for run in runs.values() for channel in run.reads)})
     signals = {run.signal for run in runs.values()}
     still = is_still(clip)
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
-        buffers = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
+        judged = signals if index in clip.judged else set()
+        buffers = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in judged}
         for folder, run in runs.items():
-            output = run.step(frame, buffers[run.signal], clip.exposure, still)
+            output = run.step(frame, buffers.get(run.signal), clip.exposure, still)
+            if output is None or not judged:
+                continue
             image = display(finite(output), clip.exposure)
             save_picture(picture_path(folder, index), image[0].permute(1, 2, 0).numpy())
             if isinstance(run, DenoiserRun) and run.error is not None:

@@ -90,7 +90,7 @@ def normalised(sums: Shares) -> Shares:
 
 @torch.no_grad()
 def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
-    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in all frames of a clip."""
+    """Shares of the pixels, as "pixels", and of each denoiser's squared error, in the judged frames of a clip."""
     denoisers = {spec.name: spec.build() for spec in specs}
     states = dict.fromkeys(denoisers)
     channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
@@ -98,13 +98,17 @@ def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]
     sums: dict[str, Shares] = {name: defaultdict(lambda: torch.zeros(())) for name in ("pixels", *denoisers)}
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
         frame = read_frame(clip, index, channels)
+        outputs = {}
+        for name, denoiser in denoisers.items():
+            outputs[name], states[name] = denoiser(frame.to(denoiser.device), states[name])
+        if index not in clip.judged:
+            continue
         references = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
         buffers = {signal: display(pair, clip.exposure).double() for signal, pair in references.items()}
         masks = places(frame, buffers["total"].mean(dim=0, keepdim=True))
-        for name, denoiser in denoisers.items():
-            output, states[name] = denoiser(frame.to(denoiser.device), states[name])
+        for name, output in outputs.items():
             shown = display(finite(output.cpu()), clip.exposure).double()
-            for key, error in squared_errors(shown, buffers[denoiser.signal], masks).items():
+            for key, error in squared_errors(shown, buffers[denoisers[name].signal], masks).items():
                 sums[name][key] = sums[name][key] + error
         for key, mask in masks.items():
             sums["pixels"][key] = sums["pixels"][key] + mask.sum()

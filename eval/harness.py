@@ -121,7 +121,8 @@ def strip(runs: Path, results: ClipResults) -> "Figure":
     """The outputs of all denoisers for a frame at three quarters of the clip, and its reference, side by side."""
     from eval.figures.show import Panel, draw_grid
 
-    index = len(results.reference.frames) * 3 // 4
+    judged = results.reference.judged
+    index = judged[len(judged) * 3 // 4]
     columns = []
     for result in (*results.results, results.reference):
         values = ((key, result.frames[index].get(key)) for key in ("rmse", "ssim"))

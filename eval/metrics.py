@@ -286,7 +286,8 @@ def within_floor(metric: str, value: float | None, floor: float | None) -> bool:
 
 def means(frames: list[Values]) -> Values:
     """Arithmetic means over the frames where a metric is defined, None where it never is."""
-    columns = {name: [row[name] for row in frames if row[name] is not None] for name in frames[0]}
+    names = dict.fromkeys(name for row in frames for name in row)
+    columns = {name: [row[name] for row in frames if row.get(name) is not None] for name in names}
     return {name: float(np.mean(values)) if values else None for name, values in columns.items()}  # type: ignore[arg-type]
 
 

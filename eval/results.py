@@ -86,10 +86,15 @@ class Result:
     scene: str
     clip: str
     metrics: Values  # means over the frames
-    frames: list[Values]
+    frames: list[Values]  # empty for a frame without a reference
     nonfinite: int = 0  # pixels, in all frames
     precision: str = "float32"
     crops: list[dict[str, int]] | None = None  # of the reference: the windows with most disocclusions
+
+    @property
+    def judged(self) -> list[int]:
+        """The frames with a reference."""
+        return [index for index, values in enumerate(self.frames) if values]
 
     @property
     def floor(self) -> bool:
@@ -113,7 +118,7 @@ def is_finished(folder: Path, wanted: str) -> bool:
         result = load_result(folder)
     except BadInput:
         return False
-    has_pictures = all(picture_path(folder, index).exists() for index in range(len(result.frames)))
+    has_pictures = all(picture_path(folder, index).exists() for index in result.judged)
     return result.key == wanted and (has_pictures or not can_draw())
 
 
@@ -154,7 +159,7 @@ def write_frames(path: Path, results: list[Result]) -> None:
     lines.writeheader()
     for result in results:
         facts = {name: getattr(result, name) for name in KEYS} | ({"denoiser": FLOOR} if result.floor else {})
-        lines.writerows(facts | {"frame": index} | values for index, values in enumerate(result.frames))
+        lines.writerows(facts | {"frame": index} | values for index, values in enumerate(result.frames) if values)
     write_file(path, text.getvalue().encode())
 
 

@@ -25,7 +25,7 @@ def means_by_age(clips: Sequence[ClipResults], metric: str = "psnr") -> dict[str
     for denoiser in dict.fromkeys(result.denoiser for clip in clips for result in clip.results):
         results = results_of(clips, denoiser)
         for age, frames in AGES.items():
-            chosen = [means(result.frames[frames])[metric] for result in results if result.frames[frames]]
+            chosen = [means(result.frames[frames]).get(metric) for result in results]
             values = [value for value in chosen if value is not None]
             rows.setdefault(denoiser, {})[age] = fmean(values) if values else None
     return rows

@@ -44,6 +44,7 @@ class Sampling(NamedTuple):
     noisy_spp: int
     reference_spp: int
     options: Options = NO_OPTIONS
+    judged: tuple[int, ...] = ()  # the frames that get a reference; empty for all
 
 
 class StepTimer:
@@ -216,7 +217,7 @@ def render_clip(
     wants_dual = "dual_motion" not in skipped
     for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, layers, timer):
         for name, step in steps_by_name.items():
-            if name not in skipped:
+            if name not in skipped and (name != "reference" or frame.index in (sampling.judged or [frame.index])):
                 with timer.step(name):
                     frame.arrays |= step(frame)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world

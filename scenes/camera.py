@@ -28,6 +28,29 @@ def intrinsics(x_fov: float, height: int, width: int) -> Array:
     return np.array([[-focal, 0, width / 2], [0, -focal, height / 2], [0, 0, 1.0]])
 
 
+STILL = np.eye(4)[None]  # object_to_world of a mesh that does not move
+
+
+def view_of(projection: Array) -> View | None:
+    """The view of a projection (3, 4) from world to homogeneous pixels, of positive weight before the camera.
+
+    None where it is singular. World coordinates may be left-handed, and so is the camera's frame then.
+    """
+    if not np.isfinite(projection).all() or np.linalg.cond(projection[:, :3]) > 1e12:
+        return None
+    # RQ decomposition by a QR of the reversed matrix.
+    q, r = np.linalg.qr(projection[::-1, :3].T)
+    K = r.T[::-1, ::-1]
+    rotation = q.T[::-1]
+    signs = np.sign(np.diag(K)) * [-1, -1, 1]  # x left, y up, z forward; see above
+    K = K * signs / (K[2, 2] * signs[2])
+    K[0, 1] = 0  # no camera here shears
+    camera_to_world = np.eye(4)
+    camera_to_world[:3, :3] = (signs[:, None] * rotation).T
+    camera_to_world[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    return View(K, camera_to_world, STILL)
+
+
 Y_UP = np.array([0.0, 1.0, 0.0])
 
 

@@ -171,7 +171,8 @@ def show(path: Path, out: Path, runs: Path, budget: str, names: Sequence[str] = 
         raise BadInput(f"there is no clip at {path}: name the folder of one, such as data/quick/test/cornell_box/000")
     clip = Clip(path)
     denoisers = runnable(clip, runs, budget, names)
-    shown = sorted({round(index) for index in np.linspace(0, clip.frames - 1, SHOWN_FRAMES)})
+    last = len(clip.judged) - 1
+    shown = sorted({clip.judged[round(index)] for index in np.linspace(0, last, SHOWN_FRAMES)})
     out.mkdir(parents=True, exist_ok=True)
     grids = grids_of(*view_clip(clip, denoisers, shown))
     for name, columns in tqdm(grids.items(), "pictures", leave=False):

@@ -79,9 +79,8 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
     missing and damaged pictures.
     """
     folders = folders_of(runs, clip)
-    count = len(clip.reference.frames)
-    frames = range(0, count, step)
-    height, width = load_picture(folders[clip.reference.denoiser], 0).shape[:2]
+    frames = clip.reference.judged[::step]
+    height, width = load_picture(folders[clip.reference.denoiser], frames[0]).shape[:2]
     images = {
         name: [data_uri(picture_path(folder, index).read_bytes(), "webp") for index in frames]
         for name, folder in folders.items()
@@ -97,7 +96,7 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
                 maps.append(data_uri(buffer.getvalue(), "webp"))
     return {
         "name": clip.name,
-        "count": count,
+        "count": len(clip.reference.frames),
         "frames": [*frames],  # those with pictures, of all `count`
         "height": height,
         "width": width,
@@ -194,8 +193,8 @@ def save_animation(runs: Path, clip: ClipResults) -> Path:
     best = sorted((name for name in flips if name not in noisy), key=flips.__getitem__)[:BEST_SHOWN]
     names = [*noisy, *best, clip.reference.denoiser]
     folders = [folders_of(runs, clip)[name] for name in names]
-    count = min(MAX_FRAMES, len(clip.reference.frames))
-    frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in range(count))
+    shown = clip.reference.judged[:MAX_FRAMES]
+    frames: Iterator[Image.Image] = (side_by_side(folders, names, index) for index in shown)
     path = runs / "report" / f"{clip.file_name}.webp"
     first = next(frames)
     with replacing(path) as temporary:

@@ -143,6 +143,7 @@ def render_to_folder(
         with timer.step("pilot"):
             needed_spp = samples_needed(scene, profile.size, quality, seed, options)
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
-    sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options)
+    judged = profile.judged if split == "test" else ()
+    sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options, judged)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
     write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), timer.read())

@@ -32,9 +32,13 @@ class DataProfile:
     rooms: dict[str, int] = field(default_factory=dict)  # rooms, of one clip each
     closeups: dict[str, int] = field(default_factory=dict)  # of further rooms, one clip each
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
+    judged: tuple[int, ...] = ()  # the frames of test clips that get a reference; empty for all
     own: Path | None = None  # the TOML of a user's own scene, the only one
 
 
+# The frames after a cut, and pairs of later ones: what changes in time needs two.
+JUDGED = (0, 4, 15, 16, 31, 32, 47, 48)
+BENCHMARK_SCENES = ("room-3000", "room-3001", "room-3002", "glass-table", "glass-vitrine")
 TEST_OF_SMALL_ROOMS = SamplingQuality(1, reference_spp=64, floor=40, most_spp=256, skips_noisy_rooms=True)
 
 DATA_PROFILES = {
@@ -69,6 +73,13 @@ DATA_PROFILES = {
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
     ),
+    # Scenes that no training uses, at a size at which people look, until the history is steady.
+    "benchmark": DataProfile(
+        size=(49, 360, 640),
+        quality=dict.fromkeys(SPLITS, SamplingQuality(realisations=1, reference_spp=256, floor=35, most_spp=2048)),
+        special={"test": [f"{name}/000" for name in BENCHMARK_SCENES]},
+        judged=JUDGED,
+    ),
     # Six scenes of glass: at rest, with a camera that moves, and with things that move.
     "glass": DataProfile(
         size=(12, 144, 256),
@@ -92,7 +103,8 @@ def own_profile(path: Path) -> DataProfile:
     if not any(clips.values()):
         raise BadInput(f"{path}: no split has any clips")
     width, height = described.resolution
-    return DataProfile((described.frames, height, width), quality, special=clips, own=path)
+    judged = described.splits.test.judged
+    return DataProfile((described.frames, height, width), quality, special=clips, judged=judged, own=path)
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:

@@ -83,6 +83,7 @@ class TrainSplit(Split, frozen=True):
 class TestSplit(Split, frozen=True):
     floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = 35.0
     most_spp: Even = 2048
+    judged: tuple[Count, ...] = ()  # the frames that get a reference; by default all
 
 
 class Splits(Table, frozen=True):
@@ -110,6 +111,9 @@ def read_description(path: Path) -> Description:
         raise BadInput(f"{path} cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
+    judged = described.splits.test.judged
+    if judged != tuple(sorted({*judged} & {*range(described.frames)})):
+        raise BadInput(f"{path}: judged = {[*judged]}: list frames from 0 to {described.frames - 1} in rising order")
     all_keys: list[Sequence[CameraKey | PoseKey | GainKey]] = [described.camera]
     all_keys += [motion.keyframes for motion in described.motion]
     all_keys += [change.keyframes for change in described.light]

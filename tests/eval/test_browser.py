@@ -10,6 +10,8 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
+from eval.benchmark.page import write_page
+
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
 pytestmark = [
@@ -183,3 +185,16 @@ def test_every_control_has_a_name_and_can_be_reached(page):
         !(e.textContent.trim() || e.ariaLabel || e.labels?.[0]?.textContent.trim())).length"""
     assert page.execute_script(unnamed) == 0
     assert page.execute_script("return document.querySelectorAll('[tabindex=\"-1\"]').length") == 0
+
+
+def test_the_blind_comparison_counts_votes(browser, tiny, tmp_path):
+    browser.get(write_page(["noisy", "accumulated"], [tiny], tmp_path, "tiny").as_uri())
+    body = browser.find_element(By.TAG_NAME, "body")
+    for count, button in enumerate(["prefer-left", "prefer-none"]):
+        WebDriverWait(browser, 10).until(lambda _, n=count: body.get_attribute("data-ready") == str(n))
+        assert "noisy" not in body.text
+        browser.find_element(By.ID, button).click()
+    rows = {row.text for row in browser.find_elements(By.CSS_SELECTOR, "#result tr")}
+    assert "no difference 1" in rows
+    assert rows > {"noisy 1", "accumulated 0"} or rows > {"noisy 0", "accumulated 1"}
+    assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []

@@ -1,0 +1,98 @@
+"""Datasets made from files of other people: what they have in common."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.clip import SCHEMA, is_clip
+from datasets.writer import ClipWriter
+from errors import BadInput
+from files import write_json
+from scenes.camera import Array, View, motion_vectors, pixel_centres, view_of
+
+Image = NDArray[np.float32]
+
+
+class ImportedFrame(NamedTuple):
+    """A frame in our conventions (docs/format.md); images are (H, W, C)."""
+
+    radiance: Image  # noisy
+    reference: Image
+    albedo: Image
+    normal: Image
+    position: Image  # in the world
+    surface: NDArray[np.bool_]  # (H, W), where a pixel shows one
+    view: View
+    motion: Image | None = None  # px; None where only the camera moves
+
+
+def view_of_clip_space(matrix: Array, to_pixels: Array) -> View:
+    """The view of a matrix (4, 4) from the world to clip space, for row vectors, as graphics APIs have it.
+
+    `to_pixels` (3, 3) leads from clip space's (x, y, w) to homogeneous pixels. Raises BadInput where it is singular.
+    """
+    view = view_of(to_pixels @ matrix.T[[0, 1, 3]])
+    if view is None:
+        raise BadInput(f"the camera matrix {matrix.tolist()} is singular")
+    return view
+
+
+def channels_of(frame: ImportedFrame, previous: View) -> dict[str, NDArray[Any]]:
+    """The channels of a frame, as ClipWriter takes them. All light counts as direct, all surfaces as one mesh."""
+    world_to_camera = np.linalg.inv(frame.view.camera_to_world)
+    shown = frame.surface[..., None]
+    depth = np.where(shown, frame.position @ world_to_camera[2, :3, None] + world_to_camera[2, 3], 0)
+    motion: NDArray[np.floating] | None = frame.motion
+    if motion is None:
+        centres = pixel_centres(*frame.surface.shape)
+        motion = motion_vectors(centres, depth[..., 0], frame.surface.astype(int), frame.view, previous)
+    dark = np.zeros_like(frame.radiance)
+    return {
+        "direct": np.where(shown, frame.radiance, 0)[None],
+        "indirect": dark[None],
+        "direct_reference": np.stack([np.where(shown, frame.reference, 0)] * 2),
+        "indirect_reference": np.stack([dark, dark]),
+        "emission": np.where(shown, 0, frame.radiance),
+        "albedo": np.where(shown, frame.albedo, 1),
+        "normal": np.where(shown, frame.normal, 0),
+        "depth": depth,
+        "roughness": np.ones_like(depth),
+        "mesh_id": shown.astype("<u2"),
+        "motion": motion,
+        "dual_motion": motion,
+        **frame.view._asdict(),
+    }
+
+
+def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[ImportedFrame]], spp: int) -> int:
+    """Write test clips by their scenes' names to a dataset, or resume. Returns how many were written.
+
+    Both buffers of references are the one image that there is: noise floors are unknown, and shown as perfect. Raises
+    BadInput where `root` has something else, and as the clips' files are read.
+    """
+    facts = {
+        "schema": SCHEMA,
+        "profile": source,
+        "scenes": list(clips),
+        "splits": {"train": [], "val": [], "test": [f"{name}/000" for name in clips]},
+    }
+    root.mkdir(parents=True, exist_ok=True)
+    if not (root / "dataset.json").exists() and any(root.glob("[!.]*")):
+        raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
+    write_json(root / "dataset.json", facts)
+    written = 0
+    for name, frames in clips.items():
+        folder = root / "test" / name / "000"
+        if is_clip(folder):
+            continue
+        with ClipWriter(folder) as writer:
+            previous = None
+            for frame in frames:
+                writer.add(channels_of(frame, previous or frame.view), {})
+                previous = frame.view
+            writer.finish({"noisy_spp": spp, "reference_spp": 0, "meshes": ["scene"], "source": source}, {})
+        written += 1
+    return written

@@ -1,0 +1,108 @@
+"""Test sequences of Noisebase (Bálint et al. 2023): 1920 x 1080, a few samples per pixel, a reference per frame.
+
+Format (https://github.com/balintio/noisebase, docs/formats/sample_test_v1.md): SEQUENCE/frameNNNN.zip, each a zarr
+group. Samples are the last axis; radiance is coded as RGBE; matrices are for row vectors, clip space's y points up. Its
+scripts leave out 28 rows at the top and at the bottom.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
+from errors import BadInput
+from extras import requires_extra
+from scenes.camera import FAR_OUTSIDE, Array
+
+LEFT_OUT = 28  # rows
+
+
+def import_noisebase(source: Path, out: Path, samples: int) -> int:
+    """Make a dataset of the sequences below `source`, with the first `samples` of each pixel. Returns how many.
+
+    Raises BadInput, naming the file, where there is none, or one is damaged or has fewer samples.
+    """
+    folders = sorted({path.parent for path in source.glob("**/frame[0-9][0-9][0-9][0-9].zip")})
+    if not folders:
+        raise BadInput(f"{source} has no sequence: each is a folder with frame0000.zip and so on")
+    clips = {folder.name: frames_of(folder, samples) for folder in folders}
+    return write_dataset(out, f"noisebase at {samples} spp", clips, samples)
+
+
+def frames_of(folder: Path, samples: int) -> Iterator[ImportedFrame]:
+    """The frames of a sequence."""
+    previous: Array | None = None
+    for path in tqdm(sorted(folder.glob("frame*.zip")), folder.name, unit="frame", leave=False):
+        arrays = read_group(path)
+        if arrays["color"].shape[-1] < samples:
+            raise BadInput(f"{path} has {arrays['color'].shape[-1]} samples per pixel, not {samples}")
+        matrix = arrays["view_proj_mat"].astype(np.float64)
+        yield imported_frame(arrays, matrix if previous is None else previous, samples)
+        previous = matrix
+
+
+def imported_frame(arrays: dict[str, NDArray[Any]], before: Array, samples: int) -> ImportedFrame:
+    """A frame, by the matrix of the frame `before`.
+
+    Surfaces are those of the first sample: the mean of several depths lies on none.
+    """
+    to_pixels = pixels_of_clip_space(*arrays["color"].shape[1:3])
+    matrix = arrays["view_proj_mat"].astype(np.float64)
+    first = {name: image_of(arrays[name][..., 0]) for name in ("position", "motion", "normal")}
+    return ImportedFrame(
+        radiance=image_of(decoded(arrays["color"][..., :samples], arrays["exposure"]).mean(axis=-1)),
+        reference=image_of(arrays["reference"]),
+        albedo=image_of(arrays["diffuse"][..., :samples].mean(axis=-1, dtype=np.float32)),
+        normal=first["normal"],
+        position=first["position"],
+        surface=np.abs(first["normal"]).sum(axis=-1) > 0,
+        view=view_of_clip_space(matrix, to_pixels),
+        motion=motion_of(first["position"], first["motion"], matrix, before, to_pixels),
+    )
+
+
+def image_of(array: NDArray[Any]) -> Image:
+    """(C, H, W) as (H, W, C), without the rows that are left out."""
+    return np.moveaxis(array[:, LEFT_OUT:-LEFT_OUT].astype(np.float32), 0, -1)
+
+
+def read_group(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a frame. Raises BadInput where the file is damaged or lacks one."""
+    with requires_extra("noisebase"):
+        import zarr
+    names = ("color", "exposure", "reference", "position", "motion", "normal", "diffuse", "view_proj_mat")
+    try:
+        with zarr.storage.ZipStore(path, mode="r") as store:
+            group = zarr.open_group(store, mode="r")
+            return {name: np.asarray(group[name]) for name in names}
+    except Exception as error:  # a damaged archive may fail in any way
+        raise BadInput(f"{path} is damaged or incomplete ({error}): get it again") from None
+
+
+def decoded(color: NDArray[np.uint8], exposure: NDArray[np.float32]) -> Image:
+    """Radiance (3, H, W, S) of RGBE `color` (4, H, W, S): each mantissa / 255 times exp of the exponent.
+
+    The exponent's 256 steps divide the range between the logarithms in `exposure` evenly.
+    """
+    low, high = (float(value) for value in exposure)
+    exponent = low + (color[3].astype(np.float32) + 1) / 256 * (high - low)
+    return color[:3].astype(np.float32) / 255 * np.exp(exponent)
+
+
+def pixels_of_clip_space(height: int, width: int) -> Array:
+    """From clip space (x, y, w) to pixels of the rows that are kept, (3, 3)."""
+    return np.array([[width / 2, 0, width / 2], [0, -height / 2, height / 2 - LEFT_OUT], [0, 0, 1]])
+
+
+def motion_of(position: Image, moved: Image, now: Array, before: Array, to_pixels: Array) -> Image:
+    """Motion vectors (H, W, 2) in pixels, of surfaces at `position` that were at `position + moved` before."""
+    pixels = []
+    for points, matrix in ((position, now), (position + moved, before)):
+        homogeneous = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
+        projected = homogeneous @ matrix[:, [0, 1, 3]] @ to_pixels.T
+        pixels.append(projected[..., :2] / np.where(projected[..., 2:] == 0, 1, projected[..., 2:]))
+    return np.clip(pixels[1] - pixels[0], -FAR_OUTSIDE, FAR_OUTSIDE).astype(np.float32)

@@ -1,0 +1,111 @@
+"""Scores on other people's data by their own rules, beside the rows that they published."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from tabulate import tabulate
+from torch import Tensor
+from tqdm import tqdm
+
+from datasets.channels import LUMINANCE_WEIGHTS
+from datasets.clip import Clip, Dataset
+from datasets.frame import read_frame, to_tensor
+from errors import BadInput
+from eval.metrics import flip, ssim
+from eval.selection import evaluated
+from models.operators import finite
+from models.spec import DenoiserSpec
+
+METRICS = ("PSNR", "SSIM", "FLIP", "tPSNR")
+GAMMA = 2.2
+# Stephen Hill's fit of the ACES tone curve (BakingLab): to its colour space, the curve's coefficients, and back.
+ACES_INPUT = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777))
+ACES_OUTPUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602))
+
+
+def gamma_tone(radiance: Tensor) -> Tensor:
+    return radiance.clamp(min=0) ** 0.454545
+
+
+def aces_tone(radiance: Tensor) -> Tensor:
+    x = torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_INPUT).to(radiance), radiance)
+    x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
+    return torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_OUTPUT).to(x), x).clamp(0, 1) ** (1 / GAMMA)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How others score, and their results: means over clips by METRICS, as far as they give them."""
+
+    tone: Callable[[Tensor], Tensor]
+    warm_up: int  # frames of each clip that do not count
+    rows: dict[str, tuple[float, ...]]
+
+
+# By the profile of an imported dataset. Sources: Fan et al. 2021, Table 2; Noisebase, docs/benchmarks/rendering_v1.md.
+PROTOCOLS = {
+    "bmfr": Protocol(
+        gamma_tone,
+        warm_up=0,
+        rows={
+            "KP (Fan et al. 2021)": (30.33,),
+            "WSKP6 (Fan et al. 2021)": (30.32,),
+            "NBGD (Meng et al. 2020)": (29.47,),
+            "BMFR (Koskela et al. 2019)": (25.58,),
+            "SVGF (Schied et al. 2017)": (22.26,),
+        },
+    ),
+    "noisebase at 2 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (28.3952, 0.87283, 0.10702)}),
+    "noisebase at 4 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (29.3461, 0.88300, 0.09624)}),
+    "noisebase at 8 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (30.3686, 0.89657, 0.08451)}),
+}
+
+
+def as_file(radiance: Tensor, protocol: Protocol) -> Tensor:
+    """What an 8-bit image of the radiance (1, 3, H, W) holds, in [0, 1] and float64."""
+    return (255 * protocol.tone(finite(radiance).double()).clamp(0, 1)).floor() / 255
+
+
+def psnr(x: Tensor, y: Tensor) -> float:
+    return -10 * math.log10(max(float((x - y).square().mean()), 1e-10))
+
+
+def luminance(image: Tensor) -> Tensor:
+    """Linear luminance (1, 1, H, W) of an image with gamma, of which Noisebase takes SSIM."""
+    return (image**GAMMA * torch.tensor(LUMINANCE_WEIGHTS).to(image)[:, None, None]).sum(dim=1, keepdim=True)
+
+
+@torch.no_grad()
+def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[float | None]]:
+    """A denoiser's METRICS of every frame that counts."""
+    denoiser = spec.build()
+    state = None
+    rows: list[list[float | None]] = []
+    before: tuple[Tensor, Tensor] | None = None
+    for index in tqdm(range(clip.frames), f"{clip.scene} {spec.name}", unit="frame", leave=False):
+        output, state = denoiser(read_frame(clip, index, denoiser.reads).to(denoiser.device), state)
+        if index < protocol.warm_up:
+            continue
+        reference = to_tensor(clip.reference(index).mean(axis=0))
+        x, y = as_file(output.cpu(), protocol), as_file(reference, protocol)
+        change = psnr(x - before[0], y - before[1]) if before else None
+        rows.append([psnr(x, y), ssim(luminance(x), luminance(y)), flip(x, y), change])
+        before = x, y
+    return rows
+
+
+def published(names: Sequence[str], data: Path, runs: Path, budget: str) -> str:
+    """A table of denoisers and published rows. Raises BadInput where the data set has no rules of its own."""
+    dataset = Dataset(data)
+    protocol = PROTOCOLS.get(dataset.facts["profile"])
+    if protocol is None:
+        raise BadInput(f"{data} was not made by `onespp import`: there are no published results to compare with")
+    lines = [[name, *(f"{value:.4g}" for value in row)] for name, row in protocol.rows.items()]
+    for spec in evaluated(names, runs, budget):
+        clips = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in dataset.clips("test")]
+        lines.append([spec.name, *(f"{mean:.4g}" for mean in np.mean(clips, axis=0))])
+    return tabulate(lines, ["", *METRICS], disable_numparse=True)

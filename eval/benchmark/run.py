@@ -1,0 +1,132 @@
+"""`onespp benchmark`: renders scenes by other people, evaluates denoisers on them, and writes results to compare."""
+
+import hashlib
+import os
+import tomllib
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from tabulate import tabulate
+
+from datasets.clip import Dataset
+from errors import BadInput
+from eval.harness import evaluate
+from eval.results import by_signal, read_results
+from eval.tables import means_by_age
+from files import write_file, write_json
+from models.registry import channels_read
+from render.job.generate import generate
+from render.job.profiles import JUDGED
+
+NAMES = (
+    *("noisy", "svgf", "oidn", "oidn-balanced", "oidn-fast"),
+    *("oidn+accumulated", "oidn+accumulated+adaptive", "one"),
+)
+FILES = ("scene.xml", "scene_v3.xml")
+AGED = ("psnr", "ssim", "flip", "temporal_error")  # metrics that are also given by the age of the history
+BUILT_IN = "benchmark"  # the profile of our own scenes
+
+
+class Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """A scene of the list."""
+
+    title: str
+    author: str
+    licence: str
+    bounces: int | None = None  # of light; by default the file's
+
+
+def entries() -> dict[str, Entry]:
+    """The scenes by name, as their folders are called."""
+    text = resources.files("eval.benchmark").joinpath("scenes.toml").read_text()
+    return msgspec.convert(tomllib.loads(text), dict[str, Entry])
+
+
+def scene_file(scenes: Path, name: str) -> Path | None:
+    """The file of a scene; None where it is not there."""
+    return next((path for file in FILES if (path := scenes / name / file).exists()), None)
+
+
+def list_scenes(scenes: Path | None) -> str:
+    """A table of the scenes; with a folder, which of them are in it."""
+    rows = []
+    for name, entry in entries().items():
+        found = ("yes" if scene_file(scenes, name) else "missing") if scenes else ""
+        rows.append([name, entry.title, entry.author, entry.licence, found])
+    table = tabulate(rows, ["folder", "title", "author", "licence", "there"], disable_numparse=True)
+    return f"{table}\n\nEach as FOLDER/scene.xml, from https://benedikt-bitterli.me/resources (Mitsuba)"
+
+
+def digest_of_folder(folder: Path) -> str:
+    """A digest of all files of a scene."""
+    sums = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        sums.update(str(path.relative_to(folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
+    return sums.hexdigest()[:16]
+
+
+def description(file: Path, toml: Path, entry: Entry, size: tuple[int, int], frames: int) -> str:
+    """The TOML of a scene: one test clip whose first frame is the file's view."""
+    judged = [frame for frame in JUDGED if frame < frames]
+    bounces = f"bounces = {entry.bounces}\n" if entry.bounces else ""
+    return (
+        f"file = {msgspec.json.encode(os.path.relpath(file, toml.parent)).decode()}\n"
+        f"resolution = {list(size)}\nframes = {frames}\n{bounces}\n"
+        "[splits.train]\nclips = 0\n\n[splits.val]\nclips = 0\n\n"
+        f"[splits.test]\nclips = 1\nfloor = 35.0\njudged = {judged}\n"
+    )
+
+
+def render_scenes(scenes: Path, data: Path, size: tuple[int, int], frames: int) -> dict[str, Path]:
+    """Render the datasets of all scenes that are there, or resume. Returns their folders by name."""
+    folders = {}
+    for name, entry in entries().items():
+        file = scene_file(scenes, name)
+        if file is None:
+            print(f"{name}: missing, no {scenes / name / FILES[0]}")
+            continue
+        toml = data / f"{name}.toml"
+        data.mkdir(parents=True, exist_ok=True)
+        write_file(toml, description(file.resolve(), toml.resolve(), entry, size, frames).encode())
+        generate(data / name, str(toml.resolve()), seed=0, reads=channels_read())
+        folders[name] = data / name
+    return folders
+
+
+def run(
+    scenes: Path | None, data: Path, runs: Path, names: Sequence[str], size: tuple[int, int], frames: int, own: bool
+) -> str:
+    """Render and evaluate; write RUNS/benchmark.json. Returns the means by the age of the history as text.
+
+    `own` adds our own scenes, which no training uses. Raises BadInput where there is nothing to evaluate.
+    """
+    folders = render_scenes(scenes, data, size, frames) if scenes else {}
+    if own:
+        generate(data / BUILT_IN, BUILT_IN, seed=0, reads=channels_read())
+    everything = [*folders.values(), *([data / BUILT_IN] if own else [])]
+    if not everything:
+        raise BadInput(f"none of the scenes is in {scenes}: `onespp benchmark list` says where to get them")
+    evaluate(everything, runs, "release", names or NAMES)
+    content, clips = read_results(runs)
+    ages = {metric: means_by_age(by_signal(clips)["total"], metric) for metric in AGED}
+    digests = {
+        name: {"files": digest_of_folder(scenes / name), "clip": Dataset(folder).clips("test")[0].fingerprint}
+        for name, folder in folders.items()
+        if scenes
+    }
+    write_json(runs / "benchmark.json", content | {"by_age": ages, "digests": digests})
+    return by_age(ages)
+
+
+def by_age(ages: dict[str, dict[str, dict[str, float | None]]]) -> str:
+    """Means over all clips, by metric, denoiser and age."""
+    rows: list[list[Any]] = [
+        [metric, name, *("-" if value is None else f"{value:.4g}" for value in values.values())]
+        for metric, table in ages.items()
+        for name, values in table.items()
+    ]
+    heads = list(next(iter(next(iter(ages.values())).values())))
+    return tabulate(rows, ["metric", "denoiser", *heads], disable_numparse=True)

@@ -1,0 +1,185 @@
+"""Files of other people become datasets: written here by their documented formats, with known cameras."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from datasets.bmfr_files import import_bmfr
+from datasets.clip import Clip, Dataset
+from datasets.frame import read_frame
+from datasets.noisebase_files import LEFT_OUT, import_noisebase
+from errors import BadInput
+from models.registry import create
+from scenes.camera import STILL, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
+
+SIZE = 72, 96
+FRAMES = 3
+
+
+def view(index, size=SIZE):
+    eye = np.array([0.1 * index, 0.2, 0.0])
+    return View(intrinsics(60.0, *size), look_at(eye, np.array([0.0, 0.1 * index, -5.0])), STILL)
+
+
+def positions(view, size=SIZE):
+    """The points (H, W, 3) of a tilted plane that pixels show: z = -5 + x / 4."""
+    ray = directions(pixel_centres(*size), view)
+    normal = np.array([-0.25, 0.0, 1.0])
+    eye = view.camera_to_world[:3, 3]
+    return eye + (-5 - eye @ normal) / (ray @ normal)[..., None] * ray
+
+
+def clip_space(view, size, y_up):
+    """The matrix (4, 4) from the world to clip space, for row vectors."""
+    u, v, w = view.K @ np.linalg.inv(view.camera_to_world)[:3]
+    height, width = size
+    y = 2 / height * v - w
+    return np.stack([2 / width * u - w, -y if y_up else y, w, w]).T
+
+
+def images(index, size=SIZE):
+    """Irradiance, albedo and a reference."""
+    rng = np.random.default_rng(index)
+    irradiance, albedo = rng.exponential(1, (*size, 3)), rng.uniform(0.1, 1, (*size, 3))
+    return irradiance, albedo, albedo
+
+
+def write_exr(path, image):
+    planes = {name: np.ascontiguousarray(image[..., i], np.float32) for i, name in enumerate("RGB")}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, planes) as file:
+        file.write(str(path))
+
+
+@pytest.fixture
+def bmfr(tmp_path):
+    folder = tmp_path / "files" / "sponza" / "inputs"
+    folder.mkdir(parents=True)
+    matrices = []
+    for index in range(FRAMES):
+        irradiance, albedo, reference = images(index)
+        normal = np.broadcast_to(np.array([-0.25, 0.0, 1.0]) / np.hypot(0.25, 1), (*SIZE, 3)).copy()
+        normal[:4] = 0  # background
+        named = {"color": irradiance, "albedo": albedo, "reference": reference, "shading_normal": normal}
+        for name, image in (named | {"world_position": positions(view(index))}).items():
+            write_exr(folder / f"{name}{index}.exr", image)
+        rows = clip_space(view(index), SIZE, y_up=False)
+        lines = ",\n".join("      {" + ", ".join(f"{x:.9e}f" for x in row) + "}" for row in rows)
+        matrices.append(f"   {{ // frame {index}\n{lines}\n   }}")
+    text = f"const float position_limit_squared = 0.01f;\nconst float camera_matrices[{FRAMES}][4][4] = {{\n"
+    offsets = "const float pixel_offsets[1][2] = {\n   {0.500000, 0.500000}, // frame 0\n};\n"
+    (folder / "camera_matrices.h").write_text(text + ",\n".join(matrices) + "\n};\n" + offsets)
+    return tmp_path / "files"
+
+
+def test_bmfr_files_keep_cameras_light_and_motion(bmfr, tmp_path):
+    assert import_bmfr(bmfr, tmp_path / "data") == 1
+    assert import_bmfr(bmfr, tmp_path / "data") == 0  # it is there
+    (clip,) = Dataset(tmp_path / "data").clips("test")
+    assert (clip.scene, clip.frames, clip.height, clip.width) == ("sponza", FRAMES, *SIZE)
+    for index in range(FRAMES):
+        wanted = view(index)
+        irradiance, albedo, reference = images(index)
+        assert np.allclose(clip.view(index).K, wanted.K, atol=1e-3)
+        assert np.allclose(clip.view(index).camera_to_world, wanted.camera_to_world, atol=1e-5)
+        assert np.allclose(clip.noisy(index)[4:], (irradiance * albedo)[4:], rtol=2e-3, atol=1e-4)
+        assert np.allclose(clip.reference(index).mean(axis=0)[4:], reference[4:], rtol=2e-3)
+        assert np.allclose(clip.read("depth", index)[4:, :, 0], depth_of(wanted)[4:], rtol=1e-5)
+        assert (clip.read("mesh_id", index)[:4] == 0).all() and (clip.read("mesh_id", index)[4:] == 1).all()
+        before = view(max(index - 1, 0))
+        motion = motion_vectors(pixel_centres(*SIZE), depth_of(wanted), np.ones(SIZE, int), wanted, before)
+        assert np.allclose(clip.read("motion", index)[4:], motion[4:], atol=1e-3)
+
+
+def depth_of(view):
+    """Along the viewing axis."""
+    to_camera = np.linalg.inv(view.camera_to_world)
+    return positions(view) @ to_camera[2, :3] + to_camera[2, 3]
+
+
+def test_imported_clips_can_be_denoised_with_history(bmfr, tmp_path):
+    import_bmfr(bmfr, tmp_path / "data")
+    clip = Clip(tmp_path / "data" / "test" / "sponza" / "000")
+    denoiser, state = create("accumulated"), None
+    for index in range(FRAMES):
+        _, state = denoiser(read_frame(clip, index, denoiser.reads), state)
+    assert state.pictures()["history length"][0, 0, 20:-20, 20:-20].min() == FRAMES
+
+
+def test_damaged_bmfr_files_are_named(bmfr, tmp_path):
+    broken = bmfr / "sponza" / "inputs" / "albedo1.exr"
+    broken.write_bytes(broken.read_bytes()[:200])
+    with pytest.raises(BadInput, match=r"albedo1\.exr is damaged"):
+        import_bmfr(bmfr, tmp_path / "data")
+    assert not (tmp_path / "data" / "test" / "sponza" / "000").exists()
+    with pytest.raises(BadInput, match="has no scene"):
+        import_bmfr(tmp_path / "data", tmp_path / "other")
+
+
+def encoded(radiance):
+    """RGBE (4, H, W, S) of radiance, and its range, by the format's description."""
+    brightest = radiance.max(axis=0)
+    low, high = np.log(radiance[radiance > 0].min()), np.log(brightest.max())
+    exponent = np.clip(np.floor((np.log(brightest) - low) / (high - low) * 256), 0, 255)
+    scale = np.exp(low + (exponent + 1) / 256 * (high - low))
+    return np.concatenate([np.round(radiance / scale * 255), exponent[None]]).astype("u1"), np.float32([low, high])
+
+
+@pytest.fixture
+def noisebase(tmp_path):
+    zarr = pytest.importorskip("zarr")
+    size = SIZE[0] + 2 * LEFT_OUT, SIZE[1]
+    folder = tmp_path / "files" / "bistro1"
+    folder.mkdir(parents=True)
+    for index in range(FRAMES):
+        here = view(index, size)
+        samples = [np.moveaxis(images(10 * index + sample, size)[0], -1, 0) for sample in (0, 1)]
+        color, exposure = encoded(np.stack(samples, axis=-1))
+        surfaces = positions(here, size), images(index, size)[1]
+        flat = [np.moveaxis(image, -1, 0)[..., None].repeat(2, axis=-1) for image in surfaces]
+        normal = np.broadcast_to(np.float16([0, 0, 1]).reshape(3, 1, 1, 1), (3, *size, 2))
+        arrays = {
+            "color": color,
+            "exposure": exposure,
+            "reference": np.moveaxis(images(index, size)[2], -1, 0).astype("f4"),
+            "position": flat[0].astype("f4"),
+            "motion": np.zeros((3, *size, 2), "f4"),
+            "normal": normal,
+            "diffuse": flat[1].astype("f2"),
+            "view_proj_mat": clip_space(here, size, y_up=True).astype("f4"),
+        }
+        with zarr.storage.ZipStore(folder / f"frame{index:04d}.zip", mode="w") as store:
+            group = zarr.create_group(store, zarr_format=2)
+            for name, array in arrays.items():
+                group.create_array(name, data=np.ascontiguousarray(array))
+    return tmp_path / "files"
+
+
+def test_noisebase_files_keep_cameras_light_and_motion(noisebase, tmp_path):
+    assert import_noisebase(noisebase, tmp_path / "data", samples=2) == 1
+    (clip,) = Dataset(tmp_path / "data").clips("test")
+    size = SIZE[0] + 2 * LEFT_OUT, SIZE[1]
+    rows = slice(LEFT_OUT, size[0] - LEFT_OUT)
+    assert (clip.scene, clip.height, clip.width, clip.facts["noisy_spp"]) == ("bistro1", *SIZE, 2)
+    for index in range(FRAMES):
+        wanted = view(index, size)
+        samples = [images(10 * index + sample, size)[0] for sample in (0, 1)]
+        assert np.allclose(clip.noisy(index), np.mean(samples, axis=0)[rows], rtol=0.02, atol=0.01)
+        assert np.allclose(clip.view(index).camera_to_world, wanted.camera_to_world, atol=1e-4)
+        assert np.allclose(clip.view(index).K[:2, 2], wanted.K[:2, 2] - [0, LEFT_OUT], atol=0.01)
+        point = positions(wanted, size)[rows][30, 40]
+        u, v, w = clip.view(index).K @ (np.linalg.inv(clip.view(index).camera_to_world)[:3] @ [*point, 1])
+        assert np.allclose([u / w, v / w], [40.5, 30.5], atol=0.01)
+        assert w == pytest.approx(float(clip.read("depth", index)[30, 40, 0]), rel=1e-4)
+        if index:
+            pixels = pixel_centres(*size)
+            to_camera = np.linalg.inv(wanted.camera_to_world)
+            depth = positions(wanted, size) @ to_camera[2, :3] + to_camera[2, 3]
+            motion = motion_vectors(pixels, depth, np.ones(size, int), wanted, view(index - 1, size))[rows]
+            assert np.allclose(clip.read("motion", index), motion, atol=0.01)
+
+
+def test_noisebase_files_with_too_few_samples_are_refused(noisebase, tmp_path):
+    with pytest.raises(BadInput, match="has 2 samples per pixel, not 4"):
+        import_noisebase(noisebase, tmp_path / "data", samples=4)
+    with pytest.raises(BadInput, match="has no sequence"):
+        import_noisebase(tmp_path / "data", tmp_path / "other", samples=1)
