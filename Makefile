@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 LLVM := libllvm19
 
 .NOTPARALLEL:
-.PHONY: all setup dataset train eval bench stress report test test-all lint clean
+.PHONY: all setup dataset train eval bench stress report test test-all blender lint clean
 
 # Seconds since this call of make began, for the documentation.
 START := $(shell date +%s)
@@ -59,6 +59,11 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 test: $(READY)
 	$(PYTEST)
 	@mkdir -p $(RUNS) && echo $(SECONDS) > $(RUNS)/test.seconds
+
+# Blender as a Python module, which needs another numpy: test-all renders with Cycles where it is installed.
+blender:
+	$(PYTHON) -m venv .venv-blender
+	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check bpy==5.0.1
 
 test-all: $(READY)
 	$(PYTEST) -m '' --hypothesis-profile thorough

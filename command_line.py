@@ -335,23 +335,107 @@ def weights(
         print(card_file(name).read_text().strip() if name else table())
 
 
+Imported = Annotated[Path, Positional, arg(metavar="DIR", help="the folder of the files")]
+
+
+def import_bmfr(source: Imported, data: Path = Path("data/bmfr")) -> None:
+    """Make a dataset of the scenes of BMFR (Koskela et al. 2019): 1280 x 720, 60 frames of 1 spp.
+
+    Args:
+        data: the dataset to write.
+    """
+    from datasets.bmfr_files import import_bmfr as make
+
+    print(f"{data}: {make(source, data)} clips")
+
+
+def import_noisebase(source: Imported, data: Path = Path("data/noisebase"), spp: int = 2) -> None:
+    """Make a dataset of the test sequences of Noisebase (Balint et al. 2023): 1920 x 1024.
+
+    Args:
+        data: the dataset to write.
+        spp: how many samples per pixel to use.
+    """
+    from datasets.noisebase_files import import_noisebase as make
+
+    print(f"{data}: {make(source, data, spp)} clips")
+
+
+def benchmark_list(scenes: Annotated[Path | None, arg(metavar="DIR", help="say which are there")] = None) -> None:
+    """List the scenes by other people: author, licence, and where to get them."""
+    from eval.benchmark.run import list_scenes
+
+    print(list_scenes(scenes))
+
+
+def benchmark_run(
+    names: Annotated[tuple[str, ...], Positional, arg(metavar="DENOISER...", help="by default OIDN, svgf, one")] = (),
+    scenes: Annotated[Path | None, arg(metavar="DIR", help="the folder that has a folder for each scene")] = None,
+    data: Annotated[Path, arg(metavar="DIR", help="where datasets are rendered")] = Path("data/benchmark"),
+    runs: Runs = RUNS / "benchmark",
+    size: Size = "640x360",
+    frames: Annotated[int, arg(metavar="N", help="of each clip")] = 49,
+    own: Annotated[bool, FlagCreatePairsOff, arg(help="also five scenes of ours that no training uses")] = False,
+) -> None:
+    """Render the scenes that are there and evaluate denoisers on them; tables and RUNS/benchmark.json."""
+    from eval.bench.denoisers import parse_size
+    from eval.benchmark.run import run as run_benchmark
+
+    print(run_benchmark(scenes, data, runs, names, parse_size(size)[::-1], frames, own))
+
+
+def benchmark_published(
+    names: Denoisers, data: Annotated[Path, arg(metavar="DIR", help="made by `onespp import`")], runs: Runs = RUNS
+) -> None:
+    """Score denoisers on other people's data by their own rules, beside the results that they published."""
+    from eval.benchmark.published import published
+
+    print(published(names, data, runs, "release"))
+
+
+def benchmark_page(
+    names: Annotated[tuple[str, str], Positional, arg(metavar="A B", help="the two denoisers")],
+    data: Annotated[tuple[Path, ...], arg(metavar="DIR...", help="datasets whose test clips are shown")],
+    runs: Runs = RUNS,
+) -> None:
+    """Write a page on which a person compares two unnamed denoisers, clip by clip, and which counts."""
+    from eval.benchmark.page import write_page
+
+    print(f"open {write_page(names, data, runs, 'release')} in a browser")
+
+
 Command = Callable[..., None]
 Commands = dict[str, "Command | Commands"]
 
 GROUPS: dict[str, Commands] = {
     "Pipeline": {"preview": preview, "dataset": dataset, "train": train, "eval": evaluate, "report": report},
-    "Datasets": {"info": info, "verify": verify, "exr": exr},
+    "Datasets": {
+        "info": info,
+        "verify": verify,
+        "exr": exr,
+        "import": {"bmfr": import_bmfr, "noisebase": import_noisebase},
+    },
     "Your own frames": {"denoise": denoise, "weights": weights, "export": export},
     "Comparisons": {
         "show": show,
         "trade": trade,
         "stress": stress,
         "bench": {"denoisers": bench_denoisers, "light": bench_light},
+        "benchmark": {
+            "list": benchmark_list,
+            "run": benchmark_run,
+            "published": benchmark_published,
+            "page": benchmark_page,
+        },
     },
 }
 TITLE = "onespp: from a 3-D scene to a real-time Monte Carlo denoiser you can trust."
 MARGIN = 14  # characters left of the summaries
-SUMMARIES = {"bench": "Measure speed and memory of denoisers, and their lag after a light changes."}
+SUMMARIES = {
+    "bench": "Measure speed and memory of denoisers, and their lag after a light changes.",
+    "benchmark": "Compare denoisers on scenes and data of other people.",
+    "import": "Make datasets of other people's files.",
+}
 
 
 def main(arguments: list[str] | None = None) -> None:

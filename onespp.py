@@ -76,7 +76,7 @@ def frames(
     Its arrays, all (H, W, C) with row 0 at the top; only "colour" is required:
 
     - "colour": noisy radiance, linear RGB
-    - "half": a second, independent sample buffer of the same size; the frame is the mean of both
+    - "buffer_b": a second, independent sample buffer of the same size; the frame is the mean of both
     - "emission": radiance of visible lights, part of the colour, which is not denoised
     - "albedo": reflectance in [0, 1]; without it radiance is filtered
     - "normal": in world space, of unit length

@@ -75,8 +75,8 @@ HIT = Channel("hit", (*REALISATIONS, 1), "<f2", LENGTH, "Z", widens=True, step="
 CHANNELS: dict[str, Channel] = {
     "direct": NOISY,
     "indirect": NOISY,
-    "direct_halves": replace(BUFFERS, of="direct"),
-    "indirect_halves": replace(BUFFERS, of="indirect"),
+    "direct_buffers": replace(BUFFERS, of="direct"),
+    "indirect_buffers": replace(BUFFERS, of="indirect"),
     "direct_reference": replace(REFERENCE_LIGHT, of="direct"),
     "indirect_reference": replace(REFERENCE_LIGHT, of="indirect"),
     "emission": Channel("emission", (*IMAGES, 3), "<f2", RADIANCE, "RGB", widens=True, essential=True),

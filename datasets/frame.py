@@ -64,8 +64,8 @@ class Frame:
 
     direct = ChannelTensor()
     indirect = ChannelTensor()
-    direct_halves = ChannelTensor()
-    indirect_halves = ChannelTensor()
+    direct_buffers = ChannelTensor()
+    indirect_buffers = ChannelTensor()
     direct_reference = ChannelTensor()
     indirect_reference = ChannelTensor()
     emission = ChannelTensor()

@@ -130,7 +130,7 @@ class FrameBuilder:
         self.view = view
         self.depth = depth
         previous = before if self.conventions.has_history else NOWHERE
-        spp = self.spp * (2 if "half" in foreign.arrays else 1)
+        spp = self.spp * (2 if "buffer_b" in foreign.arrays else 1)
         return frame_of(channels, self.reads, view, previous, self.source, spp)
 
     def given_normal(self, foreign: ForeignFrame) -> Image | None:
@@ -245,7 +245,7 @@ def light_of(foreign: ForeignFrame) -> dict[str, Image]:
     """
     surface = foreign.surface[..., None]
     colour = foreign.arrays["colour"]
-    buffers = np.stack([colour, foreign.arrays["half"]]) if "half" in foreign.arrays else None
+    buffers = np.stack([colour, foreign.arrays["buffer_b"]]) if "buffer_b" in foreign.arrays else None
     if buffers is not None:
         if colour[foreign.surface].any() and np.array_equal(*buffers):
             raise BadInput(f"{foreign.source} and its other half are the same: render them with different seeds")
@@ -257,8 +257,8 @@ def light_of(foreign: ForeignFrame) -> dict[str, Image]:
         "emission": np.where(surface, emitted, colour),
     }
     if buffers is not None:
-        light["direct_halves"] = np.where(surface, buffers - emitted, 0)
-        light["indirect_halves"] = np.zeros_like(buffers)
+        light["direct_buffers"] = np.where(surface, buffers - emitted, 0)
+        light["indirect_buffers"] = np.zeros_like(buffers)
     return light
 
 

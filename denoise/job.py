@@ -30,7 +30,7 @@ class Job:
     out: Annotated[Path, arg(metavar="DIR", help="output folder; frames keep their names")] = Path("denoised")
     weights: Annotated[Path | None, arg(metavar="FILE", aliases=["-w"], help="by default the shipped ones")] = None
     hdr: Annotated[Patterns, arg(help="another name for the colour's files")] = ()
-    half: Annotated[Patterns, arg(help="sample buffer B of the same frames, for NAME+js")] = ()
+    buffer_b: Annotated[Patterns, arg(help="sample buffer B of the same frames, for NAME+js")] = ()
     alb: Annotated[Patterns, arg(help="albedo in separate files")] = ()
     nrm: Annotated[Patterns, arg(help="normals in separate files")] = ()
     mv: Annotated[Patterns, arg(help="motion vectors in separate files")] = ()
@@ -56,6 +56,6 @@ class Job:
         colour = (*self.frames, *self.hdr)
         if not colour:
             raise BadInput("name the frames to denoise, such as 'frames/*.exr'")
-        passes = {COLOUR: colour, "half": self.half, "albedo": self.alb, "normal": self.nrm, "motion": self.mv}
+        passes = {COLOUR: colour, "buffer_b": self.buffer_b, "albedo": self.alb, "normal": self.nrm, "motion": self.mv}
         passes |= {"depth": self.depth, "position": self.pos, "id": self.ids}
         return {name: patterns for name, patterns in passes.items() if patterns}

@@ -18,7 +18,7 @@ VECTOR = ("xyz", "rgb")
 SCALAR = ("v", "z", "y", "r", "x", "d")
 QUANTITIES: dict[str, LayerNames] = {
     COLOUR: LayerNames(("noisyimage", "beauty", "combined", "", "rgba", "rgb", "color", "colour", "c"), RGB_NAMES),
-    "half": LayerNames(("otherhalf",), RGB_NAMES),  # radiance of as many other samples per pixel
+    "buffer_b": LayerNames(("otherhalf",), RGB_NAMES),  # radiance of as many other samples per pixel
     "emission": LayerNames(("emission", "emit"), RGB_NAMES),  # of directly visible surfaces, free of noise
     "albedo": LayerNames(("denoisingalbedo", "albedo", "visiblediffuse", "diffcol", "alb"), RGB_NAMES),
     "normal": LayerNames(  # shading normals

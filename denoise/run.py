@@ -87,8 +87,8 @@ def error_estimator(job: Job, denoiser: Denoiser, sources: Sources, first: ExrIm
     """The denoiser, if it and the frames allow an error estimate. Raises BadInput where not, or for --until <= 0."""
     if not isinstance(denoiser, JamesStein):
         raise BadInput(f"{job.denoiser} does not estimate its error: use {job.denoiser}+js")
-    if not (has_two_buffers(first) if sources.is_ours else sources.has("half")):
-        raise BadInput("--error and --until need two sample buffers: name buffer B by --half")
+    if not (has_two_buffers(first) if sources.is_ours else sources.has("buffer_b")):
+        raise BadInput("--error and --until need two sample buffers: name buffer B by --buffer-b")
     if job.until is not None and not 0 < job.until < math.inf:
         raise BadInput(f"--until {job.until:g} is no relative error such as 0.02")
     return denoiser

@@ -29,7 +29,7 @@ MAY_IMPORT = {
         *("eval.comparison", "eval.metrics", "eval.bench.memory"),
     },
 }
-RENDERING = {"bench", "figures", "tradeoff"}  # folders of eval that render
+RENDERING = {"bench", "benchmark", "figures", "tradeoff"}  # folders of eval that render
 
 
 def modules() -> list[Path]:

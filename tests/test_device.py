@@ -48,7 +48,7 @@ def test_denoise_and_its_error_estimate_on_a_device(tmp_path):
     for which, folder in enumerate("ab"):
         foreign.write_sequence(tmp_path / folder, [frame.buffer(which) for frame in FRAMES], foreign.blender)
     patterns = [(str(tmp_path / folder / "*.exr"),) for folder in "ab"]
-    job = Job(patterns[0], "eaw+js", tmp_path / "cpu", half=patterns[1], error=True)
+    job = Job(patterns[0], "eaw+js", tmp_path / "cpu", buffer_b=patterns[1], error=True)
     denoise(job)
     with other_device() as device:
         denoise(replace(job, out=tmp_path / "other", device=device))

@@ -373,7 +373,15 @@ def buffers(spheres, tmp_path) -> list[str]:
 
     for folder in ("a", "b"):
         foreign.write_sequence(tmp_path / folder, spheres, sampled)
-    return [str(tmp_path / "a" / "*.exr"), "--half", str(tmp_path / "b" / "*.exr"), "--threads", "1", "--as", "float"]
+    return [
+        str(tmp_path / "a" / "*.exr"),
+        "--buffer-b",
+        str(tmp_path / "b" / "*.exr"),
+        "--threads",
+        "1",
+        "--as",
+        "float",
+    ]
 
 
 def test_two_sample_buffers_are_averaged_and_shrunk_by(buffers, tmp_path):
@@ -439,10 +447,10 @@ def test_the_error_is_a_layer_of_the_part_that_holds_the_colour(tmp_path):
 def test_impossible_errors_are_refused(buffers, tmp_path, capsys):
     a, _, b, *_ = buffers
     for words, complaint in (
-        (f"{a} --half {a} --denoiser svgf+js", "different seeds"),
-        (f"{a} --half {b} --denoiser svgf --error", "use svgf+js"),
-        (f"{a} --half {b} --denoiser svgf+js --until 0", "no relative error"),
-        (f"{a} --denoiser svgf+js --error", "--half"),
+        (f"{a} --buffer-b {a} --denoiser svgf+js", "different seeds"),
+        (f"{a} --buffer-b {b} --denoiser svgf --error", "use svgf+js"),
+        (f"{a} --buffer-b {b} --denoiser svgf+js --until 0", "no relative error"),
+        (f"{a} --denoiser svgf+js --error", "--buffer-b"),
     ):
         assert complaint in fails(capsys, "denoise", *words.split(), "--out", str(tmp_path / "out"))
     assert not list(tmp_path.glob("out/*.exr"))

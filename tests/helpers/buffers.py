@@ -14,7 +14,7 @@ from tests.helpers.frames import flat_frame
 def with_buffers(a: Tensor, b: Tensor, **channels: Tensor) -> Frame:
     """A wall whose direct irradiance has sample buffers A and B (1, 3, H, W), at 8 samples per pixel."""
     frame = flat_frame(*a.shape[-2:], irradiance=(a + b) / 2)
-    buffers = {"direct_halves": torch.stack([a, b], dim=1), "indirect_halves": torch.zeros(1, 2, *a.shape[1:])}
+    buffers = {"direct_buffers": torch.stack([a, b], dim=1), "indirect_buffers": torch.zeros(1, 2, *a.shape[1:])}
     return replace(frame.with_channels(buffers | channels), spp=torch.full((1, 1, 1, 1), 8.0))
 
 

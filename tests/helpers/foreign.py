@@ -118,7 +118,7 @@ def header(path: Path) -> dict[str, Any]:
 def main(source: str, out: Path) -> None:
     """Write what Blender would of a clip's folder, references beside it, or of three synthetic frames of a size "WxH".
 
-    Of these, frames/ has one half of the samples and half/ the other.
+    Of these, frames/ has buffer A and buffer-b/ the other samples.
     """
     if Path(source).is_dir():
         clip = Clip(Path(source))
@@ -127,7 +127,7 @@ def main(source: str, out: Path) -> None:
         for index in range(clip.frames):
             write(out / "reference" / f"{index + 1:04d}.exr", {"RGB": clip.reference(index).mean(axis=0)})
     else:
-        for which, folder in enumerate(("frames", "half")):
+        for which, folder in enumerate(("frames", "buffer-b")):
             buffer = (synthetic_frame(index, *parse_size(source)).buffer(which) for index in range(3))
             write_sequence(out / folder, buffer, blender)
 

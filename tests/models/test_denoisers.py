@@ -49,8 +49,8 @@ def test_wrappers_have_the_attributes_of_the_denoiser_inside(name):
 def test_a_prototype_takes_no_memory_for_weights():
     assert all(weight.is_meta for weight in registry.prototype("rae+taa").parameters())
     assert "dual_motion" in registry.channels_read(["ntd"]) and "normal" in registry.channels_read(["noisy+taa"])
-    halves = {name for name in registry.channels_read(["ntd+js"]) if name.endswith("_halves")}
-    assert halves == {"indirect_halves"}
+    buffers = {name for name in registry.channels_read(["ntd+js"]) if name.endswith("_buffers")}
+    assert buffers == {"indirect_buffers"}
     assert registry.prototype("rae+taa").unavailable() is None
     assert fastest_precision("svgf+taa") == "float32"
 

@@ -223,7 +223,7 @@ function describe() {
     map: `FLIP of ${mappedOf.map()} against the reference: black 0, brightest 1. `,
     error: mappedOf.error(clip) in clip.errors
       ? `Estimated error of ${mappedOf.error(clip)}, in exposed radiance: black 0, brightest 0.25 and more. `
-      : "Neither tells its error: NAME+js does, where frames have halves of their samples. ",
+      : "Neither tells its error: NAME+js does, where frames have two sample buffers. ",
   };
   byId("caption").textContent = texts[view.mode] + [...new Set([view.left, view.right])].map(measured).join("; ");
   byId("name-left").textContent = view.mode === "flip" && view.flipped ? "" : view.left;

@@ -94,7 +94,7 @@ def test_more_samples_as_input_have_less_noise_and_the_same_reference(moving_box
 
 def test_buffers_predict_the_noise_of_their_mean(moving_boxes):
     """(A - B)² / 4 is the variance of the mean: the same that its realisations show."""
-    assert "direct_halves" not in moving_boxes["000"].channels  # of one sample
+    assert "direct_buffers" not in moving_boxes["000"].channels  # of one sample
     many = moving_boxes["000-16spp"]
     for name, buffers in SAMPLE_BUFFERS.items():
         drawn = np.array([[many.read(buffers, f, realisation=s) for s in range(4)] for f in range(many.frames)], float)
