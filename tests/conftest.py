@@ -1,11 +1,10 @@
-"""What tests share: compiled kernels, a tiny dataset, and a loaded moving scene."""
+"""What tests share: compiled kernels, a tiny dataset, and loaded scenes."""
 
 import os
 import shutil
 from pathlib import Path
 
 import hypothesis
-import numpy as np
 import pytest
 
 import train  # noqa: F401 - sets MKL up, which must come before MKL's first use
@@ -13,15 +12,15 @@ from eval.harness import compile_kernels
 from models import registry
 from models.registry import DENOISERS, prototype
 from models.spec import DenoiserSpec
+from render.backend import mi
 from render.stage import Stage
-from scenes.animation import Camera, Scene, Shape, Track
 from scenes.registry import build_scene
 from tests.helpers.datasets import generate_tiny
-from tests.helpers.mirrors import panel
+from tests.helpers.rendering import POSED_FRAME
 
 # For tests without a number of examples of their own; `make test-all` takes the thorough profile.
-hypothesis.settings.register_profile("quick", max_examples=10)
-hypothesis.settings.register_profile("thorough", max_examples=100)
+hypothesis.settings.register_profile("quick", max_examples=10, deadline=None)  # busy machines are slow
+hypothesis.settings.register_profile("thorough", max_examples=100, deadline=None)
 hypothesis.settings.load_profile("quick")
 
 
@@ -69,16 +68,8 @@ def stage(request: pytest.FixtureRequest) -> Stage:
     return Stage(build_scene(request.param, seed=3, frames=24), 64, 64)
 
 
-@pytest.fixture(scope="session")
-def moving() -> Stage:
-    return Stage(build_scene("cornell_box_moving", seed=3, frames=24), 96, 96)
-
-
-@pytest.fixture(scope="session")
-def square() -> Scene:
-    """A grey unit square, 3 units before a camera that looks along -z, half its width in view; black sky around it."""
-    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
-    shape = Shape("square", panel(1, 1), grey, radiance=Track.constant([1.0, 2.0, 3.0]))
-    fov = np.degrees(2 * np.arctan(1 / 3))  # two units wide at the square's distance
-    camera = Camera(Track.constant([0.0, 0, 3]), Track.constant([0.0, 0, 0]), Track.constant(fov))
-    return Scene((shape,), camera)
+@pytest.fixture
+def rays(stage: Stage) -> mi.Ray3f:
+    """Through the pixels of the stage, which is posed for POSED_FRAME."""
+    stage.pose(POSED_FRAME)
+    return stage.rays(stage.view(POSED_FRAME))

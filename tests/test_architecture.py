@@ -37,17 +37,12 @@ def modules() -> list[Path]:
     return [file.relative_to(ROOT) for folder in FOLDERS for file in sorted((ROOT / folder).rglob("*.py"))]
 
 
-def allowed_for(file: Path) -> set[str]:
-    """Modules and folders that a file may import."""
-    renders = file.parts[0] == "eval" and file.parts[1] in RENDERING
-    return MAY_IMPORT[file.parts[0]] | ({"render", "scenes"} if renders else set())
-
-
 @pytest.mark.parametrize("file", modules(), ids=str)
 def test_arrows_point_one_way(file):
     imported = {name for name in imported_by(ROOT / file) if name.split(".")[0] in FOLDERS and source_of(name)}
     folders = {name for name in imported if name in FOLDERS}
-    prefixes = allowed_for(file)
+    renders = file.parts[0] == "eval" and file.parts[1] in RENDERING
+    prefixes = MAY_IMPORT[file.parts[0]] | ({"render", "scenes"} if renders else set())
     strangers = {name for name in imported - folders if not any(f"{name}.".startswith(f"{p}.") for p in prefixes)}
     assert not strangers, f"{file} may not import {strangers}"
 

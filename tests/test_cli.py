@@ -90,10 +90,3 @@ def test_unwritable_folder(capsys, tiny, tmp_path):
     file.write_text("")
     assert str(file) in fails(capsys, "dataset", "--profile", "tiny", "--data", str(file / "below"))
     assert str(file) in fails(capsys, "eval", "noisy", "--data", str(tiny), "--runs", str(file))
-
-
-def test_verify_and_info_of_good_data(capsys, tiny):
-    main(["verify", "--data", str(tiny)])
-    main(["info", "--data", str(tiny)])
-    out = capsys.readouterr().out
-    assert "all files are intact" in out and "floor dB" in out

@@ -29,14 +29,11 @@ def test_examples_run_as_written(example, tiny, tmp_path, monkeypatch, capsys):
 def test_networks_have_their_shipped_weights(shipped, tmp_path):
     with pytest.raises(BadInput, match="'wskp3' needs trained weights"):
         onespp.load("wskp3")
-    for path in (shipped / "wskp3.safetensors", tmp_path / "others"):
+    others = tmp_path / "others"
+    for path in (shipped / "wskp3.safetensors", others):
         save_weights(create("wskp3"), "wskp3", {}, path)
     given = onespp.load("wskp3", shipped / "wskp3.safetensors", torch.float32).state_dict()
-    for name, weights, same in (
-        ("wskp3", None, True),
-        ("wskp3+taa", None, True),
-        ("wskp3", tmp_path / "others", False),
-    ):
+    for name, weights, same in (("wskp3", None, True), ("wskp3+taa", None, True), ("wskp3", others, False)):
         found = list(onespp.load(name, weights, torch.float32).state_dict().values())
         assert all(map(torch.equal, found, given.values())) == same
 

@@ -1,40 +1,49 @@
-"""What tests of the report share."""
+"""What tests of the report and of evaluation share."""
 
+import contextlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-import torch
 from PIL import Image
 
 from eval.harness import evaluate
 from eval.report.page import report
-from models.registry import create
-from models.weights import save_weights
-from train.task import run_folder
+from tests.helpers.training import folder_of, fresh_weights
+from train.task import WEIGHTS_FILE
 
 TIMES = {"noisy": 1.0, "accumulated": 2.0, "eaw": 5.0, "ntd": 50.0}
 INDIRECT = {"noisy (indirect)": 0.8, "accumulated (indirect)": 1.2}
 
 
+def untrained(runs: Path, name: str, seed: int = 0) -> Path:
+    """Fresh weights, where those of a training with budget `tiny` are kept."""
+    folder_of(runs, name).mkdir(parents=True, exist_ok=True)
+    return fresh_weights(name, folder_of(runs, name) / WEIGHTS_FILE, seed)
+
+
+def bench_of(runs: Path, times: dict[str, float], size: tuple[int, int], threads: Iterable[int] = (1, 2)) -> None:
+    """Milliseconds as `onespp bench denoisers` leaves them at a size: with two threads half of those with one."""
+    rows = [
+        {"denoiser": name, "dtype": dtype, "height": size[0], "width": size[1], "threads": n, "ms_median": ms / n}
+        for name, ms in times.items()
+        for dtype in ("float32", "bfloat16", "float16")
+        for n in threads
+    ]
+    (runs / "bench").mkdir(parents=True)
+    results = {"schema": 1, "device": "cpu", "threads": max(threads), "rows": rows}
+    (runs / "bench" / "results.json").write_text(json.dumps(results))
+
+
 @pytest.fixture(scope="session")
 def evaluated(tiny, tmp_path_factory) -> Path:
-    """Results on the tiny data set, the bench's times, a figure, and the report of them."""
+    """Results on the tiny data set, what was printed of them, the bench's times, a figure, and the report of all."""
     runs = tmp_path_factory.mktemp("evaluated")
-    torch.manual_seed(0)
-    folder = run_folder(runs, "ntd", "tiny")
-    folder.mkdir(parents=True)
-    save_weights(create("ntd"), "ntd", {}, folder / "weights.safetensors")
-    evaluate([tiny], runs, "tiny", list(TIMES))
-    rows = [
-        {"denoiser": name, "height": 720, "width": 1280, "dtype": dtype, "threads": threads, "ms_median": ms / threads}
-        for name, ms in (TIMES | INDIRECT).items()
-        for dtype in ("float32", "bfloat16")
-        for threads in (1, 2)
-        if name != "eaw" or dtype == "float32"
-    ]
-    (runs / "bench").mkdir()
-    (runs / "bench" / "results.json").write_text(json.dumps({"device": "cpu", "threads": 2, "rows": rows}))
+    untrained(runs, "ntd")
+    with (runs / "table.txt").open("w") as printed, contextlib.redirect_stdout(printed):
+        evaluate([tiny], runs, "tiny", list(TIMES))
+    bench_of(runs, TIMES | INDIRECT, (720, 1280))
     (runs / "report" / "figures").mkdir(parents=True)
     Image.new("RGB", (20, 10), "red").save(runs / "report" / "figures" / "trade-flip.png")
     report(runs)

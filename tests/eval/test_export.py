@@ -1,7 +1,6 @@
 """`onespp export` and its bench, from the command line on."""
 
 import json
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +9,10 @@ import torch
 
 from command_line import main
 from models.export.page import CPP, PYTHON
-from models.registry import create
-from models.weights import save_weights
 from provenance import ROOT
+from tests.eval.conftest import untrained
 from tests.helpers.exports import check_page
 from tests.test_cli import fails
-from train.task import run_folder
-
-onnx_only = pytest.mark.skipif(find_spec("onnxruntime") is None, reason="needs pip install 'onespp[export]'")
 
 
 def test_untrained_and_unknown(capsys, tmp_path, shipped):
@@ -31,10 +26,7 @@ def test_untrained_and_unknown(capsys, tmp_path, shipped):
 
 @pytest.mark.slow
 def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path):
-    torch.manual_seed(0)
-    folder = run_folder(tmp_path, "wskp3", "tiny")
-    folder.mkdir(parents=True)
-    save_weights(create("wskp3"), "wskp3", {}, folder / "weights.safetensors")
+    untrained(tmp_path, "wskp3")
     call = ["export", "wskp3@tiny", "--to", "pt2", "--runs", str(tmp_path)]
     export = tmp_path / "export" / "wskp3@tiny-pt2"
     export.mkdir(parents=True)

@@ -1,64 +1,42 @@
-"""The harness end to end."""
+"""Evaluation end to end: its results frame by frame, and that it resumes."""
 
-import contextlib
-import io
+import csv
 import json
-import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from datasets.clip import Dataset
 from errors import BadInput
-from eval import selection
-from eval.harness import evaluate, named_denoisers, strip
-from eval.results import load_picture, read_results
+from eval import clip_run, harness
+from eval.harness import evaluate, strip
+from eval.metrics import METRICS
+from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
+from eval.tables import means_by_age
 from files import read_json, write_json
-from models import registry
-from models.registry import create
-from models.spec import DenoiserSpec
-from models.weights import save_weights
-from train.task import run_folder
+from tests.eval.conftest import untrained
 
-METRICS = {
+KEYS = {
     *("mse", "rmse", "l1", "psnr", "ssim", "flip", "mse_unbiased", "smape", "rel_mse"),
     *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1", "energy", "detail", "block_flicker"),
 }
-
-
-TRAINED = ("rae", "ntd")
 ROWS = {
-    *(("noisy", "total"), ("accumulated", "total"), ("rae", "total")),
+    *(("noisy", "total"), ("accumulated", "total"), ("eaw", "total")),
     *(("noisy", "indirect"), ("accumulated", "indirect"), ("ntd", "indirect")),
 }
 
 
-@pytest.fixture(scope="module")
-def runs(tiny, tmp_path_factory):
-    """Results on the tiny data, of networks with fresh weights; the table that was printed is in table.txt."""
-    runs = tmp_path_factory.mktemp("runs")
-    torch.manual_seed(0)
-    for name in TRAINED:
-        folder = run_folder(runs, name, "tiny")
-        folder.mkdir(parents=True)
-        save_weights(create(name), name, {}, folder / "weights.safetensors")
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        evaluate([tiny], runs, "tiny", ["noisy", "accumulated", *TRAINED])
-    (runs / "table.txt").write_text(printed.getvalue())
-    return runs
-
-
-def test_results_file_has_the_agreed_form(runs, tiny):
-    results = json.loads((runs / "eval" / "results.json").read_text())
+def test_results_file_has_the_agreed_form(evaluated):
+    results = json.loads((evaluated / "eval" / "results.json").read_text())
     assert results.keys() == {"schema", "dataset", "device", "versions", "rows"} and results["schema"] == 1
     assert len(results["rows"]) == len(ROWS) * 2
     assert {(row["denoiser"], row["signal"]) for row in results["rows"]} == ROWS
     for row in results["rows"]:
         assert row.keys() == {"denoiser", "signal", "weights", "scene", "clip", "frames", "metrics", "nonfinite"}
-        assert row["metrics"].keys() == METRICS
-        assert (row["weights"] is None) == (row["denoiser"] not in TRAINED)
+        assert row["metrics"].keys() == KEYS
+        assert (row["weights"] is None) == (row["denoiser"] != "ntd")
         assert row["frames"] == 8 and row["nonfinite"] == 0
         assert row["metrics"]["flicker"] is None  # the camera moves
 
@@ -66,9 +44,9 @@ def test_results_file_has_the_agreed_form(runs, tiny):
 @pytest.mark.parametrize(
     ("signal", "lights"), [("total", ("direct", "indirect", "emission")), ("indirect", ("indirect",))]
 )
-def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
+def test_results_are_the_means_of_frames(evaluated, tiny, signal, lights):
     """The rows of `noisy`, and the noise floors below them, recomputed with numpy from the files."""
-    results = json.loads((runs / "eval" / "results.json").read_text())
+    results = json.loads((evaluated / "eval" / "results.json").read_text())
     clip = Dataset(tiny).clips("test")[0]
     key = ("noisy", signal, clip.scene)
     (row,) = (r for r in results["rows"] if (r["denoiser"], r["signal"], r["scene"]) == key)
@@ -85,45 +63,21 @@ def test_results_are_the_means_of_frames(runs, tiny, signal, lights):
         floor.append(((a - b) ** 2).mean() / 4)
     assert row["metrics"]["mse"] == pytest.approx(np.mean(mse), rel=1e-4)
     assert row["metrics"]["rmse"] == pytest.approx(np.mean(rmse), rel=1e-4)
-    lines = (line.split() for line in (runs / "table.txt").read_text().splitlines())
+    lines = (line.split() for line in (evaluated / "table.txt").read_text().splitlines())
     (printed,) = (line for line in lines if line[:4] == [f"{clip.scene}/{clip.name}", "(noise", "floor)", signal])
     assert float(printed[4]) == pytest.approx(np.mean(np.sqrt(floor)), abs=1e-4)
 
 
-def test_strips_show_every_denoiser_and_the_reference(runs):
-    _, clips = read_results(runs)
+def test_strips_show_every_denoiser_and_the_reference(evaluated):
+    _, clips = read_results(evaluated)
     for clip in clips:
-        axes = strip(runs, clip).axes
+        axes = strip(evaluated, clip).axes
         ending = "" if clip.signal == "total" else "-indirect"
-        assert (runs / "eval" / f"{clip.scene}-000{ending}.png").exists()
+        assert (evaluated / "eval" / f"{clip.scene}-000{ending}.png").exists()
         for result, panel in zip((*clip.results, clip.reference), axes, strict=True):
-            picture = load_picture(runs / "eval" / "clips" / f"{clip.scene}-000" / f"{result.denoiser}{ending}", 6)
+            picture = load_picture(evaluated / "eval" / "clips" / f"{clip.scene}-000" / f"{result.denoiser}{ending}", 6)
             np.testing.assert_array_equal(panel.images[0].get_array(), picture / 255)
             assert panel.get_title().startswith(result.denoiser) and ("RMSE" in panel.get_title()) != result.floor
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["noisy", "rae"], {("noisy", "total"), ("rae", "total")}),
-        (["ntd", "noisy"], {("ntd", "indirect"), ("noisy", "total"), ("noisy", "indirect")}),
-        (["ntd"], {("ntd", "indirect")}),
-    ],
-)
-def test_baselines_of_indirect_light_run_only_where_needed(names, expected):
-    denoisers = named_denoisers([DenoiserSpec.named(name) for name in names])
-    assert {(named_denoiser.name, named_denoiser.denoiser.signal) for named_denoiser in denoisers} == expected
-    assert len(denoisers) == len(expected)
-
-
-def test_named_denoiser_without_weights_is_an_error_else_skipped(tiny, tmp_path, capsys, monkeypatch, shipped):
-    with pytest.raises(BadInput, match="onespp train rae"):
-        evaluate([tiny], tmp_path, "tiny", ["rae"])
-    few = {name: registry.DENOISERS[name] for name in ("noisy", "accumulated", "rae")}
-    monkeypatch.setattr(selection, "DENOISERS", few)
-    results = evaluate([tiny], tmp_path, "tiny")
-    assert {row["denoiser"] for row in results["rows"]} == {"noisy", "accumulated"}
-    assert re.search(r"\brae\b.*: skipped", capsys.readouterr().out)
 
 
 def test_several_data_sets_are_one_table(tiny, tmp_path):
@@ -140,3 +94,161 @@ def test_several_data_sets_are_one_table(tiny, tmp_path):
     rows = evaluate([tiny, other], tmp_path, "tiny", ["noisy"])["rows"]
     scenes = {path.name for path in (tiny / "test").iterdir()}
     assert {row["scene"] for row in rows} == scenes | {f"other_{scene}" for scene in scenes}
+
+
+# --- Frame by frame, and resumed --------------------------------------------------------------------------------------
+
+NAMES = ["noisy", "accumulated", "rae@tiny"]
+
+
+def content(runs: Path) -> dict[str, bytes]:
+    """All that an evaluation writes, but strips of pictures; wherever `runs` is, which results.json names."""
+    files = [*runs.glob("eval/clips/*/*/*"), runs / "eval/results.json", runs / "eval/frames.csv"]
+    return {str(file.relative_to(runs)): file.read_bytes().replace(str(runs).encode(), b"RUNS") for file in files}
+
+
+@pytest.fixture(scope="module")
+def once(tiny, tmp_path_factory):
+    runs = tmp_path_factory.mktemp("once")
+    untrained(runs, "rae")
+    evaluate([tiny], runs, "tiny", NAMES)
+    return runs
+
+
+@pytest.fixture
+def runs(once, tmp_path):
+    return shutil.copytree(once, tmp_path / "runs")
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The denoisers that were run, clip by clip."""
+    calls = []
+    run_clip = harness.run_clip
+
+    def watched(clip, tracks, folders, quiet=False):
+        calls.append((clip.scene, sorted(track.name for track in tracks)))
+        run_clip(clip, tracks, folders, quiet)
+
+    monkeypatch.setattr(harness, "run_clip", watched)
+    return calls
+
+
+def test_results_are_the_means_of_the_csv(once, tiny):
+    with open(once / "eval" / "frames.csv") as file:
+        lines = list(csv.DictReader(file))
+    assert list(lines[0]) == ["denoiser", "signal", "scene", "clip", "frame", *METRICS]
+    assert len(lines) == 2 * 8 * (len(NAMES) + 1)
+    results = json.loads((once / "eval" / "results.json").read_text())
+    for row in results["rows"]:
+        ours = [line for line in lines if all(line[key] == row[key] for key in ("denoiser", "signal", "scene", "clip"))]
+        assert [int(line["frame"]) for line in ours] == list(range(8))
+        for metric in METRICS:
+            values = [float(line[metric]) for line in ours if line[metric]]
+            mean = row["metrics"][metric]
+            assert mean == pytest.approx(np.mean(values)) if values else mean is None
+    floors = [line for line in lines if line["denoiser"] == FLOOR and line["scene"] == "cornell_box"]
+    clip = Dataset(tiny).clips("test")[0]
+    stored = pytest.approx(clip.facts["floor_mse"], rel=1e-4)  # of what was rendered, before it became float16
+    assert np.mean([float(line["mse"]) for line in floors]) == stored
+    assert floors[0]["temporal_error"] == "" and float(floors[1]["temporal_error"]) > 0
+
+
+def test_pictures_are_displayed_outputs(once, tiny):
+    clip = Dataset(tiny).clips("test")[0]
+    for name, radiance in (
+        ("noisy", sum(np.float32(clip.read(part, 5)) for part in ("direct", "indirect", "emission"))),
+        ("reference", clip.reference(5).mean(axis=0)),
+    ):
+        saved = load_picture(folder_of(once, clip.scene, clip.name, name, "total"), 5)
+        shown = 255 * np.clip(clip.exposure * radiance, 0, 1) ** (1 / 2.2)
+        assert np.abs(saved - shown).max() <= 0.51
+
+
+def test_finished_results_are_kept(once, runs, tiny, played):
+    before = content(once)
+    evaluate([tiny], runs, "tiny", NAMES)
+    assert played == [] and content(runs) == before
+
+
+def test_only_changed_denoisers_are_evaluated_again(runs, tiny, played):
+    untrained(runs, "rae", seed=1)
+    evaluate([tiny], runs, "tiny", [*NAMES, "eaw"])
+    assert played == [("cornell_box", ["eaw", "rae@tiny"]), ("cornell_box_moving", ["eaw", "rae@tiny"])]
+    played.clear()
+    evaluate([tiny], runs, "tiny", ["noisy"])
+    rows = json.loads((runs / "eval" / "results.json").read_text())["rows"]
+    assert played == [] and {row["denoiser"] for row in rows} == {"noisy"}
+
+
+def test_another_clip_under_the_same_name_is_another_result(runs, tiny, tmp_path, played):
+    other = shutil.copytree(tiny, tmp_path / "other")
+    path = other / "test" / "cornell_box" / "000" / "clip.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"exposure": 1.0}))
+    evaluate([other], runs, "tiny", NAMES)
+    assert played == [("cornell_box", sorted([*NAMES, "reference"]))]
+
+
+@pytest.mark.parametrize("damage", ["missing result", "half a result", "missing picture"])
+def test_damaged_results_are_evaluated_again(once, runs, tiny, played, damage):
+    before = content(once)
+    folder = runs / "eval" / "clips" / "cornell_box-000" / "accumulated"
+    if damage == "missing picture":
+        (folder / "0003.webp").unlink()
+    elif damage == "missing result":
+        (folder / "result.json").unlink()
+    else:
+        (folder / "result.json").write_text('{"key": ')
+    evaluate([tiny], runs, "tiny", NAMES)
+    assert played == [("cornell_box", ["accumulated"])] and content(runs) == before
+
+
+@pytest.mark.parametrize("frame", [5, *(pytest.param(frame, marks=pytest.mark.slow) for frame in (0, 11))])
+def test_an_interrupted_evaluation_resumes_to_equal_results(once, tiny, tmp_path, monkeypatch, frame):
+    """`frame` of the 16 of both clips is the one in which it is killed."""
+    frames = []
+    save = clip_run.save_picture
+
+    def killed(folder, index, image):
+        frames.append(index)
+        if len(frames) > frame * (len(NAMES) + 1) + 1:
+            raise KeyboardInterrupt
+        save(folder, index, image)
+
+    runs = tmp_path / "runs"
+    shutil.copytree(once / "train", runs / "train")
+    monkeypatch.setattr(clip_run, "save_picture", killed)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate([tiny], runs, "tiny", NAMES)
+    assert not (runs / "eval" / "results.json").exists()
+    assert len(list(runs.glob("eval/clips/*/*/result.json"))) == (len(NAMES) + 1) * (frame // 8)
+    monkeypatch.setattr(clip_run, "save_picture", save)
+    evaluate([tiny], runs, "tiny", NAMES)
+    assert content(runs) == content(once)
+
+
+@pytest.mark.slow
+def test_parallel_evaluation_gives_the_same_results(once, tiny, tmp_path):
+    runs = tmp_path / "runs"
+    shutil.copytree(once / "train", runs / "train")
+    evaluate([tiny], runs, "tiny", NAMES, processes=2, smallest_share=1)
+    for a, b in zip(read_results(runs)[1], read_results(once)[1], strict=True):
+        for ours, theirs in zip([*a.results, a.reference], [*b.results, b.reference], strict=True):
+            assert ours.key == theirs.key and ours.frames == [
+                {k: v if v is None else pytest.approx(v, rel=1e-3) for k, v in frame.items()} for frame in theirs.frames
+            ]
+
+
+def test_denoisers_are_judged_by_the_age_of_their_history():
+    """The first frame, the fifth, and the mean from the 16th on, of the clips that are so long."""
+
+    def clip(length: int, offset: float) -> ClipResults:
+        frames = [{metric: offset + index for metric in METRICS} for index in range(length)]
+        result = Result(
+            key="", denoiser="one", signal="total", scene="box", clip=str(length), metrics={}, frames=frames
+        )
+        return ClipResults("box", str(length), "total", [result], result)
+
+    ages = means_by_age([clip(20, 100.0), clip(6, 200.0)])["one"]
+    assert list(ages.values()) == [150.0, 154.0, 117.0]
+    assert list(means_by_age([clip(1, 3.0)])["one"].values()) == [3.0, None, None]

@@ -100,7 +100,7 @@ def test_only_the_generated_part_of_a_card_changes(wskp3, tiny, tmp_path, capsys
 @pytest.mark.parametrize("name", shipped_names())
 def test_cards_are_generated_from_weights_and_measurements(name):
     card = card_file(name).read_text()
-    assert card.partition(BEGIN)[2].partition(END)[0].strip() == facts(name)
+    assert card.partition(BEGIN)[2].partition(END)[0].strip() == facts(name), "run `onespp weights --card RUNS`"
 
 
 def test_results_of_other_weights_are_refused(wskp3, tiny, tmp_path):

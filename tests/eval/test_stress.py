@@ -1,7 +1,7 @@
 """The stress bench reports exactly what a broken denoiser breaks, and lets a sound one pass."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from command_line import main
+from datasets.frame import Frame
 from errors import BadInput
 from eval.stress.cases import (
     LIGHT_CHANNELS,
@@ -28,8 +30,9 @@ from eval.stress.run import applies, cases_in, check_all, heat_map, stressed, ve
 from models import registry
 from models.denoiser import Denoiser, State
 from models.spec import DenoiserSpec
-from models.weights import save_weights
 from plotting import plt
+from tests.eval.conftest import untrained
+from tests.test_cli import fails
 
 NAMES = [case.name for case in STRESS_CASES]
 CASES = {case.name: case for case in STRESS_CASES}
@@ -39,76 +42,23 @@ KEYS = {"denoiser", "weights", "extreme", "error", "nonfinite", "violation", "re
 Check = Callable[..., list[StressRow]]
 
 
-def all_break(cases: Iterable[str], *requirements: str) -> dict[str, tuple[str, ...]]:
-    return {case: requirements for case in cases}
+def simple(answer: Callable[[Tensor, Frame], Tensor], repaired: bool, is_convex: bool = False) -> type[Denoiser]:
+    """Makes its answer of the noisy radiance alone, with bad pixels as they come or repaired."""
+
+    class Simple(Denoiser):
+        reads = LIGHT_CHANNELS
+        convex = is_convex
+
+        def __call__(self, frame, state):
+            return self.forward(frame.finite() if repaired else frame, state)
+
+        def forward(self, frame, state):
+            return answer(frame.radiance("total"), frame), State(frame.moment)
+
+    return Simple
 
 
-def broken_in(rows: Iterable[StressRow]) -> dict[str, tuple[str, ...]]:
-    """The requirements that are broken, by case."""
-    return {row.extreme: row.broken for row in rows if row.broken}
-
-
-class Simple(Denoiser):
-    """The noisy frame, with bad pixels as they come."""
-
-    reads = LIGHT_CHANNELS
-    repaired = False
-
-    def __call__(self, frame, state):
-        return self.forward(frame.finite() if self.repaired else frame, state)
-
-    def forward(self, frame, state):
-        return self.answer(frame.radiance("total"), frame), State(frame.moment)
-
-    def answer(self, radiance, frame):
-        return radiance
-
-
-class Overflows(Simple):
-    """NaN where it is bright."""
-
-    repaired = True
-
-    def answer(self, radiance, frame):
-        return torch.where(radiance > 2e4, torch.nan, radiance)
-
-
-class Spreads(Simple):
-    """One bad pixel blackens the image."""
-
-    def answer(self, radiance, frame):
-        return radiance if torch.isfinite(radiance).all() else torch.zeros_like(radiance)
-
-
-class SpreadsNaN(Simple):
-    """One bad pixel makes all bad."""
-
-    def answer(self, radiance, frame):
-        return radiance if torch.isfinite(radiance).all() else torch.full_like(radiance, torch.nan)
-
-
-class KeepsBadPixels(Simple):
-    """Nothing but the bad pixel itself is bad, which is allowed."""
-
-
-class Brightens(Simple):
-    """By 0.1 % of the irradiance."""
-
-    repaired = True
-
-    def answer(self, radiance, frame):
-        return torch.lerp(frame.emission, radiance, 1.001)
-
-
-class BrightensConvex(Brightens):
-    convex = True
-
-
-class GoesNegative(Simple):
-    repaired = True
-
-    def answer(self, radiance, frame):
-        return radiance - 1e-9
+GOES_NEGATIVE = simple(lambda radiance, _: radiance - 1e-9, repaired=True)
 
 
 @dataclass(frozen=True)
@@ -145,11 +95,11 @@ class GrowsBrighter(Denoiser):
 
 @pytest.fixture
 def check(monkeypatch) -> Check:
-    """Take a class through cases, by default all, as a denoiser of that name."""
+    """Take a class through cases, by default all, as a denoiser."""
 
-    def run(kind: type[Denoiser], name: str = "broken", cases: Sequence[StressCase] = STRESS_CASES) -> list[StressRow]:
-        monkeypatch.setitem(registry.DENOISERS, name, kind)
-        return check_all([DenoiserSpec.named(name)], cases)
+    def run(kind: type[Denoiser], cases: Sequence[StressCase] = STRESS_CASES) -> list[StressRow]:
+        monkeypatch.setitem(registry.DENOISERS, "broken", kind)
+        return check_all([DenoiserSpec.named("broken")], cases)
 
     return run
 
@@ -162,7 +112,7 @@ def check(monkeypatch) -> Check:
     [("accumulated", 0, "All requirements are kept."), ("broken", 1, "Broken requirements:")],
 )
 def test_exit_code_and_files(tmp_path, monkeypatch, capsys, name, code, printed):
-    monkeypatch.setitem(registry.DENOISERS, "broken", GoesNegative)
+    monkeypatch.setitem(registry.DENOISERS, "broken", GOES_NEGATIVE)
     try:
         main(["stress", name, "--runs", str(tmp_path)])
         ended = 0
@@ -181,14 +131,9 @@ def test_exit_code_and_files(tmp_path, monkeypatch, capsys, name, code, printed)
         picture.verify()
 
 
-def test_refusals(capsys, tmp_path):
-    for arguments, message in (
-        (["nonsense"], "unknown denoiser 'nonsense'"),
-        (["svgf", "--precision", "bfloat16"], "none of svgf computes in bfloat16"),
-    ):
-        with pytest.raises(SystemExit) as end:
-            main(["stress", *arguments, "--runs", str(tmp_path)])
-        assert end.value.code == 2 and message in capsys.readouterr().err
+def test_a_precision_that_no_denoiser_has_is_refused(capsys, tmp_path):
+    message = fails(capsys, "stress", "svgf", "--precision", "bfloat16", "--runs", str(tmp_path))
+    assert "none of svgf computes in bfloat16" in message
 
 
 def test_weights_are_named(tmp_path, shipped):
@@ -197,9 +142,7 @@ def test_weights_are_named(tmp_path, shipped):
         stressed(["wskp3@tiny"], tmp_path, "quick")
     network, classical = stressed(["wskp3", "accumulated"], tmp_path, "tiny")
     assert (weights_label(network), weights_label(classical)) == (FRESH, None)
-    path = tmp_path / "train" / "wskp3-tiny" / "weights.safetensors"
-    path.parent.mkdir(parents=True)
-    save_weights(registry.create("wskp3"), "wskp3", {}, path)
+    path = untrained(tmp_path, "wskp3")
     (network,) = stressed(["wskp3"], tmp_path, "tiny")
     assert weights_label(network) == str(path)
     (case,) = check_all(stressed(["wskp3@tiny"], tmp_path, "quick"), [CASES["1 x 1 px"]])
@@ -243,43 +186,47 @@ def test_heat_map():
 # --- Broken denoisers -------------------------------------------------------------------------------------------------
 
 
-def test_nan_is_found(check):
-    rows = check(Overflows)
-    bright = ["a firefly of 65504", "radiance 6e4", "radiance 1e-7 to 6e4"]
-    assert broken_in(rows) == all_break(bright, "finite")
+def spreading(value: float) -> type[Denoiser]:
+    """One bad pixel makes `value` of the whole image."""
+    return simple(
+        lambda radiance, _: radiance if torch.isfinite(radiance).all() else torch.full_like(radiance, value),
+        repaired=False,
+    )
+
+
+def brightening(is_convex: bool) -> type[Denoiser]:
+    """By 0.1 % of the irradiance."""
+    return simple(lambda radiance, frame: torch.lerp(frame.emission, radiance, 1.001), True, is_convex)
+
+
+BRIGHT = ["a firefly of 65504", "radiance 6e4", "radiance 1e-7 to 6e4"]
+LIT = [name for name in NAMES if name not in ("all black", "no surface at all", "logits to ±1e4")]
+OVERFLOWING = simple(lambda radiance, _: torch.where(radiance > 2e4, torch.nan, radiance), repaired=True)
+BROKEN = {
+    "overflows": (OVERFLOWING, BRIGHT, ("finite",), "finite: outputs are finite where inputs are finite"),
+    "spreads black": (spreading(0.0), IN_LIGHT, ("spread",), "spread: "),
+    "spreads NaN": (spreading(torch.nan), IN_LIGHT, ("finite", "spread"), "spread: "),
+    "keeps bad pixels": (simple(lambda radiance, _: radiance, repaired=False), [], (), "All requirements are kept."),
+    "brightens": (brightening(is_convex=False), [], (), "All requirements are kept."),
+    "brightens, convex": (brightening(is_convex=True), LIT, ("range",), "range: "),
+    "remembers": (Remembers, IN_LIGHT, ("recovery",), f"> {RECOVERY_LIMIT}"),
+}
+
+
+@pytest.mark.parametrize(("kind", "cases", "requirements", "words"), BROKEN.values(), ids=BROKEN)
+def test_what_is_broken_is_found_and_nothing_else(check, kind, cases, requirements, words):
+    """Of each case the same requirements."""
+    rows = check(kind)
+    assert {row.extreme: row.broken for row in rows if row.broken} == dict.fromkeys(cases, requirements)
     text = verdict_text(rows, STRESS_CASES)
-    assert "finite: outputs are finite where inputs are finite" in text and "recovery: " not in text
-
-
-def test_spreading_is_found(check):
-    assert broken_in(check(Spreads)) == all_break(IN_LIGHT, "spread")
-
-
-def test_spreading_nan_is_found(check):
-    assert broken_in(check(SpreadsNaN)) == all_break(IN_LIGHT, "finite", "spread")
-
-
-def test_a_bad_pixel_may_stay_bad_for_a_frame(check):
-    assert broken_in(check(KeepsBadPixels)) == {}
-
-
-def test_leaving_the_range_is_found_where_required(check):
-    lit = [name for name in NAMES if name not in ("all black", "no surface at all", "logits to ±1e4")]
-    assert broken_in(check(BrightensConvex)) == all_break(lit, "range")
-    assert broken_in(check(Brightens)) == {}
+    assert words in text and ("recovery: " in text) == (kind is Remembers)
 
 
 def test_negative_light_is_found(check):
-    rows = check(GoesNegative)
-    broken = broken_in(rows)
+    rows = check(GOES_NEGATIVE)
+    broken = {row.extreme: row.broken for row in rows if row.broken}
     assert set(broken.values()) == {("range",)} and "all black" in broken
     assert "no other goes below 0" in verdict_text(rows, STRESS_CASES)
-
-
-def test_a_state_that_does_not_recover_is_found(check):
-    rows = check(Remembers)
-    assert broken_in(rows) == all_break(IN_LIGHT, "recovery")
-    assert f"> {RECOVERY_LIMIT}" in verdict_text(rows, STRESS_CASES)
 
 
 def test_recovery_is_counted_in_frames():

@@ -3,56 +3,35 @@
 import gc
 import weakref
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from datasets.channels import MIRRORED, SECOND, SECOND_LAYER, USUAL_CHANNELS
 from datasets.clip import Clip
-from datasets.exr import write_exr
 from datasets.frame import read_frame
-from denoise.exr_image import ExrImage
-from denoise.frames import OwnFrameBuilder
-from render.clip import Arrays, Sampling, render_clip, write_clip
+from render.clip import Arrays, Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, StockShape, Track
 from scenes.bsdf import Bsdf
-from scenes.camera import FAR_OUTSIDE, directions, pixel_centres
+from scenes.camera import FAR_OUTSIDE, pixel_centres
 from scenes.glass import GLASS_SCENES
+from tests.datasets.test_mirrors import assert_the_same_from_exr, clip_of
 from tests.helpers.mirrors import BOX, FRAMES, GLIDE, SILVER, SIZE, painted, panel, placed, room
-from tests.render.test_specular import fresnel
+from tests.render.test_look_through import SURFACE, rendered
+from tests.render.test_specular import GLASS, THIN, reflectances
 
-THIN: Bsdf = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}
-GLASS: Bsdf = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-SURFACE = ("normal", "depth", "roughness", "albedo", "motion")
-
-
-def behind() -> list[Shape]:
-    """A box that glides along the picture's far side, and a wall behind it."""
-    shift = Track.constant([0.0, 0, -3])
-    wall = placed(panel(20, 20), [0, 0, -4])
-    box = RigidMotion(Track(GLIDE.keys + shift.at(0), last=FRAMES - 1.0), Track.constant(0.0))
-    return [Shape("box behind", BOX, painted(0.9), motion=box), Shape("far wall", wall, painted(0.4))]
+WITH_LAYERS = (*USUAL_CHANNELS, *SECOND_LAYER)
 
 
 def with_picture(surface: Bsdf) -> Scene:
-    """The room whose picture is of `surface`, and something behind it."""
+    """The room whose picture is of `surface`; behind it a box that glides along its far side, and a wall."""
     scene = room(surface)
-    return replace(scene, shapes=(*scene.shapes, *behind()))
-
-
-def without_picture() -> Scene:
-    scene = with_picture(THIN)
-    picture, *others = scene.shapes
-    return replace(scene, shapes=(replace(picture, mesh=placed(picture.mesh, [0, 0, -1000])), *others))
-
-
-def rendered(scene: Scene, spp: int = 1) -> list[Arrays]:
-    return [frame for frame, _ in render_clip(scene, FRAMES, *SIZE, Sampling(1, spp, 2), seed=3)]
+    wall = Shape("far wall", placed(panel(20, 20), [0, 0, -4]), painted(0.4))
+    glide = RigidMotion(Track(np.add(GLIDE.keys, [0, 0, -3]), last=FRAMES - 1.0), Track.constant(0.0))
+    return replace(scene, shapes=(*scene.shapes, Shape("box behind", BOX, painted(0.9), motion=glide), wall))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +44,7 @@ def assert_same_surfaces(frame: Arrays, forms: dict[str, str], other: Arrays, na
     picture = frame["mesh_id"][..., 0] == 1
     same = picture & (frame[forms["mesh_id"]] == other[names["mesh_id"]])[..., 0]
     assert picture.mean() > 0.4 and same.sum() >= picture.sum() - 6
-    for name in SURFACE:
+    for name in (*SURFACE, "motion"):
         shown, expected = frame[forms[name]], other[names[name]]
         found = same & (np.abs(frame[forms["motion"]]) < FAR_OUTSIDE).all(axis=-1)
         assert found.sum() > 0.9 * same.sum()  # the others were hidden
@@ -74,7 +53,10 @@ def assert_same_surfaces(frame: Arrays, forms: dict[str, str], other: Arrays, na
 
 
 def test_what_a_pane_transmits_is_the_room_without_it(pane):
-    for frame, other in zip(pane, rendered(without_picture()), strict=True):
+    scene = with_picture(THIN)
+    picture, *others = scene.shapes
+    without = replace(scene, shapes=(replace(picture, mesh=placed(picture.mesh, [0, 0, -1000])), *others))
+    for frame, other in zip(pane, rendered(without), strict=True):
         assert_same_surfaces(frame, MIRRORED, other, {name: name for name in MIRRORED})
     assert np.abs(pane[-1][MIRRORED["motion"]]).max() > 1
 
@@ -94,11 +76,8 @@ def test_elsewhere_there_is_one_layer(pane):
 
 
 def test_samples_take_the_second_layer_by_fresnels_equations(pane):
-    stage = Stage(with_picture(THIN), *SIZE)
-    towards = directions(pixel_centres(*SIZE), stage.view(0))
-    single = fresnel(-towards[..., 2] / np.linalg.norm(towards, axis=-1), 1.5)
+    _, expected = reflectances(Stage(with_picture(THIN), *SIZE))
     picture = pane[0]["mesh_id"][..., 0] == 1
-    expected = 2 * single / (1 + single)
     reflectance = pane[0]["glass_reflectance"][..., 0]
     np.testing.assert_allclose(reflectance[picture], expected[picture], rtol=1e-3)
     drawn = pane[0]["second_samples"][0, ..., 0][picture]
@@ -118,23 +97,22 @@ def test_the_light_of_the_second_layer_is_that_of_a_mirror_times_reflectance(pan
     np.testing.assert_allclose(np.mean(seconds), np.mean(expected), rtol=0.25)
 
 
-def ball(surface: Bsdf) -> Scene:
-    """A ball before a wall that shines in waves."""
+def test_motion_through_a_ball_leads_to_the_same_light():
+    """Emission, computed by other means, is the same at the end of the motion vectors; motion of the ball's is not.
+
+    The ball stands before a wall that shines in waves.
+    """
     waves = 2 + np.sin(np.linspace(0, 6 * np.pi, 256))
     texture = {"type": "bitmap", "data": np.float32(np.broadcast_to(waves[None, :, None], (256, 256, 3))), "raw": True}
     to_world = np.diag([6.0, 6, 1, 1])
     to_world[2, 3] = -3
-    wall = StockShape(
-        "wall", {"type": "rectangle", "to_world": to_world}, painted(0.0), {"type": "area", "radiance": texture}
-    )
-    sphere = Shape("ball", trimesh.creation.icosphere(subdivisions=5, radius=1), surface, smooth=True)
+    shine = {"type": "area", "radiance": texture}
+    wall = StockShape("wall", {"type": "rectangle", "to_world": to_world}, painted(0.0), shine)
+    ball = Shape("ball", trimesh.creation.icosphere(subdivisions=5, radius=1), GLASS, smooth=True)
     eye = Track(np.array([[0.0, 0.3, 4], [0.12, 0.3, 4]]), last=1.0)
-    return Scene((sphere,), Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(40.0)), max_depth=8, stock=(wall,))
-
-
-def test_motion_through_a_ball_leads_to_the_same_light():
-    """Emission, computed by other means, is the same at the end of the motion vectors; motion of the ball's is not."""
-    first, second = (frame for frame, _ in render_clip(ball(GLASS), 2, 96, 96, Sampling(1, 1, 2), seed=0))
+    camera = Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(40.0))
+    scene = Scene((ball,), camera, max_depth=8, stock=(wall,))
+    first, second = (frame for frame, _ in render_clip(scene, 2, 96, 96, Sampling(1, 1, 2), seed=0))
     inside = np.hypot(*(pixel_centres(96, 96) - [48, 51]).transpose(2, 0, 1)) < 24
     inside &= second["mesh_id"][..., 0] == 1
     assert inside.sum() > 1000
@@ -159,15 +137,9 @@ def test_what_is_no_smooth_glass_has_one_layer(surface):
     assert not set(SECOND_LAYER) & rendered(with_picture(surface))[0].keys()
 
 
-def written(scene: Scene, folder: Path) -> Clip:
-    path = folder / "test" / "room" / "000"
-    write_clip(path, scene, (FRAMES, *SIZE), Sampling(1, 1, 2), 0, (*USUAL_CHANNELS, *SECOND_LAYER))
-    return Clip(path)
-
-
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Clip:
-    return written(with_picture(THIN), tmp_path_factory.mktemp("glass"))
+    return clip_of(with_picture(THIN), tmp_path_factory.mktemp("glass"), WITH_LAYERS)
 
 
 def test_only_clips_that_show_glass_have_its_channels(clip, tmp_path):
@@ -175,7 +147,7 @@ def test_only_clips_that_show_glass_have_its_channels(clip, tmp_path):
     assert of_layers <= clip.channels.keys()
     plain = room(painted(0.5))
     hidden = Shape("pane out of sight", placed(panel(0.1, 0.1), [0, 0, 50]), THIN)
-    other = written(replace(plain, shapes=(*plain.shapes, hidden)), tmp_path)
+    other = clip_of(replace(plain, shapes=(*plain.shapes, hidden)), tmp_path, WITH_LAYERS)
     assert not of_layers & other.channels.keys()
     assert not [*other.path.glob("second*"), *other.path.glob("mirrored*")]
 
@@ -199,16 +171,7 @@ def test_blended_guides_are_means_by_probability(clip):
 
 
 def test_exported_frames_have_both_layers(clip, tmp_path):
-    reads = ("indirect", "albedo", "motion")
-    builder = OwnFrameBuilder(reads)
-    for index in range(FRAMES):
-        path = tmp_path / f"{index}.exr"
-        write_exr(path, clip, index)
-        frame, _ = builder.build(ExrImage(path))
-        expected = read_frame(clip, index, reads)
-        assert frame.channels.keys() == expected.channels.keys()
-        for name, tensor in expected.channels.items():
-            assert torch.equal(frame.channels[name], tensor), name
+    assert_the_same_from_exr(clip, ("indirect", "albedo", "motion"), tmp_path)
 
 
 def test_a_stage_is_freed_at_once():

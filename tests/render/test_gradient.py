@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datasets.channels import STRATUM
+from datasets.channels import HIT_CHANNELS, STRATUM
 from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.gradient import GradientSamples, pixel_of_each_stratum, sample_luminance
@@ -112,22 +112,24 @@ def clip():
     return [arrays for arrays, _ in render_clip(scene, 3, SIZE, SIZE, Sampling(2, 1, 2), 1)]
 
 
-def test_a_clip_begins_without_gradients(clip):
-    assert (clip[0]["gradient"] == 0).all()
+def test_a_clip_begins_without_gradients_and_motion(clip):
+    assert not any(clip[0][name].any() for name in ("gradient", "shadow_motion", "reflection_motion"))
     for frame in clip[1:]:
         difference, largest = np.moveaxis(frame["gradient"], -1, 0)
         assert (largest >= np.abs(difference)).all() and (difference != 0).any()
 
 
-def test_gradients_cost_no_other_channel_a_bit(clip):
-    names = [name for name in clip[0] if name != "gradient"]
+@pytest.mark.parametrize("left_out", [{"gradient"}, {*HIT_CHANNELS}, {"shadow_motion", "reflection_motion"}])
+def test_channels_cost_no_other_a_bit(clip, left_out):
+    names = [name for name in clip[0] if name not in left_out]
     without = render_clip(build_scene("cornell_box_moving", 3, 24), 3, SIZE, SIZE, Sampling(2, 1, 2), 1, names)
     for frame, (arrays, seconds) in zip(clip, without, strict=True):
-        assert "gradient" not in arrays and "gradient" not in seconds
+        assert set(arrays) == set(names) and not left_out & set(seconds)
         assert all(frame[name].tobytes() == arrays[name].tobytes() for name in names)
 
 
-def test_they_are_of_the_first_realisation(clip):
+def test_gradients_are_of_the_first_realisation_and_hits_of_each(clip):
     alone = render_clip(build_scene("cornell_box_moving", 3, 24), 3, SIZE, SIZE, Sampling(1, 1, 2), 1)
     for frame, (arrays, _) in zip(clip, alone, strict=True):
         assert np.array_equal(frame["gradient"], arrays["gradient"])
+        assert all(not np.array_equal(*frame[name]) for name in HIT_CHANNELS)

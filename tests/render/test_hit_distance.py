@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from datasets.channels import HIT_CHANNELS
-from render.clip import Sampling, render_clip
 from render.first_bounce import hit_channels
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
@@ -70,20 +68,6 @@ def test_means_count_the_samples_that_met_something():
     for name, means in hit_channels(tracer, stage.view(0), [SampleRange(7, 2)]).items():
         pair = np.stack([first[name], second[name]])
         np.testing.assert_allclose(means, np.ma.masked_equal(pair, 0).mean(axis=0).filled(0), rtol=1e-6)
-
-
-def test_realisations_have_their_own_and_no_other_channel_is_changed():
-    scene = build_scene("cornell_box_moving", 3, 24)
-    sampling = Sampling(realisations=2, noisy_spp=1, reference_spp=2)
-    names = ("direct", "indirect", "shadow_motion", "mesh_id")
-    plain = list(render_clip(scene, 2, 16, 16, sampling, 1, names))
-    whole = list(render_clip(scene, 2, 16, 16, sampling, 1, (*names, "light_angle")))
-    for (first, seconds), (second, more_seconds) in zip(plain, whole, strict=True):
-        assert set(first) == set(names) == set(second) - {"light_angle"}
-        assert all(np.array_equal(first[name], second[name]) for name in names)
-        assert "hit_distance" not in seconds and "hit_distance" in more_seconds
-    everything, _ = next(render_clip(scene, 1, 16, 16, sampling, 1))
-    assert all(not np.array_equal(*everything[name]) for name in HIT_CHANNELS)
 
 
 def test_distances_are_in_world_units():

@@ -15,35 +15,21 @@ from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
 
 
-@pytest.fixture(scope="module")
-def glossy() -> Stage:
-    """The Cornell box with blocks of rough metal: they throw blurred reflections of the light on floor and walls."""
-    metal = {"type": "roughconductor", "material": "Ag", "alpha": 0.05}
-    scene = repaint(build_scene("cornell_box", 3, 24), lambda s: metal if "block" in s.name else s.bsdf)
-    stage = Stage(scene, 64, 64)
-    stage.pose(POSED_FRAME)
-    return stage
-
-
 @pytest.mark.parametrize("cycles", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_every_point_of_the_halton_cycle_is_unbiased(stage, cycles):
-    stage.pose(POSED_FRAME)
-    ray = stage.rays(stage.view(POSED_FRAME))
+def test_every_point_of_the_halton_cycle_is_unbiased(stage, rays, cycles):
     tracer = PathTracer(stage, halton=True)
-    images = np.stack([np.add(*tracer.radiance(ray, seed, 1, first=seed)) for seed in range(cycles * CYCLE)])
+    images = np.stack([np.add(*tracer.radiance(rays, seed, 1, first=seed)) for seed in range(cycles * CYCLE)])
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
     assert_same_mean(emission + images, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
 
 
 @pytest.mark.slow
-def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage):
-    stage.pose(POSED_FRAME)
-    ray = stage.rays(stage.view(POSED_FRAME))
+def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage, rays):
     halton, owen = PathTracer(stage, halton=True), PathTracer(stage)
-    truth = np.add(*owen.radiance(ray, 999, 2048))
-    cycles = [np.mean([np.add(*halton.radiance(ray, s, 1, first=f)) for f in range(CYCLE)], axis=0) for s in range(4)]
+    truth = np.add(*owen.radiance(rays, 999, 2048))
+    cycles = [np.mean([np.add(*halton.radiance(rays, s, 1, first=f)) for f in range(CYCLE)], axis=0) for s in range(4)]
     seeds = [range(1000 * s, 1000 * s + CYCLE) for s in range(4)]
-    independent = [np.mean([np.add(*owen.radiance(ray, seed, 1)) for seed in each], axis=0) for each in seeds]
+    independent = [np.mean([np.add(*owen.radiance(rays, seed, 1)) for seed in each], axis=0) for each in seeds]
     errors = [np.mean((np.stack(images) - truth) ** 2) for images in (cycles, independent)]
     assert errors[0] < 0.8 * errors[1]
 
@@ -58,16 +44,21 @@ def test_a_clip_walks_through_the_cycle():
     assert not np.array_equal(frames[0]["direct"][0], frames[0]["direct"][1])
 
 
-def test_regularisation_changes_nothing_where_nothing_is_glossy(stage):
-    stage.pose(POSED_FRAME)
-    ray = stage.rays(stage.view(POSED_FRAME))
-    plain = PathTracer(stage).radiance(ray, 1, 4)
-    regular = PathTracer(stage, regularise=True).radiance(ray, 1, 4)
+def test_regularisation_changes_nothing_where_nothing_is_glossy(stage, rays):
+    plain = PathTracer(stage).radiance(rays, 1, 4)
+    regular = PathTracer(stage, regularise=True).radiance(rays, 1, 4)
     assert all(np.array_equal(a, b) for a, b in zip(plain, regular, strict=True))
 
 
-def test_regularisation_trades_bias_for_noise(glossy):
-    """Direct light is untouched. Indirect light has less variance, and a bias of a few percent."""
+def test_regularisation_trades_bias_for_noise():
+    """Direct light is untouched. Indirect light has less variance, and a bias of a few percent.
+
+    In the Cornell box with blocks of rough metal: they throw blurred reflections of the light on floor and walls.
+    """
+    metal = {"type": "roughconductor", "material": "Ag", "alpha": 0.05}
+    scene = repaint(build_scene("cornell_box", 3, 24), lambda s: metal if "block" in s.name else s.bsdf)
+    glossy = Stage(scene, 64, 64)
+    glossy.pose(POSED_FRAME)
     ray = glossy.rays(glossy.view(POSED_FRAME))
     plain, regular = (
         np.stack([PathTracer(glossy, regularise=r).radiance(ray, seed, 64) for seed in range(8)]).astype(float)

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from render.clip import render_clip
-from scenes.registry import build_scene
-from tests.helpers.plates import DISTANCE, FOCAL, SAMPLING, frames_of, plate
+from tests.helpers.plates import DISTANCE, FOCAL, frames_of, plate
 
 STEP = 0.1
 WALL = plate("a wall", 20, (0, 0, 0))
@@ -56,13 +54,3 @@ def test_the_sky_s_reflection_moves_with_the_view_alone():
 def test_diffuse_surfaces_reflect_nothing_in_particular():
     for frame in frames_of(WALL, plate("b", 0.5, (2, 0, 2), radiance=1), eye_slides=0.1):
         assert np.array_equal(frame["reflection_motion"], frame["motion"])
-
-
-def test_first_frames_do_not_move_and_no_other_channel_is_changed():
-    scene = build_scene("cornell_box_moving", 3, 24)
-    names = ("direct", "indirect", "direct_reference", "motion", "mesh_id")
-    plain = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1, names)]
-    whole = [arrays for arrays, _ in render_clip(scene, 2, 16, 16, SAMPLING, 1)]
-    assert not any(whole[0][name].any() for name in ("shadow_motion", "reflection_motion"))
-    for first, second in zip(plain, whole, strict=True):
-        assert set(first) == set(names) and all(np.array_equal(first[name], second[name]) for name in names)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from scenes.boxes import bounding_box, first_hit, overlaps, transformed_box
@@ -17,7 +17,6 @@ def random_boxes(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.stack([middle - half, middle + half], axis=1)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_transformed_box_is_the_smallest_around_a_turned_one(seed):
     rng = np.random.default_rng(seed)
@@ -28,7 +27,6 @@ def test_transformed_box_is_the_smallest_around_a_turned_one(seed):
     np.testing.assert_allclose(transformed_box(box, matrix), [moved.min(axis=0), moved.max(axis=0)], atol=1e-12)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_bounding_box_holds_all_and_overlaps_each(seed):
     boxes = random_boxes(np.random.default_rng(seed), 5)
@@ -38,7 +36,6 @@ def test_bounding_box_holds_all_and_overlaps_each(seed):
     assert not overlaps(around + 1.01 * (around[1] - around[0]), boxes)
 
 
-@settings(deadline=None)
 @given(seed=SEEDS, clearance=st.floats(0, 0.5))
 def test_clearance_is_kept_outside_of_grown_boxes(seed, clearance):
     rng = np.random.default_rng(seed)
@@ -49,7 +46,6 @@ def test_clearance_is_kept_outside_of_grown_boxes(seed, clearance):
     assert overlaps(around, boxes) == overlaps(np.stack([around, boxes[0] + 99]), boxes) == inside.any()
 
 
-@settings(deadline=None)
 @given(seed=SEEDS)
 def test_first_hit_is_where_a_ray_enters(seed):
     rng = np.random.default_rng(seed)

@@ -47,15 +47,8 @@ def lights(scene: Scene) -> list[Shape]:
     return [shape for shape in scene.shapes if shape.radiance is not None]
 
 
-def world(scene: Scene, frame: int) -> trimesh.collision.CollisionManager:
-    """All meshes where they are in a frame."""
-    manager = trimesh.collision.CollisionManager()
-    for shape in scene.shapes:
-        manager.add_object(shape.name, shape.mesh, shape.motion.matrix(frame))
-    return manager
-
-
-def check(number: int) -> None:
+@pytest.mark.parametrize("number", [*FEW, *(pytest.param(number, marks=pytest.mark.slow) for number in MANY)])
+def test_room(number):
     scene = build_room(number)
     assert 15 <= len(things(scene)) <= 60
     assert 1 <= len(lights(scene)) + (scene.sky is not None) <= 5
@@ -65,7 +58,9 @@ def check(number: int) -> None:
         assert (radiance > 0).any(axis=1).all() and radiance.max() < 65504
 
     for frame in (0, FRAMES // 2, FRAMES - 1) if scene.moves() else (0,):
-        manager = world(scene, frame)
+        manager = trimesh.collision.CollisionManager()
+        for shape in scene.shapes:
+            manager.add_object(shape.name, shape.mesh, shape.motion.matrix(frame))
         _, pairs = manager.in_collision_internal(return_names=True)
         # Building parts join each other, and lamps sit in their fixtures.
         loose = {pair for pair in pairs if any(owner(name).isdigit() for name in pair)}
@@ -79,17 +74,6 @@ def check(number: int) -> None:
     walls = np.stack([shape.mesh.bounds for shape in scene.shapes if shape.name.startswith(("wall", "floor"))])
     assert (eyes > walls[:, 0].min(axis=0) + 0.1).all()
     assert (eyes[:, [0, 2]] < walls[:, 1].max(axis=0)[[0, 2]] - 0.1).all()
-
-
-@pytest.mark.parametrize("number", FEW)
-def test_room(number):
-    check(number)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", MANY)
-def test_many_rooms(number):
-    check(number)
 
 
 def test_same_number_same_room_whatever_the_seed():
@@ -108,9 +92,10 @@ def test_rooms_differ():
     assert {"diffuse", "twosided", "roughplastic", "principled", "roughconductor"} <= kinds
 
 
-def share_of_kinds(numbers: range) -> dict[str, float]:
-    """Shares of rooms in which two things move, lights change, the camera stops, the sky is visible or glass is."""
-    rooms = [build_room(number) for number in numbers]
+@pytest.mark.slow
+def test_half_of_the_rooms_move():
+    """Also in some lights change, the camera stops, the sky is visible or glass is."""
+    rooms = [build_room(number) for number in MANY]
     facts = {
         "two things move": [sum(parts[0].motion.varies() for parts in things(s).values()) >= 2 for s in rooms],
         "lights change": [any(light.radiance.varies() or light.motion.varies() for light in lights(s)) for s in rooms],
@@ -118,12 +103,7 @@ def share_of_kinds(numbers: range) -> dict[str, float]:
         "sky": [s.sky is not None for s in rooms],
         "glass": [any("dielectric" in shape.bsdf["type"] for shape in s.shapes) for s in rooms],
     }
-    return {name: float(np.mean(values)) for name, values in facts.items()}
-
-
-@pytest.mark.slow
-def test_half_of_the_rooms_move():
-    shares = share_of_kinds(MANY)
+    shares = {name: np.mean(values) for name, values in facts.items()}
     assert 0.4 <= shares["two things move"] <= 0.65
     assert all(shares[name] >= 0.03 for name in shares)
     assert all(shares[name] <= 0.5 for name in ("lights change", "camera stops", "sky"))

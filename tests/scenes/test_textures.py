@@ -14,7 +14,7 @@ def within(values, low, high):
     return np.isfinite(values).all() and values.min() >= low - 1e-6 and values.max() <= high + 1e-6
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_texture(seed):
     a, b, other = (texture(np.random.default_rng(each)) for each in (seed, seed, seed + 1))
@@ -23,7 +23,7 @@ def test_texture(seed):
     assert np.array_equal(a, b) and not np.array_equal(a, other)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS, low=st.floats(0, 0.5), span=st.floats(0.01, 0.5))
 def test_gray_texture_spans_its_range(seed, low, span):
     a, b = (gray_texture(np.random.default_rng(seed), low, low + span) for _ in range(2))
@@ -37,7 +37,7 @@ def test_gray_textures_mostly_vary():
     assert sum(np.ptp(gray_texture(np.random.default_rng(seed), 0, 1)) == 1 for seed in range(40)) >= 38
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=SEEDS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_patterns_stay_in_the_palette_and_show_something(pattern, seed):
@@ -62,7 +62,7 @@ def test_patterns_repeat_seamlessly(pattern):
     assert (np.array(across) <= 1.5 * np.array(inside) + 1e-9).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=SEEDS, count=st.integers(1, 8))
 def test_colours(seed, count):
     colours = palette(np.random.default_rng(seed), count)

@@ -1,13 +1,19 @@
-"""A finished training, for tests that look at what it left or damage a copy of it."""
+"""Clips to train on, and a finished training for tests that look at what it left or damage a copy of it."""
 
 import shutil
 from pathlib import Path
 
 import pytest
 
+from datasets.clip import Clip, Dataset
 from tests.helpers.training import folder_of, short_task
 from train.loop import train_network
 from train.precision import BFLOAT16
+
+
+@pytest.fixture(scope="session")
+def clips(tiny: Path) -> list[Clip]:
+    return Dataset(tiny).clips("train")
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.clip import Dataset
 from datasets.frame import read_frame
-from errors import BadInput
 from models.registry import create
 from provenance import sources
 from tests.helpers.training import full_disk
@@ -14,11 +12,6 @@ from train import accumulation
 from train.accumulation import accumulate_clip, accumulation_digest
 from train.crops import AccumulatedCrops
 from train.data import load_ahead, micro_batches
-
-
-@pytest.fixture(scope="module")
-def clips(tiny):
-    return Dataset(tiny).clips("train")
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +118,3 @@ def test_crops_stack_and_come_in_parts(clips, cache):
     assert torch.equal(batch.irradiance[1:], data[5].irradiance)
     assert torch.equal(batch.frame.albedo[1:], data[5].frame.albedo)
     assert torch.equal(batch.scale.exposure()[1:], data[5].scale.exposure())
-
-
-def test_too_small_clips_are_refused(clips, cache):
-    with pytest.raises(BadInput, match="too few or too small to train on"):
-        crops(clips, cache, crop=65)

@@ -30,11 +30,6 @@ AUGMENTATIONS = {
 }
 
 
-@pytest.fixture(scope="module")
-def clips(tiny):
-    return Dataset(tiny).clips("train")
-
-
 def sequences(clips, augmentation=AUGMENTATIONS["none"], crop=32, length=5, seed=0) -> TrainingSequences:
     return TrainingSequences(clips, IMAGE_CHANNELS, length, crop, augmentation, seed)
 
@@ -249,9 +244,8 @@ def test_demodulation_round_trip_and_unread_channels(clips):
     assert not hasattr(frame, "no_channel")
 
 
-def test_sequences_of_several_samples_are_means_of_realisations(tiny):
+def test_sequences_of_several_samples_are_means_of_realisations(clips):
     """Each frame names its samples, and is the mean of as many realisations of it."""
-    clips = Dataset(tiny).clips("train")
     counts = set()
     for index in range(24):
         plain, several = (
@@ -318,12 +312,6 @@ class Recorded(WholeFrames):
         return super().__call__(clip, index, realisation)
 
 
-def is_part_of(crop: Frame, whole: Frame) -> bool:
-    """Whether the noise of a crop of 32 x 32 pixels is somewhere in the whole frame."""
-    windows = whole.indirect.unfold(2, 32, 1).unfold(3, 32, 1)
-    return bool((windows == crop.indirect[:, :, None, None]).all(dim=-1).all(dim=-1).all(dim=1).any())
-
-
 @pytest.mark.parametrize("name, reverse", [("rae", True), ("ntd", False)])
 @torch.no_grad()
 def test_crops_get_the_scale_of_their_whole_frames(clips, name, reverse):
@@ -342,7 +330,8 @@ def test_crops_get_the_scale_of_their_whole_frames(clips, name, reverse):
         last = measure.requests[0][1]
         for crop, (clip, position, realisation) in zip(crops, measure.requests, strict=True):
             frame = read_frame(clip, position, denoiser.reads, realisation, previous=last)
-            assert is_part_of(crop, frame)
+            windows = frame.indirect.unfold(2, 32, 1).unfold(3, 32, 1)  # one of which is the crop
+            assert (windows == crop.indirect[:, :, None, None]).all(dim=-1).all(dim=-1).all(dim=1).any()
             _, cropped = denoiser.predict(crop, cropped)
             _, whole = denoiser.predict(frame, whole)
             last = position

@@ -20,7 +20,6 @@ from datasets.info import summarise
 from errors import BadInput
 from files import locked
 from render.job.generate import generate, share_of
-from render.job.plan import plan
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 from tests.helpers.training import full_disk
 
@@ -218,7 +217,5 @@ def test_other_seed_or_profile_needs_another_folder(tiny):
         generate(tiny, "tiny", 1)
     with pytest.raises(BadInput, match="another profile"):
         generate(tiny, "quick", 0)
-    with pytest.raises(BadInput, match=r"unknown profile 'huge'.*quick"):
-        plan("huge", 0)
     with pytest.raises(BadInput, match="negative"):
         generate(tiny, "tiny", -1)

@@ -8,7 +8,6 @@ from render.backend import mi
 from render.scene_file.load import FOV_WITHOUT_CAMERA, camera_framing, camera_of_sensor
 from scenes.animation import Scene
 from scenes.camera import directions, pixel_centres, project
-from tests.helpers.scene_files import own, xml
 
 LENSES = {axis: {"fov": 47.0, "fov_axis": axis} for axis in ("x", "y", "smaller", "larger", "diagonal")}
 LENSES["focal_length"] = {"focal_length": "35mm"}
@@ -53,10 +52,3 @@ def test_a_scene_without_camera_is_seen_whole(aspect):
     visible = project(corners, np.ones(8, bool), Scene((), camera).view(0, 100, int(100 / aspect)))
     assert camera.x_fov.at(0) == FOV_WITHOUT_CAMERA
     assert (visible > 0).all() and (visible < [100 / aspect, 100]).all()
-
-
-@pytest.mark.parametrize("camera", ["orthographic", "irradiancemeter", "spherical", "batch"])
-def test_other_sensors_are_no_cameras(tmp_path, camera):
-    scene = own(tmp_path, xml(camera=f'<sensor type="{camera}"/>'))
-    assert any("not a perspective camera" in note for note in scene.notes)
-    assert "there is no camera: one that frames the whole scene instead" in scene.notes

@@ -86,9 +86,3 @@ def test_names_are_given_once(wanted):
     given = [names.unique(name) for name in wanted]
     assert len(set(given)) == len(given) and not set(given) & set(RESERVED_NAMES)
     assert not any("." in name or not name for name in given)
-
-
-def test_the_first_keeps_its_name():
-    names = Names()
-    assert [names.unique("ball") for _ in range(3)] == ["ball", "ball-2", "ball-3"]
-    assert names.unique("größe 1") == "größe 1" and names.unique("sky") == "sky-2"

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 import trimesh
 
 from render.backend import mi
-from render.scene_file.convert import Converter
+from render.path import PosedFrame
+from render.scene_file.convert import SceneFile
 from render.scene_file.xml import ParsedFile
+from render.stage import Stage
 from tests.helpers.scene_files import BALL, LOOK, SKY, old_xml, own, painted
 
 PICTURE = '<string name="filename" value="picture.png"/>'
@@ -31,20 +34,12 @@ def values(tag: str, **named: object) -> str:
     return "".join(f'<{tag} name="{name}" value="{value}"/>' for name, value in named.items())
 
 
-def floats(**named: object) -> str:
-    return values("float", **named)
+def element(tag: str, kind: str, *parts: str) -> str:
+    return f'<{tag} type="{kind}">{"".join(parts)}</{tag}>'
 
 
-def strings(**named: object) -> str:
-    return values("string", **named)
-
-
-def spectra(**named: object) -> str:
-    return values("spectrum", **named)
-
-
-def bsdf(kind: str, *parts: str) -> str:
-    return f'<bsdf type="{kind}">{"".join(parts)}</bsdf>'
+floats, strings, spectra = (partial(values, tag) for tag in ("float", "string", "spectrum"))
+bsdf, shape, light, integrator = (partial(element, tag) for tag in ("bsdf", "shape", "emitter", "integrator"))
 
 
 METAL = bsdf("roughconductor", strings(material="Cu"), floats(alpha=0.3))
@@ -110,10 +105,6 @@ TEXTURES = {
 }  # fmt: skip
 
 
-def shape(kind: str, *parts: str) -> str:
-    return f'<shape type="{kind}">{"".join(parts)}</shape>'
-
-
 FLIP = values("boolean", flipNormals="true")
 MESH = values("boolean", faceNormals="true") + floats(maxSmoothAngle=30)
 SHAPES = {
@@ -139,10 +130,6 @@ SHAPES = {
 }  # fmt: skip
 
 
-def light(kind: str, *parts: str) -> str:
-    return f'<emitter type="{kind}">{"".join(parts)}</emitter>'
-
-
 SUN = '<vector name="sunDirection" x="1" y="2" z="0"/>'
 LIGHTS = {
     "point": (light("point", TO_WORLD, spectra(intensity="10,5,1"), floats(samplingWeight=1)), ""),
@@ -159,7 +146,7 @@ LIGHTS = {
 
 
 def sensor(kind: str, *parts: str) -> str:
-    return f'<sensor type="{kind}">{"".join(parts)}{LOOK.format("toWorld")}</sensor>'
+    return element("sensor", kind, *parts, LOOK.format("toWorld"))
 
 
 FILM = '<film type="{}">' + strings(pixelFormat="rgb") + '<rfilter type="{}"/></film>'
@@ -178,10 +165,6 @@ SENSORS = {
     "camera": ('<camera type="perspective"><transform name="toWorld"><lookAt origin="0 0 5" target="0 0 0" up="0 1 0"/>'
                "</transform></camera>", ""),
 }  # fmt: skip
-
-
-def integrator(kind: str, *parts: str) -> str:
-    return f'<integrator type="{kind}">{"".join(parts)}</integrator>'
 
 
 DEPTH = values("integer", maxDepth=8, rrDepth=5)
@@ -211,17 +194,21 @@ def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32)).write(str(folder / "sky.exr"))
     mi.Bitmap(np.full((4, 4, 3), 127, np.uint8)).write(str(folder / "picture.png"))
+    box = trimesh.creation.box()
     for kind in ("obj", "ply"):
-        trimesh.creation.box().export(folder / f"mesh.{kind}")
-    (folder / "mesh.serialized").write_bytes(serialized(trimesh.creation.box()))
+        box.export(folder / f"mesh.{kind}")
+    # A file of version 4 with one mesh: single precision, no normals or texture coordinates.
+    counts = struct.pack("<I5sQQ", 0x1000, b"mesh\0", len(box.vertices), len(box.faces))
+    content = zlib.compress(counts + np.float32(box.vertices).tobytes() + np.uint32(box.faces).tobytes())
+    whole = struct.pack("<HH", 0x041C, 4) + content + struct.pack("<QI", 0, 1)
+    (folder / "mesh.serialized").write_bytes(whole)
     return folder
 
 
-def serialized(mesh: trimesh.Trimesh) -> bytes:
-    """A file of version 4 with one mesh: single precision, no normals or texture coordinates."""
-    counts = struct.pack("<I5sQQ", 0x1000, b"mesh\0", len(mesh.vertices), len(mesh.faces))
-    content = zlib.compress(counts + np.float32(mesh.vertices).tobytes() + np.uint32(mesh.faces).tobytes())
-    return struct.pack("<HH", 0x041C, 4) + content + struct.pack("<QI", 0, 1)
+def rendered(scene) -> np.ndarray:
+    """A frame's light (H, W, 3), with what is visible directly."""
+    posed = PosedFrame(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
+    return np.add(*posed.tracer.radiance(posed.ray, 0, 2)) + posed.emission
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -231,10 +218,21 @@ def test_it_is_honoured_or_listed(folder, name):
     assert any(words in note for note in notes) if words else notes == []
 
 
+def test_all_materials_and_lights_are_rendered_together(folder):
+    materials = [part for part, _ in [*BSDFS.values(), *TEXTURES.values()]]
+    place = '<point name="center" x="{}" y="{}" z="0"/>'
+    balls = [
+        shape("sphere", floats(radius=0.2), place.format(0.45 * (index % 8) - 1.6, 0.4 * (index // 8) - 1.2), material)
+        for index, material in enumerate(materials)
+    ]
+    image = rendered(own(folder, old_xml(*balls, *(part for part, _ in LIGHTS.values()))))
+    assert np.isfinite(image).all() and image.max() > 0
+
+
 def described(folder: Path, content: str) -> dict[str, dict]:
     """What is made of the first object of each kind: its dictionary, without nested ones but colours."""
     (folder / "scene.xml").write_text(content)
-    file = Converter(folder / "scene.xml").convert()
+    file = SceneFile(folder / "scene.xml")
     return {"bsdf": file.shapes[0].bsdf or {}, "light": file.lights[0].emitter, "sensor": file.sensor or {}}
 
 
@@ -246,6 +244,7 @@ def test_numbers_mean_what_they_meant(tmp_path):
     assert colour("0.1, 0.2 0.3") == pytest.approx([0.1, 0.2, 0.3])
     assert colour("#ff8000", "rgb") == pytest.approx([1, 128 / 255, 0], abs=1e-6)
     assert colour("#ff8000", "srgb") == pytest.approx([1, 0.2158605, 0], abs=1e-6)
+    assert colour("0.5, 0 1", "srgb") == pytest.approx([0.2140411, 0, 1], abs=1e-6)
     camera = sensor("perspective", floats(focalLength=35))
     lens = described(tmp_path, f'<scene version="0.6.0">{camera}{SKY}{BALL}</scene>')
     assert lens["sensor"]["focal_length"] == "35.0mm"
@@ -267,5 +266,5 @@ def test_included_files_are_upgraded_too(tmp_path):
     cube = shape("cube", '<ref id="a"/>', place)
     (tmp_path / "scene.xml").write_text(old_xml('<include filename="part.xml"/>', cube))
     assert ParsedFile(tmp_path / "scene.xml").notes == []
-    notes = Converter(tmp_path / "scene.xml").convert().notes
+    notes = SceneFile(tmp_path / "scene.xml").notes
     assert notes == ["gone.png (part.xml line 2): the file gone.png is missing: grey instead of this texture"]

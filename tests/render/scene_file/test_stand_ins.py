@@ -4,38 +4,14 @@ import numpy as np
 import pytest
 
 from render.backend import mi
-from render.path import PosedFrame
 from render.scene_file.convert import turned_to_y
 from render.scene_file.stand_ins import OLD_PLUGINS, black_body, mixture, phong
-from render.stage import Stage
 from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
-
-
-def rendered(scene) -> np.ndarray:
-    """A frame's light (H, W, 3), with what is visible directly."""
-    posed = PosedFrame(Stage(scene.clip("test", 0, 2, 0), 24, 32), 1)
-    return np.add(*posed.tracer.radiance(posed.ray, 0, 2)) + posed.emission
-
-
-def old(bsdf: str) -> str:
-    return old_xml(shape=painted(bsdf))
+from tests.render.scene_file.test_mitsuba_06 import bsdf, light, rendered, shape, strings, texture
 
 
 def new(bsdf: str) -> str:
     return xml(shape=painted(bsdf))
-
-
-def diffuse(reflectance: str) -> str:
-    return f'<bsdf type="diffuse">{reflectance}</bsdf>'
-
-
-def texture(plugin: str, content: str = "") -> str:
-    """A material whose reflectance is a texture."""
-    return diffuse(f'<texture type="{plugin}" name="reflectance">{content}</texture>')
-
-
-def shape(plugin: str, content: str = "") -> str:
-    return f'<shape type="{plugin}" id="thing">{content}</shape>'
 
 
 def named(tag: str, plugin: str, file: str, name: str = "") -> str:
@@ -43,62 +19,35 @@ def named(tag: str, plugin: str, file: str, name: str = "") -> str:
 
 
 CHECKS = '<texture type="checkerboard" name="{}"/>'
+LOST = named("texture", "bitmap", "no.png", "{}")
 GROUP = '<shape type="shapegroup" id="g">{}</shape><shape type="instance"><ref id="g"/></shape>'
-BLACK_BODY = '<spectrum type="blackbody" name="radiance"><float name="temperature" value="5000"/></spectrum>'
 NO_OBJ = '<string name="filename" value="no.obj"/>'
-MIXTURE = '<bsdf type="mixturebsdf"><string name="weights" value="{}"/>{}</bsdf>'
+MIXTURE = bsdf("mixturebsdf", strings(weights="x"))
 IRREGULAR = '<string name="wavelengths" value="400, 700"/><string name="values" value="0.1, 0.2"/>'
-LENS = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/>'
 WOBBLE = '<float name="{}" value="3"/>'
-MOVED = '<animation name="toWorld"><transform time="0"/></animation>'
 # Content, words of its note, and how many shapes and lights are left if not one each.
 CASES = {
-    "phong": (old('<bsdf type="phong"><float name="exponent" value="50"/></bsdf>'), "rough plastic"),
-    "ward": (old('<bsdf type="ward"/>'), "rough plastic"),
-    "coating": (old('<bsdf type="coating"><bsdf type="roughconductor"/></bsdf>'), "under the coat"),
-    "roughcoating": (old('<bsdf type="roughcoating"/>'), "diffuse surface"),
-    "mixture": (old(MIXTURE.format("0.7, 0.3", '<bsdf type="plastic"/><bsdf type="diffuse"/>')), "blendbsdf"),
-    "mixture of what": (old(MIXTURE.format("x", "")), "diffuse"),
-    "bump": (old(f'<bsdf type="bump">{CHECKS.format("t")}{diffuse("")}</bsdf>'), "bumpmap"),
-    "bumps of checks": (new(f'<bsdf type="bumpmap">{CHECKS.format("t")}{diffuse("")}</bsdf>'), "flat"),
-    "lost normals": (new(f'<bsdf type="normalmap">{named("texture", "bitmap", "no.png", "normalmap")}{diffuse("")}'
-                         "</bsdf>"), "flat"),
-    "unknown material": (old('<bsdf type="irawan"/>'), "diffuse surface"),
-    "grid": (old(texture("gridtexture")), "checkerboard"),
-    "scale": (old(texture("scale")), "grey"),
-    "wireframe": (old(texture("wireframe")), "grey"),
-    "lost texture": (new(diffuse(named("texture", "bitmap", "no.png", "reflectance"))), "no.png is missing: grey"),
+    "roughcoating": (old_xml(shape=painted(bsdf("roughcoating"))), "diffuse surface"),
+    "mixture of what": (old_xml(shape=painted(MIXTURE)), "diffuse"),
+    "bumps of checks": (new(bsdf("bumpmap", CHECKS.format("t"), bsdf("diffuse"))), "flat"),
+    "lost normals": (new(bsdf("normalmap", LOST.format("normalmap"), bsdf("diffuse"))), "flat"),
+    "scale": (old_xml(shape=painted(texture("scale"))), "grey"),
+    "lost texture": (new(bsdf("diffuse", LOST.format("reflectance"))), "no.png is missing: grey"),
     "lost volume": (new(texture("volume")), "volume"),
     "lost measurements": (new(named("bsdf", "measured", "no.bsdf")), "grey diffuse"),
     "lost mesh": (xml(shape("obj", NO_OBJ)), "no.obj is missing"),
     "lost sky": (xml(light=named("emitter", "envmap", "no.exr")), "uniform white sky"),
-    "lost spectrum": (new(diffuse('<spectrum name="reflectance" filename="no.spd"/>')),
+    "lost spectrum": (new(bsdf("diffuse", '<spectrum name="reflectance" filename="no.spd"/>')),
                       "no.spd of a spectrum is missing"),
     "hair": (old_xml(shape("hair", '<string name="filename" value="no.hair"/>')), "no shape 'hair': nothing"),
-    "unknown shape": (old_xml(shape("heightfield")), "has no shape 'heightfield': nothing"),
-    "old sky": (old_xml(light='<emitter type="sky"><float name="turbidity" value="4"/></emitter>'), "sky of sunsky"),
-    "old sun": (old_xml(light='<emitter type="sun"><vector name="sunDirection" x="1" y="2" z="1"/></emitter>'),
-                "sun of sunsky"),
     "unknown light": (old_xml('<emitter type="collimated"/>'), "has no emitter 'collimated': nothing"),
     "no light": (xml(light=""), "there is no light: a uniform white sky"),
     "two skies": (xml(SKY), "a second sky is left out"),
-    "spot without picture": (xml(f'<emitter type="spot">{named("texture", "bitmap", "no.png", "texture")}</emitter>'),
-                             "without its texture", 1, 2),
-    "medium": (xml(shape("cube", '<medium type="homogeneous" name="interior"/>')), "a medium is left out", 2, 1),
+    "spot without picture": (xml(light("spot", LOST.format("texture"))), "without its texture", 1, 2),
     "top medium": (xml('<medium type="homogeneous" id="m"/>'), "m (scene.xml line 1): a medium is left out"),
-    "subsurface": (old('<subsurface type="dipole"/><bsdf type="plastic"/>'), "surface alone"),
-    "spectrum": (new(diffuse('<spectrum name="reflectance" value="400:0.1, 700:0.9"/>')), "red, green and blue"),
-    "irregular": (new(diffuse(f'<spectrum type="irregular" name="reflectance">{IRREGULAR}</spectrum>')),
+    "irregular": (new(bsdf("diffuse", f'<spectrum type="irregular" name="reflectance">{IRREGULAR}</spectrum>')),
                   "red, green and blue"),
-    "black body": (xml(shape("disk", f'<emitter type="area">{BLACK_BODY}</emitter>')), "red, green and blue", 2, 1),
-    "integrator": (old_xml('<integrator type="bdpt"/>'), "'bdpt': path tracing"),
-    "volpath": (xml('<integrator type="volpath"><boolean name="hide_emitters" value="true"/></integrator>'),
-                "hide_emitters"),
     "two cameras": (xml(CAMERA), "a further sensor is left out"),
-    "lens": (xml(camera=CAMERA.replace("perspective", "thinlens").replace("<transform", f"{LENS}<transform")),
-             "a pinhole instead"),
-    "clipping": (xml(camera=CAMERA.replace("<transform", '<float name="near_clip" value="1"/><transform')),
-                 "near_clip"),
     "orthographic": (xml(camera=CAMERA.replace("perspective", "orthographic").replace("fov", "near_clip")),
                      "frames the whole scene"),
     "no camera": (xml(camera=""), "there is no camera: one that frames the whole scene"),
@@ -106,7 +55,7 @@ CASES = {
     "shining group": (xml(GROUP.format('<shape type="sphere"><emitter type="area"/></shape>')),
                       "do not emit light", 2, 1),
     "empty group": (xml(GROUP.format(f'<shape type="obj">{NO_OBJ}</shape>')), "an instance of nothing"),
-    "unknown property": (xml(shape("cube", WOBBLE.format("wobble") + diffuse(WOBBLE.format("jolt")))),
+    "unknown property": (xml(shape("cube", WOBBLE.format("wobble") + bsdf("diffuse", WOBBLE.format("jolt")))),
                          "does not have 'wobble'", 2, 1),
     "a moving sun": (xml(light='<emitter type="timed_sunsky"/>'), "sunsky, whose sun does not move"),
     "bitmap of nothing": (new(texture("bitmap")), "its file is not named"),
@@ -116,7 +65,6 @@ CASES = {
     "no place": (xml(shape("cube", '<float name="to_world" value="2"/>')), "its to_world is no transform", 2, 1),
     "material merged": (xml('<shape type="merge"><bsdf type="diffuse"/></shape>'), "merged shapes"),
     "a property called type": (xml(shape("cube", '<string name="type" value="../evil"/>')), "called 'type'", 2, 1),
-    "animation": (old_xml(shape("cube", MOVED)), "its first transform instead", 2, 1),
 }  # fmt: skip
 
 
@@ -132,12 +80,6 @@ def test_it_is_noted_and_rendered(tmp_path, case):
     assert np.isfinite(image).all() and image.max() > 0
 
 
-@pytest.mark.parametrize("make", [xml, old_xml])
-def test_films_and_samplers_are_the_renderers_own(tmp_path, make):
-    film = '<film type="ldrfilm"><rfilter type="gaussian"/></film><sampler type="halton"/></sensor>'
-    assert own(tmp_path, make().replace("</sensor>", film)).notes == []
-
-
 def test_files_of_pictures(tmp_path):
     """A texture, a bump map, a shining picture and a sky, each of a file."""
     values = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
@@ -149,7 +91,7 @@ def test_files_of_pictures(tmp_path):
         f'<shape type="disk"><emitter type="area">{picture.format("radiance")}</emitter></shape>',
         f'<shape type="cube"><emitter type="area">{picture.format("radiance")}</emitter></shape>',
     )
-    ball = painted(diffuse(picture.format("reflectance")))
+    ball = painted(bsdf("diffuse", picture.format("reflectance")))
     scene = own(tmp_path, xml(*parts, light=named("emitter", "envmap", "sky.exr"), shape=ball))
     assert scene.notes == [] and len(scene.scene.stock) == 4
     assert scene.scene.stock[1].bsdf["type"] == "bumpmap"
@@ -166,7 +108,8 @@ def test_a_plain_scene_needs_no_words(tmp_path):
         GROUP.format('<shape type="sphere"/><shape type="cube"/>'),
         '<emitter type="point"/>',
     )
-    scene = own(tmp_path, xml(*parts))
+    film = '<film type="ldrfilm"><rfilter type="gaussian"/></film><sampler type="halton"/></sensor>'
+    scene = own(tmp_path, xml(*parts).replace("</sensor>", film))
     assert scene.notes == [] and scene.scene.max_depth == 4
     assert [shape.name for shape in scene.scene.stock] == ["ball", "disk", "cube", "cube-2", "disk-2", "instance"]
 

@@ -1,11 +1,13 @@
-"""Pictures of scenes and references of one frame, without a data set."""
+"""Figures that need no data set: pictures of scenes and the frame in three strips."""
 
 import numpy as np
 import pytest
 from matplotlib import pyplot as plt
+from PIL import Image
 
 from errors import BadInput
 from eval.figures.contact_sheet import TITLE_INCHES, contact_sheet, displayed_frame
+from eval.figures.triptych import in_strips, triptych
 from plotting import DPI
 
 
@@ -27,3 +29,22 @@ def test_contact_sheet_shows_every_scene(tmp_path):
     assert (places[3] == 1).all()
     with pytest.raises(BadInput, match="unknown scene 'castle'"):
         contact_sheet(tmp_path / "sheet.png", ["castle"])
+
+
+def test_strips_are_in_their_order_and_slant_to_the_left():
+    pictures = tuple(np.full((40, 200, 3), value) for value in (0.1, 0.2, 0.3))
+    picture = in_strips(pictures)
+    for row in picture[..., 0]:
+        assert row[0] == 0.1 and row[106] == 0.2 and row[-1] == 0.3
+        assert (np.diff(row[row < 1]) >= 0).all() and 4 <= (row == 1).sum() <= 8
+    first_cuts = (picture[..., 0] == 1).argmax(axis=1)
+    assert first_cuts[0] > first_cuts[-1]
+
+
+def test_a_small_one(tmp_path):
+    out = tmp_path / "triptych.png"
+    triptych(out, "cornell_box", "svgf", tmp_path, frame=2, spp=4, size=(24, 40))
+    with Image.open(out) as image:
+        assert image.size == (40, 24)
+        pixels = np.asarray(image).astype(float)
+    assert pixels.std() > 10
