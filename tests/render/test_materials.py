@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from render.backend import dr, mi
+from render.loading import to_mitsuba
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, StockShape, Track
 from tests.helpers.rendering import first_gbuffer, rgb
