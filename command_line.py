@@ -335,30 +335,19 @@ def weights(
         print(card_file(name).read_text().strip() if name else table())
 
 
-Imported = Annotated[Path, Positional, arg(metavar="DIR", help="the folder of the files")]
+def import_(
+    files: Annotated[Literal["bmfr", "noisebase"], Positional, arg(help="whose files")],
+    source: Annotated[Path, Positional, arg(metavar="DIR", help="their folder")],
+    data: Annotated[Path | None, arg(metavar="DIR", help="the dataset; by default data/bmfr and so on")] = None,
+    spp: Annotated[int, arg(help="samples per pixel to use of Noisebase's")] = 2,
+) -> None:
+    """Make a dataset of the frames of BMFR (Koskela et al. 2019) or of Noisebase (Balint et al. 2023)."""
+    from datasets.bmfr_files import import_bmfr
+    from datasets.noisebase_files import import_noisebase
 
-
-def import_bmfr(source: Imported, data: Path = Path("data/bmfr")) -> None:
-    """Make a dataset of the scenes of BMFR (Koskela et al. 2019): 1280 x 720, 60 frames of 1 spp.
-
-    Args:
-        data: the dataset to write.
-    """
-    from datasets.bmfr_files import import_bmfr as make
-
-    print(f"{data}: {make(source, data)} clips")
-
-
-def import_noisebase(source: Imported, data: Path = Path("data/noisebase"), spp: int = 2) -> None:
-    """Make a dataset of the test sequences of Noisebase (Balint et al. 2023): 1920 x 1024.
-
-    Args:
-        data: the dataset to write.
-        spp: how many samples per pixel to use.
-    """
-    from datasets.noisebase_files import import_noisebase as make
-
-    print(f"{data}: {make(source, data, spp)} clips")
+    folder = data_folder(data, files)
+    clips = import_bmfr(source, folder) if files == "bmfr" else import_noisebase(source, folder, spp)
+    print(f"{folder}: {clips} clips")
 
 
 def benchmark_list(scenes: Annotated[Path | None, arg(metavar="DIR", help="say which are there")] = None) -> None:
@@ -409,12 +398,7 @@ Commands = dict[str, "Command | Commands"]
 
 GROUPS: dict[str, Commands] = {
     "Pipeline": {"preview": preview, "dataset": dataset, "train": train, "eval": evaluate, "report": report},
-    "Datasets": {
-        "info": info,
-        "verify": verify,
-        "exr": exr,
-        "import": {"bmfr": import_bmfr, "noisebase": import_noisebase},
-    },
+    "Datasets": {"info": info, "verify": verify, "exr": exr, "import": import_},
     "Your own frames": {"denoise": denoise, "weights": weights, "export": export},
     "Comparisons": {
         "show": show,
@@ -434,7 +418,6 @@ MARGIN = 14  # characters left of the summaries
 SUMMARIES = {
     "bench": "Measure speed and memory of denoisers, and their lag after a light changes.",
     "benchmark": "Compare denoisers on scenes and data of other people.",
-    "import": "Make datasets of other people's files.",
 }
 
 

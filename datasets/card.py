@@ -13,39 +13,7 @@ from files import write_file
 
 CARD_FILE = "card.json"
 PAGE_FILE = "README.md"
-
-PAGE = """# {profile}, seed {seed}
-
-{clips} clips of animated scenes, rendered for denoising: noisy frames with few samples per pixel, references in two
-independent sample buffers, and what the primary rays hit (albedo, normals, depth, motion, cameras). {bytes} bytes.
-`card.json` has all of this page for programs.
-
-- Made by `{command}`, with {versions}; generator version {generator}.{reads}
-- Rendering options: {options}.
-- Licence: {licence}.{notes}
-
-## Splits
-
-{splits}
-
-*floor_db*: PSNR in dB of the reference's own noise, as displayed, on average over the clips and in the worst one.
-
-## Channels
-
-{channels}
-
-Clips in which mirrors or smooth glass are visible also have `mirrored_albedo` and so on, the same channels of what
-these show; clips with glass also `second_albedo` and so on, of its second layer.
-
-Axes: F frames, S noise realisations, H rows, W columns, M meshes. How a channel is stored, if it is constant or derived
-from others: `clip.json` of each clip.
-
-## Clips
-
-{rows}
-
-*crc32* is the checksum of the clip's `clip.json`, which contains those of all channels.
-"""
+PAGE_TEXT = Path(__file__).with_suffix(".md")  # with names in braces
 
 
 def write_card(dataset: Dataset) -> None:
@@ -130,7 +98,7 @@ def page_of(card: dict[str, Any]) -> str:
         for name, channel in card["channels"].items()
     ]
     rows = [{"clip": name, **clip} for name, clip in card["clips"].items()]
-    return PAGE.format(
+    return PAGE_TEXT.read_text().format(
         **{key: card[key] for key in ("profile", "seed", "command", "generator", "licence", "bytes")},
         clips=len(card["clips"]),
         versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),

@@ -194,11 +194,6 @@ def ages(*names: str) -> str:
     return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
 
 
-def value(metric: str, denoiser: str, scene: str = "mean") -> str:
-    """One number."""
-    return next(row.text(metric) for row in rows_of(scene) if row.denoiser == denoiser)
-
-
 def shipped(metric: str, denoiser: str, network: str = "one") -> str:
     """A mean from the card of a network."""
     rows = read_json(measured_file(network))["means"]
@@ -228,12 +223,6 @@ def times() -> str:
         for row in rows
     ]
     return table(lines)
-
-
-def ratio(denoiser: str) -> str:
-    """The time of a denoiser as a multiple of the baseline's."""
-    ms = {row["denoiser"]: row["ms_median"] for row in timed_rows()}
-    return f"{ms[denoiser] / ms[BASELINE]:.2f}"
 
 
 def samples() -> str:
@@ -302,8 +291,7 @@ def minutes(what: str) -> str:
 
 
 GENERATORS: dict[str, Callable[..., str]] = {
-    f.__name__: f
-    for f in (ages, clip, quality, value, shipped, times, ratio, samples, front, glass, stress, device, size, minutes)
+    f.__name__: f for f in (ages, clip, quality, shipped, times, samples, front, glass, stress, device, size, minutes)
 }
 
 
