@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from render.backend import mi
-from render.scene_file.convert import Converter
+from render.scene_file.convert import SceneFile
 from render.scene_file.xml import ParsedFile
 from tests.helpers.scene_files import BALL, LOOK, SKY, old_xml, own, painted
 
@@ -234,7 +234,7 @@ def test_it_is_honoured_or_listed(folder, name):
 def described(folder: Path, content: str) -> dict[str, dict]:
     """What is made of the first object of each kind: its dictionary, without nested ones but colours."""
     (folder / "scene.xml").write_text(content)
-    file = Converter(folder / "scene.xml").convert()
+    file = SceneFile(folder / "scene.xml")
     return {"bsdf": file.shapes[0].bsdf or {}, "light": file.lights[0].emitter, "sensor": file.sensor or {}}
 
 
@@ -267,5 +267,5 @@ def test_included_files_are_upgraded_too(tmp_path):
     cube = shape("cube", '<ref id="a"/>', place)
     (tmp_path / "scene.xml").write_text(old_xml('<include filename="part.xml"/>', cube))
     assert ParsedFile(tmp_path / "scene.xml").notes == []
-    notes = Converter(tmp_path / "scene.xml").convert().notes
+    notes = SceneFile(tmp_path / "scene.xml").notes
     assert notes == ["gone.png (part.xml line 2): the file gone.png is missing: grey instead of this texture"]
