@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, field
 from msgspec.structs import asdict
 from numpy.typing import ArrayLike
 
@@ -63,7 +63,7 @@ class LightChange(Table):
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
 
-class Split(Table, frozen=True):
+class Split(Table):
     """The clips of a split, and how they are sampled."""
 
     clips: Count = 1
@@ -74,21 +74,21 @@ class Split(Table, frozen=True):
     most_spp: Even = 4096
 
 
-class TrainSplit(Split, frozen=True):
+class TrainSplit(Split):
     clips: Count = 4
     realisations: Positive = 4
     reference_spp: Even = 128
 
 
-class TestSplit(Split, frozen=True):
+class TestSplit(Split):
     floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = 35.0
     most_spp: Even = 2048
 
 
-class Splits(Table, frozen=True):
-    train: TrainSplit = TrainSplit()
-    val: Split = Split()
-    test: TestSplit = TestSplit()
+class Splits(Table):
+    train: TrainSplit = field(default_factory=TrainSplit)
+    val: Split = field(default_factory=Split)
+    test: TestSplit = field(default_factory=TestSplit)
 
 
 class Description(Table):
@@ -99,7 +99,7 @@ class Description(Table):
     camera: list[CameraKey] = []
     motion: list[Motion] = []
     light: list[LightChange] = []
-    splits: Splits = Splits()
+    splits: Splits = field(default_factory=Splits)
 
 
 def read_description(path: Path) -> Description:
@@ -111,7 +111,8 @@ def read_description(path: Path) -> Description:
     except (msgspec.DecodeError, ValueError) as error:
         raise BadInput(f"{path}: {error}; docs/scenes.md lists its keys") from None
     all_keys: list[Sequence[CameraKey | PoseKey | GainKey]] = [described.camera]
-    all_keys += [moving.keyframes for moving in (*described.motion, *described.light)]
+    all_keys += [motion.keyframes for motion in described.motion]
+    all_keys += [change.keyframes for change in described.light]
     for times in ([key.time for key in keys] for keys in all_keys):
         if times != sorted(set(times)):
             raise BadInput(f"{path}: the times {times} of keyframes do not increase: put them in order, each time once")

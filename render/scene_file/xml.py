@@ -188,7 +188,7 @@ class ParsedFile:
         usual_folders = mi.file_resolver()  # type: ignore[operator]
         folders = mi.FileResolver(usual_folders)
         folders.prepend(str(self.path.parent))
-        mi.set_file_resolver(folders)
+        mi.set_file_resolver(folders)  # type: ignore[operator]
         try:
             root = self.read(self.path)
             self.notes = upgrade(root, self.path.parent)
@@ -200,7 +200,7 @@ class ParsedFile:
         except (RuntimeError, ValueError) as error:
             raise BadInput(f"{self.path} cannot be read: {self.reason(error)}") from None
         finally:
-            mi.set_file_resolver(usual_folders)
+            mi.set_file_resolver(usual_folders)  # type: ignore[operator]
 
     def read(self, file: Path, depth: int = 0) -> LocatedElement:
         """The root of `file`, with the content of included files of its version in place."""
