@@ -24,8 +24,8 @@ def installed_llvms() -> list[tuple[int, str]]:
     with suppress(OSError):  # no ldconfig (musl, macOS): the folders below remain
         listing = subprocess.run(["/sbin/ldconfig", "-p"], capture_output=True, text=True).stdout
     paths = [line.rsplit("=> ", 1)[-1] for line in listing.splitlines() if "libLLVM" in line]
-    for folder in ("usr/lib/llvm-*/lib", "usr/lib64", "opt/homebrew/opt/llvm*/lib"):
-        paths += [str(path) for path in Path("/").glob(f"{folder}/libLLVM*")]
+    for usual in ("usr/lib/llvm-*/lib", "usr/lib64", "opt/homebrew/opt/llvm*/lib"):
+        paths += [str(path) for path in Path("/").glob(f"{usual}/libLLVM*")]
     found = []
     for path in paths:
         # The version is part of the resolved name (libLLVM-18.so.1, libLLVM.so.19.1) or of its folder (llvm-19).

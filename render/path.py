@@ -172,8 +172,7 @@ class PathTracer:
         max_events = self.stage.max_events(self.blurred is not None)
         numbers = (seed, first, spp, self.stage.scene.max_depth, max_events)
         data = [dr.opaque(mi.UInt32, number) for number in numbers]
-        arguments = (ray, pixel, *data, self.draw, self.blurred, splits)
-        return self.stage.replay(sample_mean, *arguments, freezes=self.freezes)
+        return self.stage.replay(sample_mean, ray, pixel, *data, self.draw, self.blurred, splits, freezes=self.freezes)
 
     def radiance(
         self, ray: mi.Ray3f, seed: int, spp: int, first: int = 0, splits: bool = False

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, field
 from msgspec.structs import asdict
 from numpy.typing import ArrayLike
 
@@ -63,7 +63,7 @@ class LightChange(Table, frozen=True):
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
 
-class Split(Table, frozen=True):
+class Split(Table):
     """The clips of a split, and how they are sampled."""
 
     clips: Count = 1
@@ -74,22 +74,22 @@ class Split(Table, frozen=True):
     most_spp: Even = 4096
 
 
-class TrainSplit(Split, frozen=True):
+class TrainSplit(Split):
     clips: Count = 4
     realisations: Positive = 4
     reference_spp: Even = 128
 
 
-class TestSplit(Split, frozen=True):
+class TestSplit(Split):
     floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = 35.0
     most_spp: Even = 2048
     judged: tuple[Count, ...] = ()  # the frames that get a reference; by default all
 
 
-class Splits(Table, frozen=True):
-    train: TrainSplit = TrainSplit()
-    val: Split = Split()
-    test: TestSplit = TestSplit()
+class Splits(Table):
+    train: TrainSplit = field(default_factory=TrainSplit)
+    val: Split = field(default_factory=Split)
+    test: TestSplit = field(default_factory=TestSplit)
 
 
 class Description(Table, frozen=True):
@@ -100,7 +100,7 @@ class Description(Table, frozen=True):
     camera: list[CameraKey] = []
     motion: list[Motion] = []
     light: list[LightChange] = []
-    splits: Splits = Splits()
+    splits: Splits = field(default_factory=Splits)
 
 
 def read_description(path: Path) -> Description:
