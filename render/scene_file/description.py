@@ -24,11 +24,11 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame
 Even = Annotated[int, Meta(ge=2, multiple_of=2)]
 
 
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Table(msgspec.Struct, forbid_unknown_fields=True):
     """A table of the TOML."""
 
 
-class CameraKey(Table, frozen=True):
+class CameraKey(Table):
     """The camera at a time; `fov` is horizontal, in degrees."""
 
     time: Fraction
@@ -38,7 +38,7 @@ class CameraKey(Table, frozen=True):
     fov: Annotated[float, Meta(gt=0, lt=180)] | None = None
 
 
-class PoseKey(Table, frozen=True):
+class PoseKey(Table):
     """The pose of a shape at a time, relative to the file; rotations in degrees about x, then y, then z."""
 
     time: Fraction
@@ -46,19 +46,19 @@ class PoseKey(Table, frozen=True):
     rotation: Vector = (0.0, 0.0, 0.0)
 
 
-class GainKey(Table, frozen=True):
+class GainKey(Table):
     """The brightness of a light at a time, relative to the file."""
 
     time: Fraction
     gain: Annotated[float, Meta(ge=0, le=LARGEST)]
 
 
-class Motion(Table, frozen=True):
+class Motion(Table):
     shape: str
     keyframes: Annotated[list[PoseKey], Meta(min_length=1)]
 
 
-class LightChange(Table, frozen=True):
+class LightChange(Table):
     light: str
     keyframes: Annotated[list[GainKey], Meta(min_length=1)]
 
@@ -92,7 +92,7 @@ class Splits(Table):
     test: TestSplit = field(default_factory=TestSplit)
 
 
-class Description(Table, frozen=True):
+class Description(Table):
     file: str  # a Mitsuba XML, glTF, OBJ or PLY; relative to the TOML
     resolution: tuple[Positive, Positive] = (256, 144)  # width, height
     frames: Positive = 16
