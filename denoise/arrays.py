@@ -15,7 +15,7 @@ from errors import BadInput
 from scenes.camera import View
 
 CAMERA = "camera"
-COMPONENTS = {"depth": 1, "distance": 1, "roughness": 1, "motion": 2}  # of others 3
+COMPONENTS = {"depth": 1, "distance": 1, "roughness": 1, "id": 1, "motion": 2}  # of others 3
 
 Quantities = Mapping[str, NDArray[np.floating] | View]  # of one frame
 
