@@ -146,7 +146,7 @@ def relu(line: Row, sums: Row) -> None:
 
 
 # Of one item of models.networks.one.PixelInputs: noisy, mean_3x3, mean_9x9, deviation, history, has_history.
-PixelArrays: TypeAlias = tuple[Image, Image, Image, Image, Image, Image]
+PixelArrays: TypeAlias = tuple[Image, ...]
 # Of one item: albedo, normal, depth, roughness; exposure times the frame's gain (3), samples (1), to_view (3, 3), depth
 # scale (1).
 SurfaceArrays: TypeAlias = tuple[Image, Image, Image, Image, Row, Row, Matrix, Row]
@@ -285,7 +285,7 @@ def lerp(line: Row, past: Row, new: Row, alpha: Row) -> None:
 
 # Of one item of models.networks.one.Decoded: features, sharpness, centre and importance in one, alpha, latent,
 # accumulated, length.
-DecodedArrays: TypeAlias = tuple[Image, Image, Image, Image, Image, Image, Image]
+DecodedArrays: TypeAlias = tuple[Image, ...]
 
 
 @jit_in_any_order
