@@ -40,6 +40,11 @@ class Mixture(NamedTuple):
     sided: bool = False
 
 
+def depth_of(tree: Material | Mixture) -> int:
+    """Of mixtures within each other."""
+    return 1 + max(depth_of(tree.first), depth_of(tree.second)) if isinstance(tree, Mixture) else 0
+
+
 def constant(value: float) -> mi.Texture:
     return mi.load_dict({"type": "uniform", "value": value})
 
@@ -231,44 +236,53 @@ def may_be_mirror(bsdf: mi.BSDF, material: Material | Mixture) -> bool:
 
 
 class MaterialTable:
-    """The materials of BSDFs: columns with a row for each BSDF, by its registry index, and each part of a mixture."""
+    """The materials of BSDFs: columns with a row for each, found by its registry index."""
 
     def __init__(self, bsdfs: Mapping[int, mi.BSDF]):
-        unused = constant(0)
-        self.blank = Material(unused, unused, unused, UNSCALED)  # never evaluated
-        self.rows: list[tuple[Any, ...]] = []  # of a Material, weight, rows of both parts, sided
-        self.depth = 0  # of mixtures within each other
+        # Keeps objects alive, which pointers do not.
+        self.materials: list[Material] = []
+        self.mixtures: dict[int, tuple[mi.Texture, int, int, bool]] = {}  # by row: weight, rows of both, sided
         trees = [material_of(bsdf) for bsdf in bsdfs.values()]
-        rows = {index: self.add(tree) for index, tree in zip(bsdfs, trees, strict=True)}
+        self.depth = max(map(depth_of, trees), default=0)
+        rows = [self.add(tree) for tree in trees]
         self.transmits = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs.values())
         self.has_mirrors = any(map(may_be_mirror, bsdfs.values(), trees))
         if not rows:
-            self.add(self.blank)  # an empty scene needs a row too
-        self.row = registry_table(mi.UInt32, rows)
-        by_column = map(list, zip(*self.rows, strict=True))
-        base, roughness, metallic, scale, f0, squared, internal, weight, first, second, sided = by_column
-        self.base, self.roughness, self.metallic, self.weight = map(mi.TexturePtr, (base, roughness, metallic, weight))
+            self.add(Material(constant(1), constant(1), constant(0), UNSCALED))  # an empty scene needs a row too
+        table = np.zeros(max(bsdfs, default=0) + 1, np.uint32)
+        table[list(bsdfs)] = rows
+        self.row = mi.UInt32(table)
+        base, roughness, metallic, scale, f0, squared, internal = zip(*self.materials, strict=True)
+        self.base, self.roughness, self.metallic = map(mi.TexturePtr, map(list, (base, roughness, metallic)))
         self.scale = mi.Color3f(np.stack(scale, axis=1))
-        self.f0, self.internal = (mi.Float(np.array(column, np.float32)) for column in (f0, internal))
-        self.squared, self.sided = mi.Bool(squared), mi.Bool(sided)
-        self.first, self.second = mi.UInt32(first), mi.UInt32(second)
+        self.f0 = mi.Float(np.array(f0, np.float32))
+        self.squared = mi.Bool([*squared])
+        self.internal = mi.Float(np.array(internal, np.float32))
         self.saturates = any(internal)
-        columns = [self.base, self.roughness, self.metallic, self.scale, self.f0, self.squared, self.row]
-        columns += [self.internal, self.weight, self.first, self.second, self.sided]
+        # Rows that are no mixtures refer to themselves.
+        self.unweighted = constant(0)
+        mixtures = [self.mixtures.get(row, (self.unweighted, row, row, False)) for row in range(len(self.materials))]
+        weight, first, second, sided = zip(*mixtures, strict=True)
+        self.weight = mi.TexturePtr([*weight])
+        self.first, self.second, self.sided = mi.UInt32([*first]), mi.UInt32([*second]), mi.Bool([*sided])
+        self.columns = [self.base, self.roughness, self.metallic, self.scale, self.f0, self.squared, self.row]
+        self.columns += [self.internal, self.weight, self.first, self.second, self.sided]
         # As data: unevaluated arrays would be compiled into kernels as literals, with the number of rows.
-        dr.make_opaque(columns)
-        self.state = [base, roughness, metallic, weight, columns]  # all that kernels read; pointers keep nothing alive
+        dr.make_opaque(self.columns)
 
-    def add(self, tree: Material | Mixture, level: int = 0) -> int:
-        """Append a material, or a mixture and its parts, within so many other mixtures. Returns its row."""
-        self.depth = max(self.depth, level)
-        row = len(self.rows)
+    def state(self) -> list[Any]:
+        """All that kernels read of it."""
+        textures = [[each.base, each.roughness, each.metallic] for each in self.materials]
+        return [textures, [mixture[0] for mixture in self.mixtures.values()], self.unweighted, *self.columns]
+
+    def add(self, tree: Material | Mixture) -> int:
+        """Append a material, and those of a mixture. Returns its row."""
+        row = len(self.materials)
         if isinstance(tree, Material):
-            self.rows.append((*tree, self.blank.base, row, row, False))  # as a mixture of itself
+            self.materials.append(tree)
             return row
-        self.rows.append(())
-        parts = self.add(tree.first, level + 1), self.add(tree.second, level + 1)
-        self.rows[row] = (*self.blank, tree.weight, *parts, tree.sided)
+        self.materials.append(Material(constant(1), constant(1), constant(0), UNSCALED))  # never evaluated
+        self.mixtures[row] = (tree.weight, self.add(tree.first), self.add(tree.second), tree.sided)
         return row
 
     def evaluate(self, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
@@ -282,22 +296,29 @@ class MaterialTable:
         hit = si.is_valid()
         flags = si.bsdf().flags()
         faces = (si.wi.z > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
+        no_mirror = scatters(flags)
         albedo, alpha = self.evaluate(si, hit)
-        return hit & faces & ~scatters(flags) & (alpha < MAX_MIRROR_ALPHA), albedo, alpha
+        return hit & faces & ~no_mirror & (alpha < MAX_MIRROR_ALPHA), albedo, alpha
 
     def mixed(
         self, row: mi.UInt32, depth: int, si: mi.SurfaceInteraction3f, hit: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
         """(albedo, alpha) of a row with mixtures up to `depth` levels deep."""
+        if depth == 0:
+            return self.plain_material(row, si, hit)
+        weight = dr.gather(mi.TexturePtr, self.weight, row, hit).eval(si, hit).x
+        sided = dr.gather(mi.Bool, self.sided, row, hit)
+        weight = dr.select(sided, dr.select(si.wi.z < 0, 1, 0), dr.clip(weight, 0, 1))
+        first = self.mixed(dr.gather(mi.UInt32, self.first, row, hit), depth - 1, si, hit)
+        second = self.mixed(dr.gather(mi.UInt32, self.second, row, hit), depth - 1, si, hit)
+        return dr.lerp(first[0], second[0], weight), dr.lerp(first[1], second[1], weight)
+
+    def plain_material(self, row: mi.UInt32, si: mi.SurfaceInteraction3f, hit: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """(albedo, alpha) of a row that is no mixture."""
 
         def gather(column: ColumnT) -> ColumnT:
             return dr.gather(type(column), column, row, hit)
 
-        if depth > 0:
-            weight = gather(self.weight).eval(si, hit).x
-            weight = dr.select(gather(self.sided), dr.select(si.wi.z < 0, 1, 0), dr.clip(weight, 0, 1))
-            first, second = (self.mixed(gather(rows), depth - 1, si, hit) for rows in (self.first, self.second))
-            return dr.lerp(first[0], second[0], weight), dr.lerp(first[1], second[1], weight)
         base = gather(self.base).eval(si, hit)
         if self.saturates:
             internal = gather(self.internal)

@@ -11,15 +11,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import trimesh
-from trimesh.visual import TextureVisuals
 
 from render.backend import mi
-from render.loading import load_mesh
-from scenes.animation import Shape, Track
 from scenes.sky import SKY_SIZE
 
-MAX_BSDFS, MAX_TEXTURES, MAX_SHAPES, MAX_EMITTERS = 256, 1024, 256, 16
+MAX_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
 HALF_GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}
 
 
@@ -46,12 +42,20 @@ def materials() -> list[mi.BSDF]:
 
 def mesh(normals: bool, coordinates: bool, emits: bool) -> mi.Mesh:
     """Two triangles, because arrays of one entry are compiled differently."""
-    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
-    square = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "diffuse"})
+    if emits:
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": HALF_GREY})
+    square = mi.Mesh("palette", 4, 2, props=properties, has_vertex_normals=normals, has_vertex_texcoords=coordinates)
+    parameters = mi.traverse(square)
+    parameters["vertex_positions"] = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0, 1, 1, 0])
+    parameters["faces"] = mi.UInt32([0, 1, 2, 1, 3, 2])
+    if normals:
+        parameters["vertex_normals"] = mi.Float([0, 0, 1] * 4)
     if coordinates:
-        square.visual = TextureVisuals(uv=square.vertices[:, :2])
-    radiance = Track.constant([0.5, 0.5, 0.5]) if emits else None
-    return load_mesh(Shape("palette", square, {"type": "diffuse"}, radiance, smooth=normals))
+        parameters["vertex_texcoords"] = mi.Float([0, 0, 1, 0, 0, 1, 1, 1])
+    parameters.update()
+    return square
 
 
 @cache
@@ -63,8 +67,10 @@ def palette() -> list[object]:
     objects += [mesh(normals, uv, emits) for emits in flags for normals in flags for uv in flags]
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((*SKY_SIZE, 3), np.float32))}
     objects += [mi.load_dict({"type": "scene", "sky": sky})]  # a sky depends on the extent of its scene
-    objects += [mi.load_dict({"type": "diffuse"}) for _ in range(MAX_BSDFS)][-1:]
-    objects += [mi.load_dict({"type": "uniform", "value": 0.5}) for _ in range(MAX_TEXTURES)][-1:]
-    objects += [mesh(False, False, False) for _ in range(MAX_SHAPES)][-1:]
-    objects += [mi.load_dict({"type": "area", "radiance": HALF_GREY}) for _ in range(MAX_EMITTERS)][-1:]
-    return objects
+    fillers = {
+        "BSDF": lambda: mi.load_dict({"type": "diffuse"}),
+        "Texture": lambda: mi.load_dict({"type": "uniform", "value": 0.5}),
+        "Shape": lambda: mesh(False, False, False),
+        "Emitter": lambda: mi.load_dict({"type": "area", "radiance": HALF_GREY}),
+    }
+    return objects + [[fillers[name]() for _ in range(most)][-1] for name, most in MAX_OBJECTS.items()]

@@ -111,9 +111,6 @@ class Stage:
         self.has_instances = bool(loader.grouped)
         # Dr.Jit 1.5 cannot freeze textured area lights, and scenes without shapes while another scene is loaded.
         self.freezes = bool(self.shapes) and not any(has_texture(shape.emitter) for shape in scene.stock)
-        tables = [self.materials.state, self.specular, self.glass, self.mesh_id_of_shape]
-        # All that kernels read of it, and the palette, whose objects they may call.
-        self.state = [palette(), self.mitsuba_scene, self.lights, *tables]
         self.posed: dict[str, NDArray[np.float32]] = {}
         self.poses = 0  # how often something has changed
         self.recordings: dict[Callable[..., Any], Callable[..., Any]] = {}
@@ -141,12 +138,17 @@ class Stage:
         freezes = freezes and self.freezes
         if freezes and function not in self.recordings:
             own = proxy(self)  # Mitsuba cannot free a scene during a recording, when the collector of cycles might
-            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state)
+            frozen: Any = dr.freeze(lambda *arguments: function(own, *arguments), state_fn=lambda *_: own.state())
             finalize(self, frozen.clear)  # else recordings would keep the scene
             self.recordings[function] = frozen
         result = self.recordings[function](*arguments) if freezes else function(self, *arguments)
         dr.eval(result)
         return result
+
+    def state(self) -> list[Any]:
+        """All that kernels read of it, and the palette, whose objects they may call."""
+        tables = [self.materials.state(), self.specular, self.glass, self.mesh_id_of_shape]
+        return [palette(), self.mitsuba_scene, self.lights, *tables]
 
     def mesh_id(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         """The mesh id at a surface interaction: the shape's index + 1, or 0 for none."""

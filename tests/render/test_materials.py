@@ -172,7 +172,7 @@ def test_every_shape_has_its_own_material():
         {"type": "roughplastic", "alpha": 0.25, "diffuse_reflectance": rgb(0.5, 0.5, 0.5)},
         {"type": "diffuse", "reflectance": rgb(0.9, 0.8, 0.7)},
     ]
-    assert len(Stage(textured_square(kinds[0]), 2, 2).materials.rows) == 1
+    assert len(Stage(textured_square(kinds[0]), 2, 2).materials.materials) == 1
     base = textured_square(kinds[0])
     shapes = []
     for i, bsdf in enumerate(kinds):
