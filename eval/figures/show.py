@@ -14,8 +14,9 @@ from tqdm import tqdm
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, read_frame
-from datasets.tonemap import display, psnr
+from datasets.tonemap import psnr
 from errors import BadInput
+from eval.clip_run import as_displayed
 from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
@@ -66,11 +67,6 @@ def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
     for axis, name in zip(axes[:, 0], row_names, strict=True):
         axis.set_ylabel(name, fontsize=8)
     return figure
-
-
-def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
-    """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
 
 
 @dataclass
