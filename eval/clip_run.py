@@ -64,8 +64,6 @@ class NamedDenoiser:
 
 @dataclass
 class DenoiserRun:
-    """One denoiser's run through one clip."""
-
     evaluated: NamedDenoiser
     state: State | None = None
     before: Luminances | None = None

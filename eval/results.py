@@ -199,7 +199,6 @@ def by_clip(results: list[Result]) -> Iterator[ClipResults]:
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
-    """The clips of each signal, in the order of their first clips."""
     signals = dict.fromkeys(clip.signal for clip in clips)
     return {signal: [clip for clip in clips if clip.signal == signal] for signal in signals}
 
@@ -210,15 +209,11 @@ def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
 
 
 def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
-    """The results of one denoiser, clip by clip."""
     return [result for clip in clips for result in clip.results if result.denoiser == denoiser]
 
 
 def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """The content of results.json and the results of its rows, read from their folders.
-
-    Raises BadInput where files are missing or have changed since results.json was written.
-    """
+    """results.json and the results of its rows. Raises BadInput where files are missing or have changed since."""
     path = runs / "eval" / RESULTS_FILE
     if not path.exists():
         raise BadInput(f"there are no results at {path}: make them with `onespp eval --runs {runs}`")

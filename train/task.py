@@ -41,7 +41,6 @@ class Recipe:
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def frames(self, training: bool) -> int:
-        """Frames of a sequence, in training or in validation."""
         return self.trained or self.length if training else self.length
 
     def learning_rate(self, epoch: float) -> float:
@@ -55,8 +54,6 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, on what, and where that is kept."""
-
     name: str
     create: Callable[[], Denoiser]  # with fresh weights
     recipe: Recipe

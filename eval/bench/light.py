@@ -103,7 +103,6 @@ def lag_table(lags: Mapping[str, Lag]) -> str:
 
 
 def lag_figure(lags: Mapping[str, Lag]) -> Figure:
-    """PSNR of every frame, in a panel for each change."""
     size = (3 * len(BEFORE), 4)
     figure, axes = plt.subplots(1, len(BEFORE), figsize=size, dpi=DPI, layout="constrained", sharey=True)
     for axis, change in zip(axes, BEFORE, strict=True):

@@ -71,8 +71,6 @@ def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
 
 @dataclass
 class DenoiserView:
-    """One denoiser, its state, and its panels."""
-
     name: str
     denoiser: Denoiser
     state: State | None = None
@@ -109,10 +107,7 @@ class DenoiserView:
 
 
 def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[str, Denoiser]:
-    """`noisy`, and the named denoisers or all that have weights and whose channels the clip contains.
-
-    Raises BadInput where a named one is unknown, cannot run or has no weights.
-    """
+    """`noisy`, and the named denoisers or all that can run on the clip. Raises BadInput as `evaluated`."""
     ready = {"noisy": create("noisy")}
     for spec in evaluated(names, runs, budget):
         denoiser = spec.build()

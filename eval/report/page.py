@@ -127,7 +127,6 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, An
 
 
 def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float) -> str:
-    """The page's HTML."""
     times = times_of_first_size(runs)
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
     size = sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64

@@ -158,7 +158,6 @@ class StressCheck:
         return frames if frames <= RECOVERY_LIMIT else None
 
     def row(self, denoiser: str, weights: str | None) -> StressRow:
-        """The results under the denoiser's name, with the file of its weights."""
         errors = self.errors()
         finite_errors = torch.cat([error[torch.isfinite(error)] for error in errors])
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]
