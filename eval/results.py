@@ -33,7 +33,6 @@ FLOOR = "(noise floor)"  # their name in tables
 MAX_SHOWN_ERROR = 0.25  # of exposed radiance, white in error maps
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
-FRAMES_FILE = "frames.csv"
 KEYS = ("denoiser", "signal", "scene", "clip")
 
 
@@ -147,7 +146,7 @@ def write_results(
         "versions": versions(DENOISING),
         "rows": rows,
     }
-    write_frames(runs / "eval" / FRAMES_FILE, results)
+    write_frames(runs / "eval" / "frames.csv", results)
     write_json(runs / "eval" / RESULTS_FILE, content)
     return content
 
