@@ -174,7 +174,6 @@ class ClipResults:
 
     @property
     def file_name(self) -> str:
-        """Its name in those of files."""
         return signal_label(f"{self.scene}-{self.clip}", self.signal)
 
     @property

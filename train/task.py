@@ -23,8 +23,6 @@ def run_folder(runs: Path, name: str, budget: str) -> Path:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one network is trained."""
-
     loss: Loss
     rate: float  # Adam's learning rate, at the end of the ramp if there is one
     batch: int  # sequences a step

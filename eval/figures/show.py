@@ -80,7 +80,6 @@ class DenoiserView:
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
     def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
-        """Add the panels of `frame`, which was denoised to `output`."""
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
@@ -143,7 +142,6 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
 
 
 def grids_of(views: Sequence[DenoiserView], references: Column) -> dict[str, list[Column]]:
-    """The columns of each picture, by its name."""
     grids = {"sheet": [view.images for view in views]}
     if references:
         grids["sheet"].append(references)
