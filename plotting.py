@@ -3,8 +3,14 @@
 Importing this module raises BadInput where the extra `report` is not installed.
 """
 
+import base64
+import io
 import math
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from extras import requires_extra
 from files import replacing
@@ -31,6 +37,17 @@ SMALLEST_PANEL = 256  # px, the longer side of an image
 def enlargement(height: int, width: int, smallest: int = SMALLEST_PANEL) -> int:
     """The integer factor that makes the longer side of an image at least `smallest` pixels."""
     return max(1, math.ceil(smallest / max(height, width)))
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def webp_uri(image: NDArray[np.floating], **options: Any) -> str:
+    """A WebP, with Pillow's `options`, of an image (H, W, 3) or (H, W) in [0, 1]."""
+    buffer = io.BytesIO()
+    Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(buffer, "WEBP", **options)
+    return data_uri(buffer.getvalue(), "webp")
 
 
 def save_figure(path: Path, figure: Figure) -> None:

@@ -93,7 +93,6 @@ class Frame:
         return replace(self, channels=self.channels | dict(channels))
 
     def without(self, *kinds: Kind) -> "Frame":
-        """The frame without the channels of some kinds."""
         kept = {name: tensor for name, tensor in self.channels.items() if CHANNELS[name].kind not in kinds}
         return replace(self, channels=kept)
 

@@ -19,10 +19,7 @@ SecondsByStep = dict[str, float]
 
 
 def summarise(root: Path) -> str:
-    """Tables of clips (size, noise floor, render time), of channels (storage, savings) and of steps.
-
-    Raises BadInput where there is no data set at `root`.
-    """
+    """Tables of clips, of channels and of steps. Raises BadInput where there is no data set at `root`."""
     dataset = Dataset(root)
     rows: list[dict[str, object]] = []
     clips: list[Clip] = []

@@ -1,7 +1,4 @@
-"""Exposure and the display transform, for metrics and pictures only: they are no inputs of networks.
-
-`models.operators.image_luminance` is the luminance of tensors.
-"""
+"""Exposure and the display transform, for metrics and pictures only: they are no inputs of networks."""
 
 import math
 from typing import Any, TypeVar
@@ -17,7 +14,7 @@ ArrayOrTensor = TypeVar("ArrayOrTensor", bound=Any)
 
 
 def luminance(radiance: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Luminance (...,) of linear RGB (..., 3), by the weights of ITU-R BT.709."""
+    """Luminance (...,) of linear RGB (..., 3), by ITU-R BT.709; of tensors: models.operators.image_luminance."""
     return radiance @ np.array(LUMINANCE_WEIGHTS)
 
 

@@ -244,7 +244,6 @@ class SequenceDenoiser:
         return ErrorTable(self.job.out)
 
     def builder(self) -> FrameBuilder | OwnFrameBuilder:
-        """What makes the Frames of a shot."""
         if self.sources.is_ours:
             return OwnFrameBuilder(self.denoiser.reads)
         return FrameBuilder(self.analysis.conventions, self.denoiser.reads, str(self.first.path), self.job.spp)

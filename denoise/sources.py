@@ -87,10 +87,7 @@ def find_sources(images: Mapping[str, ExrImage], named: Mapping[str, str]) -> So
 
 
 def layer_of_pass(quantity: str, image: ExrImage) -> ExrLayer:
-    """The layer of a file with a single pass: one called like the quantity, or else its plain or first layer.
-
-    Raises BadInput where no layer has the components of the quantity.
-    """
+    """The layer in a file of one pass: called like the quantity, plain, or the first. Raises BadInput without."""
     channels = list(image.channels)
     fitting = fitting_layers(quantity, channels)
     usual = [layer for name in PASS_LAYERS for layer in fitting if normalised(layer.name) == name]

@@ -1,6 +1,6 @@
 """Runs of denoisers and of the reference through one clip, measured frame by frame."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
@@ -63,14 +64,12 @@ class NamedDenoiser:
 
 @dataclass
 class DenoiserRun:
-    """One denoiser's run through one clip."""
-
     evaluated: NamedDenoiser
     state: State | None = None
     before: Luminances | None = None
     frames: list[Values] = field(default_factory=list)
     nonfinite: int = 0
-    error: Tensor | None = None  # estimated for the last frame, (1, H, W), in exposed radiance
+    error: Tensor | None = None  # estimated for the last frame, (1, H, W), in radiance
 
     @property
     def name(self) -> str:
@@ -87,26 +86,21 @@ class DenoiserRun:
     def key(self, clip: Clip) -> str:
         return self.evaluated.key(clip)
 
-    def step(self, frame: Frame, reference_buffers: Tensor | None, exposure: float, still: bool) -> Tensor:
-        """Denoise one frame, and measure it where there is a reference. Returns the radiance (1, 3, H, W)."""
+    def radiance(self, frame: Frame, reference_buffers: Tensor | None) -> Tensor:
+        """The next frame denoised, (1, 3, H, W)."""
         denoiser = self.evaluated.denoiser
         moved = frame.to(denoiser.device)
         if self.evaluated.saves_error and isinstance(denoiser, JamesStein) and frame.has_buffers:
             output, self.state, estimate = denoise_with_error(denoiser, moved, self.state)
-            self.error = exposure * estimate.radiance_error().cpu().square().mean(dim=1).sqrt()
+            self.error = estimate.radiance_error().cpu().square().mean(dim=1).sqrt()
         else:
             output, self.state = denoiser(moved, self.state)
         output = output.cpu()
         self.nonfinite += int((~torch.isfinite(output)).any(dim=1).sum())
-        if reference_buffers is None:
-            self.frames.append({})
-            self.before = None
-            return output
-        mask = disoccluded(frame.motion, frame.dual_motion)
-        comparison = Comparison(output, reference_buffers, exposure, mask, self.before, still)
-        self.frames.append(measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)})
-        self.before = comparison.luminances
         return output
+
+    def values(self, comparison: Comparison) -> Values:
+        return measure(comparison) | {"temporal_error_floor": temporal_error_floor(comparison)}
 
     def result(self, clip: Clip) -> Result:
         precision = self.evaluated.spec.precision
@@ -146,21 +140,15 @@ class ReferenceRun:
     def key(self, clip: Clip) -> str:
         return result_key(clip, [__name__], {"name": self.name, "signal": self.signal})
 
-    def step(self, frame: Frame, reference_buffers: Tensor | None, exposure: float, still: bool) -> Tensor | None:
-        """Measure one frame's reference. Returns the radiance (1, 3, H, W); None where there is none."""
-        if reference_buffers is None:
-            self.frames.append({})
-            self.before = None
-            return None
-        reference = reference_buffers.mean(dim=0, keepdim=True)
-        mask = disoccluded(frame.motion, frame.dual_motion)
-        comparison = Comparison(reference, reference_buffers, exposure, mask, self.before, still)
-        crop = densest_crop(mask[0, 0])
-        if crop:
+    def radiance(self, frame: Frame, reference_buffers: Tensor | None) -> Tensor | None:
+        """The frame's reference (1, 3, H, W); None where there is none."""
+        return None if reference_buffers is None else reference_buffers.mean(dim=0, keepdim=True)
+
+    def values(self, comparison: Comparison) -> Values:
+        assert comparison.disoccluded is not None
+        if crop := densest_crop(comparison.disoccluded[0, 0]):
             self.crops.append({"frame": len(self.frames)} | crop)
-        self.frames.append(noise_floors(comparison))
-        self.before = comparison.luminances
-        return reference
+        return noise_floors(comparison)
 
     def result(self, clip: Clip) -> Result:
         return result_of(self, clip, mean_floor(self.frames), crops=self.crops)
@@ -193,13 +181,43 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
     still = is_still(clip)
     for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False, disable=quiet):
         frame = read_frame(clip, index, channels)
+        hidden = disoccluded(frame.motion, frame.dual_motion)
         judged = signals if index in clip.judged else set()
         buffers = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in judged}
         for folder, run in runs.items():
-            output = run.step(frame, buffers.get(run.signal), clip.exposure, still)
-            if output is None or not judged:
+            reference = buffers.get(run.signal)
+            output = run.radiance(frame, reference)
+            if output is None or reference is None:
+                run.frames.append({})
+                run.before = None
                 continue
-            image = display(finite(output), clip.exposure)
-            save_picture(picture_path(folder, index), image[0].permute(1, 2, 0).numpy())
+            comparison = Comparison(output, reference, clip.exposure, hidden, run.before, still)
+            run.frames.append(run.values(comparison))
+            run.before = comparison.luminances
+            save_picture(picture_path(folder, index), as_displayed(output, clip.exposure))
             if isinstance(run, DenoiserRun) and run.error is not None:
-                save_picture(picture_path(folder, index, "error-"), (run.error[0].numpy() / MAX_SHOWN_ERROR).clip(0, 1))
+                error = (clip.exposure * run.error)[0].numpy() / MAX_SHOWN_ERROR
+                save_picture(picture_path(folder, index, "error-"), error.clip(0, 1))
+
+
+def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
+    """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
+    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
+
+
+def play(
+    clip: Clip, denoisers: Sequence[Denoiser], also: Sequence[str] = ()
+) -> Iterator[tuple[int, Frame, list[Tensor]]]:
+    """The number of each frame of a clip, the frame, and its radiance (1, 3, H, W) by each denoiser, on the CPU.
+
+    Frames have the channels that any of the denoisers reads, and those in `also`.
+    """
+    channels = sorted({*also, *(channel for denoiser in denoisers for channel in denoiser.reads)})
+    states: list[State | None] = [None] * len(denoisers)
+    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
+        frame = read_frame(clip, index, channels)
+        outputs = []
+        for place, denoiser in enumerate(denoisers):
+            output, states[place] = denoiser(frame.to(denoiser.device), states[place])
+            outputs.append(output.cpu())
+        yield index, frame, outputs

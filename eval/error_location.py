@@ -12,11 +12,11 @@ import torch
 from tabulate import tabulate
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from datasets.frame import Frame, Signal, read_frame, to_tensor
+from datasets.frame import Frame, Signal, to_tensor
 from datasets.tonemap import display
+from eval.clip_run import play
 from eval.selection import evaluated
 from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
@@ -92,23 +92,17 @@ def normalised(sums: Shares) -> Shares:
 def error_shares(clip: Clip, specs: Sequence[DenoiserSpec]) -> dict[str, Shares]:
     """Shares of the pixels, as "pixels", and of each denoiser's squared error, in the judged frames of a clip."""
     denoisers = {spec.name: spec.build() for spec in specs}
-    states = dict.fromkeys(denoisers)
-    channels = sorted({*PLACE_CHANNELS, *(name for denoiser in denoisers.values() for name in denoiser.reads)})
     signals: set[Signal] = {"total", *(denoiser.signal for denoiser in denoisers.values())}
     sums: dict[str, Shares] = {name: defaultdict(lambda: torch.zeros(())) for name in ("pixels", *denoisers)}
-    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame", leave=False):
-        frame = read_frame(clip, index, channels)
-        outputs = {}
-        for name, denoiser in denoisers.items():
-            outputs[name], states[name] = denoiser(frame.to(denoiser.device), states[name])
+    for index, frame, outputs in play(clip, [*denoisers.values()], PLACE_CHANNELS):
         if index not in clip.judged:
             continue
         references = {signal: to_tensor(clip.reference(index, signal), has_buffers=True)[0] for signal in signals}
         buffers = {signal: display(pair, clip.exposure).double() for signal, pair in references.items()}
         masks = places(frame, buffers["total"].mean(dim=0, keepdim=True))
-        for name, output in outputs.items():
-            shown = display(finite(output.cpu()), clip.exposure).double()
-            for key, error in squared_errors(shown, buffers[denoisers[name].signal], masks).items():
+        for (name, denoiser), output in zip(denoisers.items(), outputs, strict=True):
+            shown = display(finite(output), clip.exposure).double()
+            for key, error in squared_errors(shown, buffers[denoiser.signal], masks).items():
                 sums[name][key] = sums[name][key] + error
         for key, mask in masks.items():
             sums["pixels"][key] = sums["pixels"][key] + mask.sum()

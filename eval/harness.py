@@ -67,7 +67,6 @@ def runs_through(clip: Clip, denoisers: Sequence[NamedDenoiser], runs: Path) -> 
 
 
 def unfinished(clip: Clip, all_runs: dict[Path, Run]) -> dict[Path, Run]:
-    """Those of the runs whose results are not complete."""
     return {folder: run for folder, run in all_runs.items() if not is_finished(folder, run.key(clip))}
 
 

@@ -65,10 +65,7 @@ def local_mean(images: Tensor) -> Tensor:
 
 
 def ssim(x: Tensor, y: Tensor) -> float | None:
-    """Structural similarity (Wang et al. 2004), the mean over windows and RGB of displayed images (B, 3, H, W).
-
-    None for images smaller than a window.
-    """
+    """SSIM (Wang et al. 2004), the mean over windows and RGB of displayed images (B, 3, H, W); None if too small."""
     if min(x.shape[-2:]) < WINDOW:
         return None
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (local_mean(image) for image in (x, y, x * x, y * y, x * y))
@@ -262,7 +259,6 @@ METRICS = {
 
 
 def measure(comparison: Comparison) -> Values:
-    """The values of all metrics for one frame."""
     return {name: metric.of(comparison) for name, metric in METRICS.items()}
 
 

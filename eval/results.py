@@ -33,7 +33,6 @@ FLOOR = "(noise floor)"  # their name in tables
 MAX_SHOWN_ERROR = 0.25  # of exposed radiance, white in error maps
 RESULT_FILE = "result.json"
 RESULTS_FILE = "results.json"
-FRAMES_FILE = "frames.csv"
 KEYS = ("denoiser", "signal", "scene", "clip")
 
 
@@ -147,7 +146,7 @@ def write_results(
         "versions": versions(DENOISING),
         "rows": rows,
     }
-    write_frames(runs / "eval" / FRAMES_FILE, results)
+    write_frames(runs / "eval" / "frames.csv", results)
     write_json(runs / "eval" / RESULTS_FILE, content)
     return content
 
@@ -175,7 +174,6 @@ class ClipResults:
 
     @property
     def file_name(self) -> str:
-        """Its name in those of files."""
         return signal_label(f"{self.scene}-{self.clip}", self.signal)
 
     @property
@@ -199,7 +197,6 @@ def by_clip(results: list[Result]) -> Iterator[ClipResults]:
 
 
 def by_signal(clips: Sequence[ClipResults]) -> dict[Signal, list[ClipResults]]:
-    """The clips of each signal, in the order of their first clips."""
     signals = dict.fromkeys(clip.signal for clip in clips)
     return {signal: [clip for clip in clips if clip.signal == signal] for signal in signals}
 
@@ -210,15 +207,11 @@ def of_one_spp(clips: Sequence[ClipResults]) -> list[ClipResults]:
 
 
 def results_of(clips: Sequence[ClipResults], denoiser: str) -> list[Result]:
-    """The results of one denoiser, clip by clip."""
     return [result for clip in clips for result in clip.results if result.denoiser == denoiser]
 
 
 def read_results(runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
-    """The content of results.json and the results of its rows, read from their folders.
-
-    Raises BadInput where files are missing or have changed since results.json was written.
-    """
+    """results.json and the results of its rows. Raises BadInput where files are missing or have changed since."""
     path = runs / "eval" / RESULTS_FILE
     if not path.exists():
         raise BadInput(f"there are no results at {path}: make them with `onespp eval --runs {runs}`")

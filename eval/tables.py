@@ -121,7 +121,6 @@ class TableRow:
         return mark + value_cell(metric, value)
 
     def near(self, metric: str) -> bool:
-        """Whether the value is within its noise floor."""
         return not self.is_floor and within_floor(metric, self.values.get(metric), self.floors.get(metric))
 
 

@@ -12,14 +12,14 @@ import torch
 from datasets.clip import Clip
 from datasets.frame import read_frame
 from provenance import code_digest, versions
-from train.protocols import A, FilteringNetwork
+from train.protocols import AccumulatingState, FilteringNetwork
 
 ACCUMULATION_PACKAGES = ("torch", "numpy", "numba")  # that accumulation computes with
 IRRADIANCE_FILE = "irradiance.npy"
 SCALE_FILE = "scale.npy"
 
 
-def accumulation_digest(network: FilteringNetwork[A]) -> str:
+def accumulation_digest(network: FilteringNetwork) -> str:
     """16 hexadecimal digits that identify the code and the packages that accumulate for a network."""
     module = type(network).accumulate.__module__
     everything = [code_digest("train.accumulation", module), versions(ACCUMULATION_PACKAGES)]
@@ -27,7 +27,7 @@ def accumulation_digest(network: FilteringNetwork[A]) -> str:
 
 
 @torch.no_grad()
-def accumulate_clip(clip: Clip, network: FilteringNetwork[A], cache: Path) -> Path:
+def accumulate_clip(clip: Clip, network: FilteringNetwork, cache: Path) -> Path:
     """Accumulate all realisations of a clip, unless `cache` has the result already. Returns its folder.
 
     It contains irradiance.npy (F, S, H, W, 3) and scale.npy (F, S, 2), logarithms of luminance and depth; float32. Its
@@ -50,10 +50,10 @@ def accumulate_clip(clip: Clip, network: FilteringNetwork[A], cache: Path) -> Pa
     return folder
 
 
-def write_accumulated(clip: Clip, network: FilteringNetwork[A], folder: Path) -> None:
+def write_accumulated(clip: Clip, network: FilteringNetwork, folder: Path) -> None:
     shape = (clip.frames, clip.realisations, clip.height, clip.width, 3)
     scale = np.zeros((*shape[:2], 2), np.float32)
-    states: list[A | None] = [None] * clip.realisations
+    states: list[AccumulatingState | None] = [None] * clip.realisations
     # Written, not mapped: on a full disk a map ends the process, and a write raises an error.
     with (folder / IRRADIANCE_FILE).open("wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}

@@ -88,11 +88,9 @@ class Draw:
     edge: LightEdge | None
 
     def realisations(self, time: int) -> list[int]:
-        """The realisations of frame `time` of the sequence."""
         return [self.deal[(self.together * time + i) % len(self.deal)] for i in range(self.together)]
 
     def apply(self, frame: Frame, time: int) -> Frame:
-        """Frame `time` of the sequence, augmented."""
         if self.edge is not None:
             frame = lit(frame, self.edge.light(time, *frame.size))
         for _ in range(self.turns):

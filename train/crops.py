@@ -14,24 +14,20 @@ from datasets.clip import Clip
 from datasets.frame import Frame, read_frame, to_tensor
 from models.history.running_scale import RunningMean, RunningScale
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
-from train.protocols import A, FilteringNetwork
+from train.protocols import FilteringNetwork
 from train.sequences import Batch, check_fits, random_window
 
 
 class Crops:
-    """A batch of crops: frames, accumulated irradiance (B, 3, h, w), and logarithms of luminance and depth (B, 2).
-
-    Not a dataclass, whose fields Fabric would convert.
-    """
+    """A batch of crops. It is not a dataclass, because Fabric converts the fields of those."""
 
     def __init__(self, frame: Frame, irradiance: Tensor, log_scale: Tensor):
         self.frame = frame
-        self.irradiance = irradiance
-        self.log_scale = log_scale
+        self.irradiance = irradiance  # accumulated, (B, 3, h, w)
+        self.log_scale = log_scale  # logarithms of luminance and depth, (B, 2), of the sequences of the crops
 
     @property
     def scale(self) -> RunningScale:
-        """The running scales of the sequences that the crops are of."""
         return RunningScale(*(RunningMean(value, torch.ones_like(value)) for value in self.log_scale.unbind(dim=1)))
 
     def to(self, device: torch.device | str) -> "Crops":
@@ -49,7 +45,7 @@ class AccumulatedCrops:
     """
 
     def __init__(
-        self, clips: Sequence[Clip], network: FilteringNetwork[A], count: int, crop: int | None, seed: int, cache: Path
+        self, clips: Sequence[Clip], network: FilteringNetwork, count: int, crop: int | None, seed: int, cache: Path
     ):
         check_fits(clips, 1, crop)
         cache.mkdir(parents=True, exist_ok=True)
@@ -81,7 +77,6 @@ class AccumulatedCrops:
         return Crops(frame, irradiance, log_scale)
 
     def batch(self, numbers: Sequence[int]) -> Crops:
-        """One batch of the items with these numbers."""
         crops = [self[number] for number in numbers]
         irradiance = torch.cat([crop.irradiance for crop in crops])
         log_scale = torch.cat([crop.log_scale for crop in crops])

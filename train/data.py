@@ -20,10 +20,7 @@ PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, by 
 
 
 def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool, seed: int, cache: Path) -> Items:
-    """The training or validation items of `clips`. Accumulated frames are kept in the folder `cache`.
-
-    Raises BadInput where a clip is too short or too small for the recipe.
-    """
+    """The items of `clips`; accumulated frames are kept in `cache`. Raises BadInput as `check_fits`."""
     if recipe.crops:
         assert isinstance(denoiser, FilteringNetwork)
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
@@ -39,10 +36,7 @@ def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:
 
 
 def equal_parts(count: int, largest: int) -> list[range]:
-    """The fewest equal parts of range(count) of at most `largest`.
-
-    Equal, so that the mean of their means is the mean of all.
-    """
+    """The fewest parts of range(count) of at most `largest`; equal, for the mean of their means to be that of all."""
     parts = next(n for n in range(1, count + 1) if count % n == 0 and count // n <= largest)
     return [range(i, i + count // parts) for i in range(0, count, count // parts)]
 

@@ -86,17 +86,13 @@ class Log:
                 plt.imsave(temporary, image.permute(1, 2, 0).numpy(), format="png")
 
     def close(self) -> None:
-        """Flush TensorBoard's log."""
         if self.board:
             self.board.close()
 
 
 @torch.no_grad()
 def sample_picture(denoiser: Denoiser, clip: Clip, device: torch.device) -> Tensor:
-    """Noisy, output, reference and amplified difference side by side as displayed, (3, H, 4 W), of one frame.
-
-    The network runs over the frames before it too, as in use.
-    """
+    """Noisy, output, reference and amplified difference as displayed, (3, H, 4 W), of a frame with history."""
     state: State | None = None
     last = min(SAMPLE_FRAME, clip.frames - 1)
     for index in range(last + 1):

@@ -10,10 +10,8 @@ TRAINING_PACKAGES = ("torch", "numpy", "numba", "lightning-fabric")  # that trai
 
 
 class MadeBy(TypedDict):
-    """Versions by package, and the digest of the code."""
-
-    versions: dict[str, str]
-    code: str
+    versions: dict[str, str]  # by package
+    code: str  # its digest
 
 
 def made_by_here(loss: NetworkLoss) -> MadeBy:

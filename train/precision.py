@@ -34,7 +34,6 @@ def fabric_here(precision: str = FLOAT32) -> Fabric:
 
 
 def forward_and_backward(loss: NetworkLoss, batch: AnyBatch, device: str, precision: str) -> None:
-    """Compute the gradients of a batch, and drop them."""
     with torch.autocast(device, torch.bfloat16, enabled=precision == BFLOAT16):
         value, _ = loss(batch)
     value.backward()

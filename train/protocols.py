@@ -1,6 +1,6 @@
 """What the trainer needs of a network, beside what every denoiser has."""
 
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -23,17 +23,13 @@ class AccumulatingState(ScaledState, Protocol):
     def history(self) -> Accumulation: ...
 
 
-Scaled = TypeVar("Scaled", bound=ScaledState)
-A = TypeVar("A", bound=AccumulatingState)
-
-
 @runtime_checkable
-class RecurrentNetwork(Protocol[Scaled]):
+class RecurrentNetwork(Protocol):
     """A network that is trained on sequences, through time."""
 
     signal: Signal
 
-    def predict(self, frame: Frame, state: Scaled | None) -> tuple[Tensor, Scaled]:
+    def predict(self, frame: Frame, state: Any) -> tuple[Tensor, ScaledState]:
         """The network's output for a frame, (B, 3, H, W) in its own space, not clamped, and the next state."""
 
     def exposed(self, prediction: Tensor, exposure: Tensor) -> Tensor:
@@ -41,7 +37,7 @@ class RecurrentNetwork(Protocol[Scaled]):
 
 
 @runtime_checkable
-class CompressingNetwork(RecurrentNetwork[Scaled], Protocol[Scaled]):
+class CompressingNetwork(RecurrentNetwork, Protocol):
     """One whose loss compares images in the space of its inputs."""
 
     def compress(self, irradiance: Tensor, scale: RunningScale, frame: Frame) -> Tensor:
@@ -49,14 +45,14 @@ class CompressingNetwork(RecurrentNetwork[Scaled], Protocol[Scaled]):
 
 
 @runtime_checkable
-class FilteringNetwork(Protocol[A]):
+class FilteringNetwork(Protocol):
     """A network that filters single frames of accumulated irradiance, and is trained on crops of those."""
 
     signal: Signal
     reads: tuple[str, ...]  # for accumulation
     filter_reads: tuple[str, ...]
 
-    def accumulate(self, frame: Frame, state: A | None) -> A:
+    def accumulate(self, frame: Frame, state: Any) -> AccumulatingState:
         """The state after a frame, before any filter."""
 
     def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> tuple[Tensor, object]:

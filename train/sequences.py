@@ -59,16 +59,12 @@ class WholeFrames:
 
 
 class Batch:
-    """A batch of sequences: one Frame of all of them for each time step.
-
-    It is not a list, because Fabric converts the tensors in collections, and cameras must stay float64.
-    """
+    """A Frame of all sequences for each time step. Fabric would convert a list, and cameras must stay float64."""
 
     def __init__(self, frames: list[Frame]):
         self.frames = frames
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The batch with all tensors on `device`."""
         return Batch([frame.to(device) for frame in self.frames])
 
 
@@ -124,5 +120,4 @@ class TrainingSequences:
         return frames
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """One batch of the items with these numbers."""
         return Batch([Frame.stack(step) for step in zip(*(self[number] for number in numbers), strict=True)])

@@ -23,8 +23,6 @@ def run_folder(runs: Path, name: str, budget: str) -> Path:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one network is trained."""
-
     loss: Loss
     rate: float  # Adam's learning rate, at the end of the ramp if there is one
     batch: int  # sequences a step
@@ -41,7 +39,6 @@ class Recipe:
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def frames(self, training: bool) -> int:
-        """Frames of a sequence, in training or in validation."""
         return self.trained or self.length if training else self.length
 
     def learning_rate(self, epoch: float) -> float:
@@ -55,8 +52,6 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained, on what, and where that is kept."""
-
     name: str
     create: Callable[[], Denoiser]  # with fresh weights
     recipe: Recipe

@@ -192,10 +192,7 @@ class Training:
                 yield row
 
     def step(self, batch: Iterable[AnyBatch]) -> LogRow:
-        """Update the weights once, from the parts of a batch.
-
-        Returns the learning rate, the loss and its parts, the norm of the gradients, and milliseconds.
-        """
+        """Update the weights once. Returns the learning rate, the losses, the gradients' norm, and milliseconds."""
         start = time.perf_counter()
         ready = start
         loading = 0.0

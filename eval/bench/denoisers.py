@@ -79,7 +79,6 @@ class DenoiserCost:
 
     @property
     def conditions(self) -> tuple[int, int, int]:
-        """Height, width and threads."""
         return self.height, self.width, self.threads
 
 
@@ -223,7 +222,6 @@ def peaks(specs: Sequence[DenoiserSpec], size: Size, threads: int) -> list[float
 
 
 def cost(timed: TimedDenoiser, size: Size, peak_mb: float | None) -> DenoiserCost:
-    """The row of a denoiser that was timed, with its peak memory."""
     p10, median, p90 = (float(ms) for ms in 1e3 * np.percentile(timed.seconds, (10, 50, 90)))
     return DenoiserCost(
         timed.spec.way,
@@ -289,10 +287,7 @@ def measure_rows(
     unfinished: Path,
     measured: int = TIMED_FRAMES,
 ) -> Iterator[list[DenoiserCost]]:
-    """Yield the rows of each size and number of threads.
-
-    They are stored in the file `unfinished` and reused if that is of the same denoisers, code and device.
-    """
+    """Yield the rows of each size and number of threads; those of the same call in `unfinished` are reused."""
     modules = {module for spec in specs for module in spec.modules}
     call = {
         "specs": [repr(spec) for spec in specs],

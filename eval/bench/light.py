@@ -12,11 +12,12 @@ from tqdm import tqdm
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip, is_clip
-from datasets.frame import read_frame, to_tensor
+from datasets.frame import to_tensor
 from datasets.tonemap import display, psnr
+from eval.clip_run import play
 from eval.selection import evaluated
 from files import write_file, write_json
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser
 from models.operators import finite
 from plotting import DPI, Figure, plt, save_figure
 from provenance import device_in_words
@@ -84,9 +85,7 @@ def clip_of(change: str, folder: Path) -> Clip:
 def psnr_of_frames(denoiser: Denoiser, clip: Clip, exposure: float) -> list[float]:
     """PSNR in dB of each displayed frame, for the signal that the denoiser returns."""
     values = []
-    state: State | None = None
-    for index in range(clip.frames):
-        output, state = denoiser(read_frame(clip, index, denoiser.reads), state)
+    for index, _, (output,) in play(clip, [denoiser]):
         reference = to_tensor(clip.reference(index, denoiser.signal).mean(axis=0))
         error = display(finite(output), exposure) - display(reference, exposure)
         values.append(psnr(error.square().mean().item()))
@@ -104,7 +103,6 @@ def lag_table(lags: Mapping[str, Lag]) -> str:
 
 
 def lag_figure(lags: Mapping[str, Lag]) -> Figure:
-    """PSNR of every frame, in a panel for each change."""
     size = (3 * len(BEFORE), 4)
     figure, axes = plt.subplots(1, len(BEFORE), figsize=size, dpi=DPI, layout="constrained", sharey=True)
     for axis, change in zip(axes, BEFORE, strict=True):

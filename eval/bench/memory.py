@@ -12,7 +12,6 @@ from typing import Any
 
 
 def release_memory() -> None:
-    """Return unused memory to the system."""
     gc.collect()
     with suppress(OSError, AttributeError):  # glibc only
         ctypes.CDLL(None).malloc_trim(0)

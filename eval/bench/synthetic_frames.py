@@ -22,10 +22,7 @@ SEED = 0
 
 
 def spheres(index: int) -> tuple[Array, Array]:
-    """Centres (N, 3) and radii (N,) in frame `index`.
-
-    Every second sphere moves in a circle, which causes occlusions and disocclusions.
-    """
+    """Centres (N, 3) and radii (N,) in frame `index`. Every second sphere moves in a circle and hides others."""
     rng = np.random.default_rng(SEED)
     centres = rng.uniform((-3.5, -1.2, -5.5), (3.5, 1.5, -1.0), (SPHERES, 3))
     angle = 0.08 * index + rng.uniform(0, 2 * np.pi, SPHERES)

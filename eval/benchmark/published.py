@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from tabulate import tabulate
 from torch import Tensor
-from tqdm import tqdm
 
 from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.clip import Clip, Dataset
-from datasets.frame import read_frame, to_tensor
+from datasets.frame import to_tensor
 from errors import BadInput
+from eval.clip_run import play
 from eval.metrics import flip, ssim
 from eval.selection import evaluated
 from models.operators import finite
@@ -82,16 +82,13 @@ def luminance(image: Tensor) -> Tensor:
 @torch.no_grad()
 def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[float | None]]:
     """A denoiser's METRICS of every frame that counts."""
-    denoiser = spec.build()
-    state = None
     rows: list[list[float | None]] = []
     before: tuple[Tensor, Tensor] | None = None
-    for index in tqdm(range(clip.frames), f"{clip.scene} {spec.name}", unit="frame", leave=False):
-        output, state = denoiser(read_frame(clip, index, denoiser.reads).to(denoiser.device), state)
+    for index, _, (output,) in play(clip, [spec.build()]):
         if index < protocol.warm_up:
             continue
         reference = to_tensor(clip.reference(index).mean(axis=0))
-        x, y = as_file(output.cpu(), protocol), as_file(reference, protocol)
+        x, y = as_file(output, protocol), as_file(reference, protocol)
         change = psnr(x - before[0], y - before[1]) if before else None
         rows.append([psnr(x, y), ssim(luminance(x), luminance(y)), flip(x, y), change])
         before = x, y

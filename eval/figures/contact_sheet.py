@@ -35,10 +35,7 @@ def displayed_frame(
 def contact_sheet(
     path: Path, names: Sequence[str], seed: int = 0, frames: int = 24, size: tuple[int, int] = (192, 256), spp: int = 64
 ) -> None:
-    """Write a PNG with the middle frame of each scene in `names`, each of `size` (height, width) in pixels.
-
-    Raises BadInput for an unknown scene.
-    """
+    """Write a PNG of the scenes' middle frames in `size` (height, width). Raises BadInput for an unknown scene."""
     height, width = size
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

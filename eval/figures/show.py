@@ -14,8 +14,9 @@ from tqdm import tqdm
 from datasets.channels import REFERENCE_CHANNELS
 from datasets.clip import Clip, is_clip
 from datasets.frame import Frame, read_frame
-from datasets.tonemap import display, psnr
+from datasets.tonemap import psnr
 from errors import BadInput
+from eval.clip_run import as_displayed
 from eval.selection import evaluated
 from models.denoiser import Denoiser, State
 from models.operators import finite
@@ -68,15 +69,8 @@ def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:
     return figure
 
 
-def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
-    """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
-
-
 @dataclass
 class DenoiserView:
-    """One denoiser, its state, and its panels."""
-
     name: str
     denoiser: Denoiser
     state: State | None = None
@@ -86,7 +80,6 @@ class DenoiserView:
     pictures: dict[str, list[NDArray[np.floating]]] = field(default_factory=dict)
 
     def keep(self, output: Tensor, frame: Frame, exposure: float) -> None:
-        """Add the panels of `frame`, which was denoised to `output`."""
         image = as_displayed(output, exposure)
         signal = self.denoiser.signal
         caption = self.name if signal == "total" else f"{self.name} ({signal})"
@@ -113,10 +106,7 @@ class DenoiserView:
 
 
 def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[str, Denoiser]:
-    """`noisy`, and the named denoisers or all that have weights and whose channels the clip contains.
-
-    Raises BadInput where a named one is unknown, cannot run or has no weights.
-    """
+    """`noisy`, and the named denoisers or all that can run on the clip. Raises BadInput as `evaluated`."""
     ready = {"noisy": create("noisy")}
     for spec in evaluated(names, runs, budget):
         denoiser = spec.build()
@@ -152,7 +142,6 @@ def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int
 
 
 def grids_of(views: Sequence[DenoiserView], references: Column) -> dict[str, list[Column]]:
-    """The columns of each picture, by its name."""
     grids = {"sheet": [view.images for view in views]}
     if references:
         grids["sheet"].append(references)

@@ -1,5 +1,6 @@
 """One frame in three slanted strips: noisy, denoised, reference. `python -m eval.figures.triptych --help`."""
 
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,11 +12,11 @@ from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
-from datasets.frame import read_frame
 from datasets.tonemap import clip_exposure, display, luminance
+from eval.clip_run import play
 from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
-from models.denoiser import Denoiser, State
+from models.denoiser import Denoiser
 from plotting import Image
 from render.clip import Sampling, write_clip
 from render.path import PosedFrame
@@ -33,10 +34,7 @@ Picture = NDArray[np.float64]
 @torch.inference_mode()
 def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
     """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all frames."""
-    state: State | None = None
-    for index in range(clip.frames):
-        frame = read_frame(clip, index, (*network.reads, "direct", "indirect", "emission"))
-        output, state = network(frame, state)
+    _, frame, (output,) = deque(play(clip, [network], ("direct", "indirect", "emission")), maxlen=1).pop()
     noisy, denoised = (image[0].permute(1, 2, 0).double().numpy() for image in (frame.radiance("total"), output))
     return noisy, denoised
 

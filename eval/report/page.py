@@ -1,7 +1,5 @@
 """`onespp report`: one HTML file with all results, and short animated pictures of clips, for slides."""
 
-import base64
-import io
 import math
 from collections.abc import Iterator, Sequence
 from importlib import resources
@@ -19,7 +17,7 @@ from eval.tradeoff.trades import Times, dominated_by_name, times_of_first_size
 from extras import requires_extra
 from files import replacing, write_file
 from models.spec import DenoiserSpec
-from plotting import Image, ImageDraw, ImageFont, enlargement, plt
+from plotting import Image, ImageDraw, ImageFont, data_uri, enlargement, plt, webp_uri
 from timing import thread_count, threads_for
 
 with requires_extra("report"):
@@ -34,10 +32,6 @@ BEST_SHOWN = 2  # denoisers, in an animation
 MAX_FRAMES = 240
 MILLISECONDS = 83  # that each frame is shown
 BANNER = 22  # px above the panels, for their names
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def four_digits(value: float | None) -> float | None:
@@ -91,9 +85,7 @@ def page_clip(runs: Path, clip: ClipResults, step: int) -> dict[str, Any]:
             reference = load_picture(folders[clip.reference.denoiser], index)
             for name, maps in flips.items():
                 errors = flip_map(load_picture(folders[name], index) / 255, reference / 255)
-                buffer = io.BytesIO()
-                Image.fromarray((255 * errors + 0.5).astype(np.uint8)).save(buffer, "WEBP", lossless=True, method=2)
-                maps.append(data_uri(buffer.getvalue(), "webp"))
+                maps.append(webp_uri(errors, lossless=True, method=2))
     return {
         "name": clip.name,
         "count": len(clip.reference.frames),
@@ -135,7 +127,6 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, An
 
 
 def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float) -> str:
-    """The page's HTML."""
     times = times_of_first_size(runs)
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
     size = sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64

@@ -42,7 +42,6 @@ def scaled(frame: Frame, names: Sequence[str], factor: float | Tensor) -> Frame:
 
 
 def light_times(factor: float) -> FrameChange:
-    """Multiply all light by `factor`."""
     return lambda frame: scaled(frame, LIGHT_CHANNELS, factor)
 
 

@@ -13,17 +13,15 @@ from datasets.frame import Frame
 from eval.bench.denoisers import network_of
 from eval.stress.cases import NOISE_PERIOD, RECOVERY_LIMIT, SPOILED_FRAME, FrameChange, PixelChange, StressCase, as_is
 from models.denoiser import Denoiser
-from models.operators import finite
+from models.operators import MIN_DIVISOR, finite
 from models.spec import PRECISIONS
 
 ROUNDING = 1e-4  # relative; of sums in float32, demodulation and back
-MIN_LIMIT = 1e-30  # ends of the range of irradiance below it are not divided by
 MAX_RESIDUE = 1e-3  # of the brightest pixel: smaller changes count as none
 ROUNDINGS = 10  # of half precision count as none: networks amplify them, RAE by its power of 5 alone
 ORDINARY_VALUES = (0.0, 1.0)  # of the bad pixel, to find the pixels that depend on it
 FRESH = "fresh"  # instead of a file: random weights
 BLACK_BELOW = 1e-30  # radiance: an image without a brighter pixel counts as black
-MIN_LOGIT_SCALE = 1e-30  # divisor of logits that are all 0
 REQUIREMENTS = {
     "finite": "outputs are finite where inputs are finite",
     "range": "convex filters stay within the range of irradiance since the last reset; no other goes below 0",
@@ -69,8 +67,8 @@ def range_violation(denoiser: Denoiser, frames: Iterable[Frame], outputs: Sequen
         irradiance = finite((output - frame.emission).double() / frame.divisor)[0, :, surface[0, 0]]
         if irradiance.numel():
             least, most = low.sum(dim=0), high.sum(dim=0)
-            above = (irradiance.amax(dim=1) - most) / most.clamp(min=MIN_LIMIT)
-            below = (least - irradiance.amin(dim=1)) / least.clamp(min=MIN_LIMIT)
+            above = (irradiance.amax(dim=1) - most) / most.clamp(min=MIN_DIVISOR)
+            below = (least - irradiance.amin(dim=1)) / least.clamp(min=MIN_DIVISOR)
             largest = max(largest, float(torch.maximum(above, below).max()))
     return largest
 
@@ -89,7 +87,7 @@ def largest_logits(denoiser: Denoiser, size: float) -> Iterator[None]:
 
     def scale(layer: nn.Module, inputs: Any, output: Tensor) -> Tensor:
         logits = output.float()  # the factor may overflow half precision
-        return (logits * (size / logits.abs().max().clamp(min=MIN_LOGIT_SCALE))).to(output.dtype)
+        return (logits * (size / logits.abs().max().clamp(min=MIN_DIVISOR))).to(output.dtype)
 
     hooks = [layer.register_forward_hook(scale) for layer in last_layers(denoiser)]
     try:
@@ -158,7 +156,6 @@ class StressCheck:
         return frames if frames <= RECOVERY_LIMIT else None
 
     def row(self, denoiser: str, weights: str | None) -> StressRow:
-        """The results under the denoiser's name, with the file of its weights."""
         errors = self.errors()
         finite_errors = torch.cat([error[torch.isfinite(error)] for error in errors])
         bad = [~torch.isfinite(output).all(dim=0) for output in self.outputs]

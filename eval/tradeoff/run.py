@@ -163,7 +163,6 @@ def draw_samples(rows: Sequence[Trade], title: str) -> Figure:
 
 
 def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, times: Times) -> str:
-    """The output of `onespp trade`."""
     parts = [title, FRONTS]
     for signal in dict.fromkeys(row.signal for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row.signal == signal])}")

@@ -35,10 +35,7 @@ NoisyFrame = dict[str, NDArray[np.floating]]  # of each of NOISY_CHANNELS (H, W,
 
 
 def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
-    """The scene and the seed of a clip.
-
-    Raises BadInput where this version or other packages would render it differently.
-    """
+    """The scene and seed of a clip. Raises BadInput where this version or these packages would render another."""
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
     check_versions(dataset)
@@ -49,10 +46,7 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
 
 
 def rendered(clip: Clip, dataset: Dataset, spp: int, with_buffers: bool) -> Iterator[NoisyFrame]:
-    """Noisy frames rendered with `spp` stratified samples, the same as those of a clip such as 000-4spp.
-
-    Raises BadInput as `scene_of`.
-    """
+    """Noisy frames of `spp` stratified samples, as in a clip such as 000-4spp. Raises BadInput as `scene_of`."""
     scene, seed = scene_of(clip, dataset)
     sampling = Sampling(1, spp, 2, Options(**dataset.facts["options"]))  # the reference is not used
     channels = (*NOISY_CHANNELS, *SAMPLE_BUFFERS.values()) if with_buffers else NOISY_CHANNELS

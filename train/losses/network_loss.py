@@ -10,7 +10,7 @@ from datasets.frame import Frame
 from models.denoiser import Denoiser
 from models.history.running_scale import RunningScale
 from train.crops import AnyBatch, Crops
-from train.protocols import FilteringNetwork, RecurrentNetwork, Scaled
+from train.protocols import FilteringNetwork, RecurrentNetwork, ScaledState
 from train.sequences import Batch
 
 Parts = dict[str, Tensor]  # of a loss by name: scalars, to display
@@ -53,10 +53,10 @@ def surface_mean(values: Tensor, depth: Tensor) -> Tensor:
     return (total / (values.shape[1] * surface.sum(dim=(1, 2, 3))).clamp(min=1)).mean()
 
 
-def predictions(network: RecurrentNetwork[Scaled], batch: AnyBatch) -> Iterator[tuple[Frame, Tensor, RunningScale]]:
+def predictions(network: RecurrentNetwork, batch: AnyBatch) -> Iterator[tuple[Frame, Tensor, RunningScale]]:
     """Each frame of a batch of sequences with what the network predicts, and the running scale there."""
     assert isinstance(batch, Batch)
-    state: Scaled | None = None
+    state: ScaledState | None = None
     for frame in batch.frames:
         prediction, state = network.predict(frame, state)
         yield frame, prediction, state.scale
