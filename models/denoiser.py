@@ -101,7 +101,13 @@ class Denoiser(nn.Module):
 
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """`forward`, with NaN and infinities replaced by 0. Raises BadInput where one of `constants` varies."""
-        self.check_constants(frame)
+        for name, value in self.constants.items():
+            channel = frame.channel(name)
+            if ((channel - channel.new_tensor(value)[:, None, None]).abs() > CONSTANT_TOLERANCE).any():
+                raise BadInput(
+                    f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
+                    f"{type(self).__name__} are specialised: use general weights"
+                )
         return self.run(frame.finite(), state)
 
     def run(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
@@ -147,17 +153,6 @@ class Denoiser(nn.Module):
                 drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
             self.inputs = {other: count for other, count in self.inputs.items() if other != name}
             self.constants[name] = list(constants[name])
-
-    def check_constants(self, frame: Frame) -> None:
-        """Raise BadInput where a channel that the network was specialised to varies."""
-        for name, value in self.constants.items():
-            channel = frame.channel(name)
-            wanted = channel.new_tensor(value)[:, None, None]
-            if ((channel - wanted).abs() > CONSTANT_TOLERANCE).any():
-                raise BadInput(
-                    f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
-                    f"{type(self).__name__} are specialised: use general weights"
-                )
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         """Switch to inference for good. Raises BadInput for a precision that it refuses."""
