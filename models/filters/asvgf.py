@@ -62,7 +62,6 @@ class ASVGF(SVGF):
 
     made_from = "accounts"
     reads: tuple[str, ...] = (*SVGF.reads, "gradient")
-    baseline_for = ()
 
     def change(self, frame: Frame) -> Tensor:
         return change_of_light(frame)
