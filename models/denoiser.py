@@ -80,8 +80,6 @@ class Denoiser(nn.Module):
     filters_emission: bool = False  # whether emission is a part of what it filters; else it is added back untouched
     blends_layers: bool = False  # whether it takes glass in one layer, with guides blended from both, instead of twice
     has_kernels: bool = True  # whether compiled kernels do a part of its work
-    baseline_for: tuple[Signal, ...] = ()  # signals whose denoisers evaluations, cards and trade-offs compare with it
-    evaluated_with: tuple[str, ...] = ()  # suffixes with which `onespp eval` runs it beside the denoiser itself
     inputs: Mapping[str, int] = MappingProxyType({})  # of its network in order, and how many channels each has
     # Channels, by the names of inputs, that its network can do without where they do not vary; its input for a value.
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}
@@ -101,7 +99,13 @@ class Denoiser(nn.Module):
 
     def __call__(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         """`forward`, with NaN and infinities replaced by 0. Raises BadInput where one of `constants` varies."""
-        self.check_constants(frame)
+        for name, value in self.constants.items():
+            channel = frame.channel(name)
+            if ((channel - channel.new_tensor(value)[:, None, None]).abs() > CONSTANT_TOLERANCE).any():
+                raise BadInput(
+                    f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
+                    f"{type(self).__name__} are specialised: use general weights"
+                )
         return self.run(frame.finite(), state)
 
     def run(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
@@ -147,17 +151,6 @@ class Denoiser(nn.Module):
                 drop_inputs(layer, first, self.dispensable[name](torch.tensor(constants[name])))
             self.inputs = {other: count for other, count in self.inputs.items() if other != name}
             self.constants[name] = list(constants[name])
-
-    def check_constants(self, frame: Frame) -> None:
-        """Raise BadInput where a channel that the network was specialised to varies."""
-        for name, value in self.constants.items():
-            channel = frame.channel(name)
-            wanted = channel.new_tensor(value)[:, None, None]
-            if ((channel - wanted).abs() > CONSTANT_TOLERANCE).any():
-                raise BadInput(
-                    f"{frame.source}: {name} is not {value} everywhere, for which the weights of "
-                    f"{type(self).__name__} are specialised: use general weights"
-                )
 
     def prepare(self, precision: torch.dtype = torch.float32) -> None:
         """Switch to inference for good. Raises BadInput for a precision that it refuses."""

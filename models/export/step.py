@@ -72,7 +72,6 @@ class Step(nn.Module):
     """One frame of a denoiser (B = 1) as a function of tensors by name.
 
     Its state is a history image, the running scale and, with the warp inside, the previous frame's G-buffer and camera.
-
     """
 
     reads: ClassVar[tuple[str, ...]]  # names of the FRAME_PORTS that it takes, apart from those of the warp

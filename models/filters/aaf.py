@@ -78,16 +78,15 @@ def widths(frame: Frame) -> Tensor:
     return torch.minimum(sigmas, (MAX_REACH / TRUNCATION * size)[:, None])
 
 
-def positions(frame: Frame) -> Tensor:
-    """Positions of surfaces relative to the camera, in world axes, (B, 3, H, W)."""
-    rotation = frame.now.camera_to_world[:, :3, :3].to(frame.depth)
-    return torch.einsum("bij,bhwj->bihw", rotation, frame_rays(frame)) * frame.depth
-
-
 def pack_geometry(frame: Frame) -> Tensor:
-    """The geometry that weights depend on, (B, 1, 6, H, W): positions, unit normals (0 for background)."""
+    """The geometry that weights depend on, (B, 1, 6, H, W), in world axes.
+
+    Positions relative to the camera, unit normals (0 for background).
+    """
+    rotation = frame.now.camera_to_world[:, :3, :3].to(frame.depth)
+    position = torch.einsum("bij,bhwj->bihw", rotation, frame_rays(frame)) * frame.depth
     unit = torch.where(frame.depth > 0, F.normalize(frame.normal, dim=1, eps=MIN_DIVISOR), 0)
-    return torch.cat([positions(frame), unit], dim=1)[:, None]
+    return torch.cat([position, unit], dim=1)[:, None]
 
 
 def gaussian_weight(width: Tensor, p: Tensor, q: Tensor) -> Tensor:

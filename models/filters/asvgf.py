@@ -16,6 +16,7 @@ from datasets.channels import STRATUM
 from datasets.frame import Frame
 from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, Tap, b3_spline, strip_taps, window_mean
 from models.filters.svgf import SVGF, geometry_weight, pack_geometry
+from models.layers import pixels_at
 from models.operators import MIN_DIVISOR, pad_to_multiple
 
 
@@ -35,17 +36,6 @@ def repeat_strata(strata: Tensor, size: tuple[int, int]) -> Tensor:
     return strata.repeat_interleave(STRATUM, dim=-2).repeat_interleave(STRATUM, dim=-1)[..., : size[0], : size[1]]
 
 
-def strata_geometry(frame: Frame) -> Tensor:
-    """`pack_geometry` of the brightest sample in each stratum, (B, 7, h, w)."""
-    _, index = F.max_pool2d(frame.gradient[:, 1:], STRATUM, ceil_mode=True, return_indices=True)
-
-    def gathered(channel: Tensor) -> Tensor:
-        indices = index.flatten(2).expand(-1, channel.shape[1], -1)
-        return channel.flatten(2).gather(2, indices).unflatten(2, index.shape[-2:])
-
-    return pack_geometry(gathered(frame.depth), gathered(frame.normal), gathered(frame.mesh_id))[:, 0]
-
-
 def gradient_level(gradient: Tensor, geometry: Tensor, step: int) -> Tensor:
     """One level of the à-trous transform of gradients (B, 2, h, w) within `geometry`. Taps are `step` strata apart."""
 
@@ -58,7 +48,9 @@ def gradient_level(gradient: Tensor, geometry: Tensor, step: int) -> Tensor:
 def change_of_light(frame: Frame) -> Tensor:
     """λ = min(1, |δ| / Δ) of the filtered differences δ and luminances Δ, (B, 1, H, W)."""
     gradient = strata_sums(frame.gradient)
-    geometry = strata_geometry(frame)
+    _, brightest = F.max_pool2d(frame.gradient[:, 1:], STRATUM, ceil_mode=True, return_indices=True)
+    surfaces = (pixels_at(channel, brightest) for channel in (frame.depth, frame.normal, frame.mesh_id))
+    geometry = pack_geometry(*surfaces)[:, 0]
     for step in ATROUS_STEPS:
         gradient = gradient_level(gradient, geometry, step)
     difference, luminance = gradient.split(1, dim=1)
@@ -70,7 +62,6 @@ class ASVGF(SVGF):
 
     made_from = "accounts"
     reads: tuple[str, ...] = (*SVGF.reads, "gradient")
-    baseline_for = ()
 
     def change(self, frame: Frame) -> Tensor:
         return change_of_light(frame)

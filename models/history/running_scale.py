@@ -46,24 +46,19 @@ class RunningScale:
         return torch.where(depth > 0, depth / (depth + scale), 1)
 
 
-def block_luminances(radiance: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean luminance of the surfaces in each block, float64, 0 without any, and whether there are any: (B, blocks)."""
+def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
+    """Logarithms of one frame's mean luminance and of its median depth, both of surfaces alone: (B, 2).
+
+    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is black, or has no surface.
+    """
 
     def block_means(image: Tensor) -> Tensor:
         return F.avg_pool2d(image, LUMINANCE_BLOCK, ceil_mode=True, count_include_pad=False).flatten(1).double()
 
     surface = (depth > 0).to(radiance)
     share = block_means(surface)
-    y = block_means(image_luminance(radiance).clamp(min=0) * surface)
-    return y / torch.where(share > 0, share, 1), share > 0
-
-
-def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
-    """Logarithms of one frame's mean luminance and of its median depth, both of surfaces alone: (B, 2).
-
-    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is black, or has no surface.
-    """
-    y, has_surface = block_luminances(radiance, depth)
+    has_surface = share > 0
+    y = block_means(image_luminance(radiance).clamp(min=0) * surface) / torch.where(has_surface, share, 1)
     blocks = has_surface.sum(dim=1).clamp(min=1)
     mean = y.sum(dim=1) / blocks
     log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)) * has_surface

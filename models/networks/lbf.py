@@ -29,7 +29,6 @@ What differs, since frames have 1 spp and noise-free features:
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -216,19 +215,14 @@ def cross_bilateral(pixels: Pixels, sharpness: Tensor) -> Tensor:
     return cast(Tensor, CrossBilateral.apply(sharpness, *pixels))
 
 
-def visibility(frame: Frame) -> tuple[Tensor, Tensor]:
-    """The share of samples that direct light reaches, and its variance: both (B, 1, H, W)."""
-    lit = (frame.direct.amax(dim=1, keepdim=True) > 0).to(frame.direct)
-    mean_3x3, mean_9x9, _ = mesh_means(lit.expand(-1, 3, -1, -1), frame.mesh_id)
-    share = mean_9x9[:, :1]
-    return mean_3x3[:, :1], share * (1 - share).clamp(min=0) / 9
-
-
 def features_of(frame: Frame, scale: RunningScale) -> tuple[Tensor, Tensor]:
     """The features (B, sum(FEATURE_GROUPS), H, W) and the variance of their noise, (B, groups, H, W)."""
     unit = torch.exp(scale.log_depth.value)[:, None, None, None]
     position = (positions_around_eye(frame.depth, ray_axes(frame.now)) / unit).clamp(-MAX_POSITION, MAX_POSITION)
-    visible, variance = visibility(frame)
+    lit = (frame.direct.amax(dim=1, keepdim=True) > 0).to(frame.direct)
+    mean_3x3, mean_9x9, _ = mesh_means(lit.expand(-1, 3, -1, -1), frame.mesh_id)
+    visible, share = mean_3x3[:, :1], mean_9x9[:, :1]  # of samples that direct light reaches
+    variance = share * (1 - share).clamp(min=0) / 9
     features = torch.cat([position.to(frame.depth), frame.normal, frame.albedo, frame.roughness, visible], dim=1)
     return features, torch.cat([torch.zeros_like(variance)] * (len(FEATURE_GROUPS) - 1) + [variance], dim=1)
 
@@ -256,8 +250,9 @@ class LBFState(FilteredState):
     """With the sharpness (B, 1 + groups, H, W) as the filter's parameters."""
 
     def pictures(self) -> dict[str, Tensor]:
-        width = {} if self.parameters is None else {"width of the filter (px)": (2 * self.parameters[:, :1]) ** -0.5}
-        return AccumulatedState.pictures(self) | width
+        assert self.parameters is not None
+        width = (2 * self.parameters[:, :1]) ** -0.5
+        return AccumulatedState.pictures(self) | {"width of the filter (px)": width}
 
 
 class LBF(KernelPredictor):
@@ -273,7 +268,6 @@ class LBF(KernelPredictor):
     convex = True
     inputs = MappingProxyType({"secondary features": SECONDARY})
     dispensable: ClassVar = {}
-    state = LBFState
 
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
@@ -301,4 +295,4 @@ class LBF(KernelPredictor):
         filtered, sharpness = self.filter(frame, after.history.irradiance, after.scale)
         surface = (frame.depth > 0).to(frame.depth)
         irradiance = remove_spikes(filtered, surface)
-        return frame.remodulate(irradiance, self.signal), replace(after, parameters=sharpness)
+        return frame.remodulate(irradiance, self.signal), LBFState(frame.moment, after.history, after.scale, sharpness)

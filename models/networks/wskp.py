@@ -1,6 +1,6 @@
 """WSKP: weight-sharing kernel prediction (Fan et al. 2021), its multi-resolution variant and its baselines KP."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar
@@ -60,12 +60,6 @@ def network_features(
 Filtered = tuple[Tensor, Tensor | None]  # irradiance (B, 3, H, W), and parameters of the filter to display, if any
 
 
-def shared_kernels(image: Tensor, predicted: Tensor, surface: Tensor | None) -> Filtered:
-    """By the first M of WINDOWS, whose importance maps and mixture are `predicted` (B, 2 M, H, W) (§4.1)."""
-    importance, mixture = predicted.to(image.dtype).chunk(2, dim=1)
-    return fuse(image, importance, mixture, WINDOWS[: mixture.shape[1]], surface), mixture
-
-
 def free_kernels(image: Tensor, predicted: Tensor, surface: Tensor | None) -> Filtered:
     """By one free kernel per pixel, whose logits are `predicted` (B, k², H, W): the paper's baseline (§6.1)."""
     return apply_kernels(image, predicted, surface), None
@@ -94,11 +88,15 @@ class KernelPredictor(Accumulating):
     inputs: Mapping[str, int] = FEATURE_CHANNELS
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
     filter_reads: tuple[str, ...] = ("emission", "albedo", "normal", "depth")  # channels that `filter` reads
-    filter_image: Callable[[Tensor, Tensor, Tensor | None], Filtered] = staticmethod(shared_kernels)
-    state: ClassVar[type[FilteredState]] = FilteredState
     network: nn.Module
     side_multiple = 1  # of the network's images; they are padded
     reach: int | None = None  # rows above and below that a pixel depends on; None for all
+
+    @staticmethod
+    def filter_image(image: Tensor, predicted: Tensor, surface: Tensor | None) -> Filtered:
+        """By the first M of WINDOWS, whose importance maps and mixture are `predicted` (B, 2 M, H, W) (§4.1)."""
+        importance, mixture = predicted.to(image.dtype).chunk(2, dim=1)
+        return fuse(image, importance, mixture, WINDOWS[: mixture.shape[1]], surface), mixture
 
     def reconstruct(self, irradiance: Tensor, predicted: Tensor, surface: Tensor | None = None) -> Filtered:
         """Irradiance (B, 3, H, W) of surfaces, filtered with the network's output."""
@@ -110,7 +108,7 @@ class KernelPredictor(Accumulating):
         history = self.accumulated(frame, before)
         radiance = history.irradiance * frame.divisor
         scale = running_scale(radiance, frame.depth, before.scale if before else None)
-        return self.state(frame.moment, history, scale)
+        return FilteredState(frame.moment, history, scale)
 
     def filter(self, frame: Frame, irradiance: Tensor, scale: RunningScale) -> Filtered:
         """Accumulated `irradiance` (B, 3, H, W) filtered, of large images in strips of rows."""
@@ -165,14 +163,12 @@ class TrunkPredictor(KernelPredictor):
 class WSKP(TrunkPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
-    evaluated_with: tuple[str, ...] = ("adaptive",)
     outputs = 2 * len(WINDOWS)
 
 
 class WSKP3(WSKP):
     """The smaller of the paper's two networks."""
 
-    evaluated_with = ()
     layers = 3
 
 

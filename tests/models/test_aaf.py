@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from datasets.channels import HIT_CHANNELS
 from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
-from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, positions, widths
+from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, widths
 from tests.helpers import foreign
 from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
@@ -98,7 +98,7 @@ def test_positions_are_where_the_camera_s_rays_end():
     frame = synthetic_frame(7, 20, 30)
     expected = np.moveaxis(foreign.positions(frame) - foreign.view(frame).camera_to_world[:3, 3], -1, 0)
     hit = frame.depth[0, 0].numpy() > 0
-    np.testing.assert_allclose(positions(frame)[0].numpy()[:, hit], expected[:, hit], atol=1e-5)
+    np.testing.assert_allclose(pack_geometry(frame)[0, 0, :3].numpy()[:, hit], expected[:, hit], atol=1e-5)
 
 
 # --- The filter -------------------------------------------------------------------------------------------------------
