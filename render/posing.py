@@ -67,8 +67,7 @@ class StockParameters:
 def at_rest(parameters: mi.SceneParameters, names: list[str]) -> dict[str, Array]:
     """The values of the named parameters that exist and are not empty."""
     found = {name: parameters[name] for name in names if name in parameters}
-    plain = {name: getattr(value, "matrix", value) for name, value in found.items()}  # of a transform
-    values = {name: np.array(value, np.float64) for name, value in plain.items()}
+    values = {name: np.array(getattr(value, "matrix", value), np.float64) for name, value in found.items()}
     return {name: value for name, value in values.items() if value.size}
 
 
