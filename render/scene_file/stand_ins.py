@@ -167,6 +167,10 @@ def without_relief(described: Properties) -> StandIn | None:
     return flat, f"a flat surface without {described['type']}, whose texture is no bitmap"
 
 
+def has_volume(described: Properties) -> bool:
+    return any(value["type"] in ("gridvolume", "constvolume") for value in nested(described))
+
+
 def spot_without_texture(described: Properties) -> StandIn | None:
     if described.get("texture") != GREY:
         return None
@@ -261,11 +265,7 @@ def valid_lens(described: Properties) -> StandIn | None:
 REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     **dict.fromkeys(("bumpmap", "normalmap"), without_relief),
     # Mitsuba crashes without a volume, and without a file or values.
-    "volume": lambda described: (
-        None
-        if {value["type"] for value in nested(described)} & {"gridvolume", "constvolume"}
-        else (GREY, "grey, because its volume is missing")
-    ),
+    "volume": lambda described: None if has_volume(described) else (GREY, "grey, because its volume is missing"),
     "bitmap": valid_bitmap,
     "conductor": valid_metal,
     **dict.fromkeys(("roughconductor", "roughdielectric", "roughplastic"), valid_microfacets),
