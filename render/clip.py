@@ -5,17 +5,16 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS, SECOND, SECOND_LAYER
 from datasets.writer import ClipWriter
 from render.backend import mi
 from render.first_bounce import hit_channels
-from render.gbuffer import light_of_second_layer, render_gbuffer
+from render.gbuffer import Arrays, light_of_second_layer, render_gbuffer
 from render.glass_motion import chains_at, traced_motion
 from render.gradient import GradientSamples
 from render.motion import dual_motion_vectors, tracked_motion
@@ -24,7 +23,7 @@ from render.stage import Stage
 from scenes.animation import Scene
 from scenes.camera import View, motion_vectors, pixel_centres
 
-Arrays = dict[str, NDArray[Any]]  # channels of one frame by name
+Seconds = dict[str, float]  # by step
 
 
 class Options(NamedTuple):
@@ -47,23 +46,12 @@ class Sampling(NamedTuple):
     judged: tuple[int, ...] = ()  # the frames that get a reference; empty for all
 
 
-class StepTimer:
-    """Seconds by step since they were last read."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Count the time within the context as that of a step."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-    def read(self) -> dict[str, float]:
-        """Seconds by step; resets them."""
-        seconds, self.seconds = self.seconds, {}
-        return seconds
+@contextmanager
+def timed(seconds: Seconds, step: str) -> Iterator[None]:
+    """Add the time within the context to that of a step."""
+    start = time.perf_counter()
+    yield
+    seconds[step] = seconds.get(step, 0.0) + time.perf_counter() - start
 
 
 NOISY_STREAM, REFERENCE_STREAM, GRADIENT_STREAM, SECOND_BUFFER_STREAM = range(4)
@@ -85,44 +73,44 @@ class FrameInProgress:
 
 
 def noise_free_frames(
-    stage: Stage, frames: int, regularise: bool, wants_dual: bool, layers: list[dict[str, str]], timer: StepTimer
+    stage: Stage, frames: int, regularise: bool, wants_dual: bool, layers: list[dict[str, str]], seconds: Seconds
 ) -> Iterator[FrameInProgress]:
     """Yield every frame with its G-buffer and motion vectors, also of `layers`: MIRRORED, SECOND.
 
     Dual motion vectors and those through glass need rays through the scene of the previous frame, so the G-buffer is
-    rendered a frame ahead.
+    rendered a frame ahead. The time that this takes is added to `seconds`.
     """
     centres = pixel_centres(stage.height, stage.width)
-    with timer.step("gbuffer"):
+    with timed(seconds, "gbuffer"):
         view = stage.view(0)
         arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
     motions = ("motion", "dual_motion", *(forms["motion"] for forms in layers))
     frame = FrameInProgress(0, view, view, arrays | dict.fromkeys(motions, np.zeros_like(centres)))
     for index in range(1, frames):
-        with timer.step("gbuffer"):
+        with timed(seconds, "gbuffer"):
             stage.pose(index)
             view = stage.view(index)
             arrays = render_gbuffer(stage, view, regularise, SECOND in layers)
             shows_glass = arrays.get("glass_reflectance", np.zeros(1)).any()
             branches = (False, True) if shows_glass else ()
             chains = [chains_at(stage, view, centres.reshape(-1, 2), rarer) for rarer in branches]
-        with timer.step("motion"):
+        with timed(seconds, "motion"):
             surface = arrays["depth"][..., 0].astype(np.float64), arrays["mesh_id"][..., 0]
             arrays["motion"] = motion_vectors(centres, *surface, view, frame.view)
             for forms in layers:
                 shown = arrays[forms["depth"]][..., 0].astype(np.float64), arrays[forms["mesh_id"]][..., 0]
                 arrays[forms["motion"]] = motion_vectors(centres, *shown, view, frame.view)
-        with timer.step("gbuffer"):
+        with timed(seconds, "gbuffer"):
             stage.pose(index - 1)
         if wants_dual:
-            with timer.step("dual_motion"):
+            with timed(seconds, "dual_motion"):
                 arrays["dual_motion"] = dual_motion_vectors(stage, *surface, arrays["motion"], view, frame.view)
-        with timer.step("motion"):
+        with timed(seconds, "motion"):
             for forms, chain in zip(layers, chains, strict=False):
                 arrays[forms["motion"]] = traced_motion(stage, chain, arrays[forms["motion"]], view, frame.view)
         yield frame
         frame = FrameInProgress(index, view, frame.view, arrays)
-    with timer.step("gbuffer"):
+    with timed(seconds, "gbuffer"):
         stage.pose(frames - 1)
     yield frame
 
@@ -195,7 +183,7 @@ def render_clip(
     sampling: Sampling,
     seed: int,
     channels: Collection[str] | None = None,
-) -> Iterator[tuple[Arrays, dict[str, float]]]:
+) -> Iterator[tuple[Arrays, Seconds]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
     `channels` are those to render, with what mirrors and glass show in a scene with these, in two layers if they name
@@ -205,7 +193,7 @@ def render_clip(
     Deterministic in its arguments for one Mitsuba variant and processor.
     """
     stage = Stage(scene, height, width)
-    timer = StepTimer()
+    seconds: Seconds = {}  # since the last frame
     wanted = set(CHANNELS) - set(SAMPLE_BUFFERS.values()) if channels is None else set(channels)
     in_layers = stage.glass is not None and not wanted.isdisjoint(SECOND_LAYER)
     layers = [MIRRORED] * stage.looks_through + [SECOND] * in_layers
@@ -215,13 +203,14 @@ def render_clip(
     steps = (sampled.noisy, sampled.hit_distance, sampled.shadow_motion, sampled.gradient, sampled.reference)
     steps_by_name = {step.__name__: step for step in steps}  # optional ones are called so in the channel table
     wants_dual = "dual_motion" not in skipped
-    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, layers, timer):
+    for frame in noise_free_frames(stage, frames, sampling.options.regularise, wants_dual, layers, seconds):
         for name, step in steps_by_name.items():
             if name not in skipped and (name != "reference" or frame.index in (sampling.judged or [frame.index])):
-                with timer.step(name):
+                with timed(seconds, name):
                     frame.arrays |= step(frame)
         frame.arrays |= frame.view._asdict()  # K, camera_to_world, object_to_world
-        yield {name: array for name, array in frame.arrays.items() if name in wanted}, timer.read()
+        yield {name: array for name, array in frame.arrays.items() if name in wanted}, dict(seconds)
+        seconds.clear()
 
 
 def write_clip(
@@ -231,7 +220,7 @@ def write_clip(
     sampling: Sampling,
     seed: int,
     channels: Collection[str],
-    seconds_before: dict[str, float] | None = None,
+    seconds_before: Seconds | None = None,
 ) -> None:
     """Render channels of a scene into a clip of `size` (frames, height, width), completely or not at all.
 

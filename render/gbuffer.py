@@ -14,6 +14,8 @@ from render.specular_light import specular_light
 from render.stage import Stage
 from scenes.camera import Array, View
 
+Arrays = dict[str, NDArray[Any]]  # channels of one frame by name
+
 
 def depth_along_axis(stage: Stage, length: mi.Float, ray: mi.Ray3f, view: View) -> NDArray[np.float32]:
     """Depth (N,) along the viewing axis, in world units; 0 where nothing is hit. float32, as stored.
@@ -56,7 +58,7 @@ def own_surface(stage: Stage, ray: mi.Ray3f) -> tuple[dict[str, dr.AnyArray], mi
 
 def layer_channels(
     stage: Stage, view: View, ray: mi.Ray3f, forms: dict[str, str], max_splits: int
-) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32]]:
+) -> tuple[Arrays, NDArray[np.float32]]:
     """What mirrors and glass show along primary rays, by the names of its channels in `forms`, MIRRORED or SECOND.
 
     And the probability of reflection at the glass that splits them. See `look_through`.
@@ -68,9 +70,7 @@ def layer_channels(
     return arrays, stage.image(shown.reflectance)
 
 
-def render_gbuffer(
-    stage: Stage, view: View, regularise: bool = False, in_layers: bool = True
-) -> dict[str, NDArray[Any]]:
+def render_gbuffer(stage: Stage, view: View, regularise: bool = False, in_layers: bool = True) -> Arrays:
     """The noise-free channels (H, W, C) of the channel table, with the stage posed for `view`'s frame.
 
     `regularise` is that of the path tracer whose samples complete them, `in_layers` whether to describe the second
@@ -104,14 +104,8 @@ def render_gbuffer(
 
 
 def layers(
-    stage: Stage,
-    view: View,
-    ray: mi.Ray3f,
-    own: dict[str, NDArray[Any]],
-    max_splits: int,
-    shines: bool,
-    in_layers: bool,
-) -> dict[str, NDArray[Any]]:
+    stage: Stage, view: View, ray: mi.Ray3f, own: Arrays, max_splits: int, shines: bool, in_layers: bool
+) -> Arrays:
     """What mirrors and glass show along primary rays, if there are any: whether any `shines`.
 
     `own` are the channels of what the primary rays hit, with which all begins.

@@ -10,14 +10,14 @@ pixel centres; where it is hidden or outside the image, the gradient is 0. The s
 realisation, which evaluation plays; for the others the gradient is unbiased too, and independent of their noise.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets.channels import LUMINANCE_WEIGHTS, STRATUM
 from render.backend import mi
-from render.gbuffer import trace_visible
+from render.gbuffer import Arrays, trace_visible
 from render.loading import columns, uploaded
 from render.motion import is_same_surface
 from render.path import PathTracer, SampleRange
@@ -52,7 +52,7 @@ class GradientSamples(NamedTuple):
 
     @staticmethod
     def of(
-        frame: dict[str, NDArray[Any]], light: NDArray[np.float32], view: View, poses: int, draw: SampleRange, seed: int
+        frame: Arrays, light: NDArray[np.float32], view: View, poses: int, draw: SampleRange, seed: int
     ) -> "GradientSamples":
         """One of each stratum of a `frame`, whose samples have that `light` (H, W, 3)."""
         height, width = light.shape[:2]

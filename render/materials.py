@@ -93,10 +93,6 @@ UNSCALED = np.ones(3, np.float32)
 MAX_MIRROR_ALPHA = 0.1  # GGX; rougher surfaces show nothing sharply but what touches them
 
 
-def diffuse_material(parameters: BsdfParameters) -> Material:
-    return Material(parameters.textures["reflectance"], constant(1), constant(0), UNSCALED)
-
-
 def plastic_material(parameters: BsdfParameters) -> Material:
     alpha = parameters.textures.get("alpha") or constant(parameters.number("alpha", 0.0))
     eta = parameters.colour("eta").mean() if "eta" in parameters.textures else parameters.number("eta")
@@ -138,7 +134,7 @@ def principled_material(parameters: BsdfParameters) -> Material | Mixture:
 
 
 MATERIAL_OF: dict[str, Callable[[BsdfParameters], Material | Mixture]] = {
-    "SmoothDiffuse": diffuse_material,
+    "SmoothDiffuse": lambda bsdf: Material(bsdf.textures["reflectance"], constant(1), constant(0), UNSCALED),
     **dict.fromkeys(("SmoothPlastic", "RoughPlastic", "PolarizedPlastic"), plastic_material),
     **dict.fromkeys(("SmoothConductor", "RoughConductor"), conductor_material),
     **dict.fromkeys(("SmoothDielectric", "ThinDielectric", "RoughDielectric", "Null"), clear_material),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from render.backend import dr, mi
 from render.first_bounce import first_bounce
-from render.gbuffer import VisibleSurface, trace_visible
+from render.gbuffer import Arrays, VisibleSurface, trace_visible
 from render.materials import registry_index
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
@@ -120,9 +120,7 @@ def shadow_of(blocker: Array, light: Array, infinite: NDArray[np.bool_], plane: 
         return blocker + np.where(steps > 0, steps, np.nan)[..., None] * along
 
 
-def tracked_motion(
-    tracer: PathTracer, draw: SampleRange, frame: dict[str, NDArray[Any]], now: View, previous: View
-) -> dict[str, Array]:
+def tracked_motion(tracer: PathTracer, draw: SampleRange, frame: Arrays, now: View, previous: View) -> dict[str, Array]:
     """The channels `shadow_motion` and `reflection_motion` (H, W, 2), in pixels, of a frame with depth and motion.
 
     shadow_motion: to where, in the previous frame, the blocker cast its shadow from the same point on the light onto

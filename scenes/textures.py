@@ -20,10 +20,7 @@ class Pattern(NamedTuple):
     """A texture before it has colours."""
 
     tone: Array  # (S, S), 0..PALETTE_SIZE - 1: position in a palette, interpolated between integers
-    shade: Array  # (S, S), factor on the colour, about 1
-
-
-UNSHADED = np.ones((TEXTURE_SIZE, TEXTURE_SIZE))
+    shade: Array = np.ones((TEXTURE_SIZE, TEXTURE_SIZE))  # (S, S), factor on the colour, about 1
 
 
 def periodic_noise(rng: Rng, smoothness: float, stretch: float = 1.0) -> Array:
@@ -43,9 +40,9 @@ def checks(rng: Rng) -> Pattern:
     a, b = rng.choice(PALETTE_SIZE, 2, replace=False)
     kind = rng.integers(3)
     if kind == 0:
-        return Pattern(np.where((i + j) % 2 == 0, a, b), UNSHADED)
+        return Pattern(np.where((i + j) % 2 == 0, a, b))
     if kind == 1:
-        return Pattern((i % 2 + j % 2) / 2, UNSHADED)
+        return Pattern((i % 2 + j % 2) / 2)
     tones = rng.integers(0, PALETTE_SIZE, (rows, columns))
     shades = rng.uniform(0.8, 1.2, (rows, columns))
     return Pattern(tones[j, i], shades[j, i])
@@ -63,8 +60,8 @@ def stripes(rng: Rng) -> Pattern:
 
     kind = rng.integers(4)
     if kind == 0:
-        return Pattern((bars(X) + bars(Y)) / 2, UNSHADED)
-    return Pattern(bars((X, Y, X + Y)[kind - 1]), UNSHADED)
+        return Pattern((bars(X) + bars(Y)) / 2)
+    return Pattern(bars((X, Y, X + Y)[kind - 1]))
 
 
 def bond(columns: int, rows: int, shift: ArrayLike) -> tuple[NDArray[np.intp], Array]:
@@ -107,7 +104,7 @@ def tiles(rng: Rng) -> Pattern:
 def clouds(rng: Rng) -> Pattern:
     """Fractal noise, as on concrete, plaster or rust."""
     smoothness, contrast = uniforms(rng, (0.8, 1.8), (0.1, 0.8))
-    return Pattern((PALETTE_SIZE - 1) * (0.5 + 0.5 * np.tanh(contrast * periodic_noise(rng, smoothness))), UNSHADED)
+    return Pattern((PALETTE_SIZE - 1) * (0.5 + 0.5 * np.tanh(contrast * periodic_noise(rng, smoothness))))
 
 
 def marble(rng: Rng) -> Pattern:
@@ -161,7 +158,7 @@ def prints(rng: Rng) -> Pattern:
     for cx, cy, label in zip(*centres, rng.integers(1, PALETTE_SIZE, count), strict=True):
         # Motifs wrap around at the edges.
         tone[motif(rng, (x - cx + 0.5) % 1 - 0.5, (y - cy + 0.5) % 1 - 0.5, size)] = label
-    return Pattern(np.tile(tone, (repeats, repeats)), UNSHADED)
+    return Pattern(np.tile(tone, (repeats, repeats)))
 
 
 def scratches(rng: Rng) -> Pattern:

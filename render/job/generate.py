@@ -12,7 +12,7 @@ from datasets.clip import ClipKind, Dataset, is_clip
 from errors import BadInput
 from files import locked, read_json, write_json
 from provenance import RENDERING, versions
-from render.clip import NO_OPTIONS, Options, Sampling, StepTimer, write_clip
+from render.clip import NO_OPTIONS, Options, Sampling, timed, write_clip
 from render.job.pilots import choose_rooms, samples_needed
 from render.job.plan import plan, scene_of_clip
 from render.job.profiles import DataProfile, profile_of
@@ -138,12 +138,12 @@ def render_to_folder(
     split, _, clip_name = folder.parts[-3:]
     quality = profile.quality[split]
     scene, seed = scene_of_clip(folder, profile, dataset_seed)
-    timer = StepTimer()
+    seconds: dict[str, float] = {}
     if needed_spp is None:
-        with timer.step("pilot"):
+        with timed(seconds, "pilot"):
             needed_spp = samples_needed(scene, profile.size, quality, seed, options)
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     judged = profile.judged if split == "test" else ()
     sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options, judged)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
-    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), timer.read())
+    write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), seconds)

@@ -71,15 +71,6 @@ def elements_of(file: Path, content: bytes) -> LocatedElement:
 # --- Elements of old files --------------------------------------------------------------------------------------------
 
 
-def linear_colour(colour: str) -> str:
-    """The linear values of a colour of old files: #rrggbb, or three sRGB values."""
-    if colour.startswith("#"):
-        encoded = np.array([*bytes.fromhex(colour[1:7])]) / 255
-    else:
-        encoded = np.array([float(value) for value in colour.replace(",", " ").split()])
-    return ", ".join(f"{value:.6f}" for value in srgb_to_linear(encoded))
-
-
 def named_like(element: LocatedElement, tag: str, **attributes: str) -> LocatedElement:
     """Another element under the same name, at the same place."""
     return LocatedElement(tag, {"name": element.get("name", "")} | attributes, element.place)
@@ -101,16 +92,19 @@ def old_animation(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     return first, f"an <animation> ('{element.get('name')}'): its first transform instead"
 
 
-def old_srgb(element: LocatedElement, folder: Path) -> tuple[Element, str]:
-    return named_like(element, "rgb", value=linear_colour(element.get("value", ""))), ""
-
-
-def old_rgb(element: LocatedElement, folder: Path) -> tuple[Element, str]:
-    """Hexadecimal values are linear."""
-    value = element.get("value", "")
-    if value.startswith("#"):
-        element.set("value", ", ".join(f"{byte / 255:.6f}" for byte in bytes.fromhex(value[1:7])))
-    return element, ""
+def old_colour(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+    """The values of <rgb>, hexadecimal ones too, are linear; those of <srgb> are not."""
+    colour = element.get("value", "")
+    if colour.startswith("#"):
+        values = np.array([*bytes.fromhex(colour[1:7])]) / 255
+    elif element.tag == "rgb":
+        return element, ""
+    else:
+        values = np.array([float(value) for value in colour.replace(",", " ").split()])
+    linear = srgb_to_linear(values) if element.tag == "srgb" else values
+    upgraded = element if element.tag == "rgb" else named_like(element, "rgb")
+    upgraded.set("value", ", ".join(f"{value:.6f}" for value in linear))
+    return upgraded, ""
 
 
 def old_blackbody(element: LocatedElement, folder: Path) -> tuple[Element, str]:
@@ -138,8 +132,7 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
 UPGRADES: dict[str, Callable[[LocatedElement, Path], tuple[Element, str]]] = {
     "subsurface": old_subsurface,
     "animation": old_animation,
-    "srgb": old_srgb,
-    "rgb": old_rgb,
+    **dict.fromkeys(("srgb", "rgb"), old_colour),
     "blackbody": old_blackbody,
     "spectrum": old_spectrum,
 }
