@@ -12,11 +12,6 @@ from train.recipes import TRAINABLE
 from train.task import WEIGHTS_FILE, run_folder
 
 USUAL_BUDGET = "quick"  # of commands that do not ask for one
-# Denoisers that evaluations, cards and trade-offs compare with those of indirect light, and with those of total light.
-INDIRECT_BASELINES = ("noisy", "accumulated", "svgf", "trmv")
-BASELINES = (*INDIRECT_BASELINES, "oidn")
-# Denoisers that `onespp eval` runs with wrappers too.
-EVALUATED_WRAPPED = ("oidn+accumulated", "oidn+accumulated+adaptive", "oidn-accumulated+adaptive", "wskp6+adaptive")
 
 Obstacle = Callable[[DenoiserName], str | None]  # why a denoiser cannot run, and the remedy
 
@@ -78,7 +73,11 @@ def weights_of(name: DenoiserName, runs: Path) -> Path | None:
 
 def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
     """All denoisers, then those with wrappers; networks with shipped weights and with those trained in `budget`."""
-    for name in map(parse_name, (*DENOISERS, *EVALUATED_WRAPPED)):
+    plain = [DenoiserName(base) for base in DENOISERS]
+    wrapped = [
+        replace(name, wrappers=tuple(suffix.split("+"))) for name in plain for suffix in prototype(name).evaluated_with
+    ]
+    for name in (*plain, *wrapped):
         yield name
         trained = replace(name, budget=budget)
         if shipped_weights(name.base) and not untrained(runs, budget, trained):
@@ -97,8 +96,13 @@ def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu"
     ]
 
 
+def baselines() -> tuple[str, ...]:
+    """The names of the denoisers with which those of total light are compared."""
+    return tuple(name for name in DENOISERS if "total" in prototype(name).baseline_for)
+
+
 def with_indirect_baselines(specs: Sequence[DenoiserSpec]) -> list[DenoiserSpec]:
     """The specs; if any returns indirect light alone, its baselines among them also with that signal."""
     if all(spec.returns == "total" for spec in specs):
         return [*specs]
-    return [*specs, *(replace(spec, signal="indirect") for spec in specs if spec.name in INDIRECT_BASELINES)]
+    return [*specs, *(replace(spec, signal="indirect") for spec in specs if "indirect" in spec.facts.baseline_for)]

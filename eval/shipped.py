@@ -10,7 +10,7 @@ from tabulate import tabulate
 from errors import BadInput
 from eval.metrics import METRICS
 from eval.results import RESULTS_FILE, ClipResults, of_one_spp, read_results, results_of
-from eval.selection import BASELINES
+from eval.selection import baselines
 from eval.tables import LEGEND, PRINTED, clip_rows, mean_rows
 from files import read_json, write_file, write_json
 from models.registry import require_shipped, shipped_names
@@ -155,7 +155,7 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     Raises BadInput unless the network was evaluated with the shipped weights as they are now.
     """
     weights = require_shipped(name)
-    wanted = (*BASELINES, name)
+    wanted = (*baselines(), name)
     path = runs / "eval" / RESULTS_FILE
     content, clips = read_results(runs)
     evaluated = [clip for clip in clips if results_of([clip], name)]

@@ -80,6 +80,8 @@ class Denoiser(nn.Module):
     filters_emission: bool = False  # whether emission is a part of what it filters; else it is added back untouched
     blends_layers: bool = False  # whether it takes glass in one layer, with guides blended from both, instead of twice
     has_kernels: bool = True  # whether compiled kernels do a part of its work
+    baseline_for: tuple[Signal, ...] = ()  # signals whose denoisers evaluations, cards and trade-offs compare with it
+    evaluated_with: tuple[str, ...] = ()  # suffixes with which `onespp eval` runs it beside the denoiser itself
     inputs: Mapping[str, int] = MappingProxyType({})  # of its network in order, and how many channels each has
     # Channels, by the names of inputs, that its network can do without where they do not vary; its input for a value.
     dispensable: ClassVar[Mapping[str, Callable[[Tensor], Tensor]]] = {}

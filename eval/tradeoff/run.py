@@ -17,7 +17,7 @@ from eval.clip_run import NamedDenoiser
 from eval.harness import clips_of_one_spp, evaluate_clip
 from eval.metrics import METRICS
 from eval.results import ClipResults, Result, by_clip
-from eval.selection import BASELINES, cannot_run, choose, untrained, weights_file, with_indirect_baselines
+from eval.selection import baselines, cannot_run, choose, untrained, weights_file, with_indirect_baselines
 from eval.tradeoff.samples import RENDERER, Cost, sample_cost, scene_of, with_samples
 from eval.tradeoff.trades import Times, Trade, front_table, samples_table, trades
 from files import write_json
@@ -102,7 +102,7 @@ def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSp
 
 def with_more_samples(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
     """The named candidates, or baselines and networks with shipped weights, in the precision of `onespp eval`."""
-    usual = (*BASELINES, *shipped_names())
+    usual = (*baselines(), *shipped_names())
     return [
         candidate
         for candidate in chosen

@@ -62,6 +62,7 @@ class ASVGF(SVGF):
 
     made_from = "accounts"
     reads: tuple[str, ...] = (*SVGF.reads, "gradient")
+    baseline_for = ()
 
     def change(self, frame: Frame) -> Tensor:
         return change_of_light(frame)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
 from models.denoiser import CLASSICAL, Denoiser, State, matching_state
 from models.history.accumulation import Accumulation, accumulate
 
@@ -19,6 +19,7 @@ class Noisy(Denoiser):
     convex = True
     has_kernels = False
     blends_layers = True
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         return frame.radiance(self.signal), State(frame.moment)
@@ -48,6 +49,7 @@ class Accumulated(Accumulating):
 
     refuses = CLASSICAL
     convex = True
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))

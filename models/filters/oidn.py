@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame
+from datasets.frame import Frame, Signal
 from errors import BadInput
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.baselines import AccumulatedState, Accumulating
@@ -87,6 +87,8 @@ class OIDN(Denoiser):
     has_kernels = False
     filters_emission = True
     blends_layers = True
+    baseline_for: tuple[Signal, ...] = ("total",)
+    evaluated_with: tuple[str, ...] = ("accumulated", "accumulated+adaptive")
 
     quality: OIDNQuality = "high"
     key: tuple[int, int, int] | None = None  # (H, W, threads) of the filter
@@ -118,17 +120,24 @@ class OIDN(Denoiser):
 class OIDNBalanced(OIDN):
     """OIDN in its quality "balanced"."""
 
+    baseline_for = ()
+    evaluated_with = ()
     quality = "balanced"
 
 
 class OIDNFast(OIDN):
     """OIDN in its quality "fast"."""
 
+    baseline_for = ()
+    evaluated_with = ()
     quality = "fast"
 
 
 class OIDNIrradiance(OIDN):
     """Denoises irradiance + emission, with an albedo of 1; the albedo is multiplied afterwards, of irradiance alone."""
+
+    baseline_for = ()
+    evaluated_with = ()
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         emission = frame.emission if self.signal == "total" else 0
@@ -140,6 +149,8 @@ class OIDNAccumulated(Accumulating, OIDN):
     """Denoises temporally accumulated radiance. The history is not filtered."""
 
     has_kernels = True
+    baseline_for = ()
+    evaluated_with = ("adaptive",)
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         history = self.accumulated(frame, matching_state(state, AccumulatedState, frame))

@@ -215,6 +215,7 @@ class SVGF(Denoiser):
     refuses = CLASSICAL
     convex = True
     separates_lights = True
+    baseline_for: tuple[Signal, ...] = ("total", "indirect")
 
     def change(self, frame: Frame) -> Tensor | None:
         """The share of the history to discard, (B, 1, H, W) in [0, 1]; None for none."""

@@ -75,8 +75,9 @@ class TRMV(SVGF):
         previous = matching_state(state, TRMVState, frame)
         signals = irradiances(frame, self.signal).split(1, dim=1)
         histories = previous.histories if previous else [None] * len(signals)
-        moved = [frame.with_channels({"motion": vectors}) for vectors in reliable_vectors(frame)[-len(signals) :]]
-        integrated = [*map(integrate, moved, signals, histories)]
+        integrated = []
+        for vectors, signal, history in zip(reliable_vectors(frame)[-len(signals) :], signals, histories, strict=True):
+            integrated.append(integrate(frame.with_channels({"motion": vectors}), signal, history))
         geometry = pack_geometry(frame.depth, frame.normal, frame.mesh_id)
         variance = torch.cat([estimate_variance(part, geometry) for part in integrated], dim=1)
         colour = torch.cat([part.colour for part in integrated], dim=1)

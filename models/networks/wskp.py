@@ -163,12 +163,14 @@ class TrunkPredictor(KernelPredictor):
 class WSKP(TrunkPredictor):
     """ImportanceNet of 3 or 6 RepVGG blocks; importance maps and shares of windows 3, 5, ..., 13 (§4.1, §5.3)."""
 
+    evaluated_with: tuple[str, ...] = ("adaptive",)
     outputs = 2 * len(WINDOWS)
 
 
 class WSKP3(WSKP):
     """The smaller of the paper's two networks."""
 
+    evaluated_with = ()
     layers = 3
 
 
