@@ -102,7 +102,6 @@ def test_shipped_weights_come_first_unless_a_budget_is_named(tmp_path, shipped):
 def test_the_default_includes_shipped_networks_and_those_trained_here(tmp_path, shipped, monkeypatch, capsys):
     few = {name: DENOISERS[name] for name in ("noisy", "rae", "wskp3", "wskp6", "kp")}
     monkeypatch.setattr(selection, "DENOISERS", few)
-    monkeypatch.setattr(selection, "EVALUATED_WRAPPED", ("wskp6+adaptive",))
     ours = {name: write_weights(name, shipped / f"{name}.safetensors") for name in ("wskp3", "wskp6")}
     trained = {name: write_weights(name, run_folder(tmp_path, name, "tiny") / WEIGHTS_FILE) for name in ("wskp6", "kp")}
     assert [(spec.name, spec.weights) for spec in evaluated([], tmp_path, "tiny")] == [
