@@ -1,6 +1,5 @@
 """Scores on other people's data by their own rules, beside the rows that they published."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,14 @@ import torch
 from tabulate import tabulate
 from torch import Tensor
 
-from datasets.channels import LUMINANCE_WEIGHTS
 from datasets.clip import Clip, Dataset
 from datasets.frame import to_tensor
+from datasets.tonemap import psnr
 from errors import BadInput
 from eval.clip_run import play
 from eval.metrics import flip, ssim
 from eval.selection import evaluated
-from models.operators import finite
+from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
 
 METRICS = ("PSNR", "SSIM", "FLIP", "tPSNR")
@@ -70,28 +69,21 @@ def as_file(radiance: Tensor, protocol: Protocol) -> Tensor:
     return (255 * protocol.tone(finite(radiance).double()).clamp(0, 1)).floor() / 255
 
 
-def psnr(x: Tensor, y: Tensor) -> float:
-    return -10 * math.log10(max(float((x - y).square().mean()), 1e-10))
-
-
-def luminance(image: Tensor) -> Tensor:
-    """Linear luminance (1, 1, H, W) of an image with gamma, of which Noisebase takes SSIM."""
-    return (image**GAMMA * torch.tensor(LUMINANCE_WEIGHTS).to(image)[:, None, None]).sum(dim=1, keepdim=True)
-
-
 @torch.no_grad()
 def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[float | None]]:
     """A denoiser's METRICS of every frame that counts."""
     rows: list[list[float | None]] = []
-    before: tuple[Tensor, Tensor] | None = None
+    before: Tensor | None = None  # the last frame's error
     for index, _, (output,) in play(clip, [spec.build()]):
         if index < protocol.warm_up:
             continue
         reference = to_tensor(clip.reference(index).mean(axis=0))
         x, y = as_file(output, protocol), as_file(reference, protocol)
-        change = psnr(x - before[0], y - before[1]) if before else None
-        rows.append([psnr(x, y), ssim(luminance(x), luminance(y)), flip(x, y), change])
-        before = x, y
+        error = x - y
+        change = None if before is None else psnr(float((error - before).square().mean()))
+        similarity = ssim(image_luminance(x**GAMMA), image_luminance(y**GAMMA))  # of linear luminance
+        rows.append([psnr(float(error.square().mean())), similarity, flip(x, y), change])
+        before = error
     return rows
 
 

@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from tabulate import tabulate
@@ -98,8 +97,8 @@ def render_scenes(scenes: Path, data: Path, size: tuple[int, int], frames: int) 
 
 def run(
     scenes: Path | None, data: Path, runs: Path, names: Sequence[str], size: tuple[int, int], frames: int, own: bool
-) -> str:
-    """Render and evaluate; write RUNS/benchmark.json. Returns the means by the age of the history as text.
+) -> Path:
+    """Render, evaluate and write RUNS/benchmark.json, whose path is returned.
 
     `own` adds our own scenes, which no training uses. Raises BadInput where there is nothing to evaluate.
     """
@@ -117,16 +116,6 @@ def run(
         for name, folder in folders.items()
         if scenes
     }
-    write_json(runs / "benchmark.json", content | {"by_age": ages, "digests": digests})
-    return by_age(ages)
-
-
-def by_age(ages: dict[str, dict[str, dict[str, float | None]]]) -> str:
-    """Means over all clips, by metric, denoiser and age."""
-    rows: list[list[Any]] = [
-        [metric, name, *("-" if value is None else f"{value:.4g}" for value in values.values())]
-        for metric, table in ages.items()
-        for name, values in table.items()
-    ]
-    heads = list(next(iter(next(iter(ages.values())).values())))
-    return tabulate(rows, ["metric", "denoiser", *heads], disable_numparse=True)
+    path = runs / "benchmark.json"
+    write_json(path, content | {"by_age": ages, "digests": digests})
+    return path
