@@ -9,14 +9,16 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypedDict
 
 ROOT = Path(__file__).parent
 FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval", "denoise")
 BESIDE_THEM = ("errors", "extras", "files", "plotting", "process", "provenance", "timing")
 
-# Packages that determine the bytes of a dataset, and those that determine results of denoising.
+# Packages that determine the bytes of a dataset, results of denoising, and trained weights.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")
 DENOISING = ("onespp", "torch", "numpy", "numba", "flip-evaluator", "pyoidn")
+TRAINING = ("torch", "numpy", "numba", "lightning-fabric")
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
@@ -93,3 +95,28 @@ def imported_by(path: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+class MadeBy(TypedDict):
+    """What a training ran with: weights and checkpoints name it."""
+
+    versions: dict[str, str]  # by package
+    code: str  # its digest
+
+
+def made_by_here(*modules: str) -> MadeBy:
+    """The packages installed here, and the code of `modules`."""
+    return {"versions": versions(TRAINING), "code": code_digest(*modules)}
+
+
+def differences(recorded: Sequence[MadeBy], here: MadeBy) -> str:
+    """How what a training ran with differs from here, "other code, torch 2.12.0 (now 2.13.0)"; empty if it does not."""
+    changes: dict[str, None] = {}  # an ordered set
+    for made_by in recorded:
+        if made_by["code"] != here["code"]:
+            changes["other code"] = None
+        for package in TRAINING:
+            then, now = (each["versions"].get(package, "none") for each in (made_by, here))
+            if then != now:
+                changes[f"{package} {then} (now {now})"] = None
+    return ", ".join(changes)

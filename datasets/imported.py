@@ -11,7 +11,7 @@ from datasets.clip import SCHEMA, is_clip
 from datasets.writer import ClipWriter
 from errors import BadInput
 from files import write_json
-from scenes.camera import Array, View, motion_vectors, pixel_centres, view_of
+from scenes.camera import Array, View, project, view_of
 
 Image = NDArray[np.float32]
 
@@ -26,7 +26,7 @@ class ImportedFrame(NamedTuple):
     position: Image  # in the world
     surface: NDArray[np.bool_]  # (H, W), where a pixel shows one
     view: View
-    motion: Image | None = None  # px; None where only the camera moves
+    moved: Image | float = 0.0  # from where surfaces are in the world to where they were in the frame before
 
 
 def view_of_clip_space(matrix: Array, to_pixels: Array) -> View:
@@ -45,10 +45,8 @@ def channels_of(frame: ImportedFrame, previous: View) -> dict[str, NDArray[Any]]
     world_to_camera = np.linalg.inv(frame.view.camera_to_world)
     shown = frame.surface[..., None]
     depth = np.where(shown, frame.position @ world_to_camera[2, :3, None] + world_to_camera[2, 3], 0)
-    motion: NDArray[np.floating] | None = frame.motion
-    if motion is None:
-        centres = pixel_centres(*frame.surface.shape)
-        motion = motion_vectors(centres, depth[..., 0], frame.surface.astype(int), frame.view, previous)
+    now = frame.position.astype(np.float64)
+    motion = project(now + frame.moved, frame.surface, previous) - project(now, frame.surface, frame.view)
     dark = np.zeros_like(frame.radiance)
     return {
         "direct": np.where(shown, frame.radiance, 0)[None],
@@ -61,8 +59,8 @@ def channels_of(frame: ImportedFrame, previous: View) -> dict[str, NDArray[Any]]
         "depth": depth,
         "roughness": np.ones_like(depth),
         "mesh_id": shown.astype("<u2"),
-        "motion": motion,
-        "dual_motion": motion,
+        "motion": np.where(shown, motion, 0),
+        "dual_motion": np.where(shown, motion, 0),
         **frame.view._asdict(),
     }
 

@@ -16,9 +16,8 @@ from tqdm import tqdm
 from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
 from errors import BadInput
 from extras import requires_extra
-from scenes.camera import FAR_OUTSIDE, Array
 
-LEFT_OUT = 28  # rows
+CROPPED_ROWS = 28  # rows
 
 
 def import_noisebase(source: Path, out: Path, samples: int) -> int:
@@ -34,40 +33,29 @@ def import_noisebase(source: Path, out: Path, samples: int) -> int:
 
 
 def frames_of(folder: Path, samples: int) -> Iterator[ImportedFrame]:
-    """The frames of a sequence."""
-    previous: Array | None = None
+    """The frames of a sequence. Surfaces are those of the first sample: the mean of several depths lies on none."""
     for path in tqdm(sorted(folder.glob("frame*.zip")), folder.name, unit="frame", leave=False):
         arrays = read_group(path)
-        if arrays["color"].shape[-1] < samples:
-            raise BadInput(f"{path} has {arrays['color'].shape[-1]} samples per pixel, not {samples}")
-        matrix = arrays["view_proj_mat"].astype(np.float64)
-        yield imported_frame(arrays, matrix if previous is None else previous, samples)
-        previous = matrix
-
-
-def imported_frame(arrays: dict[str, NDArray[Any]], before: Array, samples: int) -> ImportedFrame:
-    """A frame, by the matrix of the frame `before`.
-
-    Surfaces are those of the first sample: the mean of several depths lies on none.
-    """
-    to_pixels = pixels_of_clip_space(*arrays["color"].shape[1:3])
-    matrix = arrays["view_proj_mat"].astype(np.float64)
-    first = {name: image_of(arrays[name][..., 0]) for name in ("position", "motion", "normal")}
-    return ImportedFrame(
-        radiance=image_of(decoded(arrays["color"][..., :samples], arrays["exposure"]).mean(axis=-1)),
-        reference=image_of(arrays["reference"]),
-        albedo=image_of(arrays["diffuse"][..., :samples].mean(axis=-1, dtype=np.float32)),
-        normal=first["normal"],
-        position=first["position"],
-        surface=np.abs(first["normal"]).sum(axis=-1) > 0,
-        view=view_of_clip_space(matrix, to_pixels),
-        motion=motion_of(first["position"], first["motion"], matrix, before, to_pixels),
-    )
+        _, height, width, count = arrays["color"].shape
+        if count < samples:
+            raise BadInput(f"{path} has {count} samples per pixel, not {samples}")
+        to_pixels = np.array([[width / 2, 0, width / 2], [0, -height / 2, height / 2 - CROPPED_ROWS], [0, 0, 1]])
+        normal = image_of(arrays["normal"][..., 0])
+        yield ImportedFrame(
+            radiance=image_of(decoded(arrays["color"][..., :samples], arrays["exposure"]).mean(axis=-1)),
+            reference=image_of(arrays["reference"]),
+            albedo=image_of(arrays["diffuse"][..., :samples].mean(axis=-1, dtype=np.float32)),
+            normal=normal,
+            position=image_of(arrays["position"][..., 0]),
+            surface=np.abs(normal).sum(axis=-1) > 0,
+            view=view_of_clip_space(arrays["view_proj_mat"].astype(np.float64), to_pixels),
+            moved=image_of(arrays["motion"][..., 0]),
+        )
 
 
 def image_of(array: NDArray[Any]) -> Image:
     """(C, H, W) as (H, W, C), without the rows that are left out."""
-    return np.moveaxis(array[:, LEFT_OUT:-LEFT_OUT].astype(np.float32), 0, -1)
+    return np.moveaxis(array[:, CROPPED_ROWS:-CROPPED_ROWS].astype(np.float32), 0, -1)
 
 
 def read_group(path: Path) -> dict[str, NDArray[Any]]:
@@ -91,18 +79,3 @@ def decoded(color: NDArray[np.uint8], exposure: NDArray[np.float32]) -> Image:
     low, high = (float(value) for value in exposure)
     exponent = low + (color[3].astype(np.float32) + 1) / 256 * (high - low)
     return color[:3].astype(np.float32) / 255 * np.exp(exponent)
-
-
-def pixels_of_clip_space(height: int, width: int) -> Array:
-    """From clip space (x, y, w) to pixels of the rows that are kept, (3, 3)."""
-    return np.array([[width / 2, 0, width / 2], [0, -height / 2, height / 2 - LEFT_OUT], [0, 0, 1]])
-
-
-def motion_of(position: Image, moved: Image, now: Array, before: Array, to_pixels: Array) -> Image:
-    """Motion vectors (H, W, 2) in pixels, of surfaces at `position` that were at `position + moved` before."""
-    pixels = []
-    for points, matrix in ((position, now), (position + moved, before)):
-        homogeneous = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
-        projected = homogeneous @ matrix[:, [0, 1, 3]] @ to_pixels.T
-        pixels.append(projected[..., :2] / np.where(projected[..., 2:] == 0, 1, projected[..., 2:]))
-    return np.clip(pixels[1] - pixels[0], -FAR_OUTSIDE, FAR_OUTSIDE).astype(np.float32)

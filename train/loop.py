@@ -12,8 +12,8 @@ from tqdm import tqdm
 from errors import BadInput
 from extras import can_draw
 from files import locked
+from provenance import differences
 from train.log import Log, loss_curve, sample_picture
-from train.made_by import differences
 from train.precision import fabric_here
 from train.task import WEIGHTS_FILE, Task
 from train.training import BEST_FILE, Training, load_checkpoint

@@ -5,9 +5,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from datasets.clip import Dataset
 from errors import BadInput
 from models.registry import create
+from models.spec import fastest_precision
 from train.augmentation import Augmentation
 from train.losses.displayed import DisplayedLoss
 from train.losses.ntd import NTDLoss
@@ -157,4 +160,5 @@ def task_for(name: str, data: Path, runs: Path, budget: str) -> Task:
         data=Dataset(data),
         folder=run_folder(runs, name, budget),
         cache=runs / "accumulated",
+        usual_precision=fastest_precision(name, "cuda" if torch.cuda.is_available() else "cpu"),
     )

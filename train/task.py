@@ -60,7 +60,8 @@ class Task:
     folder: Path  # of this training
     cache: Path  # of accumulated frames, which trainings share
     seed: int = 0
-    precision: str | None = None  # None: the fastest here
+    precision: str | None = None  # None: that of the training that is resumed, or else usual_precision
+    usual_precision: str = "float32"
     micro_batch: int | None = None  # items in memory together; None: what fits a few gigabytes
     start: Path | None = None  # the weights to begin with instead of fresh ones
     specialised: bool = False  # whether the network does without what does not vary in the data

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -20,13 +19,12 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from errors import BadInput
 from files import write_file
 from models.weights import save_weights
-from provenance import file_digest
+from provenance import MadeBy, file_digest, made_by_here
 from train.crops import AnyBatch
 from train.data import equal_parts, items, largest_micro_batch, load_ahead, micro_batches
 from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
-from train.made_by import MadeBy, made_by_here
-from train.precision import fabric_here, fastest_precision
+from train.precision import fabric_here
 from train.task import Task
 
 BEST_FILE = "best.safetensors"
@@ -104,7 +102,7 @@ class Training:
         self.total = self.recipe.epochs * self.per_epoch
         self.position = Position()
 
-        self.precision: str = fabric.broadcast(self.choose_precision(loss, saved, fabric))
+        self.precision: str = fabric.broadcast(self.choose_precision(saved))
         self.fabric = fabric_here(self.precision)
         optimiser = torch.optim.Adam(denoiser.parameters(), lr=self.recipe.learning_rate(0), betas=self.recipe.betas)
         self.loss, self.optimiser = self.fabric.setup(loss, optimiser)
@@ -123,7 +121,7 @@ class Training:
         if denoiser.constants:
             self.facts["constants"] = denoiser.constants
         self.made_by: list[MadeBy] = saved["made_by"] if saved else []
-        self.made_by_here = made_by_here(loss)
+        self.made_by_here = made_by_here("train.loop", type(loss.loss).__module__, type(denoiser).__module__)
         if saved:
             self.resume(saved)
         if not self.finished and self.made_by_here not in self.made_by:
@@ -138,18 +136,15 @@ class Training:
         """Whether validation follows the step just taken."""
         return self.finished or self.position.done % max(1, self.total // VALIDATIONS) == 0
 
-    def choose_precision(self, loss: NetworkLoss, saved: Checkpoint | None, fabric: Fabric) -> str:
-        """A resumed training keeps its precision, whatever would be the fastest this time."""
+    def choose_precision(self, saved: Checkpoint | None) -> str:
+        """That of the task; a resumed training keeps its precision."""
         wanted = self.task.precision
-        if saved:
-            kept: str = saved["precision"]
-            if wanted and kept != wanted:
-                raise BadInput(f"{self.task.folder} has a training in {kept}: delete it or use another --runs")
-            return kept
-        if wanted:
-            return wanted
-        first, *_ = micro_batches(0, 1, self.recipe.batch, self.micro_batch, 0, fabric.world_size)
-        return fastest_precision(loss, self.items.batch(first), fabric.device.type)
+        if not saved:
+            return wanted or self.task.usual_precision
+        kept: str = saved["precision"]
+        if wanted and kept != wanted:
+            raise BadInput(f"{self.task.folder} has a training in {kept}: delete it or use another --runs")
+        return kept
 
     def resume(self, saved: Checkpoint) -> None:
         if saved.get("facts") != self.facts:

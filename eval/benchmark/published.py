@@ -11,7 +11,7 @@ from torch import Tensor
 
 from datasets.clip import Clip, Dataset
 from datasets.frame import to_tensor
-from datasets.tonemap import psnr
+from datasets.tonemap import DISPLAY_GAMMA, psnr
 from errors import BadInput
 from eval.clip_run import play
 from eval.metrics import flip, ssim
@@ -19,8 +19,7 @@ from eval.selection import evaluated
 from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
 
-METRICS = ("PSNR", "SSIM", "FLIP", "tPSNR")
-GAMMA = 2.2
+PUBLISHED_METRICS = ("PSNR", "SSIM", "FLIP", "tPSNR")
 # Stephen Hill's fit of the ACES tone curve (BakingLab): to its colour space, the curve's coefficients, and back.
 ACES_INPUT = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777))
 ACES_OUTPUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602))
@@ -33,12 +32,12 @@ def gamma_tone(radiance: Tensor) -> Tensor:
 def aces_tone(radiance: Tensor) -> Tensor:
     x = torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_INPUT).to(radiance), radiance)
     x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
-    return torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_OUTPUT).to(x), x).clamp(0, 1) ** (1 / GAMMA)
+    return torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_OUTPUT).to(x), x).clamp(0, 1) ** (1 / DISPLAY_GAMMA)
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How others score, and their results: means over clips by METRICS, as far as they give them."""
+    """How others score, and their results: means over clips by PUBLISHED_METRICS, as far as they give them."""
 
     tone: Callable[[Tensor], Tensor]
     warm_up: int  # frames of each clip that do not count
@@ -71,7 +70,7 @@ def as_file(radiance: Tensor, protocol: Protocol) -> Tensor:
 
 @torch.no_grad()
 def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[float | None]]:
-    """A denoiser's METRICS of every frame that counts."""
+    """A denoiser's PUBLISHED_METRICS of every frame that counts."""
     rows: list[list[float | None]] = []
     before: Tensor | None = None  # the last frame's error
     for index, _, (output,) in play(clip, [spec.build()]):
@@ -81,7 +80,7 @@ def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[floa
         x, y = as_file(output, protocol), as_file(reference, protocol)
         error = x - y
         change = None if before is None else psnr(float((error - before).square().mean()))
-        similarity = ssim(image_luminance(x**GAMMA), image_luminance(y**GAMMA))  # of linear luminance
+        similarity = ssim(image_luminance(x**DISPLAY_GAMMA), image_luminance(y**DISPLAY_GAMMA))  # of linear luminance
         rows.append([psnr(float(error.square().mean())), similarity, flip(x, y), change])
         before = error
     return rows
@@ -97,4 +96,4 @@ def published(names: Sequence[str], data: Path, runs: Path, budget: str) -> str:
     for spec in evaluated(names, runs, budget):
         clips = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in dataset.clips("test")]
         lines.append([spec.name, *(f"{mean:.4g}" for mean in np.mean(clips, axis=0))])
-    return tabulate(lines, ["", *METRICS], disable_numparse=True)
+    return tabulate(lines, ["", *PUBLISHED_METRICS], disable_numparse=True)

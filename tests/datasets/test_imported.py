@@ -7,7 +7,7 @@ import pytest
 from datasets.bmfr_files import import_bmfr
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
-from datasets.noisebase_files import LEFT_OUT, import_noisebase
+from datasets.noisebase_files import CROPPED_ROWS, import_noisebase
 from errors import BadInput
 from models.registry import create
 from scenes.camera import STILL, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
@@ -127,7 +127,7 @@ def encoded(radiance):
 @pytest.fixture
 def noisebase(tmp_path):
     zarr = pytest.importorskip("zarr")
-    size = SIZE[0] + 2 * LEFT_OUT, SIZE[1]
+    size = SIZE[0] + 2 * CROPPED_ROWS, SIZE[1]
     folder = tmp_path / "files" / "bistro1"
     folder.mkdir(parents=True)
     for index in range(FRAMES):
@@ -157,15 +157,15 @@ def noisebase(tmp_path):
 def test_noisebase_files_keep_cameras_light_and_motion(noisebase, tmp_path):
     assert import_noisebase(noisebase, tmp_path / "data", samples=2) == 1
     (clip,) = Dataset(tmp_path / "data").clips("test")
-    size = SIZE[0] + 2 * LEFT_OUT, SIZE[1]
-    rows = slice(LEFT_OUT, size[0] - LEFT_OUT)
+    size = SIZE[0] + 2 * CROPPED_ROWS, SIZE[1]
+    rows = slice(CROPPED_ROWS, size[0] - CROPPED_ROWS)
     assert (clip.scene, clip.height, clip.width, clip.facts["noisy_spp"]) == ("bistro1", *SIZE, 2)
     for index in range(FRAMES):
         wanted = view(index, size)
         samples = [images(10 * index + sample, size)[0] for sample in (0, 1)]
         assert np.allclose(clip.noisy(index), np.mean(samples, axis=0)[rows], rtol=0.02, atol=0.01)
         assert np.allclose(clip.view(index).camera_to_world, wanted.camera_to_world, atol=1e-4)
-        assert np.allclose(clip.view(index).K[:2, 2], wanted.K[:2, 2] - [0, LEFT_OUT], atol=0.01)
+        assert np.allclose(clip.view(index).K[:2, 2], wanted.K[:2, 2] - [0, CROPPED_ROWS], atol=0.01)
         point = positions(wanted, size)[rows][30, 40]
         u, v, w = clip.view(index).K @ (np.linalg.inv(clip.view(index).camera_to_world)[:3] @ [*point, 1])
         assert np.allclose([u / w, v / w], [40.5, 30.5], atol=0.01)

@@ -126,9 +126,9 @@ def played(monkeypatch):
     calls = []
     run_clip = harness.run_clip
 
-    def watched(clip, tracks, folders, quiet=False):
-        calls.append((clip.scene, sorted(track.name for track in tracks)))
-        run_clip(clip, tracks, folders, quiet)
+    def watched(clip, runs, quiet=False):
+        calls.append((clip.scene, sorted(run.name for run in runs.values())))
+        run_clip(clip, runs, quiet)
 
     monkeypatch.setattr(harness, "run_clip", watched)
     return calls
@@ -209,11 +209,11 @@ def test_an_interrupted_evaluation_resumes_to_equal_results(once, tiny, tmp_path
     frames = []
     save = clip_run.save_picture
 
-    def killed(folder, index, image):
-        frames.append(index)
+    def killed(path, image):
+        frames.append(path)
         if len(frames) > frame * (len(NAMES) + 1) + 1:
             raise KeyboardInterrupt
-        save(folder, index, image)
+        save(path, image)
 
     runs = tmp_path / "runs"
     shutil.copytree(once / "train", runs / "train")

@@ -65,7 +65,7 @@ def test_what_needs_references_takes_the_judged_frames(both):
 
 @pytest.mark.parametrize(
     ("split", "frames", "reason"),
-    [("train", [0], "training and validation"), ("test", [1, 0], "rising order"), ("test", [2], "from 0 to 1")],
+    [("train", [0], "unknown field `judged`"), ("test", [1, 0], "rising order"), ("test", [2], "from 0 to 1")],
 )
 def test_frames_that_cannot_be_judged_are_refused(tmp_path, split, frames, reason):
     path = write(tmp_path, xml(), f"[splits.{split}]\njudged = {frames}\n")

@@ -2,7 +2,6 @@
 
 import math
 import shutil
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from errors import BadInput
 from tests.helpers.training import full_disk, short_task, tensors
 from train.loop import train_network
 from train.losses.network_loss import NetworkLoss
-from train.precision import BFLOAT16, FLOAT32, fastest_precision
 from train.training import BEST_FILE, CHECKPOINT_FILE, MAX_SKIPPED_IN_A_ROW, Training, average_decay, update_average
 
 
@@ -168,29 +166,3 @@ def test_the_average_is_what_is_validated_and_saved(tiny, tmp_path):
     assert all(torch.equal(saved[name], p) for name, p in training.judged.denoiser.state_dict().items())
     training.judged = training.loss.module
     assert training.validate() != validation
-
-
-class SlowIn(torch.nn.Module):
-    """A loss that computes for long in one precision, and waits for longer in the other, as on a busy machine."""
-
-    def __init__(self, precision: str):
-        super().__init__()
-        self.precision = precision
-        self.weight = torch.nn.Parameter(torch.ones(()))
-
-    def forward(self, batch):
-        if torch.is_autocast_enabled("cpu") == (self.precision == BFLOAT16):
-            end = time.process_time() + 0.02
-            while time.process_time() < end:
-                pass
-        else:
-            time.sleep(0.05)
-        return self.weight * 1, {}
-
-
-@pytest.mark.parametrize("slow, fast", [(BFLOAT16, FLOAT32), (FLOAT32, BFLOAT16)])
-def test_the_faster_precision_wins_however_busy_the_machine(slow, fast):
-    loss = SlowIn(slow)
-    threads = torch.get_num_threads()
-    assert fastest_precision(loss, torch.zeros(1), "cpu") == fast
-    assert loss.weight.grad is None and torch.get_num_threads() == threads

@@ -207,7 +207,7 @@ def folder(tmp_path_factory) -> Path:
 
 def rendered(scene) -> np.ndarray:
     """A frame's light (H, W, 3), with what is visible directly."""
-    posed = PosedFrame(Stage(scene.clip(2, 0, False, True), 24, 32), 1)
+    posed = PosedFrame(Stage(scene.clip("test", 0, 2, 0), 24, 32), 1)
     return np.add(*posed.tracer.radiance(posed.ray, 0, 2)) + posed.emission
 
 
