@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from extras import requires_extra
+from errors import requires_extra
 from files import replacing
 
 with requires_extra("report"):

@@ -13,7 +13,7 @@ from typing import TypedDict
 
 ROOT = Path(__file__).parent
 FOLDERS = ("scenes", "render", "datasets", "models", "train", "eval", "denoise")
-BESIDE_THEM = ("errors", "extras", "files", "plotting", "process", "provenance", "timing")
+BESIDE_THEM = ("errors", "files", "plotting", "process", "provenance", "timing")
 
 # Packages that determine the bytes of a dataset, results of denoising, and trained weights.
 RENDERING = ("onespp", "mitsuba", "drjit", "numpy")

@@ -81,16 +81,13 @@ def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[Imported
     if not (root / "dataset.json").exists() and any(root.glob("[!.]*")):
         raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
     write_json(root / "dataset.json", facts)
-    written = 0
-    for name, frames in clips.items():
-        folder = root / "test" / name / "000"
-        if is_clip(folder):
-            continue
+    missing = {root / "test" / name / "000": frames for name, frames in clips.items()}
+    missing = {folder: frames for folder, frames in missing.items() if not is_clip(folder)}
+    for folder, frames in missing.items():
         with ClipWriter(folder) as writer:
             previous = None
             for frame in frames:
                 writer.add(channels_of(frame, previous or frame.view), {})
                 previous = frame.view
             writer.finish({"noisy_spp": spp, "reference_spp": 0, "meshes": ["scene"], "source": source}, {})
-        written += 1
-    return written
+    return len(missing)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
-from errors import BadInput
-from extras import requires_extra
+from errors import BadInput, requires_extra
 
 CROPPED_ROWS = 28  # rows
 

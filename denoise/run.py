@@ -25,9 +25,8 @@ from denoise.layers import COLOUR, parse_layers
 from denoise.motion_convention import MotionConvention
 from denoise.sequence import FrameFiles, files_of, gaps, numbered, sequence_of, split_at_cuts
 from denoise.sources import Sources, find_sources, has_two_buffers
-from errors import BadInput
+from errors import BadInput, requires_extra
 from eval.bench.memory import status_mb
-from extras import requires_extra
 from files import read_json, replacing, write_json
 from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN, OIDNQuality

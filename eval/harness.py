@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from datasets.clip import Clip, Dataset
-from errors import BadInput
+from errors import BadInput, can_draw
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.clip_run import DenoiserRun, NamedDenoiser, ReferenceRun, Run, run_clip
 from eval.results import (
@@ -32,7 +32,6 @@ from eval.results import (
 )
 from eval.selection import evaluated, with_indirect_baselines
 from eval.tables import results_table, table_by_age
-from extras import can_draw
 from models.spec import DenoiserSpec
 from process import set_up_process
 from provenance import device_in_words

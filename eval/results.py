@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from datasets.clip import Clip, ClipKind
 from datasets.frame import Signal
-from errors import BadInput
+from errors import BadInput, can_draw
 from eval.metrics import METRICS, Values
-from extras import can_draw
 from files import read_json, write_file, write_json
 from provenance import DENOISING, code_digest, versions
 

@@ -12,8 +12,8 @@ from trimesh.visual import TextureVisuals
 from errors import BadInput
 from render.backend import VARIANT, dr, mi
 from scenes.animation import Shape, StockLight, StockShape
-from scenes.bsdf import Bsdf
 from scenes.camera import Array
+from scenes.colours import Bsdf
 
 ArrayT = TypeVar("ArrayT", bound=dr.AnyArray)
 PLACE = "_place"  # where a file describes it: a key in descriptions that Mitsuba does not get

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import mi
-from scenes.sky import SKY_SIZE
+from scenes.textures import SKY_SIZE
 
 MAX_OBJECTS = {"BSDF": 256, "Texture": 1024, "Shape": 256, "Emitter": 16}
 HALF_GREY = {"type": "rgb", "value": [0.5, 0.5, 0.5]}

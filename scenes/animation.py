@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from scenes.bsdf import Bsdf
 from scenes.camera import Y_UP, Array, View, axis_rotation, intrinsics, look_at
+from scenes.colours import Bsdf
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,16 @@
-"""Colours: the sRGB curve, random linear reflectances for interiors and random colours of lamps."""
+"""Colours, from the sRGB curve to random lamps, and materials of one colour or texture as Mitsuba dictionaries."""
 
 import colorsys
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenes.camera import Array
 from scenes.draws import Rng
+
+Bsdf = dict[str, Any]  # or a texture within one; the values of a bitmap are a numpy array under "data"
 
 MIN_REFLECTANCE = 0.02  # linear
 MAX_REFLECTANCE = 0.9
@@ -70,3 +75,18 @@ def light_colour(rng: Rng) -> Array:
     position = (len(LIGHT_COLOURS) - 1) * rng.beta(3, 2)
     colour = np.stack([np.interp(position, range(len(LIGHT_COLOURS)), channel) for channel in LIGHT_COLOURS.T])
     return np.asarray(colour / colour.max())
+
+
+def rgb(values: Iterable[float]) -> Bsdf:
+    """A constant colour: linear RGB, 0..1."""
+    return {"type": "rgb", "value": list(values)}
+
+
+def bitmap(values: NDArray[np.float32], repeats: float = 1.0) -> Bsdf:
+    """A texture of linear `values` (H, W, C), `repeats` times in a unit of texture coordinates."""
+    return {"type": "bitmap", "data": values, "raw": True, "to_uv": np.diag([repeats, repeats, 1.0])}
+
+
+def diffuse_bsdf(reflectance: Bsdf) -> Bsdf:
+    """A Lambertian surface of that colour or texture."""
+    return {"type": "diffuse", "reflectance": reflectance}

@@ -11,10 +11,10 @@ import numpy as np
 import trimesh
 
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track, still
-from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
 from scenes.camera import Array
+from scenes.colours import Bsdf, diffuse_bsdf, rgb
 from scenes.draws import Rng
-from scenes.sky import sky
+from scenes.textures import sky
 
 SceneBuilder = Callable[[Rng, int], Scene]  # of a clip's number of frames
 

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scenes.bsdf import Bsdf, bitmap, diffuse_bsdf, rgb
-from scenes.colours import colour
+from scenes.colours import Bsdf, bitmap, colour, diffuse_bsdf, rgb
 from scenes.draws import Rng, log_uniform
 from scenes.textures import gray_texture, texture
 

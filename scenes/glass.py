@@ -11,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes.animation import AT_REST, Camera, RigidMotion, Scene, Shape, Track, still
-from scenes.bsdf import Bsdf, bitmap, diffuse_bsdf, rgb
 from scenes.camera import Array
+from scenes.colours import Bsdf, bitmap, diffuse_bsdf, rgb
 from scenes.draws import Rng
 from scenes.finish import CLEAR_GLASS, GLASS
 from scenes.meshes import Surface, hollow, lathe, silhouette, slab, solid, superellipsoid, tube
-from scenes.sky import sky
-from scenes.textures import bond, texture
+from scenes.textures import bond, sky, texture
 
 WATER: Bsdf = {"type": "dielectric", "int_ior": 1.33}
 FROSTED: Bsdf = {"type": "roughdielectric", "int_ior": GLASS, "alpha": 0.2}

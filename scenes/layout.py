@@ -6,8 +6,8 @@ import numpy as np
 
 from scenes.animation import RigidMotion, Shape, still
 from scenes.boxes import bounding_box, overlaps, transformed_box
-from scenes.bsdf import Bsdf
 from scenes.camera import Array
+from scenes.colours import Bsdf
 from scenes.draws import Rng
 from scenes.finish import finish
 from scenes.meshes import Surface

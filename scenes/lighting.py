@@ -11,9 +11,8 @@ import trimesh
 
 from scenes.animation import AT_REST, KeyframedTrack, RigidMotion, Shape, Track, still
 from scenes.boxes import bounding_box, transformed_box
-from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
-from scenes.colours import light_colour
+from scenes.colours import diffuse_bsdf, light_colour, rgb
 from scenes.draws import log_uniform, one_of, uniforms
 from scenes.layout import GAP, Layout
 from scenes.meshes import Surface, horizontal_rectangle, join, lathe, slab, superellipsoid

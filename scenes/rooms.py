@@ -9,8 +9,8 @@ import numpy as np
 from scenes import lighting
 from scenes.animation import Scene, Shape, Track
 from scenes.boxes import bounding_box
-from scenes.bsdf import diffuse_bsdf, rgb
 from scenes.camera import Array
+from scenes.colours import diffuse_bsdf, rgb
 from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
@@ -18,7 +18,7 @@ from scenes.furnishing import against_walls, furnish
 from scenes.layout import Layout
 from scenes.meshes import Surface, horizontal_rectangle, join, sheet, slab
 from scenes.objects.fittings import make_blind, make_curtain
-from scenes.sky import sky
+from scenes.textures import sky
 
 MAX_LAMPS = 4
 MIN_ZOOM, MAX_ZOOM = 1.5, 6.0  # of close-ups, times the room's focal length

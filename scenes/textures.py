@@ -1,4 +1,4 @@
-"""Random bitmap textures of linear reflectances for interiors; all repeat seamlessly. S is TEXTURE_SIZE."""
+"""Random bitmap textures for interiors, linear reflectances that repeat seamlessly, and skies. S is TEXTURE_SIZE."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scenes.camera import Array
-from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, palette
-from scenes.draws import Rng, one_of, uniforms
+from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, light_colour, palette
+from scenes.draws import Rng, log_uniform, one_of, uniforms
 
 TEXTURE_SIZE = 256  # px
 PALETTE_SIZE = 4  # colours of a texture
+SKY_SIZE = (64, 128)  # rows and columns; kernels of scenes with skies of the same size are shared
 
 # Texture coordinates of all texels' centres.
 X, Y = np.meshgrid((np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE, (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE)
@@ -199,3 +200,24 @@ def gray_texture(rng: Rng, low: float, high: float) -> NDArray[np.float32]:
     values = painted(rng, rng.permutation(np.linspace(0.2, 1, PALETTE_SIZE))[:, None])
     values -= values.min()
     return (low + (high - low) * values / max(values.max(), 1e-9)).astype(np.float32)
+
+
+def sky(rng: Rng, sun: Array | None) -> Array:
+    """Radiance (*SKY_SIZE, 3) of a sky over dark ground: latitude-longitude, y up.
+
+    `sun` is the direction (3,) to the sun, or None under clouds. The sun gives 0.3 to 30 times the light of its sky.
+    """
+    height, width = SKY_SIZE
+    up = np.cos(np.pi * ((np.arange(height) + 0.5) / height))[:, None, None]
+    zenith = rng.uniform(0.6, 1.0, 3) * [0.4, 0.6, 1.0]
+    horizon = rng.uniform(0.6, 1.0, 3) * [0.9, 0.95, 1.0]
+    ground = rng.uniform(0.5, 1.0, 3) * 0.2
+    blend = np.clip(up, 0, 1) ** 0.5
+    image = np.where(up > 0, zenith * blend + horizon * (1 - blend), ground)
+    image = np.repeat(image, width, axis=1)
+    if sun is not None:
+        x, y, z = sun / np.linalg.norm(sun)
+        row = np.arccos(y) / np.pi * height
+        column = np.arctan2(x, -z) / np.pi / 2 % 1 * width
+        image[int(row), int(column)] += light_colour(rng) * log_uniform(rng, 300, 20000)
+    return np.asarray(image)

@@ -12,7 +12,7 @@ from torch import Tensor
 from datasets.clip import Clip
 from datasets.frame import read_frame, to_tensor
 from datasets.tonemap import display
-from extras import can_draw
+from errors import can_draw
 from files import replacing
 from models.denoiser import Denoiser, State
 from models.operators import finite

@@ -9,8 +9,7 @@ from pathlib import Path
 from lightning_fabric import Fabric
 from tqdm import tqdm
 
-from errors import BadInput
-from extras import can_draw
+from errors import BadInput, can_draw
 from files import locked
 from provenance import differences
 from train.log import Log, loss_curve, sample_picture

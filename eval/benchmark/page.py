@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from datasets.clip import Clip, Dataset
-from errors import BadInput
 from eval.clip_run import as_displayed, play
 from eval.selection import evaluated
 from files import write_file
@@ -25,13 +24,11 @@ def video(clip: Clip, spec: DenoiserSpec) -> list[str]:
     return [webp_uri(as_displayed(output, clip.exposure), quality=QUALITY) for _, _, (output,) in played]
 
 
-def write_page(names: Sequence[str], data: Sequence[Path], runs: Path, budget: str) -> Path:
+def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget: str) -> Path:
     """Write RUNS/compare.html, one file that works offline. Returns its path.
 
-    Raises BadInput unless two denoisers are named, and as `onespp eval`.
+    Raises BadInput as `onespp eval`.
     """
-    if len(names) != 2:
-        raise BadInput("name two denoisers to compare, such as one and oidn+accumulated+adaptive")
     specs = evaluated(names, runs, budget)
     clips = [
         {

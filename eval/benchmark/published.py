@@ -25,10 +25,6 @@ ACES_INPUT = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840
 ACES_OUTPUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602))
 
 
-def gamma_tone(radiance: Tensor) -> Tensor:
-    return radiance.clamp(min=0) ** 0.454545
-
-
 def aces_tone(radiance: Tensor) -> Tensor:
     x = torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_INPUT).to(radiance), radiance)
     x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
@@ -47,7 +43,7 @@ class Protocol:
 # By the profile of an imported dataset. Sources: Fan et al. 2021, Table 2; Noisebase, docs/benchmarks/rendering_v1.md.
 PROTOCOLS = {
     "bmfr": Protocol(
-        gamma_tone,
+        lambda radiance: radiance.clamp(min=0) ** 0.454545,
         warm_up=0,
         rows={
             "KP (Fan et al. 2021)": (30.33,),

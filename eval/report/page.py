@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from errors import BadInput
+from errors import BadInput, requires_extra
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, by_signal, folders_of, load_picture, of_one_spp, picture_path, read_results
 from eval.tables import LEGEND, scores_of, table_rows
 from eval.tradeoff.trades import Times, dominated_by_name, times_of_first_size
-from extras import requires_extra
 from files import replacing, write_file
 from models.spec import DenoiserSpec
 from plotting import Image, ImageDraw, ImageFont, data_uri, enlargement, plt, webp_uri

@@ -14,7 +14,6 @@ def port_table(ports: Sequence[Mapping[str, Any]]) -> str:
 
 def instructions(manifest: Mapping[str, Any]) -> str:
     """The text, in Markdown."""
-    kind = manifest["format"]
     texts = {path.stem: path.read_text() for path in TEXTS.iterdir()}
     cpp = f"```cpp\n{texts['cpp'].replace('FILE', manifest['file'])}```"
     return texts["README"].format(
@@ -24,6 +23,6 @@ def instructions(manifest: Mapping[str, Any]) -> str:
         outputs=port_table(manifest["outputs"]),
         state="\n".join(f"- `{each['input']}`: `{each['from']}` of the previous frame" for each in manifest["state"]),
         history=texts[manifest["warp"]].strip(),
-        python=texts[kind],
-        cpp=cpp if kind == "onnx" else "Export to ONNX: `onespp export … --to onnx`.",
+        python=texts[manifest["format"]],
+        cpp=cpp if manifest["format"] == "onnx" else "Export to ONNX: `onespp export … --to onnx`.",
     )

@@ -12,7 +12,7 @@ from render.loading import PLACE
 from render.scene_file.stand_ins import GREY, REPAIRS, SURFACE_LIGHTS, Names, Properties, StandIn, plugins, stand_in
 from render.scene_file.xml import ParsedFile, inside
 from scenes.animation import StockLight, StockShape
-from scenes.bsdf import diffuse_bsdf, rgb
+from scenes.colours import diffuse_bsdf, rgb
 
 RENDERER_SETTINGS = ("Sampler", "Film", "ReconstructionFilter")  # of other renderers: frames here follow the TOML
 # By kind of object: the kinds that may be nested in it. Mitsuba crashes on some others.

@@ -15,15 +15,13 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from errors import BadInput
-from extras import can_draw
+from errors import BadInput, can_draw
 from render.loading import MAX_EXTENT
 from render.scene_file.stand_ins import GREY, Names
 from scenes.animation import Camera, Shape, Track
-from scenes.bsdf import Bsdf, diffuse_bsdf, rgb
 from scenes.camera import Array
-from scenes.colours import srgb_to_linear
-from scenes.sky import sky
+from scenes.colours import Bsdf, diffuse_bsdf, rgb, srgb_to_linear
+from scenes.textures import sky
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply")
 SUN = np.array([0.4, 0.8, 0.45])  # the direction to it, y up

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import mi
-from scenes.bsdf import diffuse_bsdf, rgb
+from scenes.colours import diffuse_bsdf, rgb
 
 Properties = dict[str, Any]  # a Mitsuba dictionary
 StandIn = tuple[Properties | None, str]  # None is nothing; and a description of it

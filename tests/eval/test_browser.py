@@ -188,7 +188,7 @@ def test_every_control_has_a_name_and_can_be_reached(page):
 
 
 def test_the_blind_comparison_counts_votes(browser, tiny, tmp_path):
-    browser.get(write_page(["noisy", "accumulated"], [tiny], tmp_path, "tiny").as_uri())
+    browser.get(write_page(("noisy", "accumulated"), [tiny], tmp_path, "tiny").as_uri())
     body = browser.find_element(By.TAG_NAME, "body")
     for count, button in enumerate(["prefer-left", "prefer-none"]):
         WebDriverWait(browser, 10).until(lambda _, n=count: body.get_attribute("data-ready") == str(n))

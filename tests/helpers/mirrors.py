@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
-from scenes.bsdf import Bsdf
+from scenes.colours import Bsdf
 
 SIZE = (48, 64)
 FRAMES = 3

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from render.clip import Arrays, Sampling, render_clip
 from scenes.animation import Camera, RigidMotion, Scene, Shape, Track
-from scenes.bsdf import Bsdf
+from scenes.colours import Bsdf
 
 SIZE = 48  # px, at a field of view of 90°
 DISTANCE = 4.0  # of the eye from the wall at z = 0

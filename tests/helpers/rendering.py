@@ -8,8 +8,8 @@ from render.clip import Arrays
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes.animation import Scene
-from scenes.bsdf import Bsdf
 from scenes.camera import Array, View, motion_vectors, pixel_centres
+from scenes.colours import Bsdf
 
 POSED_FRAME = 5  # where tests of radiance pose their stages
 BLOCK_SIZE = 4  # px

@@ -15,8 +15,8 @@ from render.clip import Arrays, Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, RigidMotion, Scene, Shape, StockShape, Track
-from scenes.bsdf import Bsdf
 from scenes.camera import FAR_OUTSIDE, pixel_centres
+from scenes.colours import Bsdf
 from scenes.glass import GLASS_SCENES
 from tests.datasets.test_mirrors import assert_the_same_from_exr, clip_of
 from tests.helpers.mirrors import BOX, FRAMES, GLIDE, SILVER, SIZE, painted, panel, placed, room

@@ -10,8 +10,8 @@ from render.clip import Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, Track
-from scenes.bsdf import Bsdf
 from scenes.camera import directions, pixel_centres
+from scenes.colours import Bsdf
 from scenes.registry import build_scene
 from tests.helpers.mirrors import SILVER, panel, placed
 from tests.helpers.rendering import assert_same_mean, first_gbuffer, rgb, stock_radiance
