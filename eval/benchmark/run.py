@@ -15,7 +15,7 @@ from datasets.clip import Dataset
 from errors import BadInput
 from eval.harness import evaluate
 from eval.results import by_signal, read_results
-from eval.tables import means_by_age
+from eval.tables import PRINTED, means_by_age
 from files import write_file, write_json
 from models.registry import channels_read
 from render.job.generate import generate
@@ -100,9 +100,7 @@ def run(
         raise BadInput(f"none of the scenes is in {scenes}: `onespp benchmark list` says where to get them")
     evaluate(everything, runs, "release", names or NAMES)
     content, clips = read_results(runs)
-    ages = {
-        metric: means_by_age(by_signal(clips)["total"], metric) for metric in ("psnr", "ssim", "flip", "temporal_error")
-    }
+    ages = {metric: means_by_age(by_signal(clips)["total"], metric) for metric in PRINTED}
     digests = {
         name: {"files": digest_of_folder(scenes / name), "clip": Dataset(folder).clips("test")[0].fingerprint}
         for name, folder in folders.items()
