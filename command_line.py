@@ -25,8 +25,8 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,glass,benchmark,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, the release (days), scenes of glass, long clips, "
+        metavar="{tiny,quick,release,benchmark,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), long clips, scenes of glass, "
         "or N small rooms with references of S spp",
     ),
 ]

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from datasets.clip import SPLITS
 from errors import BadInput
 from provenance import ROOT
 from render.scene_file.description import CameraKey, GainKey, PoseKey, camera_of, gain_of, motion_of, read_description
@@ -29,12 +28,11 @@ def test_the_example_of_the_docs(tmp_path):
     assert [(key.time, key.up, key.fov) for key in parsed.camera] == [(0, None, None), (1, (0, 1, 0), 24)]
     assert parsed.motion[0].shape == "ball" and parsed.motion[0].keyframes[2] == PoseKey(1, (0.3, 0, 0), (0, 90, 0))
     assert parsed.light[0].light == "lamp" and parsed.light[0].keyframes[1] == GainKey(1, 0.25)
-    assert parsed.splits["test"].most_spp == 2048
+    assert parsed.splits.test.judged == (0, 4, 14, 15)
     plain = described(tmp_path, "file = 'a.xml'")
     assert (parsed.resolution, parsed.frames) == (plain.resolution, plain.frames)
-    for split in SPLITS:
-        wanted, default = (getattr(each.splits, split) for each in (parsed, plain))
-        assert replace(wanted, camera=None) == default
+    assert replace(parsed.splits.train, camera=None) == plain.splits.train and parsed.splits.val == plain.splits.val
+    assert replace(parsed.splits.test, judged=()) == plain.splits.test
 
 
 REFUSED = {
