@@ -5,20 +5,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled.arrays import Image, Index, Row, Rows, Scalar, f32
+from models.compiled.arrays import RGB, Image, Index, Row, Rows, Scalar, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import jit_in_any_order, jit_parallel, run_items
-from models.compiled.lines import add_square, add_weighted, divide_line, triple, triple_of_lines, window_taps
+from models.compiled.lines import add_square, divide_line, triple, triple_of_lines, window_taps
 from models.filters.atrous import RADIUS, SPLINE
 
 MAX_DECAY = 30  # e^-30 = 1e-13 counts as 0: denormal numbers are slow
 
 
 @jit_in_any_order
-def decay(line: Row, scale: Scalar) -> None:
-    """Distances a >= 0 become scale e^-a."""
-    for x in range(line.size):
-        line[x] = scale * (exp(-min(line[x], f32(MAX_DECAY))) if line[x] < f32(MAX_DECAY) else f32(0))
+def decay(a: Scalar) -> Scalar:
+    """e^-a for a >= 0."""
+    return exp(-min(a, f32(MAX_DECAY))) if a < f32(MAX_DECAY) else f32(0)
+
+
+@jit_in_any_order
+def add_tap(sums: RGB, total: Row, h: Scalar, distance: Row, colour: RGB) -> None:
+    """Add one tap of n pixels, weighted by h exp(-distance), to the sums of colours and of weights."""
+    red, green, blue = sums
+    from_red, from_green, from_blue = colour
+    for i in range(distance.size):
+        w = h * decay(distance[i])
+        total[i] += w
+        red[i] += w * from_red[i]
+        green[i] += w * from_green[i]
+        blue[i] += w * from_blue[i]
 
 
 @jit_in_any_order
@@ -32,8 +44,7 @@ def sum_row(sums: Rows, space: Row, row: Index, colour: Image, features: Image, 
             add_square(distance, features[c, row, left:right], features[c, row + dy, left + dx : right + dx])
         h = SPLINE[dy // step + RADIUS] * SPLINE[dx // step + RADIUS]
         there = triple(colour, row + dy, left + dx, right + dx)
-        decay(distance, h)
-        add_weighted(triple_of_lines(sums, left, right), sums[3, left:right], distance, there)
+        add_tap(triple_of_lines(sums, left, right), sums[3, left:right], h, distance, there)
 
 
 @jit_parallel

@@ -28,6 +28,12 @@ def display(line: Row, irradiance: Row, albedo: Row, exposure: Scalar) -> None:
         line[x] = exp(f32(1 / GAMMA) * log(min(max(exposed, f32(MIN_EXPOSED)), f32(1))))
 
 
+@jit_with_reciprocals
+def scale_normal(line: Row, normal: Row) -> None:
+    for x in range(line.size):
+        line[x] = normal[x] * f32(0.5) + f32(0.5)
+
+
 @jit_parallel
 def feature_image(
     out: Image, images: tuple[Image, ...], exposure: Row, scale: Row, with_albedo: bool, with_normal: bool
@@ -44,7 +50,7 @@ def feature_image(
                 if with_albedo:
                     lines[3 + c] = albedo[c, y]
                 if with_normal:
-                    lines[after_albedo + c] = normal[c, y] * f32(0.5) + f32(0.5)
+                    scale_normal(lines[after_albedo + c], normal[c, y])
             scale_depth(lines[out.shape[2] - 1], depth[0, y], scale[0])
             transpose(out[y], lines)
 

@@ -7,10 +7,16 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models.compiled.affinity import STRIDE, measure
-from models.compiled.arrays import Image, Plane, Row, Rows, Scalar, Signals, f32
+from models.compiled.arrays import Image, Plane, Row, Rows, Scalar, Signals
 from models.compiled.eaw import decay
 from models.compiled.jit import array, jit_in_any_order, jit_parallel, run_items
 from models.compiled.lines import window_taps
+
+
+@jit_in_any_order
+def decay_line(line: Row) -> None:
+    for x in range(line.size):
+        line[x] = decay(line[x])
 
 
 @jit_in_any_order
@@ -32,7 +38,7 @@ def sum_image(sums: Signals, image: Image, guides: Rows, gaussians: Plane) -> No
         for dx, dy, left, right in window_taps(row, radius, 1, height, width):
             weight = space[: right - left]
             measure(weight, guides, row * width + left, row * width + right, dy * width + dx)
-            decay(weight, f32(1))
+            decay_line(weight)
             for s in range(filters):
                 scale = gaussians[radius + dy, s] * gaussians[radius + dx, s]
                 if scale > 0:
