@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from command_line import main
-from models.export.page import CPP, PYTHON
+from models.export.page import TEXTS
 from provenance import ROOT
 from tests.eval.conftest import untrained
 from tests.helpers.exports import check_page
@@ -44,4 +44,5 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
 
 def test_the_docs_have_the_calls_that_are_tested():
     page = Path(ROOT / "docs" / "export.md").read_text()
-    assert PYTHON["onnx"] in page and CPP.replace("FILE", "wskp6.onnx") in page
+    python, cpp = ((TEXTS / f"{name}.txt").read_text() for name in ("onnx", "cpp"))
+    assert python in page and cpp.replace("FILE", "wskp6.onnx") in page
