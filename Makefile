@@ -74,4 +74,4 @@ lint: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-blender build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
