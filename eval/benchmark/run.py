@@ -46,7 +46,8 @@ def list_scenes(scenes: Path | None) -> str:
         found = ("yes" if scene_file(scenes, name) else "missing") if scenes else ""
         rows.append([name, entry["title"], entry["author"], entry["licence"], found])
     table = tabulate(rows, ["folder", "title", "author", "licence", "there"], disable_numparse=True)
-    return f"{table}\n\nEach as FOLDER/scene.xml, from https://benedikt-bitterli.me/resources (Mitsuba): check the licence there"
+    source = "https://benedikt-bitterli.me/resources (Mitsuba)"
+    return f"{table}\n\nEach as FOLDER/scene.xml, from {source}; check the licence there"
 
 
 def digest_of_folder(folder: Path) -> str:
