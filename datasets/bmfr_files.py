@@ -37,6 +37,8 @@ def frames_of(folder: Path) -> Iterator[ImportedFrame]:
     """The frames of a scene, as many as there are colours and matrices."""
     matrices = read_matrices(folder / MATRICES)
     count = sum((folder / f"color{index}.exr").exists() for index in range(len(matrices)))
+    if not count:
+        raise BadInput(f"{folder / 'color0.exr'} is missing")
     for index in tqdm(range(count), folder.parent.name, unit="frame", leave=False):
         color, reference, albedo, normal, position = (
             read_rgb(folder / f"{name}{index}.exr")
@@ -45,7 +47,7 @@ def frames_of(folder: Path) -> Iterator[ImportedFrame]:
         surface = np.abs(normal).sum(axis=-1) > 0
         height, width = surface.shape
         to_pixels = np.array([[width / 2, 0, width / 2], [0, height / 2, height / 2], [0, 0, 1]])
-        view = view_of_clip_space(matrices[index], to_pixels)
+        view = view_of_clip_space(matrices[index], to_pixels, folder / MATRICES)
         yield ImportedFrame(color * albedo, reference, albedo, normal, position, surface, view)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from datasets.clip import SCHEMA, is_clip
 from datasets.writer import ClipWriter
 from errors import BadInput
-from files import write_json
+from files import read_json, write_json
 from scenes.camera import Array, View, project, view_of
 
 Image = NDArray[np.float32]
@@ -29,14 +29,15 @@ class ImportedFrame(NamedTuple):
     moved: Image | float = 0.0  # from where surfaces are in the world to where they were in the frame before
 
 
-def view_of_clip_space(matrix: Array, to_pixels: Array) -> View:
+def view_of_clip_space(matrix: Array, to_pixels: Array, file: Path) -> View:
     """The view of a matrix (4, 4) from the world to clip space, for row vectors, as graphics APIs have it.
 
-    `to_pixels` (3, 3) leads from clip space's (x, y, w) to homogeneous pixels. Raises BadInput where it is singular.
+    `to_pixels` (3, 3) leads from clip space's (x, y, w) to homogeneous pixels. Raises BadInput, naming the
+    `file`, where it is singular.
     """
     view = view_of(to_pixels @ matrix.T[[0, 1, 3]])
     if view is None:
-        raise BadInput(f"the camera matrix {matrix.tolist()} is singular")
+        raise BadInput(f"{file} has a singular camera matrix, {matrix.tolist()}: get it again")
     return view
 
 
@@ -78,9 +79,10 @@ def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[Imported
         "splits": {"train": [], "val": [], "test": [f"{name}/000" for name in clips]},
     }
     root.mkdir(parents=True, exist_ok=True)
-    if not (root / "dataset.json").exists() and any(root.glob("[!.]*")):
-        raise BadInput(f"{root} contains something other than a dataset: choose an empty or new folder")
-    write_json(root / "dataset.json", facts)
+    plan = root / "dataset.json"
+    if any(root.glob("[!.]*")) and not (plan.exists() and read_json(plan) == facts):
+        raise BadInput(f"{root} contains something other than these clips: choose an empty or new folder")
+    write_json(plan, facts)
     missing = {root / "test" / name / "000": frames for name, frames in clips.items()}
     missing = {folder: frames for folder, frames in missing.items() if not is_clip(folder)}
     for folder, frames in missing.items():

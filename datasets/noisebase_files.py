@@ -47,7 +47,7 @@ def frames_of(folder: Path, samples: int) -> Iterator[ImportedFrame]:
             normal=normal,
             position=image_of(arrays["position"][..., 0]),
             surface=np.abs(normal).sum(axis=-1) > 0,
-            view=view_of_clip_space(arrays["view_proj_mat"].astype(np.float64), to_pixels),
+            view=view_of_clip_space(arrays["view_proj_mat"].astype(np.float64), to_pixels, path),
             moved=image_of(arrays["motion"][..., 0]),
         )
 

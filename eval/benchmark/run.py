@@ -98,7 +98,8 @@ def run(
         generate(data / BUILT_IN, BUILT_IN, seed=0, reads=channels_read())
     everything = [*folders.values(), *([data / BUILT_IN] if own else [])]
     if not everything:
-        raise BadInput(f"none of the scenes is in {scenes}: `onespp benchmark list` says where to get them")
+        where = f"none of the scenes is in {scenes}" if scenes else "nothing to evaluate: name --scenes DIR or --own"
+        raise BadInput(f"{where}; `onespp benchmark list` says where to get scenes")
     evaluate(everything, runs, "release", names or NAMES)
     content, clips = read_results(runs)
     ages = {metric: means_by_age(by_signal(clips)["total"], metric) for metric in PRINTED}

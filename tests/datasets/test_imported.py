@@ -7,6 +7,7 @@ import pytest
 from datasets.bmfr_files import import_bmfr
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
+from datasets.imported import write_dataset
 from datasets.noisebase_files import CROPPED_ROWS, import_noisebase
 from errors import BadInput
 from models.registry import create
@@ -103,6 +104,25 @@ def test_imported_clips_can_be_denoised_with_history(bmfr, tmp_path):
     for index in range(FRAMES):
         _, state = denoiser(read_frame(clip, index, denoiser.reads), state)
     assert state.pictures()["history length"][0, 0, 20:-20, 20:-20].min() == FRAMES
+
+
+def test_another_dataset_is_not_overwritten(bmfr, tmp_path):
+    import_bmfr(bmfr, tmp_path / "data")
+    before = (tmp_path / "data" / "dataset.json").read_bytes()
+    with pytest.raises(BadInput, match="something other than these clips"):
+        write_dataset(tmp_path / "data", "noisebase at 2 spp", {}, 2)
+    assert (tmp_path / "data" / "dataset.json").read_bytes() == before
+
+
+def test_a_scene_without_frames_or_with_a_singular_camera_is_refused(bmfr, tmp_path):
+    folder = bmfr / "sponza" / "inputs"
+    zeros = ", ".join(["{0.0, 0.0, 0.0, 0.0}"] * 4)
+    (folder / "camera_matrices.h").write_text(f"const float camera_matrices[1][4][4] = {{ {{ {zeros} }} }};")
+    with pytest.raises(BadInput, match=r"camera_matrices\.h has a singular"):
+        import_bmfr(bmfr, tmp_path / "data")
+    (folder / "color0.exr").unlink()
+    with pytest.raises(BadInput, match=r"color0\.exr is missing"):
+        import_bmfr(bmfr, tmp_path / "data")
 
 
 def test_damaged_bmfr_files_are_named(bmfr, tmp_path):
