@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,8 +50,7 @@ def are_encoded(normals: Image, surface: NDArray[np.bool_]) -> bool:
     return bool(off_unit[1] < off_unit[0])
 
 
-@dataclass(frozen=True)
-class FrameViews:
+class FrameViews(NamedTuple):
     world: View
     positions: View | None  # by which positions become depths
 

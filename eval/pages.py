@@ -59,14 +59,8 @@ def kept(values: Values) -> Values:
     return {metric: values.get(metric) for metric in PRINTED}
 
 
-def extract_bench(runs: Path) -> dict[str, Any]:
-    content = read_json(runs / "bench" / "results.json")
-    return {key: content[key] for key in ("device", "threads", "rows")}
-
-
-def extract_trade(runs: Path) -> dict[str, Any]:
-    content = read_json(runs / "report" / "trade.json")
-    return {key: content[key] for key in ("device", "size", "threads", "clips", "samples")}
+def extract_keys(file: str, *keys: str) -> Callable[[Path], dict[str, Any]]:
+    return lambda runs: {key: read_json(runs / file)[key] for key in keys}
 
 
 def extract_stress(runs: Path) -> dict[str, Any]:
@@ -108,8 +102,8 @@ def extract_times(runs: Path) -> dict[str, Any]:
 
 EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the command that measures, and the extract
     "eval": ("onespp eval", extract_eval),
-    "bench": ("onespp bench denoisers", extract_bench),
-    "trade": ("onespp trade", extract_trade),
+    "bench": ("onespp bench denoisers", extract_keys("bench/results.json", "device", "threads", "rows")),
+    "trade": ("onespp trade", extract_keys("report/trade.json", "device", "size", "threads", "clips", "samples")),
     "stress": ("onespp stress --long", extract_stress),
     "times": ("make", extract_times),
     "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),

@@ -22,22 +22,7 @@ BEGIN = "<!-- facts: written by `onespp weights NETWORK --card RUNS` -->"
 END = "<!-- end of facts -->"
 LISTED_APART = ("budget", "seed", "data", "parameters", "step", "validation", "from")  # of the recipe, by cards
 
-FACTS = """- {parameters} parameters, {bytes} bytes, SHA-256 `{digest}`. Licence: {licence}.
-- Trained by `onespp train {name} --budget {budget} --seed {seed}` on the data set `{data}` (seed {data_seed}, generator
-  version {generator}, {scenes} scenes){start}.
-  Weights of step {step}, which had the lowest validation loss: {validation:.4g}.
-- Recipe: `{recipe}`.
-- Trained with {makers}.
-
-Means over the {count} test clips at 1 spp of `{dataset}`, {signal} radiance, in {precision} ({device}; {versions}):
-
-{means}
-
-{metric} per clip:
-
-{clips}
-
-{legend}."""
+FACTS = Path(__file__).with_name("shipped_facts.md")  # with names in braces
 
 
 def table() -> str:
@@ -121,27 +106,31 @@ def facts(name: str) -> str:
     data = recipe["data"]
     fields = {key: recipe[key] for key in ("parameters", "budget", "seed", "step", "validation")}
     fields |= {key: measured[key] for key in ("signal", "precision", "device", "versions")}
-    return FACTS.format(
-        **fields,
-        name=name,
-        bytes=weights.stat().st_size,
-        digest=file_digest(weights),
-        licence=WEIGHTS_LICENCE,
-        data=Path(data["profile"]).name,
-        data_seed=data["seed"],
-        generator=data["generator"],
-        scenes=len(data["scenes"]),
-        start=f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
-        recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
-        makers=" and ".join(
-            f"{version_list(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]
-        ),
-        count=measured["clips"],
-        dataset="`, `".join(measured["datasets"]),
-        means=tabulate(measured["means"], "keys", "github", disable_numparse=True),
-        metric=METRICS["psnr"].title,
-        clips=tabulate(measured["psnr"], "keys", "github", disable_numparse=True),
-        legend=LEGEND,
+    return (
+        FACTS.read_text()
+        .strip()
+        .format(
+            **fields,
+            name=name,
+            bytes=weights.stat().st_size,
+            digest=file_digest(weights),
+            licence=WEIGHTS_LICENCE,
+            data=Path(data["profile"]).name,
+            data_seed=data["seed"],
+            generator=data["generator"],
+            scenes=len(data["scenes"]),
+            start=f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
+            recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
+            makers=" and ".join(
+                f"{version_list(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]
+            ),
+            count=measured["clips"],
+            dataset="`, `".join(measured["datasets"]),
+            means=tabulate(measured["means"], "keys", "github", disable_numparse=True),
+            metric=METRICS["psnr"].title,
+            clips=tabulate(measured["psnr"], "keys", "github", disable_numparse=True),
+            legend=LEGEND,
+        )
     )
 
 

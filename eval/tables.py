@@ -101,10 +101,6 @@ class TableRow:
         return self.denoiser == FLOOR
 
     @property
-    def is_mean(self) -> bool:
-        return self.clip == MEAN
-
-    @property
     def made_from(self) -> str:
         """What the implementation of its denoiser follows; "-" for one that is here no more."""
         try:

@@ -41,7 +41,6 @@ BEFORE: dict[str, tuple[float, tuple[float, float, float]]] = {
     "moved": (1.0, (0.6, 0.0, -0.5)),
 }
 
-
 Lag = dict[str, list[float]]  # PSNR in dB of every frame of one denoiser, by the name of the change
 
 

@@ -15,7 +15,7 @@ from models.compiled import features as kernels
 from models.compiled.features import FEATURE_CHANNELS, GAMMA
 from models.compiled.fusion import THREAD_ROWS, WINDOWS
 from models.denoiser import State, matching_state
-from models.filters.baselines import Accumulated, AccumulatedState, Accumulating
+from models.filters.baselines import AccumulatedState, Accumulating
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import encoded
 from models.networks.fusion import fuse
@@ -83,7 +83,6 @@ class FilteredState(AccumulatedState):
 class KernelPredictor(Accumulating):
     """Temporal accumulation, a network that predicts filter parameters, the filter on irradiance, remodulation (§4)."""
 
-    reads: tuple[str, ...] = Accumulated.reads
     is_network = True
     inputs: Mapping[str, int] = FEATURE_CHANNELS
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": scaled_normal}
