@@ -107,11 +107,11 @@ def compile_kernels(spec: DenoiserSpec) -> None:
 
 
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
-    """Evaluate clips in parallel, after compiling kernels in parallel: else each process would compile all of them."""
+    """Evaluate clips in parallel, after compiling kernels in parallel, those of networks first: they take longest."""
     work = partial(evaluate_in_worker, specs, runs, max(1, torch.get_num_threads() // processes))
     jobs = [(clip.path, clip.first_hits) for clip in clips]
     with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
-        list(tqdm(pool.imap_unordered(compile_kernels, specs), "kernels", len(specs), unit="denoiser"))
+        list(tqdm(pool.imap_unordered(compile_kernels, specs[::-1]), "kernels", len(specs), unit="denoiser"))
         list(tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"))
 
 

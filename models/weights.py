@@ -16,7 +16,7 @@ from models.denoiser import Denoiser
 def save_weights(
     denoiser: Denoiser, name: str, recipe: dict[str, Any], path: Path, made_by: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Write atomically. `made_by` names the code and packages that trained them, see train/made_by.py."""
+    """Write atomically. `made_by` names the code and packages that trained them, see provenance.MadeBy."""
     tensors = {key: tensor.detach().contiguous().cpu() for key, tensor in denoiser.state_dict().items()}
     metadata = {"denoiser": name, "recipe": json.dumps(recipe), "made_by": json.dumps(list(made_by))}
     if denoiser.constants:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from errors import BadInput, requires_extra
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, by_signal, folders_of, load_picture, of_one_spp, picture_path, read_results
-from eval.tables import LEGEND, scores_of, table_rows
+from eval.tables import LEGEND, MEAN, scores_of, table_rows
 from eval.tradeoff.trades import Times, dominated_by_name, times_of_first_size
 from files import replacing, write_file
 from models.spec import DenoiserSpec
@@ -150,6 +150,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
         rows=rows,
         metrics=metrics,
         legend=LEGEND,
+        mean=MEAN,
         times=times,
         figures=[{"name": path.stem.replace("-", " "), "uri": data_uri(path.read_bytes(), "png")} for path in figures],
         has_error_maps=any(clip["errors"] for clip in pictures),
