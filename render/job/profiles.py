@@ -55,7 +55,7 @@ DATA_PROFILES = {
         boxes={"train": 1, "test": 1},
         rooms={"train": 12, "val": 2},
         quality={
-            "train": SamplingQuality(realisations=4, reference_spp=32),
+            "train": SamplingQuality(realisations=4, reference_spp=16),
             "val": SamplingQuality(realisations=1, reference_spp=64),
             "test": TEST_OF_SMALL_ROOMS,
         },
