@@ -165,6 +165,7 @@ def test_rooms_that_would_need_too_many_samples_are_skipped():
 
 def test_rooms_that_all_need_too_many_samples_end_the_search(monkeypatch):
     monkeypatch.setattr(pilots, "samples_needed", lambda *_: 4096)
+    monkeypatch.setattr(pilots, "scene_of_clip", lambda *_: (None, 0))
     bounded = SamplingQuality(realisations=1, reference_spp=16, floor=90.0, most_spp=128, skips_noisy_rooms=True)
     profile = DataProfile((2, 32, 32), {"test": bounded}, rooms={"test": 2})
     with pytest.raises(BadInput, match="fewer than 2 in 64 rooms reach 90 dB within 128 spp"):
