@@ -21,9 +21,10 @@ from tests.helpers.other_device import Other, other_device
 
 WRAPPED = ("svgf+js", "wskp6+adaptive", "ntd+taa")
 FRAMES = [synthetic_frame(index, 24, 32) for index in range(2)]
+NAMES = [*(name for name in DENOISERS if "oidn" not in name), *WRAPPED]
 
 
-@pytest.mark.parametrize("name", [*(name for name in DENOISERS if "oidn" not in name), *WRAPPED])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "lbf")) for name in NAMES])
 def test_every_denoiser_computes_on_the_device_of_its_frames(name):
     spec = DenoiserSpec.named(name, compiled=False)
     with spec.running():

@@ -77,7 +77,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("shapes", "share"), CASES.values(), ids=CASES)
+def case_of(name):
+    return pytest.param(*CASES[name], id=name, marks=[pytest.mark.slow] * (name in ("behind two", "behind a slab")))
+
+
+@pytest.mark.parametrize(("shapes", "share"), map(case_of, CASES))
 def test_a_lamp_is_as_free_of_noise_as_one_seen_directly(shapes, share):
     """In a black room nothing remains to be sampled, but for reflections back and forth that are too weak to follow."""
     scene = scene_of(*shapes)

@@ -54,6 +54,7 @@ def resume(root: Path) -> str:
     return subprocess.run(dataset_command(root), check=True, capture_output=True, text=True).stdout
 
 
+@pytest.mark.slow
 def test_a_job_killed_amid_a_clip_resumes_to_equal_bytes(tiny, tiny_copy):
     remove_clips(tiny_copy, "val/cornell_box_moving/000", "test/cornell_box/000")
     with subprocess.Popen(dataset_command(tiny_copy), stderr=subprocess.DEVNULL) as job:
