@@ -16,6 +16,7 @@ from eval.harness import evaluate_clip, named_denoisers
 from models.registry import DENOISERS
 from models.spec import DenoiserSpec
 from tests.helpers import foreign
+from tests.helpers.denoisers import each
 from tests.helpers.frames import run
 from tests.helpers.other_device import Other, other_device
 
@@ -24,7 +25,7 @@ FRAMES = [synthetic_frame(index, 24, 32) for index in range(2)]
 NAMES = [*(name for name in DENOISERS if "oidn" not in name), *WRAPPED]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "lbf")) for name in NAMES])
+@pytest.mark.parametrize("name", each(NAMES, "lbf"))
 def test_every_denoiser_computes_on_the_device_of_its_frames(name):
     spec = DenoiserSpec.named(name, compiled=False)
     with spec.running():

@@ -11,6 +11,7 @@ from models import registry
 from models.history.running_scale import running_scale
 from models.networks.ntd import reconstruct_image
 from models.operators import halve, halve_surface
+from tests.helpers.denoisers import each
 from tests.helpers.frames import chain, flat_frame, play, prepared, run
 
 NAMES = [name for name in registry.DENOISERS if not registry.prototype(name).unavailable()]
@@ -54,7 +55,7 @@ def noisy_frames(surface: torch.Tensor, count: int = 3) -> list[Frame]:
 
 
 @both_implementations
-@pytest.mark.parametrize("name", [name for name in NAMES if not registry.prototype(name).filters_emission])
+@pytest.mark.parametrize("name", each(name for name in NAMES if not registry.prototype(name).filters_emission))
 def test_background_is_its_emission_alone(name):
     denoiser = prepared(name)
     surface = torch.rand(1, 1, 40, 37) < 0.5

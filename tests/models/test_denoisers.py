@@ -12,6 +12,7 @@ from models import registry
 from models.networks.rae import RAE, RAEState
 from models.spec import fastest_precision, load, precisions_of
 from models.weights import load_weights, save_weights
+from tests.helpers.denoisers import each
 from tests.helpers.frames import flat_frame, play, run
 
 NAMES = list(registry.DENOISERS)
@@ -27,7 +28,7 @@ def denoisers():
     return {name: registry.create(name).eval() for name in NAMES}
 
 
-@pytest.mark.parametrize("name", NAMES + WRAPPED)
+@pytest.mark.parametrize("name", each(NAMES + WRAPPED))
 def test_a_prototype_has_the_attributes_of_the_denoiser(name):
     prototype = registry.prototype(name)
     denoiser = registry.create(name)
@@ -55,7 +56,7 @@ def test_a_prototype_takes_no_memory_for_weights():
     assert fastest_precision("svgf+taa") == "float32"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_a_change_of_size_resets_the_history(denoisers, name):
     """Also where both sizes are padded alike, and for another batch size."""
     a = flat_frame(20, 20)
@@ -65,7 +66,7 @@ def test_a_change_of_size_resets_the_history(denoisers, name):
     torch.testing.assert_close(run(denoisers[name], [b, two])[1], run(denoisers[name], [two])[0])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_batch_items_do_not_mix(tiny, denoisers, name):
     """In frames with no more channels than it reads."""
     clips = Dataset(tiny).clips("train")
@@ -77,7 +78,7 @@ def test_batch_items_do_not_mix(tiny, denoisers, name):
         torch.testing.assert_close(together[item : item + 1], run(denoisers[name], frames)[-1], rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_radiance_that_demodulation_would_make_infinite(denoisers, name):
     frames = [flat_frame(9, 11).with_channels({"albedo": torch.zeros(1, 3, 9, 11)}) for _ in range(3)]
     frames[1].direct[0, :, 4, 5] = 3e38

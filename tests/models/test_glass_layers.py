@@ -12,6 +12,7 @@ from eval.stress.check import ROUNDING
 from models import compiled, layers, registry
 from models.denoiser import LayeredState
 from models.registry import DENOISERS
+from tests.helpers.denoisers import each
 from tests.helpers.frames import flat_frame, play, prepared, run
 
 SIZE = (23, 37)  # odd: blocks of the last row and column are not whole
@@ -113,7 +114,7 @@ def test_blended_guides_are_weighted_by_probability():
     assert torch.equal(blend.albedo * ~glass, frame.albedo * ~glass) and not blend.has_layers
 
 
-@pytest.mark.parametrize("name", [*DENOISERS, "eaw+adaptive", "svgf+js", "one+taa"])
+@pytest.mark.parametrize("name", each((*DENOISERS, "eaw+adaptive", "svgf+js", "one+taa")))
 def test_every_denoiser_takes_both_layers(name):
     """Convex filters return no irradiance beyond that of the samples of each layer; the state is of both layers."""
     denoiser = prepared(name)

@@ -10,6 +10,7 @@ from eval.stress.check import ROUNDING, range_violation
 from models.registry import DENOISERS, channels_read
 from render.clip import Sampling, write_clip
 from scenes.animation import Scene, Shape, Track
+from tests.helpers.denoisers import each
 from tests.helpers.frames import prepared, run
 from tests.helpers.mirrors import CAMERA, FRAMES, SILVER, SIZE, panel, placed, room
 
@@ -37,7 +38,7 @@ def test_its_light_is_emission(frames):
         np.testing.assert_allclose(frame.emission[shows_lamp.expand_as(frame.emission)], RADIANCE, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", DENOISERS)
+@pytest.mark.parametrize("name", each(DENOISERS))
 def test_no_denoiser_spreads_it(frames, name):
     denoiser = prepared(name)
     given = frames[:1] if denoiser.offline else frames

@@ -21,6 +21,7 @@ from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.stress.check import ROUNDING, range_violation
 from models import compiled, registry
+from tests.helpers.denoisers import each
 from tests.helpers.frames import chain, flat_frame, play, prepared, run
 
 WRAPPED = ("noisy+taa", "noisy+accumulated", "wskp3+taa", "eaw+adaptive", "wskp3+adaptive", "eaw+js")
@@ -79,7 +80,7 @@ def frames_strategy(draw, longest=4, largest=19):
 SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 @SETTINGS
 @given(frames=frames_strategy())
 def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
@@ -89,7 +90,7 @@ def test_finite_in_finite_out_and_nothing_below_zero(denoisers, name, frames):
         assert (output >= 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "noisy"])
+@pytest.mark.parametrize("name", each(name for name in NAMES if name != "noisy"))
 @SETTINGS
 @given(
     frames=frames_strategy(),
@@ -112,7 +113,7 @@ def test_a_poisoned_pixel_counts_as_zero(denoisers, name, frames, poison, channe
     torch.testing.assert_close(poisoned, black, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if registry.prototype(name).convex])
+@pytest.mark.parametrize("name", each(name for name in NAMES if registry.prototype(name).convex))
 @SETTINGS
 @given(frames=frames_strategy())
 def test_convex_filters_stay_in_range(denoisers, name, frames):
@@ -135,7 +136,7 @@ def noisy_sequence(count: int, size: int = 8):
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_long_sequences_stay_bounded(denoisers, name, count):
     """Offline denoisers, which have no history, get a tenth."""
     outputs, state = play(denoisers[name], noisy_sequence(count // 10 if denoisers[name].offline else count))
@@ -153,7 +154,7 @@ def shown_psnr(images, others, exposure) -> float:
 
 
 @pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, name, precision):
     half = registry.create(name)
     if precision in half.refuses:
@@ -182,7 +183,7 @@ def sequence(clip, start: int, count: int) -> list[Frame]:
     return [read_frame(clip, index, ALL, window=window) for index in range(start, start + count)]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_a_scene_cut_resets_the_history(tiny, denoisers, name):
     """Frames of another place in the middle of a sequence come out as if they were the first."""
     here, there = Dataset(tiny).clips("test")[:2]
@@ -192,7 +193,7 @@ def test_a_scene_cut_resets_the_history(tiny, denoisers, name):
     torch.testing.assert_close(cut, run(denoisers[name], after), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", each(NAMES))
 def test_preparing_twice_changes_nothing(name):
     denoiser = prepared(name)
     frame = flat_frame(9, 7)
