@@ -136,6 +136,7 @@ def evaluate(
     device: Device = "cpu",
     first_hits: Annotated[bool, arg(help="describe mirrors and glass by themselves, not by what they show")] = False,
     where: Annotated[bool, arg(help="print where the squared error is instead: edges, roughness, scale")] = False,
+    jod: Annotated[bool, arg(help="also print JOD by ColorVideoVDP, which the extra `cvvdp` installs")] = False,
 ) -> None:
     """Evaluate denoisers on the test clips, by default all that can run: table, images, results.json.
 
@@ -150,6 +151,10 @@ def evaluate(
         print(error_tables(folders, runs, budget, names, device, first_hits))
     else:
         evaluate_on(folders, runs, budget, names, processes, device, first_hits)
+    if jod:
+        from eval.jod import jod_table
+
+        print(jod_table(runs))
 
 
 def report(

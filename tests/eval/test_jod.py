@@ -1,0 +1,73 @@
+"""JOD from the pictures of an evaluation."""
+
+import importlib
+import shutil
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from errors import BadInput
+from eval.jod import FRAMES_PER_SECOND, jod_of_clip, jod_table
+from eval.results import read_results
+from files import read_json
+
+
+class MeanDifference:
+    """In place of the metric: 10 less the mean difference in 1/255."""
+
+    def __init__(self):
+        self.calls = []
+
+    def predict(self, output, reference, dim_order, frames_per_second):
+        assert output.shape == reference.shape and dim_order == "BCFHW"
+        assert output.min() >= 0 and 0.5 < output.max() <= 1
+        self.calls.append((tuple(output.shape), frames_per_second))
+        return 10 - 255 * (output - reference).abs().mean(), {}
+
+
+@pytest.fixture
+def clip(evaluated):
+    return read_results(evaluated)[1][0]
+
+
+def test_a_clip_is_one_video(evaluated, clip):
+    metric = MeanDifference()
+    values = jod_of_clip(metric, evaluated, clip)
+    assert values.keys() == {result.denoiser for result in clip.results}
+    assert metric.calls == [((1, 3, 8, 64, 64), FRAMES_PER_SECOND)] * len(values)
+    assert values["noisy"] < values["accumulated"] < 10
+
+
+def test_frames_between_which_references_are_missing_are_stills(evaluated, clip):
+    frames = [values if index in (0, 5) else {} for index, values in enumerate(clip.reference.frames)]
+    metric = MeanDifference()
+    values = jod_of_clip(metric, evaluated, replace(clip, reference=replace(clip.reference, frames=frames)))
+    assert metric.calls == [((1, 3, 1, 64, 64), 0)] * 2 * len(values)
+
+
+def test_a_missing_package_names_its_extra(evaluated, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycvvdp", None)
+    with pytest.raises(BadInput, match=r"pycvvdp is not installed: `pip install 'onespp\[cvvdp\]'`"):
+        jod_table(evaluated)
+
+
+def can_import_metric() -> bool:
+    try:
+        importlib.import_module("pycvvdp")
+    except (ImportError, RuntimeError):  # torchvision refuses to load beside a build of PyTorch for other devices
+        return False
+    return True
+
+
+@pytest.mark.skipif(not can_import_metric(), reason="needs the extra cvvdp")
+def test_by_colorvideovdp(evaluated, clip, tmp_path):
+    shutil.copytree(evaluated / "eval", tmp_path / "eval")
+    assert "standard_fhd" in jod_table(tmp_path)
+    for values in read_json(tmp_path / "eval" / "jod.json")["clips"].values():
+        assert 0 < values["noisy"] < values["accumulated"] < 10
+    pycvvdp = importlib.import_module("pycvvdp")
+    video = torch.rand(1, 3, 8, 64, 64)
+    perfect = pycvvdp.cvvdp(display_name="standard_fhd", quiet=True).predict(video, video, frames_per_second=24)
+    assert float(perfect[0]) == pytest.approx(10)
