@@ -151,10 +151,10 @@ def evaluate(
         print(error_tables(folders, runs, budget, names, device, first_hits))
     else:
         evaluate_on(folders, runs, budget, names, processes, device, first_hits)
-    if jod:
-        from eval.jod import jod_table
+        if jod:
+            from eval.jod import jod_table
 
-        print(jod_table(runs))
+            print(jod_table(runs))
 
 
 def report(

@@ -46,13 +46,17 @@ class NamedDenoiser:
         """Built on first use: only if results are missing."""
         return self.spec.build()
 
+    @cached_property
+    def weights_digest(self) -> str | None:
+        return file_digest(self.spec.weights) if self.spec.weights else None
+
     def key(self, clip: Clip) -> str:
         """A digest of everything that determines its result on a clip."""
         facts = {
             "name": self.name,
             "signal": self.spec.returns,
             "precision": self.spec.precision,
-            "weights": file_digest(self.spec.weights) if self.spec.weights else None,
+            "weights": self.weights_digest,
             "device": self.spec.device,
         }
         return result_key(clip, [__name__, *self.spec.modules], facts)

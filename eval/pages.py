@@ -60,7 +60,8 @@ def kept(values: Values) -> Values:
 
 
 def extract_keys(file: str, *keys: str) -> Callable[[Path], dict[str, Any]]:
-    return lambda runs: {key: read_json(runs / file)[key] for key in keys}
+    """Some of the content of a JSON file."""
+    return lambda runs: {key: value for key, value in read_json(runs / file, keys).items() if key in keys}
 
 
 def extract_stress(runs: Path) -> dict[str, Any]:

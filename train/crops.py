@@ -15,7 +15,7 @@ from datasets.frame import Frame, read_frame, to_tensor
 from models.history.running_scale import RunningMean, RunningScale
 from train.accumulation import IRRADIANCE_FILE, SCALE_FILE, accumulate_clip
 from train.protocols import FilteringNetwork
-from train.sequences import Batch, random_window
+from train.sequences import Batch, check_fits, random_window
 
 
 class Crops:
@@ -41,12 +41,13 @@ class AccumulatedCrops:
     """Crops of `crop` x `crop` pixels (None: whole frames); item i of epoch e depends on (seed, e, i) only.
 
     An epoch has `count` crops for every frame of the clips, at random places. Accumulated frames are kept in the
-    folder `cache`. No clip may be smaller than a crop.
+    folder `cache`. Raises BadInput where a clip is smaller than a crop.
     """
 
     def __init__(
         self, clips: Sequence[Clip], network: FilteringNetwork, count: int, crop: int | None, seed: int, cache: Path
     ):
+        check_fits(clips, 1, crop)
         cache.mkdir(parents=True, exist_ok=True)
         folders = [accumulate_clip(clip, network, cache) for clip in tqdm(clips, "accumulating", leave=False)]
         self.irradiance: list[NDArray[np.float32]] = [np.load(f / IRRADIANCE_FILE, mmap_mode="r") for f in folders]
