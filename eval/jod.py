@@ -14,12 +14,13 @@ from tabulate import tabulate
 from torch import Tensor
 from tqdm import tqdm
 
-from errors import requires_extra
+from errors import BadInput, requires_extra
 from eval.results import NOISE_FLOOR, ClipResults, folders_of, load_picture, read_results
 from files import write_json
 
 DISPLAY = "standard_fhd"  # a 24-inch display of 200 cd/m², seen from 60 cm
 FRAMES_PER_SECOND = 24
+MIN_SIDE = 3  # px; the metric fails on a single pixel
 
 
 def video(folder: Path, frames: Sequence[int]) -> Tensor:
@@ -29,10 +30,15 @@ def video(folder: Path, frames: Sequence[int]) -> Tensor:
 
 
 def jod_of_clip(metric: Any, runs: Path, clip: ClipResults) -> dict[str, float]:
-    """JOD of each denoiser: of the video, or where only some frames have a reference, the mean of these as stills."""
+    """JOD of each denoiser: of the video, or where only some frames have a reference, the mean of these as stills.
+
+    Raises BadInput where the images are too small.
+    """
     folders = folders_of(runs, clip)
     frames = clip.reference.judged
     reference = video(folders.pop(NOISE_FLOOR), frames)
+    if min(reference.shape[-2:]) < MIN_SIDE:
+        raise BadInput(f"{clip.name} is too small for JOD: evaluate clips of {MIN_SIDE} x {MIN_SIDE} pixels or more")
     whole = len(frames) == len(clip.reference.frames)
     values = {}
     for name, folder in folders.items():

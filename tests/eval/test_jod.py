@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from errors import BadInput
+from eval import jod
 from eval.jod import FRAMES_PER_SECOND, jod_of_clip, jod_table
 from eval.results import read_results
 from files import read_json
@@ -45,6 +46,12 @@ def test_frames_between_which_references_are_missing_are_stills(evaluated, clip)
     metric = MeanDifference()
     values = jod_of_clip(metric, evaluated, replace(clip, reference=replace(clip.reference, frames=frames)))
     assert metric.calls == [((1, 3, 1, 64, 64), 0)] * 2 * len(values)
+
+
+def test_a_clip_of_one_pixel_is_refused(evaluated, clip, monkeypatch):
+    monkeypatch.setattr(jod, "video", lambda folder, frames: torch.zeros(1, 3, len(frames), 1, 1))
+    with pytest.raises(BadInput, match="too small for JOD"):
+        jod_of_clip(MeanDifference(), evaluated, clip)
 
 
 def test_a_missing_package_names_its_extra(evaluated, monkeypatch):
