@@ -111,7 +111,8 @@ NTD_BUDGETS = {
 ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
-    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedLoss(temporal=0.5)},
+    "release": {"epochs": 30, "rate": 1e-3, "batch": 3, "length": 10, "crop": 96, "clip": 3.0}
+    | {"loss": DisplayedLoss(temporal=0.5, squared=25.0)},
 }
 
 PAPERS_AND_BUDGETS: dict[str, tuple[Recipe, Budgets]] = {

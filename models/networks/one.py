@@ -1,7 +1,7 @@
 """`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
@@ -34,6 +34,9 @@ from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
+STRIP_PIXELS = 1 << 20  # of larger images the network works on strips of about so many
+REACH = 32  # rows above and below that what is predicted for a pixel depends on: 28, in whole patches of 8
+SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness")  # that network_inputs reads
 HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
 
 
@@ -234,6 +237,16 @@ def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidde
     return patches_of(channels), pixels
 
 
+def fetched(before: OneState | None, frame: Frame, surface: Tensor) -> tuple[Tensor, Tensor]:
+    """The channels HISTORY of the previous frame, reprojected, and 1 where they are valid, else 0."""
+    has_history = torch.zeros_like(surface)
+    if before is None:
+        return has_history.expand(-1, sum(HISTORY), -1, -1), has_history
+    past = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
+    history, valid = reproject(frame, past, before.gbuffer)
+    return history, valid.to(history) * surface
+
+
 class One(Denoiser):
     """Recurrent kernel prediction. Without validated history, the weight of the current frame is 1."""
 
@@ -257,20 +270,37 @@ class One(Denoiser):
         surface = (frame.depth > 0).to(frame.depth)
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        has_history = torch.zeros_like(surface)
-        history = has_history.expand(-1, sum(HISTORY), -1, -1)
-        if before is not None:
-            past = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
-            history, valid = reproject(frame, past, before.gbuffer)
-            has_history = valid.to(noisy) * surface
+        history, has_history = fetched(before, frame, surface)
         inputs = PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
+        decoded = self.decoded(frame, scale, inputs)
+        images = carried(decoded, history, surface, self.steps)
+        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
+
+    def decoded(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
+        """What the network predicts, of large images in strips of rows: its activations take most of the memory."""
+        height, width = frame.size
+        rows = max(1, STRIP_PIXELS // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
+        if rows >= height or torch.is_grad_enabled():
+            return self.decoded_whole(frame, scale, inputs)
+        whole: Decoded | None = None
+        for top in range(0, height, rows):
+            first = max(0, top - REACH)
+            needed = slice(first, top + rows + REACH)
+            part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in SURFACE_CHANNELS})
+            strip = self.decoded_whole(part, scale, PixelInputs(*(each[..., needed, :] for each in inputs)))
+            whole = whole or Decoded(*(each.new_empty(*each.shape[:2], height, width) for each in strip))
+            for image, values in zip(whole, strip, strict=True):
+                image[..., top : top + rows, :] = values[..., top - first : top - first + rows, :]
+        assert whole is not None
+        return whole
+
+    def decoded_whole(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
+        """`decoded`, in one piece."""
         first, _, last = cast(Sequence[nn.Linear], self.network.detail)  # ReLU in between
         patches, hidden = network_inputs(frame, scale, inputs, first)
         height, width = frame.size
         head = self.network(patches.to(self.precision, memory_format=torch.channels_last))[..., :height, :width]
-        decoded = Decoded(*decode_head(head.to(noisy), hidden, last, inputs, frame.samples.to(noisy)))
-        images = carried(decoded, history, surface, self.steps)
-        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
+        return Decoded(*decode_head(head.to(inputs.noisy), hidden, last, inputs, frame.samples.to(inputs.noisy)))
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         irradiance, after = self.predict(frame, state)

@@ -63,13 +63,13 @@ DATA_PROFILES = {
     ),
     # Whole rooms, and parts of others with the resolution of large images.
     "release": DataProfile(
-        size=(12, 128, 128),
+        size=(12, 144, 144),
         boxes={"test": 1},
-        rooms={"train": 128, "val": 8, "test": 6},
-        closeups={"train": 128, "val": 4},
+        rooms={"train": 72, "val": 4, "test": 6},
+        closeups={"train": 72, "val": 4},
         quality={
-            "train": SamplingQuality(realisations=8, reference_spp=32),
-            "val": SamplingQuality(realisations=8, reference_spp=64),
+            "train": SamplingQuality(realisations=6, reference_spp=24),
+            "val": SamplingQuality(realisations=1, reference_spp=64),
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},

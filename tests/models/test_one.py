@@ -138,3 +138,15 @@ def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh):
     outputs, state = play(fresh, frames(images))
     assert all(torch.isfinite(output).all() for output in outputs)
     assert torch.isfinite(state.output).all() and torch.isfinite(state.accumulated).all()
+
+
+@pytest.mark.parametrize("height", [70, 200])
+def test_the_network_works_on_strips_of_large_images(height, monkeypatch):
+    """With history, and with strips that are thinner than what they depend on."""
+    frames = [synthetic_frame(i, height, 48) for i in range(3)]
+    denoiser = prepared("one")
+    with torch.inference_mode():
+        whole = run(denoiser, frames)
+        monkeypatch.setattr("models.networks.one.STRIP_PIXELS", 24 * 48)
+        strips = run(denoiser, frames)
+    torch.testing.assert_close(strips, whole, rtol=1e-4, atol=1e-5)

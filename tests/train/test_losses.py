@@ -360,9 +360,13 @@ def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
     denoiser = create("one")
     factors = iter((1.5, 0.7))
     predicted = predict_as(monkeypatch, denoiser, lambda frame, _: next(factors) * frame.reference_irradiance("total"))
-    value, parts = NetworkLoss(denoiser, DisplayedLoss(temporal=0.5, scales=(1, 8)))(batch)
+    value, parts = NetworkLoss(denoiser, DisplayedLoss(temporal=0.5, scales=(1, 8), squared=3.0))(batch)
     spatial = 0.0
     errors: list[list[Tensor]] = []
+
+    def cost(error: Tensor) -> Tensor:
+        return error.abs() + 3.0 * error**2
+
     for frame, (irradiance, scale) in zip(batch.frames, predicted, strict=True):
         images = (irradiance, frame.reference_irradiance("total"))
         output, truth = (scale.exposure() * frame.divisor * image for image in images)
@@ -372,9 +376,9 @@ def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
         small = [image.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2)) / share.clamp(min=1e-6) for image in blocks]
         errors.append([surface * (tone(output) - tone(truth)), tone(small[0]) - tone(small[1])])
         shares = (frame.depth, share)
-        spatial += sum(surface_mean(error.abs(), each) / 2 for error, each in zip(errors[-1], shares, strict=True))
+        spatial += sum(surface_mean(cost(error), each) / 2 for error, each in zip(errors[-1], shares, strict=True))
     changes = [now - then for then, now in zip(*errors, strict=True)]
-    temporal = sum(surface_mean(change.abs(), each) for change, each in zip(changes, shares, strict=True))
+    temporal = sum(surface_mean(cost(change), each) for change, each in zip(changes, shares, strict=True))
     assert parts["spatial"].item() == pytest.approx(spatial.item(), rel=1e-4)
     assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
 

@@ -34,21 +34,24 @@ def block_means(radiance: Tensor, surface: Tensor, scale: int) -> tuple[Tensor, 
     return mean / share.clamp(min=1e-6), share
 
 
-def sum_of_scales(errors: Sequence[Tensor], shares: Sequence[Tensor]) -> Tensor:
-    """The sum of the mean absolute values of errors where there are surfaces."""
-    return torch.stack([surface_mean(error.abs(), share) for error, share in zip(errors, shares, strict=True)]).sum()
+def sum_of_scales(errors: Sequence[Tensor], shares: Sequence[Tensor], squared: float) -> Tensor:
+    """The sum over scales of the means of |error| + squared · error² where there are surfaces."""
+    costs = (error.abs() + squared * error.square() for error in errors)
+    return torch.stack([surface_mean(cost, share) for cost, share in zip(costs, shares, strict=True)]).sum()
 
 
 @dataclass(frozen=True)
 class DisplayedLoss(Loss):
-    """L1 of what is displayed, and of its changes, at each scale. For any network, which sets the exposure.
+    """The error of what is displayed, and of its changes, at each scale. For any network, which sets the exposure.
 
     A network that is only compared pixel by pixel to noisy references learns their median, which is too dark where
     light is rare. Means over blocks have hardly any noise left: they keep the energy, and they are where blotches show.
+    Squares, whose optimum is the mean, add weight to large errors, as PSNR does.
     """
 
     temporal: float = 0.25  # weight of what changes, where there are sequences
     scales: tuple[int, ...] = (1, 4, 16)  # pixels, the first of them 1
+    squared: float = 0.0  # weight of squared errors
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Output minus target (B, 3, H, W) as displayed, 0 off surfaces, and their share in blocks of each scale."""
@@ -66,9 +69,10 @@ class DisplayedLoss(Loss):
         for frame, output, exposure in exposed_outputs(network, batch):
             target = exposure * frame.reference_buffers(network.signal).mean(dim=1)
             errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
-            spatial.append(sum_of_scales(errors, shares))
+            spatial.append(sum_of_scales(errors, shares, self.squared))
             if before:
-                temporal.append(sum_of_scales([now - then for now, then in zip(errors, before, strict=True)], shares))
+                changes = [now - then for now, then in zip(errors, before, strict=True)]
+                temporal.append(sum_of_scales(changes, shares, self.squared))
             before = errors
         parts = {"spatial": torch.stack(spatial).mean()}
         loss = parts["spatial"]
