@@ -369,13 +369,16 @@ def benchmark_run(
     runs: Runs = RUNS / "benchmark",
     size: Size = "640x360",
     frames: Annotated[int, arg(metavar="N", help="of each clip")] = 49,
+    floor: Annotated[float, arg(metavar="DB", help="noise floor of the references")] = 35.0,
     own: Annotated[bool, FlagCreatePairsOff, arg(help="also five scenes of ours that no training uses")] = False,
 ) -> None:
     """Render the scenes that are there and evaluate denoisers on them; tables and RUNS/benchmark.json."""
     from eval.bench.denoisers import parse_size
+    from eval.benchmark.run import Format
     from eval.benchmark.run import run as run_benchmark
 
-    print(run_benchmark(scenes, data, runs, names, parse_size(size)[::-1], frames, own))
+    clips = Format(parse_size(size)[::-1], frames, floor)
+    print(run_benchmark(scenes, data, runs, names, clips, own))
 
 
 def benchmark_published(

@@ -28,7 +28,8 @@ from provenance import ROOT, device_in_words
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
-FIRST_STEADY_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
+GLASS_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
+STEADY_FRAME = 15  # that of the benchmark: history no longer grows
 SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
 
 
@@ -77,11 +78,11 @@ def extract_stress(runs: Path) -> dict[str, Any]:
     return {"device": content["device"], "rows": rows}
 
 
-def steady_clips(runs: Path) -> list[dict[str, Any]]:
-    """Metrics of all denoisers, and their noise floors, from FIRST_STEADY_FRAME of each clip on."""
+def steady_clips(runs: Path, first: int) -> list[dict[str, Any]]:
+    """Metrics of all denoisers, and their noise floors, from frame `first` of each clip on."""
     rows = []
     for clip in read_results(runs)[1]:
-        values = {result.denoiser: result.frames[FIRST_STEADY_FRAME:] for result in (*clip.results, clip.reference)}
+        values = {result.denoiser: result.frames[first:] for result in (*clip.results, clip.reference)}
         rows.append({"scene": clip.scene, "clip": clip.clip, "results": {n: kept(means(f)) for n, f in values.items()}})
     return rows
 
@@ -90,7 +91,16 @@ def extract_glass(runs: Path) -> dict[str, Any]:
     """Results on the profile `glass`, with what glass shows as guides and with first hits."""
     content, _ = read_results(runs / "glass")
     folders = {"what it shows": runs / "glass", "first hits": runs / "glass" / "first-hits"}
-    return {"device": content["device"], "clips": {guides: steady_clips(path) for guides, path in folders.items()}}
+    return {
+        "device": content["device"],
+        "clips": {guides: steady_clips(path, GLASS_FRAME) for guides, path in folders.items()},
+    }
+
+
+def extract_benchmark(runs: Path) -> dict[str, Any]:
+    """Results of the benchmark by the age of the history, and by scene once that is steady."""
+    content = read_json(runs / "benchmark.json", ("device", "by_age"))
+    return {"device": content["device"], "ages": content["by_age"]["psnr"], "clips": steady_clips(runs, STEADY_FRAME)}
 
 
 def extract_times(runs: Path) -> dict[str, Any]:
@@ -107,6 +117,7 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
     "trade": ("onespp trade", extract_keys("report/trade.json", "device", "size", "threads", "clips", "samples")),
     "stress": ("onespp stress --long", extract_stress),
     "times": ("make", extract_times),
+    "benchmark": ("onespp benchmark run --scenes DIR", extract_benchmark),
     "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),
 }
 
@@ -182,10 +193,10 @@ def quality(metric: str, signal: str = "total") -> str:
     return table(lines)
 
 
-def ages(*names: str) -> str:
-    """PSNR of the named denoisers by the age of their history."""
-    rows = measured("eval")["ages"]
-    texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names}
+def ages(source: str, *names: str) -> str:
+    """PSNR in a source of the named denoisers, or of all, by the age of their history."""
+    rows = measured(source)["ages"]
+    texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
     return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
 
 
@@ -257,6 +268,21 @@ def glass() -> str:
     return table([line for alike in lines.values() for line in alike.values()])
 
 
+def steady() -> str:
+    """PSNR of the benchmark's denoisers by scene, with a steady history, and means of other metrics."""
+    clips = measured("benchmark")["clips"]
+    lines = []
+    for denoiser in clips[0]["results"]:
+        values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
+        floor = denoiser == NOISE_FLOOR
+        line = {"denoiser": FLOOR if floor else f"`{denoiser}`"}
+        line |= {scene: value_cell("psnr", row["psnr"]) for scene, row in values.items()}
+        average = means([*values.values()])
+        line |= {METRICS[metric].title: value_cell(metric, average[metric]) for metric in SHOWN_METRICS}
+        lines.append(line)
+    return table(lines)
+
+
 def stress() -> str:
     """The requirements of the stress bench that denoisers break."""
     rows = measured("stress")["rows"]
@@ -286,7 +312,8 @@ def minutes(what: str) -> str:
 
 
 GENERATORS: dict[str, Callable[..., str]] = {
-    f.__name__: f for f in (ages, clip, quality, shipped, times, samples, front, glass, stress, device, size, minutes)
+    f.__name__: f
+    for f in (ages, clip, quality, shipped, times, samples, front, glass, steady, stress, device, size, minutes)
 }
 
 

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tabulate import tabulate
 
@@ -58,19 +58,27 @@ def digest_of_folder(folder: Path) -> str:
     return sums.hexdigest()[:16]
 
 
-def description(file: Path, toml: Path, bounces: int | None, size: tuple[int, int], frames: int) -> str:
+class Format(NamedTuple):
+    """Of the clips: what is rendered of every scene."""
+
+    size: tuple[int, int]  # width, height
+    frames: int
+    floor: float  # noise floor of the references, PSNR in dB
+
+
+def description(file: Path, toml: Path, bounces: int | None, clips: Format) -> str:
     """The TOML of a scene: one test clip whose first frame is the file's view."""
-    judged = [frame for frame in JUDGED if frame < frames]
+    judged = [frame for frame in JUDGED if frame < clips.frames]
     light = f"bounces = {bounces}\n" if bounces else ""
     return (
         f"file = {json.dumps(os.path.relpath(file, toml.parent))}\n"
-        f"resolution = {list(size)}\nframes = {frames}\n{light}\n"
+        f"resolution = {list(clips.size)}\nframes = {clips.frames}\n{light}\n"
         "[splits.train]\nclips = 0\n\n[splits.val]\nclips = 0\n\n"
-        f"[splits.test]\nclips = 1\nfloor = 35.0\njudged = {judged}\n"
+        f"[splits.test]\nclips = 1\nfloor = {clips.floor}\njudged = {judged}\n"
     )
 
 
-def render_scenes(scenes: Path, data: Path, size: tuple[int, int], frames: int) -> dict[str, Path]:
+def render_scenes(scenes: Path, data: Path, clips: Format) -> dict[str, Path]:
     """Render the datasets of all scenes that are there, or resume. Returns their folders by name."""
     folders = {}
     for name, entry in entries().items():
@@ -80,20 +88,28 @@ def render_scenes(scenes: Path, data: Path, size: tuple[int, int], frames: int) 
             continue
         toml = data / f"{name}.toml"
         data.mkdir(parents=True, exist_ok=True)
-        write_file(toml, description(file.resolve(), toml.resolve(), entry.get("bounces"), size, frames).encode())
+        write_file(toml, description(file.resolve(), toml.resolve(), entry.get("bounces"), clips).encode())
         generate(data / name, str(toml.resolve()), seed=0, reads=channels_read())
         folders[name] = data / name
     return folders
 
 
-def run(
-    scenes: Path | None, data: Path, runs: Path, names: Sequence[str], size: tuple[int, int], frames: int, own: bool
-) -> Path:
+def digests_of(scene: Path, dataset: Path) -> dict[str, Any]:
+    """Digests of a scene's files and of its clip, and what its references cost."""
+    clip = Dataset(dataset).clips("test")[0]
+    return {
+        "files": digest_of_folder(scene),
+        "clip": clip.fingerprint,
+        "reference_spp": clip.facts["reference_spp"],
+    }
+
+
+def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips: Format, own: bool) -> Path:
     """Render, evaluate and write RUNS/benchmark.json, whose path is returned.
 
     `own` adds our own scenes, which no training uses. Raises BadInput where there is nothing to evaluate.
     """
-    folders = render_scenes(scenes, data, size, frames) if scenes else {}
+    folders = render_scenes(scenes, data, clips) if scenes else {}
     if own:
         generate(data / BUILT_IN, BUILT_IN, seed=0, reads=channels_read())
     everything = [*folders.values(), *([data / BUILT_IN] if own else [])]
@@ -101,13 +117,9 @@ def run(
         where = f"none of the scenes is in {scenes}" if scenes else "nothing to evaluate: name --scenes DIR or --own"
         raise BadInput(f"{where}; `onespp benchmark list` says where to get scenes")
     evaluate(everything, runs, "release", names or NAMES)
-    content, clips = read_results(runs)
-    ages = {metric: means_by_age(by_signal(clips)["total"], metric) for metric in PRINTED}
-    digests = {
-        name: {"files": digest_of_folder(scenes / name), "clip": Dataset(folder).clips("test")[0].fingerprint}
-        for name, folder in folders.items()
-        if scenes
-    }
+    content, results = read_results(runs)
+    ages = {metric: means_by_age(by_signal(results)["total"], metric) for metric in PRINTED}
+    digests = {name: digests_of(scenes / name, folder) for name, folder in folders.items() if scenes}
     path = runs / "benchmark.json"
     write_json(path, content | {"by_age": ages, "digests": digests})
     return path

@@ -12,7 +12,7 @@ from datasets.imported import ImportedFrame, write_dataset
 from errors import BadInput
 from eval.benchmark.page import write_page
 from eval.benchmark.published import aces_tone, published
-from eval.benchmark.run import entries, list_scenes, run
+from eval.benchmark.run import Format, entries, list_scenes, run
 from files import read_json
 from scenes.camera import STILL, View, intrinsics, look_at
 from tests.helpers.scene_files import xml
@@ -27,7 +27,7 @@ def benchmark(tmp_path_factory):
     for name in ("kitchen", "bedroom"):
         (root / "scenes" / name).mkdir(parents=True)
         (root / "scenes" / name / "scene.xml").write_text(xml())
-    return root, run(root / "scenes", root / "data", root / "runs", NAMES, (24, 24), frames=6, own=False)
+    return root, run(root / "scenes", root / "data", root / "runs", NAMES, Format((24, 24), 6, 35.0), own=False)
 
 
 def test_scenes_that_are_there_are_evaluated_and_the_others_named(benchmark):
@@ -45,7 +45,7 @@ def test_scenes_that_are_there_are_evaluated_and_the_others_named(benchmark):
 
 def test_a_folder_without_any_of_the_scenes_is_refused(tmp_path):
     with pytest.raises(BadInput, match="none of the scenes"):
-        run(tmp_path, tmp_path / "data", tmp_path / "runs", NAMES, (24, 24), frames=2, own=False)
+        run(tmp_path, tmp_path / "data", tmp_path / "runs", NAMES, Format((24, 24), 2, 35.0), own=False)
 
 
 def test_the_page_has_both_videos_of_every_clip(benchmark):
