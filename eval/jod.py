@@ -24,9 +24,9 @@ MIN_SIDE = 3  # px; the metric fails on a single pixel
 
 
 def video(folder: Path, frames: Sequence[int]) -> Tensor:
-    """Frames as displayed, (1, 3, F, H, W) in [0, 1]."""
+    """Frames as displayed, (1, 3, F, H, W) in 8 bits, which the metric takes."""
     pictures = np.stack([load_picture(folder, index) for index in frames])
-    return torch.from_numpy(pictures).permute(3, 0, 1, 2)[None].float() / 255
+    return torch.from_numpy(pictures).permute(3, 0, 1, 2)[None]
 
 
 def jod_of_clip(metric: Any, runs: Path, clip: ClipResults) -> dict[str, float]:

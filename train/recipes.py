@@ -111,7 +111,7 @@ NTD_BUDGETS = {
 ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
-    "release": {"epochs": 20, "rate": 1e-3, "batch": 4, "length": 10, "crop": 80, "clip": 3.0}
+    "release": {"epochs": 16, "rate": 1e-3, "batch": 4, "length": 10, "crop": 80, "clip": 3.0}
     | {"loss": DisplayedLoss(temporal=0.5, squared=25.0)},
 }
 

@@ -376,7 +376,7 @@ def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
         surface = (frame.depth > 0).float()
         a, b = (clipped_tone(scale.exposure() * frame.reference_buffers("total")[:, i]) for i in (0, 1))
         noise = torch.stack([((a - b)[i, :, surface[i, 0] > 0] ** 2).mean() / 4 for i in range(2)])
-        weight = (0.003 / (0.003 + noise))[:, None, None, None]
+        weight = (0.01 / (0.01 + noise))[:, None, None, None]
         blocks = [image * surface for image in (output, truth)]
         share = surface.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2))
         small = [image.unfold(2, 8, 8).unfold(3, 8, 8).mean(dim=(-1, -2)) / share.clamp(min=1e-6) for image in blocks]

@@ -12,7 +12,7 @@ from models.denoiser import Denoiser
 from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
 
-NOISE = 0.003  # squared, of the displayed reference that counts half
+NOISE = 0.01  # squared, of the displayed reference that counts half
 TONE_OFFSET = 1e-4  # of exposed radiance: it bounds the slope of the curve at black
 
 
