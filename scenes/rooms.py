@@ -1,9 +1,5 @@
-"""`room-N`, a random interior for any integer N, and parts of such through longer lenses: `closeup-N` and `dim-N`.
+"""`room-N`, a random interior for any integer N, and `closeup-N`, a part of room-N through a longer lens."""
 
-Light finds the ways of `dim-N` by chance: it is a sky seen through windows, or comes from hidden lamps.
-"""
-
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -37,23 +33,16 @@ class Style(NamedTuple):
     lamps: tuple[int, int]  # their number: from, to (exclusive)
     day: bool = False  # light enters through windows or missing walls
     missing_walls: tuple[int, int] = (0, 1)  # their number: from, to (exclusive)
-    panels: float = 0.5  # share of the rooms with windows that are lit by panels there instead of a sky around them
 
 
-Styles = Mapping[str, Style]
-STYLES: Styles = {
+# Chosen so that rooms are as hard to denoise as real interiors (docs/data.md).
+STYLES = {
     "open": Style(0.24, lighting.OPEN_FIXTURES, (1, 4)),
     "luminous": Style(0.24, (lighting.luminous_panel,), (1, 4)),
     "terrace": Style(0.26, (lighting.luminous_panel, lighting.orb), (0, 2), day=True, missing_walls=(1, 4)),
     "window": Style(0.16, lighting.DAY_FIXTURES, (0, 3), day=True),
     "mixed": Style(0.08, (*lighting.OPEN_FIXTURES, *lighting.HIDDEN_FIXTURES), (1, 5)),
     "hidden": Style(0.02, lighting.HIDDEN_FIXTURES, (1, 3)),
-}
-# In real interiors most samples find no light (docs/experiments.md).
-DIM_STYLES: Styles = {
-    "window": Style(0.5, (lighting.hanging, lighting.standing_lamp), (0, 2), day=True, panels=0.0),
-    "hidden": Style(0.35, lighting.HIDDEN_FIXTURES, (1, 4)),
-    "mixed": Style(0.15, (*lighting.OPEN_FIXTURES, *lighting.HIDDEN_FIXTURES), (3, 6)),
 }
 ROOFLESS = 0.6  # share of the rooms with missing walls that have no ceiling either
 NIGHT = 0.25  # share of the rooms lit by lamps alone that have windows, black outside
@@ -144,7 +133,7 @@ def holes(layout: Layout, style: Style) -> None:
 def outside(layout: Layout, style: Style) -> Array | None:
     """The sky around the room: by day in half of the rooms with windows, and wherever walls are missing."""
     rng = layout.rng
-    if not style.day or (not layout.missing_walls and rng.random() < style.panels):
+    if not style.day or (not layout.missing_walls and rng.random() < 0.5):
         return None
     if rng.random() >= (0.3 if layout.missing_walls else 0.75):
         return sky(rng, sun=None)
@@ -153,11 +142,11 @@ def outside(layout: Layout, style: Style) -> Array | None:
     return sky(rng, sun=through @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])
 
 
-def room(rng: Rng, frames: int, styles: Styles = STYLES) -> Scene:
+def room(rng: Rng, frames: int) -> Scene:
     """A random interior for a clip of `frames` frames, in metres: 15 to 60 things, 1 to 4 lamps or windows."""
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
     layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.3, 0.5))))
-    style = styles[str(rng.choice(list(styles), p=[style.share for style in styles.values()]))]
+    style = STYLES[str(rng.choice(list(STYLES), p=[style.share for style in STYLES.values()]))]
     holes(layout, style)
     environment = outside(layout, style)
     eye = flight_path(layout)
@@ -187,17 +176,7 @@ def room(rng: Rng, frames: int, styles: Styles = STYLES) -> Scene:
 
 def closeup(rng: Rng, frames: int) -> Scene:
     """A random room through a longer lens, as finely resolved as in an image several times as wide."""
-    return zoomed(rng, room(rng, frames), frames)
-
-
-def dim(rng: Rng, frames: int) -> Scene:
-    """The same of a room where light is rare, and bounces once more than in other rooms."""
-    scene = room(rng, frames, DIM_STYLES)
-    return zoomed(rng, replace(scene, max_depth=scene.max_depth + 1), frames)
-
-
-def zoomed(rng: Rng, scene: Scene, frames: int) -> Scene:
-    """A scene through a lens 1.5 to 6 times as long, aimed at another part of the image."""
+    scene = room(rng, frames)
     camera = scene.camera
     zoom = log_uniform(rng, MIN_ZOOM, MAX_ZOOM)
     across, up = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)  # to the right and upwards, in half image widths

@@ -111,8 +111,7 @@ NTD_BUDGETS = {
 ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},
     "quick": {"epochs": 10},
-    "release": {"epochs": 16, "rate": 1e-3, "batch": 4, "length": 10, "crop": 80, "clip": 3.0}
-    | {"loss": DisplayedLoss(temporal=0.5, squared=25.0)},
+    "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedLoss(temporal=0.5)},
 }
 
 PAPERS_AND_BUDGETS: dict[str, tuple[Recipe, Budgets]] = {

@@ -38,13 +38,8 @@ def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp 
     """All clips of a split, each as SCENE/CLIP, for the dataset with that seed. Close-ups are of other rooms."""
     boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes.get(split, 0))]
     first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms.get(split, 0)
-    numbers = count(first)
-    parts = [
-        f"{kind}-{number}/000"
-        for kind, counts in (("closeup", profile.closeups), ("dim", profile.dim))
-        for number in islice(numbers, counts.get(split, 0))
-    ]
-    return boxes + rooms_of(profile, split, seed, needed_spp) + parts + profile.special.get(split, [])
+    closeups = [f"closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
+    return boxes + rooms_of(profile, split, seed, needed_spp) + closeups + profile.special.get(split, [])
 
 
 def plan(

@@ -31,7 +31,6 @@ class DataProfile:
     boxes: dict[str, int] = field(default_factory=dict)  # clips of each Cornell box
     rooms: dict[str, int] = field(default_factory=dict)  # rooms, of one clip each
     closeups: dict[str, int] = field(default_factory=dict)  # of further rooms, one clip each
-    dim: dict[str, int] = field(default_factory=dict)  # parts of further rooms where light is rare
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
     judged: tuple[int, ...] = ()  # the frames of test clips that get a reference; empty for all
     own: Path | None = None  # the TOML of a user's own scene, the only one
@@ -64,14 +63,13 @@ DATA_PROFILES = {
     ),
     # Whole rooms, and parts of others with the resolution of large images.
     "release": DataProfile(
-        size=(12, 144, 144),
+        size=(12, 128, 128),
         boxes={"test": 1},
-        rooms={"train": 72, "val": 4, "test": 6},
-        closeups={"train": 72, "val": 4},
-        dim={"train": 36, "val": 3},
+        rooms={"train": 128, "val": 8, "test": 6},
+        closeups={"train": 128, "val": 4},
         quality={
-            "train": SamplingQuality(realisations=6, reference_spp=24, floor=30, most_spp=64),
-            "val": SamplingQuality(realisations=1, reference_spp=64),
+            "train": SamplingQuality(realisations=8, reference_spp=32),
+            "val": SamplingQuality(realisations=8, reference_spp=64),
             "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},

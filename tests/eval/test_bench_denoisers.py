@@ -21,6 +21,7 @@ from eval.bench.denoisers import (
     measure_rows,
     other_ways,
     parse_size,
+    peaks,
     size_name,
     thread_counts,
     time_in_turns,
@@ -108,6 +109,12 @@ def test_oidn_has_no_parameters_to_count():
     (timed,) = time_in_turns([DenoiserSpec.named("oidn+taa")], (8, 8), measured=1)
     row = cost(timed, (8, 8), 1.0)
     assert (row.peak_mb, row.parameters, row.macs_per_pixel) == (1.0, None, None)
+
+
+@pytest.mark.slow
+def test_one_denoises_3840_x_2160_in_four_gigabytes():
+    (peak,) = peaks([DenoiserSpec.named("one")], (2160, 3840), 2)
+    assert peak is None or peak < 4000
 
 
 def test_slow_denoisers_are_timed_on_fewer_frames():

@@ -166,25 +166,3 @@ def test_numbers_draw_different_parts():
     }
     assert len(zooms) == 2
     assert build_scene("closeup-1", 5, 1).view(0, 8, 8).K[0, 0] == build_scene("closeup-1", 6, 1).view(0, 8, 8).K[0, 0]
-
-
-def dark_share(name: str) -> float:
-    """The share of surface pixels that one sample leaves twenty times darker than the mean of 64."""
-    size = 32
-    stage = Stage(build_scene(name, 0, 2), size, size)
-    stage.pose(0)
-    rays = stage.rays(stage.view(0))
-    one, many = (luminance(np.add(*PathTracer(stage).radiance(rays, seed, spp))) for seed, spp in ((0, 1), (1, 64)))
-    return float((one < many / 20)[many > 0].mean())
-
-
-@pytest.mark.slow
-def test_light_is_rare_in_dim_rooms():
-    shares = {kind: np.mean([dark_share(f"{kind}-{number}") for number in range(5)]) for kind in ("dim", "closeup")}
-    assert shares["dim"] > 0.5 > shares["closeup"]
-
-
-def test_dim_rooms_are_lit_by_the_sky_or_by_lamps():
-    scenes = [build_scene(f"dim-{number}", 0, 2) for number in range(4)]
-    assert all(scene.sky is not None or lights(scene) for scene in scenes)
-    assert all(scene.max_depth > 3 for scene in scenes)
