@@ -10,6 +10,7 @@ from datasets.channels import LUMINANCE_WEIGHTS
 from models.history.geometry import pixel_centres
 
 MAX_LUMINANCE = 1e16  # its square must stay finite
+STRIP_PIXELS = 1 << 20  # networks take larger images in strips of about so many
 MAX_IRRADIANCE = 1e30  # sums with weights of exp(10) must stay finite
 MIN_DIVISOR = 1e-30  # keeps quotients finite where lengths, depths, variances or sums of weights are 0
 STRIP_ROWS = 64  # of images that are worked on in strips: temporaries stay in the cache, two threads have enough to do

@@ -30,13 +30,12 @@ from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import ConvReLU
-from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, pad_to_multiple
+from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, STRIP_PIXELS, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
-STRIP_PIXELS = 1 << 20  # of larger images the network works on strips of about so many
-REACH = 32  # rows above and below that what is predicted for a pixel depends on: 28, in whole patches of 8
-SURFACE_CHANNELS = ("albedo", "normal", "depth", "roughness")  # that network_inputs reads
+NETWORK_REACH = 32  # rows above and below that what is predicted for a pixel depends on, in whole patches of 8
+NETWORK_SURFACE = ("albedo", "normal", "depth", "roughness", "mesh_id")
 HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
 
 
@@ -268,34 +267,39 @@ class One(Denoiser):
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
         surface = (frame.depth > 0).to(frame.depth)
+        decoded, past, scale = self.decoded(frame, before, surface)
+        images = carried(decoded, past, surface, self.steps)
+        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
+
+    def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
+        """What the network predicts, the previous output reprojected, and the running scale.
+
+        The filter needs nothing else: what only the network reads is freed on return.
+        """
         noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
         history, has_history = fetched(before, frame, surface)
-        inputs = PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
-        decoded = self.decoded(frame, scale, inputs)
-        images = carried(decoded, history, surface, self.steps)
-        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
-
-    def decoded(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
-        """What the network predicts, of large images in strips of rows: its activations take most of the memory."""
         height, width = frame.size
-        rows = max(1, STRIP_PIXELS // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
-        if rows >= height or torch.is_grad_enabled():
-            return self.decoded_whole(frame, scale, inputs)
-        whole: Decoded | None = None
+        if height * width <= STRIP_PIXELS or torch.is_grad_enabled():
+            return self.decoded_rows(frame, scale, noisy, history, has_history), history[:, :3].clone(), scale
+        # Large images in strips of rows: the network's activations would take most of the memory.
+        rows = max(1, STRIP_PIXELS // 2 // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
+        channels = *head_channels(len(self.steps)).values(), 3, 1
+        whole = Decoded(*(noisy.new_empty(len(noisy), count, height, width) for count in channels))
         for top in range(0, height, rows):
-            first = max(0, top - REACH)
-            needed = slice(first, top + rows + REACH)
-            part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in SURFACE_CHANNELS})
-            strip = self.decoded_whole(part, scale, PixelInputs(*(each[..., needed, :] for each in inputs)))
-            whole = whole or Decoded(*(each.new_empty(*each.shape[:2], height, width) for each in strip))
+            first = max(0, top - NETWORK_REACH)
+            needed = slice(first, top + rows + NETWORK_REACH)
+            part = replace(frame, channels={name: frame.channels[name][..., needed, :] for name in NETWORK_SURFACE})
+            strip = self.decoded_rows(part, scale, *(each[..., needed, :] for each in (noisy, history, has_history)))
             for image, values in zip(whole, strip, strict=True):
                 image[..., top : top + rows, :] = values[..., top - first : top - first + rows, :]
-        assert whole is not None
-        return whole
+        return whole, history[:, :3].clone(), scale
 
-    def decoded_whole(self, frame: Frame, scale: RunningScale, inputs: PixelInputs) -> Decoded:
-        """`decoded`, in one piece."""
+    def decoded_rows(
+        self, frame: Frame, scale: RunningScale, noisy: Tensor, history: Tensor, has_history: Tensor
+    ) -> Decoded:
+        """What the network predicts for a frame, or for some of its rows, of which it needs NETWORK_SURFACE."""
+        inputs = PixelInputs(noisy, *mesh_means(noisy, frame.mesh_id), history, has_history)
         first, _, last = cast(Sequence[nn.Linear], self.network.detail)  # ReLU in between
         patches, hidden = network_inputs(frame, scale, inputs, first)
         height, width = frame.size

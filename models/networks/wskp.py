@@ -21,11 +21,10 @@ from models.networks.convolution import encoded
 from models.networks.fusion import fuse
 from models.networks.pixel_kernels import apply_kernels
 from models.networks.repvgg import BRANCH_SIZES, merge, repvgg
-from models.operators import halve, pad_to_multiple, pyramid
+from models.operators import STRIP_PIXELS, halve, pad_to_multiple, pyramid
 
 WSKP_WIDTH = 24  # ours: the paper does not print its widths
 MAX_WHOLE_PIXELS = 1920 * 1080  # larger frames would take gigabytes and are filtered in strips, with the same result
-STRIP_PIXELS = 1 << 20
 
 
 def scaled_normal(normal: Tensor) -> Tensor:

@@ -16,17 +16,18 @@ from eval.bench.denoisers import (
     TIMED_FRAMES,
     bench_denoisers,
     cost,
+    denoiser_peak_mb,
     is_usual,
     macs_per_pixel,
     measure_rows,
     other_ways,
     parse_size,
-    peaks,
     size_name,
     thread_counts,
     time_in_turns,
     timed_specs,
 )
+from eval.bench.memory import alone
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.harness import compile_kernels
 from eval.selection import cannot_run
@@ -112,9 +113,12 @@ def test_oidn_has_no_parameters_to_count():
 
 
 @pytest.mark.slow
-def test_one_denoises_3840_x_2160_in_four_gigabytes():
-    (peak,) = peaks([DenoiserSpec.named("one")], (2160, 3840), 2)
-    assert peak is None or peak < 4000
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_one_denoises_3840_x_2160_in_four_gigabytes(precision):
+    frames = [synthetic_frame(index, 2160, 3840) for index in range(2)]
+    peak = alone(denoiser_peak_mb, DenoiserSpec.named("one", precision=precision), frames, 2)
+    assert peak is not None
+    assert peak < 4000
 
 
 def test_slow_denoisers_are_timed_on_fewer_frames():
