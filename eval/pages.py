@@ -98,9 +98,17 @@ def extract_glass(runs: Path) -> dict[str, Any]:
 
 
 def extract_benchmark(runs: Path) -> dict[str, Any]:
-    """Results of the benchmark by the age of the history, and by scene once that is steady."""
-    content = read_json(runs / "benchmark.json", ("device", "by_age"))
-    return {"device": content["device"], "ages": content["by_age"]["psnr"], "clips": steady_clips(runs, STEADY_FRAME)}
+    """Results of the benchmark by size: by the age of the history, by scene once that is steady, and of rendering."""
+    files = sorted(runs.glob("benchmark*/benchmark.json"))
+    if not files:
+        raise BadInput(f"no {runs / 'benchmark' / 'benchmark.json'}")
+    sizes = {}
+    for file in files:
+        content = read_json(file, ("device", "size", "by_age", "rendered", "where"))
+        clips = steady_clips(file.parent, STEADY_FRAME)
+        kept_keys = {key: content[key] for key in ("rendered", "where")}
+        sizes[content["size"]] = {"ages": content["by_age"]["psnr"], "clips": clips} | kept_keys
+    return {"device": content["device"], "sizes": sizes}
 
 
 def extract_times(runs: Path) -> dict[str, Any]:
@@ -193,9 +201,9 @@ def quality(metric: str, signal: str = "total") -> str:
     return table(lines)
 
 
-def ages(source: str, *names: str) -> str:
-    """PSNR in a source of the named denoisers, or of all, by the age of their history."""
-    rows = measured(source)["ages"]
+def ages(*names: str, rows: dict[str, Any] | None = None) -> str:
+    """PSNR of the named denoisers, or of all, by the age of their history."""
+    rows = rows or measured("eval")["ages"]
     texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
     return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
 
@@ -268,18 +276,60 @@ def glass() -> str:
     return table([line for alike in lines.values() for line in alike.values()])
 
 
-def steady() -> str:
+def of_size(size: str) -> dict[str, Any]:
+    """The benchmark's results at a size, such as 640x360. Raises BadInput where it was not measured."""
+    sizes = measured("benchmark")["sizes"]
+    if size not in sizes:
+        raise BadInput(f"not measured: `onespp benchmark run --size {size}`, then `python -m eval.pages RUNS`")
+    return dict(sizes[size])
+
+
+def benchmark_ages(size: str, *names: str) -> str:
+    """PSNR of the benchmark's denoisers by the age of their history."""
+    return ages(*names, rows=of_size(size)["ages"])
+
+
+def steady(size: str) -> str:
     """PSNR of the benchmark's denoisers by scene, with a steady history, and means of other metrics."""
-    clips = measured("benchmark")["clips"]
+    clips = of_size(size)["clips"]
     lines = []
     for denoiser in clips[0]["results"]:
         values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
         floor = denoiser == NOISE_FLOOR
         line = {"denoiser": FLOOR if floor else f"`{denoiser}`"}
-        line |= {scene: value_cell("psnr", row["psnr"]) for scene, row in values.items()}
         average = means([*values.values()])
         line |= {METRICS[metric].title: value_cell(metric, average[metric]) for metric in SHOWN_METRICS}
+        line |= {scene: value_cell("psnr", row["psnr"]) for scene, row in values.items()}
         lines.append(line)
+    return table(lines)
+
+
+def where(size: str, *questions: str) -> str:
+    """Shares of the pixels and of the squared error of the benchmark's clips, by what `onespp eval --where` asks."""
+    lines = []
+    for scene, shares in of_size(size)["where"].items():
+        for share, answers in shares.items():
+            line = {"clip": scene, "share of": share if share == "pixels" else f"`{share}`"}
+            for question in questions:
+                every = dict.fromkeys(a for each in shares.values() for a in each.get(question, ()))
+                own = answers.get(question, {})
+                line |= {answer: f"{100 * own[answer]:.0f} %" if answer in own else "" for answer in every}
+            lines.append(line)
+    return table(lines)
+
+
+def rendering(size: str) -> str:
+    """What the references of the benchmark's clips cost."""
+    lines = [
+        {
+            "clip": row["scene"],
+            "references": str(row["judged"]),
+            "spp": str(row["reference_spp"]),
+            "noise floor": f"{row['floor']:.1f} dB",
+            "minutes": f"{row['seconds'] / 60:.1f}",
+        }
+        for row in of_size(size)["rendered"]
+    ]
     return table(lines)
 
 
@@ -313,7 +363,10 @@ def minutes(what: str) -> str:
 
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
-    for f in (ages, clip, quality, shipped, times, samples, front, glass, steady, stress, device, size, minutes)
+    for f in (
+        *(ages, clip, quality, shipped, times, samples, front, glass, stress, device, size, minutes),
+        *(benchmark_ages, steady, where, rendering),
+    )
 }
 
 

@@ -11,12 +11,15 @@ from typing import Any, NamedTuple
 
 from tabulate import tabulate
 
-from datasets.clip import Dataset
+from datasets.clip import Clip, Dataset
+from datasets.tonemap import psnr
 from errors import BadInput
+from eval.error_location import error_shares
 from eval.harness import evaluate
 from eval.results import by_signal, read_results
+from eval.selection import evaluated
 from eval.tables import PRINTED, means_by_age
-from files import write_file, write_json
+from files import read_json, write_file, write_json
 from models.registry import channels_read
 from render.job.generate import generate
 from render.job.profiles import JUDGED
@@ -27,6 +30,9 @@ NAMES = (
 )
 FILES = ("scene.xml", "scene_v3.xml")
 BUILT_IN = "benchmark"  # the profile of our own scenes
+BUDGET = "release"
+LOCATED = ("oidn", "one")  # whose errors are located
+FILE = "benchmark.json"
 
 
 def entries() -> dict[str, dict[str, Any]]:
@@ -94,14 +100,25 @@ def render_scenes(scenes: Path, data: Path, clips: Format) -> dict[str, Path]:
     return folders
 
 
-def digests_of(scene: Path, dataset: Path) -> dict[str, Any]:
-    """Digests of a scene's files and of its clip, and what its references cost."""
-    clip = Dataset(dataset).clips("test")[0]
+def rendered(clip: Clip) -> dict[str, Any]:
+    """What a clip's references cost: samples a pixel, their noise floor as PSNR in dB, seconds of rendering in all."""
+    seconds = sum(read_json(clip.path / "timing.json").values())
     return {
-        "files": digest_of_folder(scene),
-        "clip": clip.fingerprint,
+        "scene": clip.scene,
+        "judged": len(clip.judged),
         "reference_spp": clip.facts["reference_spp"],
+        "floor": psnr(clip.facts["floor_mse"]),
+        "seconds": seconds,
     }
+
+
+def located(clip: Clip, names: Sequence[str], runs: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Shares of the pixels and of the squared error by denoiser, question and answer: see `onespp eval --where`."""
+    shares: dict[str, dict[str, dict[str, float]]] = {}
+    for name, values in error_shares(clip, evaluated(names, runs, BUDGET)).items():
+        for (question, answer), share in values.items():
+            shares.setdefault(name, {}).setdefault(question, {})[answer] = float(share)
+    return shares
 
 
 def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips: Format, own: bool) -> Path:
@@ -116,10 +133,22 @@ def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips
     if not everything:
         where = f"none of the scenes is in {scenes}" if scenes else "nothing to evaluate: name --scenes DIR or --own"
         raise BadInput(f"{where}; `onespp benchmark list` says where to get scenes")
-    evaluate(everything, runs, "release", names or NAMES)
+    names = names or NAMES
+    evaluate(everything, runs, BUDGET, names)
     content, results = read_results(runs)
-    ages = {metric: means_by_age(by_signal(results)["total"], metric) for metric in PRINTED}
-    digests = {name: digests_of(scenes / name, folder) for name, folder in folders.items() if scenes}
-    path = runs / "benchmark.json"
-    write_json(path, content | {"by_age": ages, "digests": digests})
+    tested = [clip for folder in everything for clip in Dataset(folder).clips("test")]
+    facts = {
+        "size": "x".join(map(str, clips.size)),
+        "by_age": {metric: means_by_age(by_signal(results)["total"], metric) for metric in PRINTED},
+        "digests": {name: digests_of(scenes / name, folder) for name, folder in folders.items() if scenes},
+        "rendered": [rendered(clip) for clip in tested],
+        "where": {clip.scene: located(clip, [name for name in LOCATED if name in names], runs) for clip in tested},
+    }
+    path = runs / FILE
+    write_json(path, content | facts)
     return path
+
+
+def digests_of(scene: Path, dataset: Path) -> dict[str, str]:
+    """Digests of a scene's files and of its clip."""
+    return {"files": digest_of_folder(scene), "clip": Dataset(dataset).clips("test")[0].fingerprint}

@@ -17,7 +17,7 @@ from files import read_json
 from scenes.camera import STILL, View, intrinsics, look_at
 from tests.helpers.scene_files import xml
 
-NAMES = ("noisy", "svgf")
+NAMES = ("noisy", "svgf", "one")
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,10 @@ def test_scenes_that_are_there_are_evaluated_and_the_others_named(benchmark):
     assert content["digests"]["kitchen"]["clip"] == clip.fingerprint
     assert content["digests"]["kitchen"]["files"] == content["digests"]["bedroom"]["files"]
     assert content["by_age"]["psnr"]["svgf"]["fifth"] > content["by_age"]["psnr"]["noisy"]["fifth"]
+    assert [row["scene"] for row in content["rendered"]] == ["bedroom", "kitchen"]
+    assert all(row["judged"] == 2 and row["seconds"] > 0 for row in content["rendered"])
+    assert content["where"]["kitchen"].keys() == {"pixels", "one"}
+    assert sum(content["where"]["kitchen"]["one"]["place"].values()) == pytest.approx(1)
     listed = list_scenes(root / "scenes")
     assert listed.count("missing") == len(entries()) - 2 and "Jay-Artist" in listed
 
@@ -50,7 +54,7 @@ def test_a_folder_without_any_of_the_scenes_is_refused(tmp_path):
 
 def test_the_page_has_both_videos_of_every_clip(benchmark):
     root, _ = benchmark
-    page = write_page(NAMES, [root / "data" / "kitchen"], root / "runs", "quick").read_text()
+    page = write_page(NAMES[:2], [root / "data" / "kitchen"], root / "runs", "quick").read_text()
     assert page.count("data:image/webp;base64,") == 2 * 6 and "kitchen/000" in page
 
 
