@@ -176,16 +176,6 @@ def table(lines: list[dict[str, Any]]) -> str:
     return f"\n{tabulate(lines, 'keys', 'github', disable_numparse=True)}\n"
 
 
-def clip(scene: str, *names: str) -> str:
-    """Metrics of the named denoisers, or of all, on a scene's clip or in the mean; and the noise floor."""
-    rows = {row.denoiser: row for row in rows_of(scene)}
-    floor = list(rows)[-1]
-    chosen = [rows[name] for name in (*(names or list(rows)[:-1]), floor)]
-    titles = {metric: METRICS[metric].title for metric in PRINTED if metric != "rmse"}  # PSNR says the same
-    lines = [{"denoiser": cell(row)} | {title: row.text(key) for key, title in titles.items()} for row in chosen]
-    return table(lines)
-
-
 def cell(row: TableRow) -> str:
     return row.denoiser if row.is_floor else f"`{row.denoiser}`"
 
@@ -289,17 +279,17 @@ def benchmark_ages(size: str, *names: str) -> str:
     return ages(*names, rows=of_size(size)["ages"])
 
 
-def steady(size: str) -> str:
-    """PSNR of the benchmark's denoisers by scene, with a steady history, and means of other metrics."""
+def steady(size: str, *names: str) -> str:
+    """Means of the benchmark's clips with a steady history, and PSNR by scene; of the named denoisers, or of all."""
     clips = of_size(size)["clips"]
     lines = []
-    for denoiser in clips[0]["results"]:
+    for denoiser in (*names, NOISE_FLOOR) if names else clips[0]["results"]:
         values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
-        floor = denoiser == NOISE_FLOOR
-        line = {"denoiser": FLOOR if floor else f"`{denoiser}`"}
-        average = means([*values.values()])
-        line |= {METRICS[metric].title: value_cell(metric, average[metric]) for metric in SHOWN_METRICS}
-        line |= {scene: value_cell("psnr", row["psnr"]) for scene, row in values.items()}
+        label = FLOOR if denoiser == NOISE_FLOOR else denoiser
+        row = TableRow("mean", label, "total", means([*values.values()]), {})
+        line = {"denoiser": cell(row), "made from": row.made_from}
+        line |= {METRICS[metric].title: row.text(metric) for metric in SHOWN_METRICS}
+        line |= {scene: value_cell("psnr", each["psnr"]) for scene, each in values.items()}
         lines.append(line)
     return table(lines)
 
@@ -364,7 +354,7 @@ def minutes(what: str) -> str:
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
-        *(ages, clip, quality, shipped, times, samples, front, glass, stress, device, size, minutes),
+        *(ages, quality, shipped, times, samples, front, glass, stress, device, size, minutes),
         *(benchmark_ages, steady, where, rendering),
     )
 }
