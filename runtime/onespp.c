@@ -118,19 +118,16 @@ static inline float exponential(float x)
     return float_of(bits_of(p) + (int32_t)n * (1 << 23));
 }
 
-/* ln x for normal x > 0: e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), where x = m 2^e. */
+/* ln x for normal x = m 2^e, as e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), with m between the roots of 1/2 and
+ * of 2, where the bits of the latter begin. x >= 1/2. */
 static inline float logarithm(float x)
 {
-    int32_t bits = bits_of(x);
-    float m = float_of((bits & 0x7fffff) | 0x3f800000);
-    float e = (float)((bits >> 23) - 127);
-    int large = m > 1.4142135f;
-    m = large ? m * 0.5f : m;
-    e = large ? e + 1.f : e;
+    int32_t e = (bits_of(x) - 0x3f3504f3) >> 23;
+    float m = float_of(bits_of(x) - e * (1 << 23));
     float t = (m - 1.f) / (m + 1.f);
     float s = t * t;
     float series = 1.f + s * (1.f / 3 + s * (1.f / 5 + s * (1.f / 7 + s * (1.f / 9))));
-    return e * 0.6931471805599453f + 2.f * t * series;
+    return (float)e * 0.6931471805599453f + 2.f * t * series;
 }
 
 static inline float luminance(float red, float green, float blue)
@@ -434,8 +431,9 @@ static void load(float *restrict line, const onespp_image *image, int channel, i
 {
     ptrdiff_t step = image->column;
     const float *from = image->data + image->channel * channel + image->row * y + step * x;
+    float constant = finite(*from);
     for (int i = 0; i < n; i++)
-        line[i] = finite(from[i * step]);
+        line[i] = step ? finite(from[i * step]) : constant;
 }
 
 /* Mesh ids of n pixels; negative ones, which stand for pixels outside the image here, count as one mesh. */
@@ -1038,7 +1036,9 @@ enum {
 static void expose(float *restrict line, const float *restrict light, float exposure, int n)
 {
     for (int i = 0; i < n; i++)
-        line[i] = logarithm(1 + least(most(light[i], 0) * exposure, MAX_EXPOSED));
+        line[i] = 1 + least(most(light[i], 0) * exposure, MAX_EXPOSED);
+    for (int i = 0; i < n; i++)
+        line[i] = logarithm(line[i]);
 }
 
 /* The lines that are means of irradiance, and its deviation. */
@@ -1105,11 +1105,12 @@ static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict 
         for (int i = 0; i < n; i++)
             lines[NORMAL_INPUT + c][i] = axis[0] * normal[0][i] + axis[1] * normal[1][i] + axis[2] * normal[2][i];
     }
-    float *depth = lines[DEPTH_INPUT], *roughness = lines[ROUGHNESS_INPUT];
+    float *restrict depth = lines[DEPTH_INPUT], *restrict roughness = lines[ROUGHNESS_INPUT], scale = job->depth_scale;
     load(depth, &frame->depth, 0, y, x0, n);
     load(roughness, &frame->roughness, 0, y, x0, n);
     for (int i = 0; i < n; i++) {
-        depth[i] = depth[i] > 0 ? depth[i] / (depth[i] + job->depth_scale) : 1;
+        float share = depth[i] / (depth[i] + scale);
+        depth[i] = depth[i] > 0 ? share : 1;
         roughness[i] = clamped(roughness[i], MAX_REFLECTANCE);
     }
 }
@@ -1195,9 +1196,11 @@ static void decode_level(const Job *job, float (*head)[CHUNK], const float *rest
 {
     float *restrict sharpness = row_line(job->d, y, LEVEL_LINES + 3 * level) + x0;
     float *restrict centre = sharpness + job->d->pitch, *restrict importance = centre + job->d->pitch;
+    float shrunk[CHUNK]; /* of softplus */
+    for (int i = 0; i < n; i++)
+        shrunk[i] = exponential(most(-fabsf(head[SHARPNESS_HEAD + level][i]), -MAX_EXPONENT));
     for (int i = 0; i < n; i++) {
-        float x = head[SHARPNESS_HEAD + level][i]; /* softplus */
-        sharpness[i] = most(x, 0) + logarithm(1 + exponential(most(-fabsf(x), -MAX_EXPONENT)));
+        sharpness[i] = most(head[SHARPNESS_HEAD + level][i], 0) + logarithm(1 + shrunk[i]);
         centre[i] = clamped(head[CENTRE_HEAD + level][i], MAX_LOGIT);
         importance[i] = depth[i] > 0 ? clamped(head[IMPORTANCE_HEAD + level][i], MAX_LOGIT) : NO_WEIGHT;
     }
