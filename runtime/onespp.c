@@ -46,7 +46,6 @@ enum {
 enum {
     CHUNK = 256, /* pixels of a row that are worked on together: what they need stays in the first caches */
     HALF_CHUNK = CHUNK / 2,
-    STRIP_PIXELS = 1 << 18,
     MIN_STRIP_ROWS = 64,
     BLOCK = 16,         /* pixels, the side of the squares whose mean luminance is measured */
     MEDIAN_GRID = 64,   /* the median depth of large images is taken from about as many rows and columns */
@@ -55,6 +54,10 @@ enum {
     ALIGNMENT = 64,
     BACKGROUND = 0 /* mesh id of pixels that show no surface */
 };
+
+#ifndef ONESPP_STRIP_PIXELS
+#define ONESPP_STRIP_PIXELS (1 << 18) /* smaller strips take less memory, and more time */
+#endif
 
 #define MAX_MAGNITUDE 1e35f  /* of a channel: two of them, divided by the smallest albedo, are finite */
 #define MAX_REFLECTANCE 100.f /* albedo, roughness and components of normals are clamped: the network stays finite */
@@ -87,7 +90,7 @@ static inline int greater(int a, int b) { return a > b ? a : b; }
 static inline float clamped(float x, float limit) { return most(least(x, limit), -limit); }
 
 /* 0 for NaN and infinities. */
-static inline float finite(float x) { return fabsf(x) <= FLT_MAX ? clamped(x, MAX_MAGNITUDE) : 0; }
+static inline float finite_or_0(float x) { return fabsf(x) <= FLT_MAX ? clamped(x, MAX_MAGNITUDE) : 0; }
 
 static inline int32_t bits_of(float x)
 {
@@ -308,7 +311,7 @@ static Window window(Arena *arena, int channels, int width, int rows)
 /* A strip's height in rows of 1/8 of the resolution. */
 static int strip_height(const onespp_config *config)
 {
-    int rows = greater(MIN_STRIP_ROWS, STRIP_PIXELS / config->max_width) / 8;
+    int rows = greater(MIN_STRIP_ROWS, ONESPP_STRIP_PIXELS / config->max_width) / 8;
     return lesser(rows, rounded_up(config->max_height, 8) / 8);
 }
 
@@ -431,9 +434,9 @@ static void load(float *restrict line, const onespp_image *image, int channel, i
 {
     ptrdiff_t step = image->column;
     const float *from = image->data + image->channel * channel + image->row * y + step * x;
-    float constant = finite(*from);
+    float constant = finite_or_0(*from);
     for (int i = 0; i < n; i++)
-        line[i] = step ? finite(from[i * step]) : constant;
+        line[i] = step ? finite_or_0(from[i * step]) : constant;
 }
 
 /* Mesh ids of n pixels; negative ones, which stand for pixels outside the image here, count as one mesh. */
@@ -815,9 +818,9 @@ static void sum_taps(
         for (int i = step; i < SPAN - step; i++)
             same[i] = mesh[i] == around->mesh[row][i + shift] ? 1.f : 0.f;
         for (int c = 0; c < SUMS; c++) {
-            const float *there = lines[row][c] + shift;
+            const float *there = lines[row][c];
             for (int i = step; i < SPAN - step; i++)
-                sums[c][i] += same[i] * there[i];
+                sums[c][i] += same[i] * there[i + shift];
         }
     }
 }
@@ -1370,16 +1373,16 @@ static void measure_distances(
         }
 }
 
-/* Adds weighted colours, whose lines are `pitch` apart, and their weights. */
+/* Adds weighted colours, whose lines are `pitch` apart, and their weights to n sums from `at` on. */
 static void add_weighted(
-    float (*restrict sums)[CHUNK], const float *restrict weight, const float *restrict image, ptrdiff_t pitch, int n)
+    float (*restrict sums)[CHUNK], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch, int n)
 {
     for (int i = 0; i < n; i++) {
         float w = weight[i];
-        sums[0][i] += w * image[i];
-        sums[1][i] += w * image[pitch + i];
-        sums[2][i] += w * image[2 * pitch + i];
-        sums[3][i] += w;
+        sums[0][at + i] += w * image[i];
+        sums[1][at + i] += w * image[pitch + i];
+        sums[2][at + i] += w * image[2 * pitch + i];
+        sums[3][at + i] += w;
     }
 }
 
@@ -1401,7 +1404,7 @@ static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
     }
     const float *image = image_lines(d, job->level, y + dy) + first + dx;
-    add_weighted((float(*)[CHUNK])(sums[0] + (first - x0)), weight, image, d->pitch, count);
+    add_weighted(sums, first - x0, weight, image, d->pitch, count);
 }
 
 /* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
@@ -1415,7 +1418,7 @@ static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, i
     memset(sums, 0, sizeof(float) * 4 * CHUNK);
     for (int i = 0; i < n; i++)
         weight[i] = exponential(centre[i]);
-    add_weighted(sums, weight, image_lines(d, job->level, y) + x0, d->pitch, n);
+    add_weighted(sums, 0, weight, image_lines(d, job->level, y) + x0, d->pitch, n);
     for (int tap = 0; tap < 9; tap++)
         if (tap != 4)
             add_tap(job, sums, y, x0, n, (tap % 3 - 1) * step, (tap / 3 - 1) * step);

@@ -1,4 +1,4 @@
-"""Writes the shipped weights of `one` as a C array in half precision, arranged as the matrices that the runtime applies.
+"""Writes the shipped weights of `one` as a C array in half precision, as the matrices that the runtime applies.
 
 `python -m runtime.weights` writes runtime/onespp_weights.h.
 """

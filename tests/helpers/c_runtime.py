@@ -100,7 +100,12 @@ class CRuntime:
     """A denoiser of the library, with the memory it takes."""
 
     def __init__(
-        self, library: ctypes.CDLL, width: int, height: int, meshes: int = 64, tasks: int = 1,
+        self,
+        library: ctypes.CDLL,
+        width: int,
+        height: int,
+        meshes: int = 64,
+        tasks: int = 1,
         parallel_for: Callable[..., None] | None = None,
     ):
         self.library = library
