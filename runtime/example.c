@@ -2,8 +2,8 @@
  *
  * SEQUENCE is what `python -m runtime.raw` writes: frames one after the other, each a header, the poses of its meshes
  * (4 x 4 doubles each) and planes of float32: direct, indirect, emission, albedo and normal (3 channels each), depth,
- * roughness and motion (2); then the mesh ids, of int32. OUTPUT becomes the denoised frames as planes of float32, three per
- * frame. Prints the time that each frame took.
+ * roughness and motion (2); then the mesh ids, of int32. OUTPUT becomes the denoised frames as planes of float32, three
+ * per frame. Prints the time that each frame took.
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -29,7 +29,7 @@ typedef struct {
     int32_t *mesh_id;
 } Raw;
 
-/* --- Threads that wait for tasks ----------------------------------------------------------------------------------- */
+/* --- Threads that wait for tasks ---------------------------------------------------------------------------------- */
 
 typedef struct {
     pthread_mutex_t lock;
@@ -78,7 +78,7 @@ static void parallel_for(void *user, int count, onespp_task task, void *argument
     pthread_mutex_unlock(&pool->lock);
 }
 
-/* --- Frames -------------------------------------------------------------------------------------------------------- */
+/* --- Frames ------------------------------------------------------------------------------------------------------- */
 
 /* Whether there is another frame, whose arrays are then allocated anew. */
 static int read_frame(FILE *file, Raw *raw)
@@ -160,7 +160,8 @@ int main(int count, char **arguments)
             return fail("a thread could not be started");
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
-    onespp_config config = {ONESPP_ABI, raw.header.width, raw.header.height, MAX_MESHES, 2 * threads, parallel_for, &pool};
+    onespp_config config = {ONESPP_ABI, raw.header.width, raw.header.height, MAX_MESHES, 2 * threads, parallel_for,
+                            &pool};
     size_t size = onespp_size(&config), pixels = (size_t)raw.header.width * (size_t)raw.header.height;
     void *memory = malloc(size);
     float *radiance = malloc(sizeof(float) * 3 * pixels);

@@ -10,10 +10,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { SIDE = 150, MOST_PIXELS = 3000, MESHES = 3, PLANES = 19, FRAMES = 4 };
+enum { SIDE = 110, MOST_PIXELS = 1500, MESHES = 3, PLANES = 19, FRAMES = 3 };
 
-static const float EXTREMES[] = {
-    0, -0.f, 1, -1, NAN, INFINITY, -INFINITY, 1e30f, -1e30f, 3e38f, -3e38f, 1e35f, 1e16f, 1e-20f, 1e-38f, 1e-45f, 0.01f};
+static const float EXTREMES[] = {0,     -0.f,   1,     -1,    NAN,    INFINITY, -INFINITY, 1e30f, -1e30f,
+                                 3e38f, -3e38f, 1e35f, 1e16f, 1e-20f, 1e-38f,   1e-45f,    0.01f};
 
 typedef struct {
     const uint8_t *bytes;

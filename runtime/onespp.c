@@ -47,8 +47,8 @@ enum {
     CHUNK = 256, /* pixels of a row that are worked on together: what they need stays in the first caches */
     HALF_CHUNK = CHUNK / 2,
     MIN_STRIP_ROWS = 64,
-    BLOCK = 16,         /* pixels, the side of the squares whose mean luminance is measured */
-    MEDIAN_GRID = 64,   /* the median depth of large images is taken from about as many rows and columns */
+    BLOCK = 16,       /* pixels, the side of the squares whose mean luminance is measured */
+    MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
     PAD = 16, /* floats before a line: alignment, and zeros to the left of the image */
     ALIGNMENT = 64,
@@ -59,7 +59,7 @@ enum {
 #define ONESPP_STRIP_PIXELS (1 << 18) /* smaller strips take less memory, and more time */
 #endif
 
-#define MAX_MAGNITUDE 1e35f  /* of a channel: two of them, divided by the smallest albedo, are finite */
+#define MAX_MAGNITUDE 1e35f   /* of a channel: two of them, divided by the smallest albedo, are finite */
 #define MAX_REFLECTANCE 100.f /* albedo, roughness and components of normals are clamped: the network stays finite */
 #define MAX_IRRADIANCE 1e30f
 #define MAX_LUMINANCE 1e16f /* its square must be finite */
@@ -77,7 +77,7 @@ enum {
 
 static const int TAP_SPACINGS[LEVELS] = {32, 16, 8, 4, 2, 1};
 
-/* --- Arithmetic ---------------------------------------------------------------------------------------------------- */
+/* --- Arithmetic --------------------------------------------------------------------------------------------------- */
 
 static inline float least(float a, float b) { return a < b ? a : b; }
 
@@ -121,8 +121,8 @@ static inline float exponential(float x)
     return float_of(bits_of(p) + (int32_t)n * (1 << 23));
 }
 
-/* ln x for normal x = m 2^e, as e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), with m between the roots of 1/2 and
- * of 2, where the bits of the latter begin. x >= 1/2. */
+/* ln x for normal x = m 2^e, as e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), with m between the roots of 1/2
+ * and of 2, where the bits of the latter begin. x >= 1/2. */
 static inline float logarithm(float x)
 {
     int32_t e = (bits_of(x) - 0x3f3504f3) >> 23;
@@ -146,8 +146,9 @@ static float float_of_half(uint16_t half)
 
 static int rounded_up(int x, int multiple) { return (x + multiple - 1) / multiple * multiple; }
 
-/* --- State and memory ---------------------------------------------------------------------------------------------- */
+/* --- State and memory --------------------------------------------------------------------------------------------- */
 
+/* clang-format off */
 /* Layers are matrices: their inputs are lines, see multiply. */
 typedef enum {
     ENTER_1, ENTER_2, DOWN_B, CONVOLVE_B, DOWN_C, CONVOLVE_C1, CONVOLVE_C2,
@@ -175,6 +176,7 @@ static const int LAYER_SIZES[LAYERS][2] = { /* outputs, inputs */
     [DETAIL_1] = {DETAIL, INPUTS},
     [DETAIL_2] = {OUTPUTS, DETAIL},
 };
+/* clang-format on */
 
 typedef struct {
     int inputs, outputs;  /* the latter a multiple of AT_ONCE: the last ones may be 0 */
@@ -383,7 +385,7 @@ static int is_valid(const onespp_config *config)
         && config->tasks >= 1 && config->tasks <= ONESPP_MAX_TASKS;
 }
 
-/* --- Frames -------------------------------------------------------------------------------------------------------- */
+/* --- Frames ------------------------------------------------------------------------------------------------------- */
 
 /* One frame at work. */
 typedef struct Job Job;
@@ -394,9 +396,9 @@ struct Job {
     int padded_width, padded_height; /* to whole pixels of 1/8 of the resolution */
     int has_history;
     float exposure, depth_scale;
-    float to_view[3][3];      /* of normals in world space: x right, y up, z towards the viewer */
+    float to_view[3][3];        /* of normals in world space: x right, y up, z towards the viewer */
     float slopes[2], origin[2]; /* of this frame's rays in x and in y: (slope * position + origin, 1) */
-    float axes[3][3];         /* the previous frame's rays in the world: x axes[0] + y axes[1] + axes[2] */
+    float axes[3][3];           /* the previous frame's rays in the world: x axes[0] + y axes[1] + axes[2] */
 
     void (*work)(Job *job, Scratch *scratch, int first, int last); /* the step at work, on rows first to last - 1 */
     int first, last;
@@ -478,9 +480,12 @@ static void load_irradiance(float *restrict line, const onespp_frame *frame, int
 }
 
 /* Where a row's line begins. */
-static float *row_line(const onespp *d, int y, int line) { return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch; }
+static float *row_line(const onespp *d, int y, int line)
+{
+    return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch;
+}
 
-/* --- Scale: the exposure and the unit of length that the network sees ---------------------------------------------- */
+/* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
 
 /* Mean luminance of surfaces over blocks; the rows are those of blocks. */
 static void measure_blocks(Job *job, Scratch *scratch, int first, int last)
@@ -573,7 +578,7 @@ static void measure(Job *job)
     job->depth_scale = clamped(expf(d->log_depth.value), MAX_MAGNITUDE);
 }
 
-/* --- Geometry ------------------------------------------------------------------------------------------------------ */
+/* --- Geometry ----------------------------------------------------------------------------------------------------- */
 
 /* out = a b, of rigid transforms. */
 static void multiply_poses(double out[16], const double a[16], const double b[16])
@@ -601,32 +606,27 @@ static void invert_pose(double out[16], const double pose[16])
 }
 
 /* The motion of a mesh whose pose goes from `before` to `now`, or of what stands still where these are NULL. Products
- * are in double and from camera to camera: scenes far from the origin keep their precision. */
+ * are in double, and the eye is subtracted before rounding: scenes far from the origin keep their precision. */
 static Motion motion_of(const Job *job, const double *before, const double *now)
 {
-    const double *eye = job->d->camera_to_world, *to_world = job->frame.camera_to_world;
-    double to_eye[16], moved[16], to_previous[16];
+    const double *pose = job->frame.camera_to_world, *eye = job->d->camera_to_world;
+    double moved[16];
     Motion motion;
-    invert_pose(to_eye, eye);
+    memcpy(moved, pose, sizeof moved);
     if (now) {
-        double to_rest[16], product[16];
+        double to_rest[16], at_rest[16];
         invert_pose(to_rest, now);
-        multiply_poses(product, to_eye, before);
-        multiply_poses(moved, product, to_rest);
-    } else {
-        memcpy(moved, to_eye, sizeof moved);
+        multiply_poses(at_rest, to_rest, pose);
+        multiply_poses(moved, before, at_rest);
     }
-    multiply_poses(to_previous, moved, to_world);
     for (int i = 0; i < 3; i++) {
-        double row[4], turned;
-        for (int j = 0; j < 4; j++) {
-            row[j] = eye[4 * i] * to_previous[j] + eye[4 * i + 1] * to_previous[4 + j] + eye[4 * i + 2] * to_previous[8 + j];
-            motion.to_previous[i][j] = (float)row[j];
-        }
+        const double *row = moved + 4 * i;
         for (int j = 0; j < 3; j++) {
-            turned = row[0] * to_world[4 * j] + row[1] * to_world[4 * j + 1] + row[2] * to_world[4 * j + 2];
-            motion.turn[i][j] = (float)turned;
+            const double *axis = pose + 4 * j;
+            motion.to_previous[i][j] = (float)row[j];
+            motion.turn[i][j] = (float)(row[0] * axis[0] + row[1] * axis[1] + row[2] * axis[2]);
         }
+        motion.to_previous[i][3] = (float)(row[3] - eye[4 * i + 3]);
     }
     return motion;
 }
@@ -658,7 +658,7 @@ static void set_up_geometry(Job *job)
     }
 }
 
-/* --- Reprojection: what the previous frame holds of a pixel's surface ---------------------------------------------- */
+/* --- Reprojection: what the previous frame holds of a pixel's surface --------------------------------------------- */
 
 typedef struct {
     float point[3], normal[3]; /* where the surface was, in the world's axes around the previous eye, and its normal */
@@ -778,7 +778,7 @@ static void reproject(const Job *job, int y, int x0, int n, float (*restrict his
     }
 }
 
-/* --- Statistics over neighbours of the same mesh ------------------------------------------------------------------- */
+/* --- Statistics over neighbours of the same mesh ------------------------------------------------------------------ */
 
 static int slot_of(int row) { return (row + RING) % RING; }
 
@@ -837,7 +837,7 @@ static void sum_neighbours(const Job *job, Neighbourhood *around, int y, int x0)
     sum_taps(around->sums_9x9, around, around->sums, y, 3);
 }
 
-/* --- Layers -------------------------------------------------------------------------------------------------------- */
+/* --- Layers ------------------------------------------------------------------------------------------------------- */
 
 static inline void fill(float *restrict line, float value)
 {
@@ -865,11 +865,11 @@ static inline void rectify(float *restrict line)
 
 typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
 
-/* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers, of which LANES and AT_ONCE take
- * half as many as there are; each input is read once for all outputs. */
+/* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers, of which LANES and AT_ONCE
+ * take half as many as there are; each input is read once for all outputs. */
 static void multiply_block(
-    const float *restrict weights, const float *restrict bias, const float *const *restrict inputs, int count, ptrdiff_t x,
-    float *restrict out, ptrdiff_t pitch, Finish finish)
+    const float *restrict weights, const float *restrict bias, const float *const *restrict inputs, int count,
+    ptrdiff_t x, float *restrict out, ptrdiff_t pitch, Finish finish)
 {
     float s0[LANES], s1[LANES], s2[LANES], s3[LANES];
     float *sums[4] = {s0, s1, s2, s3};
@@ -902,8 +902,7 @@ static void multiply(
     for (int o = 0; o < layer->outputs; o += AT_ONCE) {
         const float *weights = layer->weights + (ptrdiff_t)o * layer->inputs;
         for (int i = 0; i < n; i += LANES)
-            multiply_block(
-                weights, layer->bias + o, inputs, layer->inputs, x + i, out + o * pitch + i, pitch, finish);
+            multiply_block(weights, layer->bias + o, inputs, layer->inputs, x + i, out + o * pitch + i, pitch, finish);
     }
 }
 
@@ -1015,7 +1014,7 @@ static void double_rows(Job *job, Scratch *scratch, int first, int last)
     }
 }
 
-/* --- Inputs of the network ----------------------------------------------------------------------------------------- */
+/* --- Inputs of the network ---------------------------------------------------------------------------------------- */
 
 /* Its input lines. */
 enum {
@@ -1183,7 +1182,7 @@ static void enter_rows(Job *job, Scratch *scratch, int first, int last)
         clear_margins(&job->d->a, y, job->padded_width / 2);
 }
 
-/* --- Outputs of the network ---------------------------------------------------------------------------------------- */
+/* --- Outputs of the network --------------------------------------------------------------------------------------- */
 
 /* Its output lines. */
 enum {
@@ -1195,7 +1194,8 @@ enum {
 };
 
 /* The parameters of a level of the filter. */
-static void decode_level(const Job *job, float (*head)[CHUNK], const float *restrict depth, int level, int y, int x0, int n)
+static void decode_level(
+    const Job *job, float (*head)[CHUNK], const float *restrict depth, int level, int y, int x0, int n)
 {
     float *restrict sharpness = row_line(job->d, y, LEVEL_LINES + 3 * level) + x0;
     float *restrict centre = sharpness + job->d->pitch, *restrict importance = centre + job->d->pitch;
@@ -1288,7 +1288,7 @@ static void leave_rows(Job *job, Scratch *scratch, int first, int last)
     }
 }
 
-/* --- The network, strip by strip ----------------------------------------------------------------------------------- */
+/* --- The network, strip by strip ---------------------------------------------------------------------------------- */
 
 /* Moves what is stored of rows before `end` so that a window begins with row `first`. */
 static void scroll(Window *w, int first, int end)
@@ -1299,10 +1299,10 @@ static void scroll(Window *w, int first, int end)
     w->first = first;
 }
 
-/* Does `work` for the rows first to last - 1 that an image of `height` rows has. */
+/* Does `work` for those of the rows first to last - 1 that are in the image. */
 static void run_layer(
-    Job *job, void (*work)(Job *, Scratch *, int, int), LayerName layer, const Window *from, const Window *to, int first,
-    int last)
+    Job *job, void (*work)(Job *, Scratch *, int, int), LayerName layer, const Window *from, const Window *to,
+    int first, int last)
 {
     int height = scaled(job->padded_height, work == double_rows ? from->channels : to->channels);
     job->layer = layer;
@@ -1311,7 +1311,7 @@ static void run_layer(
     run(job, work, greater(first, 0), lesser(last, height));
 }
 
-/* Rows first to last - 1 at 1/8 of the resolution; `entered` rows of 1/2 are there already. Returns how many then are. */
+/* Rows first to last - 1 at 1/8 of the resolution; `entered` rows of 1/2 are there before. Returns how many are then. */
 static int run_strip(Job *job, int first, int last, int entered)
 {
     onespp *d = job->d;
@@ -1345,10 +1345,10 @@ static void run_network(Job *job)
         entered = run_strip(job, first, lesser(first + step, rows), entered);
 }
 
-/* --- The filter ---------------------------------------------------------------------------------------------------- */
+/* --- The filter --------------------------------------------------------------------------------------------------- */
 
-/* Where the lines of a level's output are: first in the texels, which nobody reads any more, then over the parameters of
- * the level before. */
+/* Where the lines of a level's output are: first in the texels, which nobody reads any more, then over the parameters
+ * of the level before. */
 static float *filtered_lines(const onespp *d, int level, int y)
 {
     return level == 0 ? d->texels + (ptrdiff_t)y * d->pitch * TEXEL : row_line(d, y, LEVEL_LINES + 3 * (level - 1));
@@ -1375,7 +1375,8 @@ static void measure_distances(
 
 /* Adds weighted colours, whose lines are `pitch` apart, and their weights to n sums from `at` on. */
 static void add_weighted(
-    float (*restrict sums)[CHUNK], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch, int n)
+    float (*restrict sums)[CHUNK], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch,
+    int n)
 {
     for (int i = 0; i < n; i++) {
         float w = weight[i];
@@ -1390,7 +1391,8 @@ static void add_weighted(
 static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n, int dx, int dy)
 {
     const onespp *d = job->d;
-    int first = greater(x0, -dx), last = lesser(x0 + n, job->frame.width - dx), level_line = LEVEL_LINES + 3 * job->level;
+    int first = greater(x0, -dx), last = lesser(x0 + n, job->frame.width - dx);
+    int level_line = LEVEL_LINES + 3 * job->level;
     if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
         return;
     float distance[CHUNK], weight[CHUNK];
@@ -1437,12 +1439,13 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = lesser(CHUNK, job->frame.width - x0);
             filter_chunk(job, sums, y, x0, n);
+            float *to = filtered_lines(job->d, job->level, y) + x0;
             for (int c = 0; c < RGB; c++)
-                memcpy(filtered_lines(job->d, job->level, y) + c * job->d->pitch + x0, sums[c], sizeof(float) * (size_t)n);
+                memcpy(to + c * job->d->pitch, sums[c], sizeof(float) * (size_t)n);
         }
 }
 
-/* --- The end of a frame -------------------------------------------------------------------------------------------- */
+/* --- The end of a frame ------------------------------------------------------------------------------------------- */
 
 /* One colour of the denoised radiance. */
 static void write_radiance(const Job *job, int channel, const float *restrict irradiance, int y, int x0, int n)
@@ -1499,7 +1502,7 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
         }
 }
 
-/* --- The interface ------------------------------------------------------------------------------------------------- */
+/* --- The interface ------------------------------------------------------------------------------------------------ */
 
 int onespp_abi(void) { return ONESPP_ABI; }
 

@@ -1,7 +1,8 @@
-/* onespp.h - the denoiser `one` in C99: noisy radiance of a few samples per pixel in, smooth radiance out, frame by frame.
+/* onespp.h - the denoiser `one` in C99: noisy radiance of a few samples per pixel in, smooth radiance out, frame by
+ * frame.
  *
- * All memory is the caller's: ask for its size, hand it over once, and free it when done. Nothing else is allocated, and
- * there is no global state: any number of denoisers can run at the same time, each called by one thread at a time.
+ * All memory is the caller's: ask for its size, hand it over once, and free it when done. Nothing else is allocated,
+ * and there is no global state: any number of denoisers can run at the same time, each called by one thread at a time.
  *
  * Images have any layout that strides describe. A number that is NaN or infinite counts as 0.
  */
@@ -32,8 +33,8 @@ enum {
 #define ONESPP_MIN_SAMPLES 1e-3f
 #define ONESPP_MAX_SAMPLES 1e9f
 
-/* An image of floats: pixel (x, y) of a channel is data[channel * c + row * y + column * x]. Planes of W x H pixels have
- * the strides {W * H, W, 1}, interleaved pixels of three channels {1, 3 * W, 3}; strides of 0 repeat one value. */
+/* An image of floats: pixel (x, y) of a channel is data[channel * c + row * y + column * x]. Planes of W x H pixels
+ * have the strides {W * H, W, 1}, interleaved pixels of three channels {1, 3 * W, 3}; strides of 0 repeat one value. */
 typedef struct {
     const float *data;
     ptrdiff_t channel, row, column;
@@ -53,8 +54,8 @@ typedef struct {
  *
  * Camera space has x to the left, y up and z forward. With p a point in camera space, pixel = (K p) / p_z, where x goes
  * right, y down, and the centre of the first pixel is (0.5, 0.5): so K[0] and K[4], the focal lengths in pixels, are
- * negative here. Other conventions work alike as long as K and camera_to_world agree, but normals are judged as seen from
- * a camera with these axes. Images marked optional may have data = NULL. */
+ * negative here. Other conventions work alike as long as K and camera_to_world agree, but normals are judged as seen
+ * from a camera with these axes. Images marked optional may have data = NULL. */
 typedef struct {
     int width, height; /* at most those of onespp_config; another size than before resets */
     int reset;         /* 1 for the first frame and after a cut: forget everything before */
@@ -76,8 +77,8 @@ typedef struct {
     const double *object_to_world; /* meshes x 16, rigid, entry mesh_id - 1; NULL for 0 meshes. Others do not move */
 } onespp_frame;
 
-/* Calls task(argument, i) once for each i from 0 to count - 1, in any order and on any threads, and returns when all have
- * returned. */
+/* Calls task(argument, i) once for each i from 0 to count - 1, in any order and on any threads, and returns when all
+ * have returned. */
 typedef void (*onespp_task)(void *argument, int index);
 typedef void (*onespp_parallel_for)(void *user, int count, onespp_task task, void *argument);
 

@@ -316,7 +316,7 @@ def test_sanitizers_have_nothing_to_say(name, tmp_path):
     """About random frames, with everything that numbers and sizes can be."""
     if compiler(name) is None:
         pytest.skip(f"{name} is not installed")
-    flags = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, *STRICT)
+    flags = ("-O2", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, *STRICT)
     sources = [str(FOLDER / name) for name in ("fuzz.c", "onespp.c")]
     subprocess.run([name, *flags, *sources, "-o", str(tmp_path / "fuzz"), "-lm"], check=True)
     subprocess.run([str(tmp_path / "fuzz"), "60"], check=True)
