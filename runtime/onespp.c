@@ -1311,7 +1311,7 @@ static void run_layer(
     run(job, work, greater(first, 0), lesser(last, height));
 }
 
-/* Rows first to last - 1 at 1/8 of the resolution; `entered` rows of 1/2 are there before. Returns how many are then. */
+/* Rows first to last - 1 at 1/8 of the resolution, after `entered` rows of 1/2; returns how many there are then. */
 static int run_strip(Job *job, int first, int last, int entered)
 {
     onespp *d = job->d;
