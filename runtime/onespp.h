@@ -54,8 +54,10 @@ typedef struct {
  *
  * Camera space has x to the left, y up and z forward. With p a point in camera space, pixel = (K p) / p_z, where x goes
  * right, y down, and the centre of the first pixel is (0.5, 0.5): so K[0] and K[4], the focal lengths in pixels, are
- * negative here. Other conventions work alike as long as K and camera_to_world agree, but normals are judged as seen
- * from a camera with these axes. Images marked optional may have data = NULL. */
+ * negative. From cameras with x to the right, negate these columns of camera_to_world: of OpenCV's the first two (y
+ * down, z forward), of OpenGL's the first and the third (y up, z backward).
+ *
+ * Images marked optional may have data = NULL. Albedo, roughness and normals count as at most 100. */
 typedef struct {
     int width, height; /* at most those of onespp_config; another size than before resets */
     int reset;         /* 1 for the first frame and after a cut: forget everything before */
