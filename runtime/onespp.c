@@ -279,8 +279,10 @@ struct onespp {
     /* What a frame needs. */
     ptrdiff_t pitch; /* of lines of rows, and of depth and mesh */
     float *rows;
-    Window a, b, b_too, c, c_too, sum_a, hidden;
-    float *zeros; /* a line */
+    Window a, b, b_too, c, c_too; /* activations at 1/2, 1/4 and 1/8 of the resolution, of a strip */
+    Window sum_a;                 /* of `a` and what comes from 1/4 */
+    Window hidden;                /* of the per-pixel layers */
+    float *zeros;                 /* a line */
     Motion *motions;
     double *blocks; /* mean luminance of each, -1 without surfaces */
     float *depths;
@@ -487,33 +489,36 @@ static float *row_line(const onespp *d, int y, int line)
 
 /* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
 
-/* Mean luminance of surfaces over blocks; the rows are those of blocks. */
-static void measure_blocks(Job *job, Scratch *scratch, int first, int last)
+/* Mean luminance of the surfaces of a block, -1 without any. */
+static double block_luminance(const onespp_frame *frame, int row, int column)
 {
-    (void)scratch;
-    const onespp_frame *frame = &job->frame;
-    int columns = (frame->width + BLOCK - 1) / BLOCK;
-    for (int row = first; row < last; row++) {
-        for (int column = 0; column < columns; column++) {
-            int x = column * BLOCK, n = lesser(BLOCK, frame->width - x), surfaces = 0;
-            float sum = 0;
-            for (int y = row * BLOCK; y < lesser((row + 1) * BLOCK, frame->height); y++) {
-                float colour[RGB][BLOCK], divisor[BLOCK], depth[BLOCK];
-                for (int c = 0; c < RGB; c++) {
-                    load_irradiance(colour[c], frame, c, y, x, n);
-                    load_divisor(divisor, frame, c, y, x, n);
-                    for (int i = 0; i < n; i++)
-                        colour[c][i] *= divisor[i];
-                }
-                load(depth, &frame->depth, 0, y, x, n);
-                for (int i = 0; i < n; i++) {
-                    sum += luminance(colour[0][i], colour[1][i], colour[2][i]);
-                    surfaces += depth[i] > 0;
-                }
-            }
-            job->d->blocks[(ptrdiff_t)row * columns + column] = surfaces ? (double)sum / surfaces : -1;
+    int x = column * BLOCK, n = lesser(BLOCK, frame->width - x), surfaces = 0;
+    float sum = 0;
+    for (int y = row * BLOCK; y < lesser((row + 1) * BLOCK, frame->height); y++) {
+        float light[RGB][BLOCK], divisor[BLOCK], depth[BLOCK];
+        for (int c = 0; c < RGB; c++) {
+            load_irradiance(light[c], frame, c, y, x, n);
+            load_divisor(divisor, frame, c, y, x, n);
+            for (int i = 0; i < n; i++)
+                light[c][i] *= divisor[i];
+        }
+        load(depth, &frame->depth, 0, y, x, n);
+        for (int i = 0; i < n; i++) {
+            sum += luminance(light[0][i], light[1][i], light[2][i]);
+            surfaces += depth[i] > 0;
         }
     }
+    return surfaces ? (double)sum / surfaces : -1;
+}
+
+/* The rows are those of blocks. */
+static void measure_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    int columns = (job->frame.width + BLOCK - 1) / BLOCK;
+    for (int row = first; row < last; row++)
+        for (int column = 0; column < columns; column++)
+            job->d->blocks[(ptrdiff_t)row * columns + column] = block_luminance(&job->frame, row, column);
 }
 
 static void update(RunningMean *mean, double value)
@@ -571,7 +576,7 @@ static void measure(Job *job)
 {
     onespp *d = job->d;
     int columns = (job->frame.width + BLOCK - 1) / BLOCK, rows = (job->frame.height + BLOCK - 1) / BLOCK;
-    run(job, measure_blocks, 0, rows);
+    run(job, measure_rows, 0, rows);
     update(&d->log_luminance, log_luminance(d->blocks, columns * rows));
     update(&d->log_depth, log_depth(d, &job->frame));
     job->exposure = clamped(MIDDLE_GREY * expf(-d->log_luminance.value), MAX_MAGNITUDE);
@@ -949,7 +954,7 @@ static void convolve_rows(Job *job, Scratch *scratch, int first, int last)
     }
 }
 
-/* Even and odd pixels of 2 n pixels. */
+/* Even and odd pixels of 2 n pixels. In patches of 2 x 2 pixels, lines are in the order of rows, columns, channels. */
 static void split(float *restrict even, float *restrict odd, const float *restrict line, int n)
 {
     for (int i = 0; i < n; i++) {
@@ -1325,7 +1330,7 @@ static int run_strip(Job *job, int first, int last, int entered)
     run(job, enter_rows, entered, end);
     run_layer(job, halve_rows, DOWN_B, &d->a, &d->b, 2 * (first - REACH_C) - 1, 2 * (last + REACH_C) + 1);
     run_layer(job, convolve_rows, CONVOLVE_B, &d->b, &d->b_too, 2 * (first - REACH_C), 2 * (last + REACH_C));
-    run_layer(job, halve_rows, DOWN_C, &d->b_too, &d->c, first - 3, last + 3);
+    run_layer(job, halve_rows, DOWN_C, &d->b_too, &d->c, first - REACH_C, last + REACH_C);
     run_layer(job, convolve_rows, CONVOLVE_C1, &d->c, &d->c_too, first - 2, last + 2);
     run_layer(job, convolve_rows, CONVOLVE_C2, &d->c_too, &d->c, first - 1, last + 1);
     job->skip = &d->b_too;
