@@ -1,0 +1,185 @@
+/* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS]
+ *
+ * SEQUENCE is what `python -m runtime.raw` writes: frames one after the other, each a header, the poses of its meshes
+ * (4 x 4 doubles each) and planes of float32: direct, indirect, emission, albedo and normal (3 channels each), depth,
+ * roughness and motion (2); then the mesh ids, of int32. OUTPUT becomes the denoised frames as planes of float32, three
+ * per frame. Prints the time that each frame took.
+ */
+#define _POSIX_C_SOURCE 200809L
+
+#include "onespp.h"
+
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+enum { MAX_MESHES = 4096, MAX_THREADS = 64, PLANES = 19 };
+
+typedef struct {
+    int32_t width, height, reset, meshes;
+    double samples, K[9], camera_to_world[16];
+} Header;
+
+typedef struct {
+    Header header;
+    double *poses;
+    float *planes;
+    int32_t *mesh_id;
+} Raw;
+
+/* --- Threads that wait for tasks ---------------------------------------------------------------------------------- */
+
+typedef struct {
+    pthread_mutex_t lock;
+    pthread_cond_t work, done;
+    onespp_task task;
+    void *argument;
+    int count, next, finished;
+} Pool;
+
+/* Takes tasks until none is left. The lock is held before and after. */
+static void take_tasks(Pool *pool)
+{
+    while (pool->next < pool->count) {
+        int index = pool->next++;
+        pthread_mutex_unlock(&pool->lock);
+        pool->task(pool->argument, index);
+        pthread_mutex_lock(&pool->lock);
+        if (++pool->finished == pool->count)
+            pthread_cond_signal(&pool->done);
+    }
+}
+
+static void *live(void *argument)
+{
+    Pool *pool = argument;
+    pthread_mutex_lock(&pool->lock);
+    for (;;) {
+        take_tasks(pool);
+        pthread_cond_wait(&pool->work, &pool->lock);
+    }
+    return NULL;
+}
+
+static void parallel_for(void *user, int count, onespp_task task, void *argument)
+{
+    Pool *pool = user;
+    pthread_mutex_lock(&pool->lock);
+    pool->task = task;
+    pool->argument = argument;
+    pool->count = count;
+    pool->next = pool->finished = 0;
+    pthread_cond_broadcast(&pool->work);
+    take_tasks(pool);
+    while (pool->finished < pool->count)
+        pthread_cond_wait(&pool->done, &pool->lock);
+    pthread_mutex_unlock(&pool->lock);
+}
+
+/* --- Frames ------------------------------------------------------------------------------------------------------- */
+
+/* Whether there is another frame, whose arrays are then allocated anew. */
+static int read_frame(FILE *file, Raw *raw)
+{
+    Header *header = &raw->header;
+    if (fread(header, sizeof *header, 1, file) != 1)
+        return 0;
+    if (header->width < 1 || header->width > ONESPP_MAX_SIDE || header->height < 1 || header->height > ONESPP_MAX_SIDE
+        || header->meshes < 0 || header->meshes > MAX_MESHES)
+        return 0;
+    size_t pixels = (size_t)header->width * (size_t)header->height, poses = 16 * (size_t)header->meshes;
+    raw->poses = realloc(raw->poses, sizeof(double) * (poses + 1));
+    raw->planes = realloc(raw->planes, sizeof(float) * PLANES * pixels);
+    raw->mesh_id = realloc(raw->mesh_id, sizeof(int32_t) * pixels);
+    return raw->poses && raw->planes && raw->mesh_id && fread(raw->poses, sizeof(double), poses, file) == poses
+        && fread(raw->planes, sizeof(float), PLANES * pixels, file) == PLANES * pixels
+        && fread(raw->mesh_id, sizeof(int32_t), pixels, file) == pixels;
+}
+
+/* Planes one after the other; moves on to what follows them. */
+static onespp_image image(const float **planes, const Header *header, int channels)
+{
+    ptrdiff_t size = (ptrdiff_t)header->width * header->height;
+    onespp_image result = {*planes, size, header->width, 1};
+    *planes += channels * size;
+    return result;
+}
+
+static onespp_frame described(const Raw *raw)
+{
+    const Header *header = &raw->header;
+    const float *planes = raw->planes;
+    onespp_frame frame = {.width = header->width, .height = header->height, .reset = header->reset};
+    frame.samples = (float)header->samples;
+    frame.direct = image(&planes, header, 3);
+    frame.indirect = image(&planes, header, 3);
+    frame.emission = image(&planes, header, 3);
+    frame.albedo = image(&planes, header, 3);
+    frame.normal = image(&planes, header, 3);
+    frame.depth = image(&planes, header, 1);
+    frame.roughness = image(&planes, header, 1);
+    frame.motion = image(&planes, header, 2);
+    onespp_ids ids = {raw->mesh_id, header->width, 1};
+    frame.mesh_id = ids;
+    memcpy(frame.K, header->K, sizeof frame.K);
+    memcpy(frame.camera_to_world, header->camera_to_world, sizeof frame.camera_to_world);
+    frame.meshes = header->meshes;
+    frame.object_to_world = raw->poses;
+    return frame;
+}
+
+static double seconds(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+static int fail(const char *message)
+{
+    fprintf(stderr, "%s\n", message);
+    return EXIT_FAILURE;
+}
+
+int main(int count, char **arguments)
+{
+    int threads = count > 3 ? atoi(arguments[3]) : 2;
+    FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL, *out = file ? fopen(arguments[2], "wb") : NULL;
+    Raw raw = {0};
+    if (!out || threads < 1 || threads > MAX_THREADS)
+        return fail("usage: example SEQUENCE OUTPUT [THREADS]");
+    if (!read_frame(file, &raw))
+        return fail("there is no frame");
+
+    static Pool pool = {PTHREAD_MUTEX_INITIALIZER, PTHREAD_COND_INITIALIZER, PTHREAD_COND_INITIALIZER, 0, 0, 0, 0, 0};
+    pthread_t thread;
+    for (int i = 1; i < threads; i++)
+        if (pthread_create(&thread, NULL, live, &pool))
+            return fail("a thread could not be started");
+
+    /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
+    onespp_config config = {ONESPP_ABI, raw.header.width, raw.header.height, MAX_MESHES, 2 * threads, parallel_for,
+                            &pool};
+    size_t size = onespp_size(&config), pixels = (size_t)raw.header.width * (size_t)raw.header.height;
+    void *memory = malloc(size);
+    float *radiance = malloc(sizeof(float) * 3 * pixels);
+    onespp *denoiser;
+    int error = onespp_create(&config, memory, size, &denoiser);
+    if (error || !radiance)
+        return fail(error ? onespp_message(error) : "out of memory");
+    do {
+        onespp_frame frame = described(&raw);
+        onespp_output output = {radiance, (ptrdiff_t)frame.width * frame.height, frame.width, 1};
+        double start = seconds();
+        error = onespp_denoise(denoiser, &frame, &output);
+        if (error)
+            return fail(onespp_message(error));
+        printf("%.1f ms\n", 1e3 * (seconds() - start));
+        pixels = (size_t)frame.width * (size_t)frame.height;
+        if (fwrite(radiance, sizeof(float), 3 * pixels, out) != 3 * pixels)
+            return fail("the output could not be written");
+    } while (read_frame(file, &raw));
+    return fclose(out) ? fail("the output could not be written") : EXIT_SUCCESS;
+}

@@ -1,0 +1,1624 @@
+/* onespp.c - see onespp.h.
+ *
+ * What it computes is models/networks/one.py. A frame takes these steps, each split into tasks by rows:
+ *
+ *   measure    means of luminance over blocks, for the exposure
+ *   enter      reprojection, neighbourhood statistics, inputs of the network, its per-pixel and first layers
+ *   layers     the U-Net at 1/2, 1/4 and 1/8 of the resolution
+ *   leave      its last layers, decoded into the parameters of the filter and the new accumulation
+ *   filter     six levels of an a-trous filter; the last one writes the output and what the next frame needs
+ *
+ * `enter` to `leave` work on strips of rows, so that activations take little memory. Strips overlap: what 3 x 3 taps
+ * below and above a strip need is computed twice, except for `enter`, whose results are kept from strip to strip.
+ *
+ * Images are stored in lines: a row of an image is one line of floats per channel, and all loops that matter run along
+ * lines, where compilers vectorise them. What reprojection fetches is stored in texels: all channels of a pixel side by
+ * side, in one cache line.
+ */
+#include "onespp.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
+#include "onespp_weights.h"
+
+#if defined(__AVX512F__)
+enum { LANES = 64, AT_ONCE = 4 }; /* pixels and outputs that a layer sums in registers, see multiply_block */
+#else
+enum { LANES = 32, AT_ONCE = 2 };
+#endif
+
+enum {
+    RGB = 3,
+    LATENT = 6,   /* channels carried from frame to frame */
+    FEATURES = 8, /* that pixels are compared by */
+    LEVELS = 6,   /* of the filter */
+    DETAIL = 24,  /* hidden channels of the per-pixel layers */
+    PATCH = 4,    /* pixels, 2 x 2 */
+    WIDTH_A = 40, /* channels at 1/2 of the resolution */
+    WIDTH_B = 56, /* 1/4 */
+    WIDTH_C = 64, /* 1/8 */
+    REACH_A = 14, /* rows of 1/2 above and below that the network's output depends on */
+    REACH_C = 3   /* rows of 1/8 */
+};
+
+enum {
+    CHUNK = 256, /* pixels of a row that are worked on together: what they need stays in the first caches */
+    HALF_CHUNK = CHUNK / 2,
+    MIN_STRIP_ROWS = 64,
+    BLOCK = 16,       /* pixels, the side of the squares whose mean luminance is measured */
+    MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
+    MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
+    PAD = 16, /* floats before a line: alignment, and zeros to the left of the image */
+    ALIGNMENT = 64,
+    BACKGROUND = 0 /* mesh id of pixels that show no surface */
+};
+
+#ifndef ONESPP_STRIP_PIXELS
+#define ONESPP_STRIP_PIXELS (1 << 18) /* smaller strips take less memory, and more time */
+#endif
+
+#define MAX_MAGNITUDE 1e35f   /* of a channel: two of them, divided by the smallest albedo, are finite */
+#define MAX_REFLECTANCE 100.f /* albedo, roughness and components of normals are clamped: the network stays finite */
+#define MAX_IRRADIANCE 1e30f
+#define MAX_LUMINANCE 1e16f /* its square must be finite */
+#define MAX_EXPOSED 1e13f
+#define MIDDLE_GREY 0.18f /* the exposed geometric mean of luminance */
+#define MIN_MEAN 1e-20f
+#define ALBEDO_FLOOR 0.01f
+#define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
+#define MAX_LOGIT 10.f
+#define MIN_LOGIT -40.f
+#define NO_WEIGHT -1e4f /* importance of pixels that show no surface */
+#define MAX_EXPONENT 80.f
+#define PLANE_TOLERANCE 0.01f /* of the depth: largest distance of a tap's surface from the point's plane */
+#define NORMAL_TOLERANCE 0.9f /* smallest cosine between a tap's normal and the point's */
+
+static const int TAP_SPACINGS[LEVELS] = {32, 16, 8, 4, 2, 1};
+
+/* --- Arithmetic --------------------------------------------------------------------------------------------------- */
+
+static inline float least(float a, float b) { return a < b ? a : b; }
+
+static inline float most(float a, float b) { return a > b ? a : b; }
+
+static inline int lesser(int a, int b) { return a < b ? a : b; }
+
+static inline int greater(int a, int b) { return a > b ? a : b; }
+
+static inline float clamped(float x, float limit) { return most(least(x, limit), -limit); }
+
+/* 0 for NaN and infinities. */
+static inline float finite_or_0(float x) { return fabsf(x) <= FLT_MAX ? clamped(x, MAX_MAGNITUDE) : 0; }
+
+static inline int32_t bits_of(float x)
+{
+    int32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+
+static inline float float_of(int32_t bits)
+{
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
+/* e^x for |x| <= 87, within 3e-7: 2^f on [-1/2, 1/2] is a polynomial. Unlike libm's, compilers vectorise it. */
+static inline float exponential(float x)
+{
+    const float magic = 12582912.f; /* 1.5 * 2^23: adding it rounds to an integer */
+    float t = x * 1.4426950408889634f;
+    float n = (t + magic) - magic;
+    float f = t - n;
+    float p = 0.00967151f + f * 0.00132647f;
+    p = 0.05550734f + f * p;
+    p = 0.24022242f + f * p;
+    p = 0.69314698f + f * p;
+    p = 1.f + f * p;
+    return float_of(bits_of(p) + (int32_t)n * (1 << 23));
+}
+
+/* ln x for normal x = m 2^e, as e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), with m between the roots of 1/2
+ * and of 2, where the bits of the latter begin. x >= 1/2. */
+static inline float logarithm(float x)
+{
+    int32_t e = (bits_of(x) - 0x3f3504f3) >> 23;
+    float m = float_of(bits_of(x) - e * (1 << 23));
+    float t = (m - 1.f) / (m + 1.f);
+    float s = t * t;
+    float series = 1.f + s * (1.f / 3 + s * (1.f / 5 + s * (1.f / 7 + s * (1.f / 9))));
+    return (float)e * 0.6931471805599453f + 2.f * t * series;
+}
+
+static inline float luminance(float red, float green, float blue)
+{
+    return 0.2126f * red + 0.7152f * green + 0.0722f * blue;
+}
+
+static float float_of_half(uint16_t half)
+{
+    float magnitude = float_of((half & 0x7fff) << 13) * 0x1p112f; /* the bias of exponents differs by 112 */
+    return half & 0x8000 ? -magnitude : magnitude;
+}
+
+static int rounded_up(int x, int multiple) { return (x + multiple - 1) / multiple * multiple; }
+
+/* --- State and memory --------------------------------------------------------------------------------------------- */
+
+/* clang-format off */
+/* Layers are matrices: their inputs are lines, see multiply. */
+typedef enum {
+    ENTER_1, ENTER_2, DOWN_B, CONVOLVE_B, DOWN_C, CONVOLVE_C1, CONVOLVE_C2,
+    UP_B, JOIN_B, UP_A, JOIN_A, LEAVE, DETAIL_1, DETAIL_2, LAYERS
+} LayerName;
+
+enum {
+    INPUTS = 5 * RGB + 4 + LATENT + RGB + RGB + 2,
+    OUTPUTS = FEATURES + 3 * LEVELS + 2 + LATENT
+};
+
+static const int LAYER_SIZES[LAYERS][2] = { /* outputs, inputs */
+    [ENTER_1] = {WIDTH_A, PATCH * INPUTS},
+    [ENTER_2] = {WIDTH_A, WIDTH_A},
+    [DOWN_B] = {WIDTH_B, PATCH * WIDTH_A},
+    [CONVOLVE_B] = {WIDTH_B, 9 * WIDTH_B},
+    [DOWN_C] = {WIDTH_C, PATCH * WIDTH_B},
+    [CONVOLVE_C1] = {WIDTH_C, 9 * WIDTH_C},
+    [CONVOLVE_C2] = {WIDTH_C, 9 * WIDTH_C},
+    [UP_B] = {PATCH * WIDTH_B, WIDTH_C},
+    [JOIN_B] = {WIDTH_B, 9 * WIDTH_B},
+    [UP_A] = {PATCH * WIDTH_A, WIDTH_B},
+    [JOIN_A] = {WIDTH_A, 9 * WIDTH_A},
+    [LEAVE] = {PATCH * OUTPUTS, WIDTH_A},
+    [DETAIL_1] = {DETAIL, INPUTS},
+    [DETAIL_2] = {OUTPUTS, DETAIL},
+};
+/* clang-format on */
+
+typedef struct {
+    int inputs, outputs;  /* the latter a multiple of AT_ONCE: the last ones may be 0 */
+    const float *bias;    /* (outputs) */
+    const float *weights; /* (outputs / AT_ONCE, inputs, AT_ONCE) */
+} Layer;
+
+/* Lines of a row that are kept for the whole image. */
+enum {
+    FEATURE_LINES = 0,
+    LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, red, green, blue of its output */
+    ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
+    OUTPUT_LINES, /* of the previous frame, reprojected */
+    ACCUMULATED_LINES = OUTPUT_LINES + RGB,
+    LENGTH_LINE = ACCUMULATED_LINES + RGB, /* of the history in samples; until `leave` of the past one, 0 for none */
+    LATENT_LINES,
+    ROW_LINES = LATENT_LINES + LATENT
+};
+
+/* Channels of a texel, in the order of a row's lines from OUTPUT_LINES on, then the normal. */
+enum {
+    OUTPUT = 0,
+    ACCUMULATED = OUTPUT + RGB,
+    LENGTH = ACCUMULATED + RGB,
+    LATENT_FROM = LENGTH + 1,
+    HISTORY = LATENT_FROM + LATENT,
+    NORMAL = HISTORY,
+    TEXEL = 16
+};
+
+/* Some rows of an image at the network's resolutions, surrounded by zeros. */
+typedef struct {
+    float *data;
+    ptrdiff_t pitch; /* floats from line to line */
+    int channels;
+    int first; /* row of the image that is stored first */
+} Window;
+
+/* A mean over frames: even at first, then with weight 1/10 for the newest. */
+typedef struct {
+    float value;
+    int count;
+} RunningMean;
+
+/* How a mesh moves from this frame's camera space to the world's axes around the previous eye. */
+typedef struct {
+    float to_previous[3][4];
+    float turn[3][3]; /* of normals in world space */
+} Motion;
+
+enum {
+    HALO = 8, /* pixels to the left and right of a chunk; statistics over 9 x 9 pixels need 4 */
+    SPAN = CHUNK + 2 * HALO,
+    RING = 8, /* rows around the one at work, row y in slot y % RING: from 3 above to 4 below */
+    SUMS = 6  /* red, green, blue, luminance, its square, 1 */
+};
+
+/* What statistics of a chunk's neighbourhoods are computed from; pixel x of the chunk is at HALO + x. */
+typedef struct {
+    int first, next; /* rows: the first that was read, and the one that will be */
+    int32_t mesh[RING][SPAN];
+    float pixels[RING][SUMS][SPAN];
+    float sums[RING][SUMS][SPAN]; /* over 3 x 3 pixels */
+    float sums_9x9[SUMS][SPAN];
+} Neighbourhood;
+
+/* What each task works with. */
+typedef union {
+    struct {
+        Neighbourhood around;
+        float history[HISTORY][CHUNK];
+        float lines[2][INPUTS][CHUNK];
+        float patches[PATCH * INPUTS][HALF_CHUNK];
+        float entered[WIDTH_A][HALF_CHUNK];
+    } enter;
+    float patches[PATCH * WIDTH_B][HALF_CHUNK];
+    struct {
+        float joined[WIDTH_A][HALF_CHUNK];
+        float patches[PATCH * OUTPUTS][HALF_CHUNK];
+        float head[OUTPUTS + AT_ONCE][CHUNK];
+        float noisy[RGB][CHUNK];
+        float depth[CHUNK];
+    } leave;
+} Scratch;
+
+struct onespp {
+    onespp_config config;
+    Layer layers[LAYERS];
+
+    /* What is carried from frame to frame. */
+    int width, height; /* 0 before the first frame */
+    RunningMean log_luminance, log_depth;
+    double K[9], camera_to_world[16];
+    int meshes;
+    double *object_to_world;
+    float *texels;
+    float *depth;
+    int32_t *mesh;
+
+    /* What a frame needs. */
+    ptrdiff_t pitch; /* of lines of rows, and of depth and mesh */
+    float *rows;
+    Window a, b, b_too, c, c_too; /* activations at 1/2, 1/4 and 1/8 of the resolution, of a strip */
+    Window sum_a;                 /* of `a` and what comes from 1/4 */
+    Window hidden;                /* of the per-pixel layers */
+    float *zeros;                 /* a line */
+    Motion *motions;
+    double *blocks; /* mean luminance of each, -1 without surfaces */
+    float *depths;
+    Scratch *scratch;
+    float *parameters;
+};
+
+typedef struct {
+    unsigned char *base; /* NULL to measure */
+    uint64_t used;
+} Arena;
+
+static void *take(Arena *arena, uint64_t count, size_t size)
+{
+    void *memory = arena->base ? arena->base + arena->used : NULL;
+    arena->used += (count * size + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+    return memory;
+}
+
+/* Floats from line to line: an odd multiple of 16, so that lines do not fall on the same sets of a cache. */
+static ptrdiff_t pitch_of(int width) { return ((width + 15) / 16 | 1) * 16; }
+
+static Window window(Arena *arena, int channels, int width, int rows)
+{
+    Window w = {NULL, pitch_of(PAD + rounded_up(width, LANES) + 1), channels, 0};
+    w.data = take(arena, (uint64_t)rows * (uint64_t)channels * (uint64_t)w.pitch, sizeof(float));
+    return w;
+}
+
+/* A strip's height in rows of 1/8 of the resolution. */
+static int strip_height(const onespp_config *config)
+{
+    int rows = greater(MIN_STRIP_ROWS, ONESPP_STRIP_PIXELS / config->max_width) / 8;
+    return lesser(rows, rounded_up(config->max_height, 8) / 8);
+}
+
+static void lay_out_strip(onespp *d, Arena *arena)
+{
+    int width = rounded_up(d->config.max_width, 8);
+    int rows = strip_height(&d->config);
+    d->a = window(arena, WIDTH_A, width / 2, 4 * rows + 2 * REACH_A);
+    d->hidden = window(arena, DETAIL, width, 8 * rows + 2 * REACH_A);
+    d->b = window(arena, WIDTH_B, width / 4, 2 * rows + 4 * REACH_C + 2);
+    d->b_too = window(arena, WIDTH_B, width / 4, 2 * rows + 4 * REACH_C + 2);
+    d->c = window(arena, WIDTH_C, width / 8, rows + 2 * REACH_C);
+    d->c_too = window(arena, WIDTH_C, width / 8, rows + 2 * REACH_C);
+    d->sum_a = window(arena, WIDTH_A, width / 2, 4 * rows + 4);
+    d->zeros = take(arena, (uint64_t)d->a.pitch, sizeof(float));
+}
+
+static void lay_out_layers(onespp *d, Arena *arena)
+{
+    uint64_t count = 0;
+    for (int i = 0; i < LAYERS; i++) {
+        Layer *layer = &d->layers[i];
+        layer->outputs = rounded_up(LAYER_SIZES[i][0], AT_ONCE);
+        layer->inputs = LAYER_SIZES[i][1];
+        count += (uint64_t)(layer->outputs * (layer->inputs + 1));
+    }
+    d->parameters = take(arena, count, sizeof(float));
+}
+
+/* Where everything is in memory. */
+static void lay_out(onespp *d, Arena *arena)
+{
+    uint64_t height = (uint64_t)d->config.max_height;
+    uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
+    d->pitch = pitch_of(d->config.max_width);
+    uint64_t pixels = height * (uint64_t)d->pitch;
+    d->texels = take(arena, pixels * TEXEL, sizeof(float));
+    d->rows = take(arena, pixels * ROW_LINES, sizeof(float));
+    d->depth = take(arena, pixels, sizeof(float));
+    d->mesh = take(arena, pixels, sizeof(int32_t));
+    d->object_to_world = take(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
+    d->motions = take(arena, (uint64_t)d->config.max_meshes + 1, sizeof(Motion));
+    d->blocks = take(arena, blocks, sizeof(double));
+    d->depths = take(arena, MAX_DEPTHS, sizeof(float));
+    d->scratch = take(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
+    lay_out_layers(d, arena);
+    lay_out_strip(d, arena);
+}
+
+/* Reads a layer from the array of all weights: biases, then a matrix (inputs, outputs). Returns what follows it. */
+static const uint16_t *unpack(Layer *layer, int outputs, float *to, const uint16_t *from)
+{
+    float *weights = to + layer->outputs;
+    memset(to, 0, sizeof(float) * (size_t)(layer->outputs * (layer->inputs + 1)));
+    for (int o = 0; o < outputs; o++)
+        to[o] = float_of_half(*from++);
+    for (int i = 0; i < layer->inputs; i++)
+        for (int o = 0; o < outputs; o++)
+            weights[(o / AT_ONCE * layer->inputs + i) * AT_ONCE + o % AT_ONCE] = float_of_half(*from++);
+    layer->bias = to;
+    layer->weights = weights;
+    return from;
+}
+
+static int is_valid(const onespp_config *config)
+{
+    return config->max_width >= 1 && config->max_width <= ONESPP_MAX_SIDE && config->max_height >= 1
+        && config->max_height <= ONESPP_MAX_SIDE && config->max_meshes >= 0 && config->max_meshes <= ONESPP_MAX_MESHES
+        && config->tasks >= 1 && config->tasks <= ONESPP_MAX_TASKS;
+}
+
+/* --- Frames ------------------------------------------------------------------------------------------------------- */
+
+/* One frame at work. */
+typedef struct Job Job;
+struct Job {
+    onespp *d;
+    onespp_frame frame; /* whose optional images are there */
+    onespp_output radiance;
+    int padded_width, padded_height; /* to whole pixels of 1/8 of the resolution */
+    int has_history;
+    float exposure, depth_scale;
+    float to_view[3][3];        /* of normals in world space: x right, y up, z towards the viewer */
+    float slopes[2], origin[2]; /* of this frame's rays in x and in y: (slope * position + origin, 1) */
+    float axes[3][3];           /* the previous frame's rays in the world: x axes[0] + y axes[1] + axes[2] */
+
+    void (*work)(Job *job, Scratch *scratch, int first, int last); /* the step at work, on rows first to last - 1 */
+    int first, last;
+    LayerName layer;
+    const Window *from, *skip, *to;
+    int level;
+};
+
+static void run_task(void *argument, int index)
+{
+    Job *job = argument;
+    int64_t rows = job->last - job->first, tasks = job->d->config.tasks;
+    int first = job->first + (int)(rows * index / tasks);
+    int last = job->first + (int)(rows * (index + 1) / tasks);
+    if (first < last)
+        job->work(job, &job->d->scratch[index], first, last);
+}
+
+/* Does `work` on rows first to last - 1. What is computed for a row must not depend on where tasks begin. */
+static void run(Job *job, void (*work)(Job *, Scratch *, int, int), int first, int last)
+{
+    const onespp_config *config = &job->d->config;
+    job->work = work;
+    job->first = first;
+    job->last = last;
+    if (config->parallel_for)
+        config->parallel_for(config->user, config->tasks, run_task, job);
+    else
+        for (int i = 0; i < config->tasks; i++)
+            run_task(job, i);
+}
+
+/* n pixels of a row of an image, from x on. */
+static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
+{
+    ptrdiff_t step = image->column;
+    const float *from = image->data + image->channel * channel + image->row * y + step * x;
+    float constant = finite_or_0(*from);
+    for (int i = 0; i < n; i++)
+        line[i] = step ? finite_or_0(from[i * step]) : constant;
+}
+
+/* Mesh ids of n pixels; negative ones, which stand for pixels outside the image here, count as one mesh. */
+static void load_mesh(int32_t *restrict line, const onespp_frame *frame, int y, int x, int n)
+{
+    if (!frame->mesh_id.data) {
+        float depth[SPAN];
+        load(depth, &frame->depth, 0, y, x, n);
+        for (int i = 0; i < n; i++)
+            line[i] = depth[i] > 0;
+        return;
+    }
+    ptrdiff_t step = frame->mesh_id.column;
+    const int32_t *from = frame->mesh_id.data + frame->mesh_id.row * y + step * x;
+    for (int i = 0; i < n; i++)
+        line[i] = from[i * step] < 0 ? INT32_MAX : from[i * step];
+}
+
+/* What irradiance is multiplied by: max(albedo, 0.01). */
+static void load_divisor(float *restrict line, const onespp_frame *frame, int channel, int y, int x, int n)
+{
+    load(line, &frame->albedo, channel, y, x, n);
+    for (int i = 0; i < n; i++)
+        line[i] = least(most(line[i], ALBEDO_FLOOR), MAX_REFLECTANCE);
+}
+
+/* Noisy irradiance of one colour of n <= SPAN pixels, 0 for those that show no surface. */
+static void load_irradiance(float *restrict line, const onespp_frame *frame, int channel, int y, int x, int n)
+{
+    float indirect[SPAN], divisor[SPAN], depth[SPAN];
+    load(line, &frame->direct, channel, y, x, n);
+    load(indirect, &frame->indirect, channel, y, x, n);
+    load_divisor(divisor, frame, channel, y, x, n);
+    load(depth, &frame->depth, 0, y, x, n);
+    for (int i = 0; i < n; i++) {
+        float irradiance = clamped((line[i] + indirect[i]) / divisor[i], MAX_IRRADIANCE);
+        line[i] = depth[i] > 0 ? most(irradiance, 0) : 0;
+    }
+}
+
+/* Where a row's line begins. */
+static float *row_line(const onespp *d, int y, int line)
+{
+    return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch;
+}
+
+/* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
+
+/* Mean luminance of the surfaces of a block, -1 without any. */
+static double block_luminance(const onespp_frame *frame, int row, int column)
+{
+    int x = column * BLOCK, n = lesser(BLOCK, frame->width - x), surfaces = 0;
+    float sum = 0;
+    for (int y = row * BLOCK; y < lesser((row + 1) * BLOCK, frame->height); y++) {
+        float light[RGB][BLOCK], divisor[BLOCK], depth[BLOCK];
+        for (int c = 0; c < RGB; c++) {
+            load_irradiance(light[c], frame, c, y, x, n);
+            load_divisor(divisor, frame, c, y, x, n);
+            for (int i = 0; i < n; i++)
+                light[c][i] *= divisor[i];
+        }
+        load(depth, &frame->depth, 0, y, x, n);
+        for (int i = 0; i < n; i++) {
+            sum += luminance(light[0][i], light[1][i], light[2][i]);
+            surfaces += depth[i] > 0;
+        }
+    }
+    return surfaces ? (double)sum / surfaces : -1;
+}
+
+/* The rows are those of blocks. */
+static void measure_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    int columns = (job->frame.width + BLOCK - 1) / BLOCK;
+    for (int row = first; row < last; row++)
+        for (int column = 0; column < columns; column++)
+            job->d->blocks[(ptrdiff_t)row * columns + column] = block_luminance(&job->frame, row, column);
+}
+
+static void update(RunningMean *mean, double value)
+{
+    if (!isfinite(value))
+        return;
+    mean->count = lesser(mean->count + 1, 10);
+    mean->value += ((float)value - mean->value) / (float)mean->count;
+}
+
+/* The mean over blocks of ln luminance; not finite where all is black. */
+static double log_luminance(const double *blocks, int count)
+{
+    double mean = 0, sum = 0;
+    int surfaces = 0;
+    for (int i = 0; i < count; i++) {
+        surfaces += blocks[i] >= 0;
+        mean += fmax(blocks[i], 0);
+    }
+    mean /= surfaces;
+    for (int i = 0; i < count; i++)
+        if (blocks[i] >= 0)
+            sum += log(fmax(blocks[i], 1e-4 * mean));
+    return surfaces ? sum / surfaces : NAN;
+}
+
+/* The lower median of positive numbers, whose bits are in the same order as they: bit by bit from the highest. */
+static float median(const float *numbers, int count)
+{
+    int32_t found = 0;
+    for (int32_t bit = 1 << 30; bit; bit >>= 1) {
+        int below = 0;
+        for (int i = 0; i < count; i++)
+            below += bits_of(numbers[i]) < (found | bit);
+        if (below <= (count - 1) / 2)
+            found |= bit;
+    }
+    return float_of(found);
+}
+
+/* ln of the median depth of surfaces; not finite without any. */
+static double log_depth(const onespp *d, const onespp_frame *frame)
+{
+    int step_y = greater(1, frame->height / MEDIAN_GRID), step_x = greater(1, frame->width / MEDIAN_GRID);
+    int count = 0;
+    for (int y = 0; y < frame->height; y += step_y)
+        for (int x = 0; x < frame->width; x += step_x) {
+            load(&d->depths[count], &frame->depth, 0, y, x, 1);
+            count += d->depths[count] > 0;
+        }
+    return count ? log((double)median(d->depths, count)) : NAN;
+}
+
+static void measure(Job *job)
+{
+    onespp *d = job->d;
+    int columns = (job->frame.width + BLOCK - 1) / BLOCK, rows = (job->frame.height + BLOCK - 1) / BLOCK;
+    run(job, measure_rows, 0, rows);
+    update(&d->log_luminance, log_luminance(d->blocks, columns * rows));
+    update(&d->log_depth, log_depth(d, &job->frame));
+    job->exposure = clamped(MIDDLE_GREY * expf(-d->log_luminance.value), MAX_MAGNITUDE);
+    job->depth_scale = clamped(expf(d->log_depth.value), MAX_MAGNITUDE);
+}
+
+/* --- Geometry ----------------------------------------------------------------------------------------------------- */
+
+/* out = a b, of rigid transforms. */
+static void multiply_poses(double out[16], const double a[16], const double b[16])
+{
+    for (int i = 0; i < 4; i++)
+        for (int j = 0; j < 4; j++) {
+            double sum = 0;
+            for (int k = 0; k < 4; k++)
+                sum += a[4 * i + k] * b[4 * k + j];
+            out[4 * i + j] = sum;
+        }
+}
+
+static void invert_pose(double out[16], const double pose[16])
+{
+    for (int i = 0; i < 3; i++) {
+        out[4 * i + 3] = 0;
+        for (int j = 0; j < 3; j++) {
+            out[4 * i + j] = pose[4 * j + i];
+            out[4 * i + 3] -= pose[4 * j + i] * pose[4 * j + 3];
+        }
+    }
+    for (int j = 0; j < 4; j++)
+        out[12 + j] = j == 3;
+}
+
+/* The motion of a mesh whose pose goes from `before` to `now`, or of what stands still where these are NULL. Products
+ * are in double, and the eye is subtracted before rounding: scenes far from the origin keep their precision. */
+static Motion motion_of(const Job *job, const double *before, const double *now)
+{
+    const double *pose = job->frame.camera_to_world, *eye = job->d->camera_to_world;
+    double moved[16];
+    Motion motion;
+    memcpy(moved, pose, sizeof moved);
+    if (now) {
+        double to_rest[16], at_rest[16];
+        invert_pose(to_rest, now);
+        multiply_poses(at_rest, to_rest, pose);
+        multiply_poses(moved, before, at_rest);
+    }
+    for (int i = 0; i < 3; i++) {
+        const double *row = moved + 4 * i;
+        for (int j = 0; j < 3; j++) {
+            const double *axis = pose + 4 * j;
+            motion.to_previous[i][j] = (float)row[j];
+            motion.turn[i][j] = (float)(row[0] * axis[0] + row[1] * axis[1] + row[2] * axis[2]);
+        }
+        motion.to_previous[i][3] = (float)(row[3] - eye[4 * i + 3]);
+    }
+    return motion;
+}
+
+static void set_up_geometry(Job *job)
+{
+    onespp *d = job->d;
+    const onespp_frame *frame = &job->frame;
+    const double *pose = frame->camera_to_world, *eye = d->camera_to_world;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            job->to_view[i][j] = (float)(i == 1 ? pose[4 * j + i] : -pose[4 * j + i]);
+    if (!job->has_history)
+        return;
+    for (int i = 0; i < 2; i++) {
+        job->slopes[i] = (float)(1 / frame->K[4 * i]);
+        job->origin[i] = (float)(-frame->K[3 * i + 2] / frame->K[4 * i]);
+    }
+    for (int i = 0; i < 3; i++) {
+        double x = eye[4 * i] / d->K[0], y = eye[4 * i + 1] / d->K[4];
+        job->axes[0][i] = (float)x;
+        job->axes[1][i] = (float)y;
+        job->axes[2][i] = (float)(eye[4 * i + 2] - x * d->K[2] - y * d->K[5]);
+    }
+    d->motions[0] = motion_of(job, NULL, NULL);
+    for (int i = 0; i < frame->meshes; i++) {
+        const double *before = i < d->meshes ? d->object_to_world + 16 * i : NULL; /* new meshes stand still */
+        d->motions[i + 1] = motion_of(job, before, before ? frame->object_to_world + 16 * i : NULL);
+    }
+}
+
+/* --- Reprojection: what the previous frame holds of a pixel's surface --------------------------------------------- */
+
+typedef struct {
+    float point[3], normal[3]; /* where the surface was, in the world's axes around the previous eye, and its normal */
+    int32_t mesh;
+} Surface;
+
+static Surface surface_before(const Job *job, int x, int y, float depth, const float normal[3], int32_t mesh)
+{
+    Surface surface;
+    const Motion *motion = &job->d->motions[mesh <= job->frame.meshes ? mesh : BACKGROUND];
+    float px = (job->slopes[0] * ((float)x + 0.5f) + job->origin[0]) * depth;
+    float py = (job->slopes[1] * ((float)y + 0.5f) + job->origin[1]) * depth;
+    for (int i = 0; i < 3; i++) {
+        const float *row = motion->to_previous[i], *turn = motion->turn[i];
+        surface.point[i] = row[0] * px + row[1] * py + row[2] * depth + row[3];
+        surface.normal[i] = turn[0] * normal[0] + turn[1] * normal[1] + turn[2] * normal[2];
+    }
+    surface.mesh = mesh;
+    return surface;
+}
+
+/* Whether pixel (x, y) of the previous frame shows the surface. */
+static int is_consistent(const Job *job, const Surface *surface, int x, int y)
+{
+    const onespp *d = job->d;
+    ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x;
+    if (x < 0 || y < 0 || x >= d->width || y >= d->height || d->mesh[pixel] != surface->mesh)
+        return 0;
+    if (surface->mesh == BACKGROUND)
+        return 1;
+    const float *normal = d->texels + pixel * TEXEL + NORMAL;
+    float px = (float)x + 0.5f, py = (float)y + 0.5f;
+    float depth = d->depth[pixel], off_plane = 0, cosine = 0;
+    for (int i = 0; i < 3; i++) {
+        float visible = depth * (job->axes[0][i] * px + job->axes[1][i] * py + job->axes[2][i]);
+        off_plane += (surface->point[i] - visible) * normal[i];
+        cosine += normal[i] * surface->normal[i];
+    }
+    return fabsf(off_plane) <= PLANE_TOLERANCE * depth && cosine >= NORMAL_TOLERANCE;
+}
+
+static void add_texel(float *restrict sum, float weight, const Job *job, int x, int y)
+{
+    const float *restrict texel = job->d->texels + ((ptrdiff_t)y * job->d->pitch + x) * TEXEL;
+    for (int c = 0; c < TEXEL; c++)
+        sum[c] += weight * texel[c];
+}
+
+/* The mean of the consistent ones among 3 x 3 pixels. */
+static void fetch_box(const Job *job, const Surface *surface, int x, int y, float texel[TEXEL])
+{
+    int count = 0;
+    for (int tap = 0; tap < 9; tap++) {
+        int column = x + tap % 3 - 1, row = y + tap / 3 - 1;
+        if (is_consistent(job, surface, column, row)) {
+            add_texel(texel, 1, job, column, row);
+            count++;
+        }
+    }
+    for (int c = 0; c < TEXEL; c++)
+        texel[c] /= (float)greater(count, 1);
+}
+
+/* The history of a surface at position (x, y) of the previous frame, from the corners of pixels: 0 where there is none.
+ *
+ * The weights of taps that fail are spread evenly over the others (SVGF, section 4.1). */
+static void fetch(const Job *job, const Surface *surface, float x, float y, float texel[TEXEL])
+{
+    int left = (int)floorf(x), top = (int)floorf(y);
+    float fx = x - (float)left, fy = y - (float)top;
+    float weights[4] = {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy};
+    int good[4], count = 0;
+    float failed = 0;
+    memset(texel, 0, sizeof(float) * TEXEL);
+    for (int tap = 0; tap < 4; tap++) {
+        good[tap] = is_consistent(job, surface, left + tap % 2, top + tap / 2);
+        count += good[tap];
+        failed += good[tap] ? 0 : weights[tap];
+    }
+    if (count == 0) {
+        fetch_box(job, surface, left + (fx >= 0.5f), top + (fy >= 0.5f), texel);
+        return;
+    }
+    for (int tap = 0; tap < 4; tap++)
+        if (good[tap])
+            add_texel(texel, weights[tap] + failed / (float)count, job, left + tap % 2, top + tap / 2);
+}
+
+/* The history of n pixels of a row, from x0 on; 0 where there is none. */
+static void reproject(const Job *job, int y, int x0, int n, float (*restrict history)[CHUNK])
+{
+    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK];
+    int32_t mesh[CHUNK];
+    if (!job->has_history) {
+        for (int c = 0; c < HISTORY; c++)
+            memset(history[c], 0, sizeof history[c]);
+        return;
+    }
+    for (int c = 0; c < 2; c++)
+        load(motion[c], &job->frame.motion, c, y, x0, n);
+    for (int c = 0; c < 3; c++)
+        load(normal[c], &job->frame.normal, c, y, x0, n);
+    load(depth, &job->frame.depth, 0, y, x0, n);
+    load_mesh(mesh, &job->frame, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        float texel[TEXEL] = {0};
+        if (depth[i] > 0) {
+            /* Far outside the image an index would overflow; any place outside is as good. */
+            float x = most(least((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
+            float y_then = most(least((float)y + motion[1][i], (float)job->d->height + 1), -2);
+            float n_here[3] = {normal[0][i], normal[1][i], normal[2][i]};
+            Surface surface = surface_before(job, x0 + i, y, depth[i], n_here, mesh[i]);
+            fetch(job, &surface, x, y_then, texel);
+        }
+        for (int c = 0; c < HISTORY; c++)
+            history[c][i] = texel[c];
+    }
+}
+
+/* --- Statistics over neighbours of the same mesh ------------------------------------------------------------------ */
+
+static int slot_of(int row) { return (row + RING) % RING; }
+
+/* Pixels of a row around a chunk: mesh -1 outside the image. */
+static void read_row(const Job *job, Neighbourhood *around, int y, int x0)
+{
+    const onespp_frame *frame = &job->frame;
+    int32_t *mesh = around->mesh[slot_of(y)];
+    float(*pixels)[SPAN] = around->pixels[slot_of(y)];
+    int first = greater(x0 - HALO, 0), last = lesser(x0 + CHUNK + HALO, frame->width);
+    int left = first - (x0 - HALO), n = last - first;
+    for (int i = 0; i < SPAN; i++)
+        mesh[i] = -1;
+    memset(pixels, 0, sizeof around->pixels[0]);
+    if (y < 0 || y >= frame->height)
+        return;
+    load_mesh(mesh + left, frame, y, first, n);
+    for (int c = 0; c < RGB; c++)
+        load_irradiance(pixels[c] + left, frame, c, y, first, n);
+    for (int i = 0; i < SPAN; i++) {
+        float bright = least(luminance(pixels[0][i], pixels[1][i], pixels[2][i]), MAX_LUMINANCE);
+        pixels[3][i] = bright;
+        pixels[4][i] = bright * bright;
+        pixels[5][i] = 1;
+    }
+}
+
+/* Sums of lines over those of the 3 x 3 taps, `step` pixels apart, that show the same mesh. */
+static void sum_taps(
+    float (*restrict sums)[SPAN], const Neighbourhood *around, float (*lines)[SUMS][SPAN], int y, int step)
+{
+    const int32_t *mesh = around->mesh[slot_of(y)];
+    memset(sums, 0, sizeof around->sums[0]);
+    for (int tap = 0; tap < 9; tap++) {
+        int row = slot_of(y + (tap / 3 - 1) * step), shift = (tap % 3 - 1) * step;
+        float same[SPAN];
+        for (int i = step; i < SPAN - step; i++)
+            same[i] = mesh[i] == around->mesh[row][i + shift] ? 1.f : 0.f;
+        for (int c = 0; c < SUMS; c++) {
+            const float *there = lines[row][c];
+            for (int i = step; i < SPAN - step; i++)
+                sums[c][i] += same[i] * there[i + shift];
+        }
+    }
+}
+
+/* Moves on to row y of the chunk that begins at x0. */
+static void sum_neighbours(const Job *job, Neighbourhood *around, int y, int x0)
+{
+    for (; around->next <= y + 4; around->next++) {
+        int row = around->next - 1;
+        read_row(job, around, around->next, x0);
+        if (row > around->first)
+            sum_taps(around->sums[slot_of(row)], around, around->pixels, row, 1);
+    }
+    sum_taps(around->sums_9x9, around, around->sums, y, 3);
+}
+
+/* --- Layers ------------------------------------------------------------------------------------------------------- */
+
+static inline void fill(float *restrict line, float value)
+{
+    for (int i = 0; i < LANES; i++)
+        line[i] = value;
+}
+
+static inline void copy(float *restrict line, const float *restrict from)
+{
+    for (int i = 0; i < LANES; i++)
+        line[i] = from[i];
+}
+
+static inline void add_scaled(float *restrict line, float factor, const float *restrict from)
+{
+    for (int i = 0; i < LANES; i++)
+        line[i] += factor * from[i];
+}
+
+static inline void rectify(float *restrict line)
+{
+    for (int i = 0; i < LANES; i++)
+        line[i] = most(line[i], 0);
+}
+
+typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
+
+/* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers, of which LANES and AT_ONCE
+ * take half as many as there are; each input is read once for all outputs. */
+static void multiply_block(
+    const float *restrict weights, const float *restrict bias, const float *const *restrict inputs, int count,
+    ptrdiff_t x, float *restrict out, ptrdiff_t pitch, Finish finish)
+{
+    float s0[LANES], s1[LANES], s2[LANES], s3[LANES];
+    float *sums[4] = {s0, s1, s2, s3};
+    for (int o = 0; o < AT_ONCE; o++) {
+        if (finish == ADDED)
+            copy(sums[o], out + o * pitch);
+        else
+            fill(sums[o], bias[o]);
+    }
+    for (int i = 0; i < count; i++, weights += AT_ONCE) {
+        const float *line = inputs[i] + x;
+        add_scaled(s0, weights[0], line);
+        add_scaled(s1, weights[1], line);
+        if (AT_ONCE > 2) {
+            add_scaled(s2, weights[2], line);
+            add_scaled(s3, weights[3], line);
+        }
+    }
+    for (int o = 0; o < AT_ONCE; o++) {
+        if (finish == RECTIFIED)
+            rectify(sums[o]);
+        copy(out + o * pitch, sums[o]);
+    }
+}
+
+/* Pixels x to x + n - 1 of a layer's outputs, lines `pitch` apart, from lines of inputs. n is rounded up to LANES. */
+static void multiply(
+    const Layer *layer, const float *const *inputs, ptrdiff_t x, int n, float *out, ptrdiff_t pitch, Finish finish)
+{
+    for (int o = 0; o < layer->outputs; o += AT_ONCE) {
+        const float *weights = layer->weights + (ptrdiff_t)o * layer->inputs;
+        for (int i = 0; i < n; i += LANES)
+            multiply_block(weights, layer->bias + o, inputs, layer->inputs, x + i, out + o * pitch + i, pitch, finish);
+    }
+}
+
+/* Pixel 0 of a line of a window. */
+static float *line_of(const Window *w, int y, int channel)
+{
+    return w->data + ((ptrdiff_t)(y - w->first) * w->channels + channel) * w->pitch + PAD;
+}
+
+/* Zeros to the left and right of an image's row, which convolutions read. */
+static void clear_margins(const Window *w, int y, int width)
+{
+    for (int c = 0; c < w->channels; c++) {
+        float *line = line_of(w, y, c);
+        memset(line - PAD, 0, sizeof(float) * PAD);
+        memset(line + width, 0, sizeof(float) * (size_t)(w->pitch - PAD - width));
+    }
+}
+
+/* The 3 x 3 taps of a row of an image of `height` rows, in the order of channels, rows, columns. */
+static void find_taps(const float **taps, const Window *from, int y, int height, const float *zeros)
+{
+    for (int c = 0; c < from->channels; c++)
+        for (int row = y - 1; row <= y + 1; row++) {
+            const float *line = row >= 0 && row < height ? line_of(from, row, c) : zeros + PAD;
+            for (int dx = -1; dx <= 1; dx++)
+                *taps++ = line + dx;
+        }
+}
+
+/* The size of the image of a window's resolution. */
+static int scaled(int size, int channels) { return size / (channels == WIDTH_A ? 2 : channels == WIDTH_B ? 4 : 8); }
+
+/* ReLU of a convolution of 3 x 3. */
+static void convolve_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    const float *taps[9 * WIDTH_C];
+    int width = scaled(job->padded_width, job->to->channels), height = scaled(job->padded_height, job->to->channels);
+    for (int y = first; y < last; y++) {
+        find_taps(taps, job->from, y, height, job->d->zeros);
+        multiply(&job->d->layers[job->layer], taps, 0, width, line_of(job->to, y, 0), job->to->pitch, RECTIFIED);
+        clear_margins(job->to, y, width);
+    }
+}
+
+/* Even and odd pixels of 2 n pixels. In patches of 2 x 2 pixels, lines are in the order of rows, columns, channels. */
+static void split(float *restrict even, float *restrict odd, const float *restrict line, int n)
+{
+    for (int i = 0; i < n; i++) {
+        even[i] = line[2 * i];
+        odd[i] = line[2 * i + 1];
+    }
+}
+
+static void join(float *restrict line, const float *restrict even, const float *restrict odd, int n)
+{
+    for (int i = 0; i < n; i++) {
+        line[2 * i] = even[i];
+        line[2 * i + 1] = odd[i];
+    }
+}
+
+/* ReLU of a convolution of 2 x 2 pixels, which become one. */
+static void halve_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    const Window *from = job->from, *to = job->to;
+    const float *lines[PATCH * WIDTH_B];
+    int width = scaled(job->padded_width, to->channels), channels = from->channels;
+    for (int i = 0; i < PATCH * channels; i++)
+        lines[i] = scratch->patches[i];
+    for (int y = first; y < last; y++) {
+        for (int x = 0; x < width; x += HALF_CHUNK) {
+            int n = lesser(HALF_CHUNK, width - x);
+            for (int i = 0; i < 2 * channels; i++) {
+                int even = i / channels * 2 * channels + i % channels;
+                const float *line = line_of(from, 2 * y + i / channels, i % channels) + 2 * x;
+                split(scratch->patches[even], scratch->patches[even + channels], line, n);
+            }
+            multiply(&job->d->layers[job->layer], lines, 0, n, line_of(to, y, 0) + x, to->pitch, RECTIFIED);
+        }
+        clear_margins(to, y, width);
+    }
+}
+
+/* A transposed convolution, of a pixel to 2 x 2, added to `skip`; the rows are those of `from`. */
+static void double_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    const Window *from = job->from, *skip = job->skip, *to = job->to;
+    const float *lines[WIDTH_C];
+    int width = scaled(job->padded_width, from->channels), channels = to->channels;
+    for (int y = first; y < last; y++) {
+        for (int c = 0; c < from->channels; c++)
+            lines[c] = line_of(from, y, c);
+        for (int x = 0; x < width; x += HALF_CHUNK) {
+            int n = lesser(HALF_CHUNK, width - x);
+            multiply(&job->d->layers[job->layer], lines, x, n, scratch->patches[0], HALF_CHUNK, PLAIN);
+            for (int i = 0; i < 2 * channels; i++) {
+                int even = i / channels * 2 * channels + i % channels;
+                const float *restrict old = line_of(skip, 2 * y + i / channels, i % channels) + 2 * x;
+                float *restrict line = line_of(to, 2 * y + i / channels, i % channels) + 2 * x;
+                join(line, scratch->patches[even], scratch->patches[even + channels], n);
+                for (int k = 0; k < 2 * n; k++)
+                    line[k] += old[k];
+            }
+        }
+        clear_margins(to, 2 * y, 2 * width);
+        clear_margins(to, 2 * y + 1, 2 * width);
+    }
+}
+
+/* --- Inputs of the network ---------------------------------------------------------------------------------------- */
+
+/* Its input lines. */
+enum {
+    NOISY_INPUT = 0,
+    MEAN_3X3_INPUT = NOISY_INPUT + RGB,
+    MEAN_9X9_INPUT = MEAN_3X3_INPUT + RGB,
+    OUTPUT_INPUT = MEAN_9X9_INPUT + RGB,
+    ACCUMULATED_INPUT = OUTPUT_INPUT + RGB,
+    DEVIATION_INPUT = ACCUMULATED_INPUT + RGB, /* relative, of luminance over 9 x 9 pixels */
+    NEWEST_INPUT,                              /* 1 / samples */
+    OLDEST_INPUT,                              /* 1 / (samples and length of the history) */
+    HAS_HISTORY_INPUT,
+    LATENT_INPUT,
+    ALBEDO_INPUT = LATENT_INPUT + LATENT,
+    NORMAL_INPUT = ALBEDO_INPUT + RGB,
+    DEPTH_INPUT = NORMAL_INPUT + 3,
+    ROUGHNESS_INPUT
+};
+
+/* ln(1 + exposure times light). */
+static void expose(float *restrict line, const float *restrict light, float exposure, int n)
+{
+    for (int i = 0; i < n; i++)
+        line[i] = 1 + least(most(light[i], 0) * exposure, MAX_EXPOSED);
+    for (int i = 0; i < n; i++)
+        line[i] = logarithm(line[i]);
+}
+
+/* The lines that are means of irradiance, and its deviation. */
+static void fill_statistics(const Job *job, const Neighbourhood *around, int y, int n, float (*restrict lines)[CHUNK])
+{
+    int slot = slot_of(y);
+    const float *count = around->sums_9x9[5] + HALO;
+    float mean[CHUNK];
+    for (int c = 0; c < RGB; c++) {
+        expose(lines[NOISY_INPUT + c], around->pixels[slot][c] + HALO, job->exposure, n);
+        for (int i = 0; i < n; i++)
+            mean[i] = around->sums[slot][c][HALO + i] / around->sums[slot][5][HALO + i];
+        expose(lines[MEAN_3X3_INPUT + c], mean, job->exposure, n);
+        for (int i = 0; i < n; i++)
+            mean[i] = around->sums_9x9[c][HALO + i] / count[i];
+        expose(lines[MEAN_9X9_INPUT + c], mean, job->exposure, n);
+    }
+    for (int i = 0; i < n; i++) {
+        float bright = around->sums_9x9[3][HALO + i] / count[i];
+        float variance = most(around->sums_9x9[4][HALO + i] / count[i] - bright * bright, 0);
+        mean[i] = sqrtf(variance) / most(bright, MIN_MEAN);
+    }
+    expose(lines[DEVIATION_INPUT], mean, 1, n);
+}
+
+/* The lines of the reprojected history; without one, its images are those of this frame. */
+static void fill_history(const Job *job, float (*restrict history)[CHUNK], int n, float (*restrict lines)[CHUNK])
+{
+    float samples = job->frame.samples;
+    const float *length = history[LENGTH];
+    for (int c = 0; c < RGB; c++) {
+        float *output = lines[OUTPUT_INPUT + c], *accumulated = lines[ACCUMULATED_INPUT + c];
+        expose(output, history[OUTPUT + c], job->exposure, n);
+        expose(accumulated, history[ACCUMULATED + c], job->exposure, n);
+        for (int i = 0; i < n; i++) {
+            output[i] = length[i] > 0 ? output[i] : lines[MEAN_9X9_INPUT + c][i];
+            accumulated[i] = length[i] > 0 ? accumulated[i] : lines[NOISY_INPUT + c][i];
+        }
+    }
+    for (int i = 0; i < n; i++) {
+        lines[NEWEST_INPUT][i] = 1 / samples;
+        lines[OLDEST_INPUT][i] = 1 / (length[i] + samples);
+        lines[HAS_HISTORY_INPUT][i] = length[i] > 0 ? 1.f : 0.f;
+    }
+    for (int c = 0; c < LATENT; c++)
+        memcpy(lines[LATENT_INPUT + c], history[LATENT_FROM + c], sizeof(float) * (size_t)n);
+}
+
+/* The lines of surfaces: albedo, normal in view space, depth and roughness. */
+static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict lines)[CHUNK])
+{
+    const onespp_frame *frame = &job->frame;
+    float normal[3][CHUNK];
+    for (int c = 0; c < 3; c++) {
+        load(lines[ALBEDO_INPUT + c], &frame->albedo, c, y, x0, n);
+        load(normal[c], &frame->normal, c, y, x0, n);
+        for (int i = 0; i < n; i++) {
+            lines[ALBEDO_INPUT + c][i] = clamped(lines[ALBEDO_INPUT + c][i], MAX_REFLECTANCE);
+            normal[c][i] = clamped(normal[c][i], MAX_REFLECTANCE);
+        }
+    }
+    for (int c = 0; c < 3; c++) {
+        const float *axis = job->to_view[c];
+        for (int i = 0; i < n; i++)
+            lines[NORMAL_INPUT + c][i] = axis[0] * normal[0][i] + axis[1] * normal[1][i] + axis[2] * normal[2][i];
+    }
+    float *restrict depth = lines[DEPTH_INPUT], *restrict roughness = lines[ROUGHNESS_INPUT], scale = job->depth_scale;
+    load(depth, &frame->depth, 0, y, x0, n);
+    load(roughness, &frame->roughness, 0, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        float share = depth[i] / (depth[i] + scale);
+        depth[i] = depth[i] > 0 ? share : 1;
+        roughness[i] = clamped(roughness[i], MAX_REFLECTANCE);
+    }
+}
+
+/* The inputs of a chunk of a row, n pixels from x0 on, whose last one is repeated. */
+static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, float (*restrict lines)[CHUNK])
+{
+    sum_neighbours(job, &scratch->enter.around, y, x0);
+    reproject(job, y, x0, n, scratch->enter.history);
+    fill_statistics(job, &scratch->enter.around, y, n, lines);
+    fill_history(job, scratch->enter.history, n, lines);
+    fill_surface(job, y, x0, n, lines);
+    for (int c = 0; c < INPUTS; c++)
+        for (int i = n; i < CHUNK; i++)
+            lines[c][i] = lines[c][n - 1];
+}
+
+/* What `leave` needs of a chunk of a row: the history of images and its length, and the hidden per-pixel layer. */
+static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, float (*lines)[CHUNK])
+{
+    const onespp *d = job->d;
+    const float *inputs[INPUTS];
+    for (int c = OUTPUT; c <= LENGTH; c++)
+        memcpy(row_line(d, y, OUTPUT_LINES + c) + x0, scratch->enter.history[c], sizeof(float) * (size_t)n);
+    for (int c = 0; c < INPUTS; c++)
+        inputs[c] = lines[c];
+    multiply(&d->layers[DETAIL_1], inputs, 0, n, line_of(&d->hidden, y, 0) + x0, d->hidden.pitch, RECTIFIED);
+}
+
+/* The first layers of the network of a chunk, n pixels at 1/2 of the resolution, from the inputs of two rows. */
+static void enter_chunk(const Job *job, Scratch *scratch, int y, int x, int n)
+{
+    const onespp *d = job->d;
+    const float *patches[PATCH * INPUTS], *entered[WIDTH_A];
+    for (int i = 0; i < 2 * INPUTS; i++) {
+        int even = i / INPUTS * 2 * INPUTS + i % INPUTS;
+        float(*to)[HALF_CHUNK] = scratch->enter.patches;
+        split(to[even], to[even + INPUTS], scratch->enter.lines[i / INPUTS][i % INPUTS], HALF_CHUNK);
+    }
+    for (int i = 0; i < PATCH * INPUTS; i++)
+        patches[i] = scratch->enter.patches[i];
+    for (int c = 0; c < WIDTH_A; c++)
+        entered[c] = scratch->enter.entered[c];
+    multiply(&d->layers[ENTER_1], patches, 0, n, scratch->enter.entered[0], HALF_CHUNK, RECTIFIED);
+    multiply(&d->layers[ENTER_2], entered, 0, n, line_of(&d->a, y, 0) + x, d->a.pitch, RECTIFIED);
+}
+
+/* The rows are those of 1/2 of the resolution. */
+static void enter_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    const onespp_frame *frame = &job->frame;
+    for (int x0 = 0; x0 < job->padded_width; x0 += CHUNK) {
+        int n = lesser(CHUNK, frame->width - x0), padded = lesser(CHUNK, job->padded_width - x0);
+        scratch->enter.around.first = scratch->enter.around.next = lesser(2 * first, frame->height - 1) - 4;
+        for (int y = first; y < last; y++) {
+            for (int i = 0; i < 2; i++) {
+                /* Below the image its last row is repeated. */
+                int row = 2 * y + i, source = lesser(row, frame->height - 1);
+                fill_inputs(job, scratch, source, x0, n, scratch->enter.lines[i]);
+                if (row == source)
+                    keep_row(job, scratch, row, x0, n, scratch->enter.lines[i]);
+            }
+            enter_chunk(job, scratch, y, x0 / 2, padded / 2);
+        }
+    }
+    for (int y = first; y < last; y++)
+        clear_margins(&job->d->a, y, job->padded_width / 2);
+}
+
+/* --- Outputs of the network --------------------------------------------------------------------------------------- */
+
+/* Its output lines. */
+enum {
+    SHARPNESS_HEAD = FEATURES,
+    CENTRE_HEAD = SHARPNESS_HEAD + LEVELS,
+    IMPORTANCE_HEAD = CENTRE_HEAD + LEVELS,
+    ALPHA_HEAD = IMPORTANCE_HEAD + LEVELS,
+    LATENT_HEAD = ALPHA_HEAD + 2
+};
+
+/* The parameters of a level of the filter. */
+static void decode_level(
+    const Job *job, float (*head)[CHUNK], const float *restrict depth, int level, int y, int x0, int n)
+{
+    float *restrict sharpness = row_line(job->d, y, LEVEL_LINES + 3 * level) + x0;
+    float *restrict centre = sharpness + job->d->pitch, *restrict importance = centre + job->d->pitch;
+    float shrunk[CHUNK]; /* of softplus */
+    for (int i = 0; i < n; i++)
+        shrunk[i] = exponential(most(-fabsf(head[SHARPNESS_HEAD + level][i]), -MAX_EXPONENT));
+    for (int i = 0; i < n; i++) {
+        sharpness[i] = most(head[SHARPNESS_HEAD + level][i], 0) + logarithm(1 + shrunk[i]);
+        centre[i] = clamped(head[CENTRE_HEAD + level][i], MAX_LOGIT);
+        importance[i] = depth[i] > 0 ? clamped(head[IMPORTANCE_HEAD + level][i], MAX_LOGIT) : NO_WEIGHT;
+    }
+}
+
+/* Weights of the newest frame, 1 without history; the new accumulation, and its length: that of a mean as noisy. */
+static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    float samples = job->frame.samples, newest[CHUNK];
+    const float *head = scratch->leave.head[ALPHA_HEAD], *output_head = scratch->leave.head[ALPHA_HEAD + 1];
+    float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0, *restrict length = row_line(d, y, LENGTH_LINE) + x0;
+    for (int i = 0; i < n; i++) {
+        float past = most(length[i], MIN_LENGTH);
+        float against = exponential(clamped(-head[i], MAX_EXPONENT)) * past / samples;
+        float against_output = exponential(clamped(-output_head[i], MAX_EXPONENT));
+        newest[i] = length[i] > 0 ? 1 / (1 + against) : 1;
+        alpha[i] = length[i] > 0 ? 1 / (1 + against_output) : 1;
+        float kept = 1 - newest[i];
+        length[i] = 1 / (newest[i] * newest[i] / samples + kept * kept / past);
+    }
+    for (int c = 0; c < RGB; c++) {
+        float *restrict accumulated = row_line(d, y, ACCUMULATED_LINES + c) + x0;
+        const float *restrict noisy = scratch->leave.noisy[c];
+        for (int i = 0; i < n; i++)
+            accumulated[i] = newest[i] * noisy[i] + (1 - newest[i]) * accumulated[i];
+    }
+}
+
+static void decode_latent(const Job *job, float (*head)[CHUNK], int y, int x0, int n)
+{
+    for (int c = 0; c < LATENT; c++) {
+        float *restrict latent = row_line(job->d, y, LATENT_LINES + c) + x0;
+        for (int i = 0; i < n; i++) { /* tanh */
+            float x = head[LATENT_HEAD + c][i];
+            float shrunk = exponential(most(-2 * fabsf(x), -MAX_EXPONENT));
+            float size = (1 - shrunk) / (1 + shrunk);
+            latent[i] = x > 0 ? size : -size;
+        }
+    }
+}
+
+/* Decodes a chunk of a row. */
+static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
+{
+    float(*head)[CHUNK] = scratch->leave.head;
+    load(scratch->leave.depth, &job->frame.depth, 0, y, x0, n);
+    for (int c = 0; c < RGB; c++)
+        load_irradiance(scratch->leave.noisy[c], &job->frame, c, y, x0, n);
+    for (int c = 0; c < FEATURES; c++)
+        memcpy(row_line(job->d, y, FEATURE_LINES + c) + x0, head[c], sizeof(float) * (size_t)n);
+    for (int level = 0; level < LEVELS; level++)
+        decode_level(job, head, scratch->leave.depth, level, y, x0, n);
+    accumulate(job, scratch, y, x0, n);
+    decode_latent(job, head, y, x0, n);
+}
+
+/* The rows are those of 1/2 of the resolution. */
+static void leave_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    const onespp *d = job->d;
+    const float *taps[9 * WIDTH_A], *joined[WIDTH_A], *hidden[DETAIL];
+    float(*patches)[HALF_CHUNK] = scratch->leave.patches;
+    for (int c = 0; c < WIDTH_A; c++)
+        joined[c] = scratch->leave.joined[c];
+    for (int y = first; y < last; y++) {
+        find_taps(taps, &d->sum_a, y, job->padded_height / 2, d->zeros);
+        for (int x = 0; x < job->padded_width / 2; x += HALF_CHUNK) {
+            int x0 = 2 * x, n = lesser(CHUNK, job->frame.width - x0);
+            multiply(&d->layers[JOIN_A], taps, x, n / 2 + n % 2, scratch->leave.joined[0], HALF_CHUNK, RECTIFIED);
+            multiply(&d->layers[LEAVE], joined, 0, n / 2 + n % 2, patches[0], HALF_CHUNK, PLAIN);
+            for (int row = 2 * y; row < lesser(2 * y + 2, job->frame.height); row++) {
+                int even = row % 2 * 2 * OUTPUTS;
+                for (int c = 0; c < OUTPUTS; c++)
+                    join(scratch->leave.head[c], patches[even + c], patches[even + OUTPUTS + c], HALF_CHUNK);
+                for (int c = 0; c < DETAIL; c++)
+                    hidden[c] = line_of(&d->hidden, row, c) + x0;
+                multiply(&d->layers[DETAIL_2], hidden, 0, n, scratch->leave.head[0], CHUNK, ADDED);
+                decode(job, scratch, row, x0, n);
+            }
+        }
+    }
+}
+
+/* --- The network, strip by strip ---------------------------------------------------------------------------------- */
+
+/* Moves what is stored of rows before `end` so that a window begins with row `first`. */
+static void scroll(Window *w, int first, int end)
+{
+    size_t row = sizeof(float) * (size_t)(w->channels * w->pitch);
+    if (end > first)
+        memmove(w->data, w->data + (ptrdiff_t)(first - w->first) * w->channels * w->pitch, row * (size_t)(end - first));
+    w->first = first;
+}
+
+/* Does `work` for those of the rows first to last - 1 that are in the image. */
+static void run_layer(
+    Job *job, void (*work)(Job *, Scratch *, int, int), LayerName layer, const Window *from, const Window *to,
+    int first, int last)
+{
+    int height = scaled(job->padded_height, work == double_rows ? from->channels : to->channels);
+    job->layer = layer;
+    job->from = from;
+    job->to = to;
+    run(job, work, greater(first, 0), lesser(last, height));
+}
+
+/* Rows first to last - 1 at 1/8 of the resolution, after `entered` rows of 1/2; returns how many there are then. */
+static int run_strip(Job *job, int first, int last, int entered)
+{
+    onespp *d = job->d;
+    int end = lesser(4 * last + REACH_A, job->padded_height / 2);
+    scroll(&d->a, greater(4 * first - REACH_A, 0), entered);
+    scroll(&d->hidden, 8 * first, 2 * entered);
+    d->b.first = d->b_too.first = greater(2 * (first - REACH_C) - 1, 0);
+    d->c.first = d->c_too.first = greater(first - REACH_C, 0);
+    d->sum_a.first = greater(4 * first - 2, 0);
+
+    run(job, enter_rows, entered, end);
+    run_layer(job, halve_rows, DOWN_B, &d->a, &d->b, 2 * (first - REACH_C) - 1, 2 * (last + REACH_C) + 1);
+    run_layer(job, convolve_rows, CONVOLVE_B, &d->b, &d->b_too, 2 * (first - REACH_C), 2 * (last + REACH_C));
+    run_layer(job, halve_rows, DOWN_C, &d->b_too, &d->c, first - REACH_C, last + REACH_C);
+    run_layer(job, convolve_rows, CONVOLVE_C1, &d->c, &d->c_too, first - 2, last + 2);
+    run_layer(job, convolve_rows, CONVOLVE_C2, &d->c_too, &d->c, first - 1, last + 1);
+    job->skip = &d->b_too;
+    run_layer(job, double_rows, UP_B, &d->c, &d->b, first - 1, last + 1);
+    run_layer(job, convolve_rows, JOIN_B, &d->b, &d->b_too, 2 * first - 1, 2 * last + 1);
+    job->skip = &d->a;
+    run_layer(job, double_rows, UP_A, &d->b_too, &d->sum_a, 2 * first - 1, 2 * last + 1);
+    run(job, leave_rows, 4 * first, 4 * last);
+    return end;
+}
+
+static void run_network(Job *job)
+{
+    int rows = job->padded_height / 8, step = strip_height(&job->d->config), entered = 0;
+    job->d->a.first = job->d->hidden.first = 0;
+    for (int first = 0; first < rows; first += step)
+        entered = run_strip(job, first, lesser(first + step, rows), entered);
+}
+
+/* --- The filter --------------------------------------------------------------------------------------------------- */
+
+/* Where the lines of a level's output are: first in the texels, which nobody reads any more, then over the parameters
+ * of the level before. */
+static float *filtered_lines(const onespp *d, int level, int y)
+{
+    return level == 0 ? d->texels + (ptrdiff_t)y * d->pitch * TEXEL : row_line(d, y, LEVEL_LINES + 3 * (level - 1));
+}
+
+static const float *image_lines(const onespp *d, int level, int y)
+{
+    return level == 0 ? row_line(d, y, ACCUMULATED_LINES) : filtered_lines(d, level - 1, y);
+}
+
+/* Squared distances of features of n pixels, lines `pitch` apart. */
+static void measure_distances(
+    float *restrict distance, const float *restrict here, const float *restrict there, ptrdiff_t pitch, int n)
+{
+    for (int f = 0; f < FEATURES; f += 4, here += 4 * pitch, there += 4 * pitch)
+        for (int i = 0; i < n; i++) {
+            float a = here[i] - there[i];
+            float b = here[pitch + i] - there[pitch + i];
+            float c = here[2 * pitch + i] - there[2 * pitch + i];
+            float e = here[3 * pitch + i] - there[3 * pitch + i];
+            distance[i] = (f ? distance[i] : 0) + (a * a + b * b + c * c + e * e);
+        }
+}
+
+/* Adds weighted colours, whose lines are `pitch` apart, and their weights to n sums from `at` on. */
+static void add_weighted(
+    float (*restrict sums)[CHUNK], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch,
+    int n)
+{
+    for (int i = 0; i < n; i++) {
+        float w = weight[i];
+        sums[0][at + i] += w * image[i];
+        sums[1][at + i] += w * image[pitch + i];
+        sums[2][at + i] += w * image[2 * pitch + i];
+        sums[3][at + i] += w;
+    }
+}
+
+/* Adds the tap (dx, dy) of a chunk of a row, where it is in the image. */
+static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n, int dx, int dy)
+{
+    const onespp *d = job->d;
+    int first = greater(x0, -dx), last = lesser(x0 + n, job->frame.width - dx);
+    int level_line = LEVEL_LINES + 3 * job->level;
+    if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
+        return;
+    float distance[CHUNK], weight[CHUNK];
+    const float *restrict sharpness = row_line(d, y, level_line) + first;
+    const float *restrict importance = row_line(d, y + dy, level_line + 2) + first + dx;
+    int count = last - first;
+    const float *here = row_line(d, y, FEATURE_LINES) + first, *there = row_line(d, y + dy, FEATURE_LINES) + first + dx;
+    measure_distances(distance, here, there, d->pitch, count);
+    for (int i = 0; i < count; i++) {
+        float exponent = clamped(importance[i] - sharpness[i] * distance[i], -MIN_LOGIT);
+        weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
+    }
+    const float *image = image_lines(d, job->level, y + dy) + first + dx;
+    add_weighted(sums, first - x0, weight, image, d->pitch, count);
+}
+
+/* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
+ * the pixel times the squared distance of their features), and by exp(centre) for the pixel itself; 0 off surfaces. */
+static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    int step = TAP_SPACINGS[job->level];
+    const float *centre = row_line(d, y, LEVEL_LINES + 3 * job->level + 1) + x0, *importance = centre + d->pitch;
+    float weight[CHUNK];
+    memset(sums, 0, sizeof(float) * 4 * CHUNK);
+    for (int i = 0; i < n; i++)
+        weight[i] = exponential(centre[i]);
+    add_weighted(sums, 0, weight, image_lines(d, job->level, y) + x0, d->pitch, n);
+    for (int tap = 0; tap < 9; tap++)
+        if (tap != 4)
+            add_tap(job, sums, y, x0, n, (tap % 3 - 1) * step, (tap / 3 - 1) * step);
+    for (int i = 0; i < n; i++) {
+        float scale = importance[i] > NO_WEIGHT ? 1 / sums[3][i] : 0;
+        for (int c = 0; c < RGB; c++)
+            sums[c][i] *= scale;
+    }
+}
+
+static void filter_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    float sums[4][CHUNK];
+    for (int y = first; y < last; y++)
+        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+            int n = lesser(CHUNK, job->frame.width - x0);
+            filter_chunk(job, sums, y, x0, n);
+            float *to = filtered_lines(job->d, job->level, y) + x0;
+            for (int c = 0; c < RGB; c++)
+                memcpy(to + c * job->d->pitch, sums[c], sizeof(float) * (size_t)n);
+        }
+}
+
+/* --- The end of a frame ------------------------------------------------------------------------------------------- */
+
+/* One colour of the denoised radiance. */
+static void write_radiance(const Job *job, int channel, const float *restrict irradiance, int y, int x0, int n)
+{
+    float divisor[CHUNK], emission[CHUNK];
+    load_divisor(divisor, &job->frame, channel, y, x0, n);
+    load(emission, &job->frame.emission, channel, y, x0, n);
+    ptrdiff_t step = job->radiance.column;
+    float *to = job->radiance.data + job->radiance.channel * channel + job->radiance.row * y + step * x0;
+    for (int i = 0; i < n; i++)
+        to[i * step] = irradiance[i] * divisor[i] + emission[i];
+}
+
+/* What the next frame's reprojection reads. */
+static void remember(const Job *job, int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x0;
+    float *texels = d->texels + pixel * TEXEL, normal[CHUNK];
+    const float *lines = row_line(d, y, OUTPUT_LINES) + x0;
+    for (int c = 0; c < HISTORY; c++)
+        for (int i = 0; i < n; i++)
+            texels[i * TEXEL + c] = lines[c * d->pitch + i];
+    for (int c = 0; c < 3; c++) {
+        load(normal, &job->frame.normal, c, y, x0, n);
+        for (int i = 0; i < n; i++)
+            texels[i * TEXEL + NORMAL + c] = normal[i];
+    }
+    load(d->depth + pixel, &job->frame.depth, 0, y, x0, n);
+    load_mesh(d->mesh + pixel, &job->frame, y, x0, n);
+}
+
+/* The last level: its output is blended into that of the previous frame. */
+static void finish_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    const onespp *d = job->d;
+    float sums[4][CHUNK];
+    for (int y = first; y < last; y++)
+        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+            int n = lesser(CHUNK, job->frame.width - x0);
+            const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
+            const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
+            filter_chunk(job, sums, y, x0, n);
+            for (int c = 0; c < RGB; c++) {
+                float *restrict output = row_line(d, y, OUTPUT_LINES + c) + x0;
+                for (int i = 0; i < n; i++) {
+                    float blended = output[i] + alpha[i] * (sums[c][i] - output[i]);
+                    output[i] = importance[i] > NO_WEIGHT ? blended : 0;
+                }
+                write_radiance(job, c, output, y, x0, n);
+            }
+            remember(job, y, x0, n);
+        }
+}
+
+/* --- The interface ------------------------------------------------------------------------------------------------ */
+
+int onespp_abi(void) { return ONESPP_ABI; }
+
+const char *onespp_message(int code)
+{
+    static const char *const messages[] = {
+        "no error",
+        "compiled with another version of onespp.h",
+        "a size or number of tasks is out of range",
+        "the memory is missing or too small",
+        "a size, a number of samples or an image is missing or out of range",
+        "a camera is not finite, or its focal length is 0",
+    };
+    return code >= 0 && code < (int)(sizeof messages / sizeof *messages) ? messages[code] : "unknown error";
+}
+
+size_t onespp_size(const onespp_config *config)
+{
+    onespp measured;
+    Arena arena = {NULL, 0};
+    if (config->abi != ONESPP_ABI || !is_valid(config))
+        return 0;
+    measured.config = *config;
+    take(&arena, 1, sizeof(onespp));
+    lay_out(&measured, &arena);
+    arena.used += ALIGNMENT; /* the caller's memory may begin anywhere */
+    return arena.used <= SIZE_MAX / 2 ? (size_t)arena.used : 0;
+}
+
+int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser)
+{
+    if (config->abi != ONESPP_ABI)
+        return ONESPP_BAD_ABI;
+    size_t needed = onespp_size(config);
+    if (needed == 0)
+        return ONESPP_BAD_CONFIG;
+    if (!memory || size < needed)
+        return ONESPP_BAD_MEMORY;
+    unsigned char *base = memory;
+    Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
+    onespp *d = take(&arena, 1, sizeof(onespp));
+    memset(d, 0, sizeof *d);
+    d->config = *config;
+    lay_out(d, &arena);
+    memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
+    float *to = d->parameters;
+    const uint16_t *from = onespp_weights;
+    for (int i = 0; i < LAYERS; i++) {
+        from = unpack(&d->layers[i], LAYER_SIZES[i][0], to, from);
+        to += d->layers[i].outputs * (d->layers[i].inputs + 1);
+    }
+    *denoiser = d;
+    return ONESPP_OK;
+}
+
+static int check(const onespp *d, const onespp_frame *frame, const onespp_output *radiance)
+{
+    int fits = frame->width >= 1 && frame->width <= d->config.max_width && frame->height >= 1
+        && frame->height <= d->config.max_height && frame->meshes >= 0 && frame->meshes <= d->config.max_meshes;
+    int complete = frame->direct.data && frame->albedo.data && frame->normal.data && frame->depth.data
+        && frame->motion.data && radiance->data && (frame->meshes == 0 || frame->object_to_world);
+    if (!fits || !complete || !(frame->samples >= ONESPP_MIN_SAMPLES && frame->samples <= ONESPP_MAX_SAMPLES))
+        return ONESPP_BAD_FRAME;
+    for (int i = 0; i < 16; i++)
+        if (!isfinite(frame->camera_to_world[i]) || (i < 9 && !isfinite(frame->K[i])))
+            return ONESPP_BAD_CAMERA;
+    return frame->K[0] == 0 || frame->K[4] == 0 ? ONESPP_BAD_CAMERA : ONESPP_OK;
+}
+
+/* A value in all pixels, where an optional image is missing. */
+static void set_default(onespp_image *image, const float *value)
+{
+    onespp_image constant = {value, 0, 0, 0};
+    if (!image->data)
+        *image = constant;
+}
+
+/* Forgets everything before this frame. */
+static void reset(onespp *d)
+{
+    RunningMean luminance = {logf(MIDDLE_GREY), 0}, depth = {0, 0};
+    d->log_luminance = luminance;
+    d->log_depth = depth;
+}
+
+int onespp_denoise(onespp *d, const onespp_frame *frame, const onespp_output *radiance)
+{
+    static const float zero = 0, one = 1;
+    int error = check(d, frame, radiance);
+    if (error)
+        return error;
+    Job job = {.d = d, .frame = *frame, .radiance = *radiance};
+    job.padded_width = rounded_up(frame->width, 8);
+    job.padded_height = rounded_up(frame->height, 8);
+    job.has_history = !frame->reset && frame->width == d->width && frame->height == d->height;
+    set_default(&job.frame.indirect, &zero);
+    set_default(&job.frame.emission, &zero);
+    set_default(&job.frame.roughness, &one);
+    if (!job.has_history)
+        reset(d);
+    measure(&job);
+    set_up_geometry(&job);
+    run_network(&job);
+    for (job.level = 0; job.level < LEVELS; job.level++)
+        run(&job, job.level < LEVELS - 1 ? filter_rows : finish_rows, 0, frame->height);
+    d->width = frame->width;
+    d->height = frame->height;
+    d->meshes = frame->meshes;
+    memcpy(d->K, frame->K, sizeof d->K);
+    memcpy(d->camera_to_world, frame->camera_to_world, sizeof d->camera_to_world);
+    if (frame->meshes)
+        memcpy(d->object_to_world, frame->object_to_world, sizeof(double) * 16 * (size_t)frame->meshes);
+    return ONESPP_OK;
+}

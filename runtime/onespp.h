@@ -1,0 +1,118 @@
+/* onespp.h - the denoiser `one` in C99: noisy radiance of a few samples per pixel in, smooth radiance out, frame by
+ * frame.
+ *
+ * All memory is the caller's: ask for its size, hand it over once, and free it when done. Nothing else is allocated,
+ * and there is no global state: any number of denoisers can run at the same time, each called by one thread at a time.
+ *
+ * Images have any layout that strides describe. A number that is NaN or infinite counts as 0.
+ */
+#ifndef ONESPP_H
+#define ONESPP_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define ONESPP_ABI 1 /* changes whenever a program has to be compiled anew */
+
+enum {
+    ONESPP_OK = 0,
+    ONESPP_BAD_ABI = 1,    /* the program was compiled with another version of this header */
+    ONESPP_BAD_CONFIG = 2, /* a size or number of tasks is out of range */
+    ONESPP_BAD_MEMORY = 3, /* the memory is NULL or smaller than onespp_size returns */
+    ONESPP_BAD_FRAME = 4,  /* a size, a number of samples, or a required image is missing or out of range */
+    ONESPP_BAD_CAMERA = 5  /* a camera's number is not finite, or its focal length is 0 */
+};
+
+#define ONESPP_MAX_SIDE 16384   /* pixels */
+#define ONESPP_MAX_MESHES 65536 /* that move */
+#define ONESPP_MAX_TASKS 1024
+#define ONESPP_MIN_SAMPLES 1e-3f
+#define ONESPP_MAX_SAMPLES 1e9f
+
+/* An image of floats: pixel (x, y) of a channel is data[channel * c + row * y + column * x]. Planes of W x H pixels
+ * have the strides {W * H, W, 1}, interleaved pixels of three channels {1, 3 * W, 3}; strides of 0 repeat one value. */
+typedef struct {
+    const float *data;
+    ptrdiff_t channel, row, column;
+} onespp_image;
+
+typedef struct {
+    float *data;
+    ptrdiff_t channel, row, column;
+} onespp_output;
+
+typedef struct {
+    const int32_t *data;
+    ptrdiff_t row, column;
+} onespp_ids;
+
+/* One frame. Radiance is linear RGB in any unit; lengths are in any unit, always the same. Matrices are row by row.
+ *
+ * Camera space has x to the left, y up and z forward. With p a point in camera space, pixel = (K p) / p_z, where x goes
+ * right, y down, and the centre of the first pixel is (0.5, 0.5): so K[0] and K[4], the focal lengths in pixels, are
+ * negative. From cameras with x to the right, negate these columns of camera_to_world: of OpenCV's the first two (y
+ * down, z forward), of OpenGL's the first and the third (y up, z backward).
+ *
+ * Images marked optional may have data = NULL. Albedo, roughness and normals count as at most 100. */
+typedef struct {
+    int width, height; /* at most those of onespp_config; another size than before resets */
+    int reset;         /* 1 for the first frame and after a cut: forget everything before */
+    float samples;     /* per pixel, in the light below; 1 where unknown */
+
+    onespp_image direct;    /* 3 channels: noisy radiance after one bounce, or the sum of both kinds of light */
+    onespp_image indirect;  /* 3, optional: noisy radiance after more bounces, added to `direct` */
+    onespp_image emission;  /* 3, optional: light sources seen directly, free of noise; added to the output */
+    onespp_image albedo;    /* 3: reflectance in [0, 1] that both kinds of light contain; 1 for background */
+    onespp_image normal;    /* 3: shading normal in world space, of length 1, towards the viewer; 0 for background */
+    onespp_image depth;     /* 1: distance along the viewing axis; 0 for background */
+    onespp_image roughness; /* 1, optional: GGX alpha; 1 for diffuse surfaces and background */
+    onespp_image motion;    /* 2: x and y from the pixel to where its surface was in the previous frame, in pixels */
+    onespp_ids mesh_id;     /* optional: number of the mesh from 1 on; 0 for background. By default one for all */
+
+    double K[9];                   /* intrinsics; of these the focal lengths and the centre are used */
+    double camera_to_world[16];    /* rigid */
+    int meshes;                    /* at most max_meshes */
+    const double *object_to_world; /* meshes x 16, rigid, entry mesh_id - 1; NULL for 0 meshes. Others do not move */
+} onespp_frame;
+
+/* Calls task(argument, i) once for each i from 0 to count - 1, in any order and on any threads, and returns when all
+ * have returned. */
+typedef void (*onespp_task)(void *argument, int index);
+typedef void (*onespp_parallel_for)(void *user, int count, onespp_task task, void *argument);
+
+typedef struct {
+    int abi;                          /* ONESPP_ABI */
+    int max_width, max_height;        /* of frames */
+    int max_meshes;                   /* with an object_to_world, per frame; 0 where nothing but the camera moves */
+    int tasks;                        /* that each step is split into: 1, or at least as many as there are threads */
+    onespp_parallel_for parallel_for; /* NULL: tasks run one after the other */
+    void *user;                       /* handed to parallel_for */
+} onespp_config;
+
+typedef struct onespp onespp;
+
+/* The ABI of the library: ONESPP_ABI of the header that it was compiled with. */
+int onespp_abi(void);
+
+/* How many bytes of memory a denoiser needs; 0 where the configuration is not valid. */
+size_t onespp_size(const onespp_config *config);
+
+/* Sets *denoiser up in `size` bytes of `memory`, which it uses until the caller frees or reuses them. */
+int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser);
+
+/* Denoises one frame: writes 3 channels of radiance. The result does not depend on tasks and threads. The output may
+ * overlap no input. After an error nothing was written, and the state is what it was. */
+int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_output *radiance);
+
+/* A code in words, in English. */
+const char *onespp_message(int code);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

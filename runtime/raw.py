@@ -1,0 +1,52 @@
+"""Frames as the raw sequences that example.c reads.
+
+`python -m runtime.raw CLIP|WxH FRAMES FILE` writes a clip's frames, or synthetic ones of a size.
+"""
+
+import struct
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from datasets.clip import Clip
+from datasets.frame import Frame, Moment, read_frame
+from eval.bench.synthetic_frames import synthetic_frame
+from models.registry import prototype
+
+PLANES = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion")
+
+
+def raw(frame: Frame, reset: bool) -> bytes:
+    """One frame (B = 1)."""
+    height, width = frame.size
+    poses = frame.now.object_to_world[0].numpy()
+    header = struct.pack("<4i", width, height, reset, len(poses))
+    numbers = [frame.samples.view(1), frame.now.K.flatten(), frame.now.camera_to_world.flatten()]
+    cameras = np.concatenate([each.double().numpy() for each in numbers])
+    images = (frame.channels[name][0].numpy().astype("<f4") for name in PLANES)
+    mesh_id = frame.mesh_id[0].numpy().astype("<i4")
+    return b"".join([header, *(array.tobytes() for array in (cameras, poses, *images, mesh_id))])
+
+
+def write_raw(frames: Iterable[Frame], path: Path) -> None:
+    """A sequence; it resets wherever a frame does not follow the one before."""
+    before: Moment | None = None
+    with path.open("wb") as file:
+        for frame in frames:
+            file.write(raw(frame, reset=before is None or not frame.follows(before)))
+            before = frame.moment
+
+
+def main(source: str, count: int, path: Path) -> None:
+    if Path(source).is_dir():
+        clip = Clip(Path(source))
+        write_raw((read_frame(clip, index, prototype("one").reads) for index in range(count)), path)
+    else:
+        width, height = map(int, source.split("x"))
+        write_raw((synthetic_frame(index, height, width) for index in range(count)), path)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))

@@ -1,0 +1,150 @@
+"""The C runtime, built by the C compiler and called through ctypes with Frames."""
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datasets.frame import Frame
+from models.networks.one import One
+from models.registry import create, require_shipped
+from models.weights import load_weights
+from provenance import ROOT
+
+FOLDER = ROOT / "runtime"
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
+OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno")
+ABI = 1
+
+Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int)
+ParallelFor = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, Task, ctypes.c_void_p)
+
+
+class Config(ctypes.Structure):
+    """onespp_config."""
+
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("abi", "max_width", "max_height", "max_meshes", "tasks")),
+        ("parallel_for", ParallelFor),
+        ("user", ctypes.c_void_p),
+    )
+
+
+class Image(ctypes.Structure):
+    """onespp_image, and onespp_output."""
+
+    _fields_ = (("data", ctypes.c_void_p), *((name, ctypes.c_ssize_t) for name in ("channel", "row", "column")))
+
+
+class Ids(ctypes.Structure):
+    """onespp_ids."""
+
+    _fields_ = (("data", ctypes.c_void_p), ("row", ctypes.c_ssize_t), ("column", ctypes.c_ssize_t))
+
+
+IMAGES = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion")
+
+
+class CFrame(ctypes.Structure):
+    """onespp_frame."""
+
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("width", "height", "reset")),
+        ("samples", ctypes.c_float),
+        *((name, Image) for name in IMAGES),
+        ("mesh_id", Ids),
+        ("K", ctypes.c_double * 9),
+        ("camera_to_world", ctypes.c_double * 16),
+        ("meshes", ctypes.c_int),
+        ("object_to_world", ctypes.c_void_p),
+    )
+
+
+def compiler(name: str) -> str | None:
+    """The path of a C compiler that is installed."""
+    return shutil.which(name)
+
+
+def build(target: Path, cc: str, flags: Sequence[str] = OPTIMISED) -> ctypes.CDLL:
+    """The runtime as a shared library."""
+    sources = (str(FOLDER / "onespp.c"), "-o", str(target), "-lm")
+    subprocess.run([cc, *STRICT, *flags, "-shared", "-fPIC", *sources], check=True)
+    library = ctypes.CDLL(str(target))
+    library.onespp_size.restype = ctypes.c_size_t
+    library.onespp_message.restype = ctypes.c_char_p
+    return library
+
+
+def rounded_one() -> One:
+    """`one` in PyTorch with the shipped weights in half precision, as the runtime has them."""
+    denoiser = create("one")
+    assert isinstance(denoiser, One)
+    load_weights(denoiser, "one", require_shipped("one"))
+    denoiser.prepare()
+    for parameter in denoiser.parameters():
+        parameter.data = parameter.half().float()
+    return denoiser
+
+
+def address(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+class CRuntime:
+    """A denoiser of the library, with the memory it takes."""
+
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        width: int,
+        height: int,
+        meshes: int = 64,
+        tasks: int = 1,
+        parallel_for: Callable[..., None] | None = None,
+    ):
+        self.library = library
+        callback = ParallelFor(parallel_for) if parallel_for else ParallelFor()
+        self.config = Config(ABI, width, height, meshes, tasks, callback, None)
+        self.size = library.onespp_size(ctypes.byref(self.config))
+        self.memory = np.full(self.size, 0xFF, np.uint8)  # NaN, wherever something is read before it was written
+        self.denoiser = ctypes.c_void_p()
+        arguments = ctypes.byref(self.config), address(self.memory), ctypes.c_size_t(self.size)
+        assert library.onespp_create(*arguments, ctypes.byref(self.denoiser)) == 0
+
+    def call(self, frame: CFrame, output: Image) -> int:
+        return self.library.onespp_denoise(self.denoiser, ctypes.byref(frame), ctypes.byref(output))
+
+    def __call__(self, frame: Frame, reset: bool, interleaved: bool = False, without: Sequence[str] = ()) -> Tensor:
+        """Radiance (1, 3, H, W)."""
+        height, width = frame.size
+        arrays: dict[str, Any] = {}
+        given = CFrame(width=width, height=height, reset=reset, samples=frame.samples.item())
+        for name in IMAGES:
+            if name in without:
+                continue
+            array = frame.channels[name][0].numpy()
+            arrays[name] = np.ascontiguousarray(np.moveaxis(array, 0, -1) if interleaved else array, np.float32)
+            setattr(given, name, strided(arrays[name], interleaved))
+        if "mesh_id" not in without:
+            arrays["mesh_id"] = np.ascontiguousarray(frame.mesh_id[0, 0].numpy().astype(np.int32))
+            given.mesh_id = Ids(address(arrays["mesh_id"]), width, 1)
+        poses = np.ascontiguousarray(frame.now.object_to_world[0].numpy())
+        given.K[:] = frame.now.K[0].flatten().tolist()
+        given.camera_to_world[:] = frame.now.camera_to_world[0].flatten().tolist()
+        given.meshes, given.object_to_world = len(poses), address(poses)
+        output = np.full((height, width, 3) if interleaved else (3, height, width), np.nan, np.float32)
+        assert self.call(given, strided(output, interleaved)) == 0
+        return torch.from_numpy(np.moveaxis(output, -1, 0).copy() if interleaved else output)[None]
+
+
+def strided(array: np.ndarray, interleaved: bool) -> Image:
+    """Of an array (H, W, C) or (C, H, W)."""
+    strides = [stride // array.itemsize for stride in array.strides]
+    row, column, channel = strides if interleaved else (*strides[1:], strides[0])
+    return Image(address(array), channel, row, column)

@@ -1,0 +1,356 @@
+"""The C runtime is `one`: frame by frame, at any size, on any number of threads, and whatever the frames contain."""
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from datasets.clip import Dataset
+from datasets.frame import Frame, read_frame
+from eval.bench.synthetic_frames import synthetic_frame
+from models.denoiser import State
+from models.networks.one import One
+from models.registry import require_shipped
+from runtime.raw import write_raw
+from runtime.weights import HEADER, header
+from tests.helpers.c_runtime import (
+    FOLDER,
+    OPTIMISED,
+    STRICT,
+    CFrame,
+    Config,
+    CRuntime,
+    Image,
+    Task,
+    address,
+    build,
+    compiler,
+    rounded_one,
+)
+from tests.helpers.frames import MESHES, chain, flat_frame
+
+CC = compiler("cc") or compiler("gcc") or compiler("clang")
+TOLERANCE = 1e-4  # of the brightest pixel
+SIZE = (40, 56)
+STRIPS = "-DONESPP_STRIP_PIXELS=1"  # of 64 rows
+NATIVE = "-march=native"
+
+pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+
+
+@pytest.fixture(scope="module", params=[(), (NATIVE, STRIPS)], ids=["generic", "native, in strips"])
+def library(request, tmp_path_factory) -> ctypes.CDLL:
+    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", CC, (*OPTIMISED, *request.param))
+
+
+@pytest.fixture(scope="module")
+def one() -> One:
+    return rounded_one()
+
+
+@pytest.fixture
+def frames() -> list[Frame]:
+    return synthetic(4)
+
+
+def synthetic(count: int, size: tuple[int, int] = SIZE, first: int = 0) -> list[Frame]:
+    return [synthetic_frame(first + index, *size) for index in range(count)]
+
+
+@torch.no_grad()
+def compare(library: ctypes.CDLL, one: One, frames: Iterable[Frame], resets: Sequence[int] = (0,)) -> float:
+    """The largest difference of the sequence, relative to the brightest pixel of its frame."""
+    runtime = CRuntime(library, 200, 200)
+    state: State | None = None
+    worst = 0.0
+    for index, frame in enumerate(frames):
+        expected, state = one(frame, None if index in resets else state)
+        actual = runtime(frame, index in resets)
+        difference = (actual - expected).abs().amax() / expected.abs().amax().clamp(min=1e-6)
+        worst = max(worst, difference.item())
+        assert difference <= TOLERANCE, f"frame {index} differs by {difference:.1e} of the brightest pixel"
+    return worst
+
+
+def test_the_array_of_weights_is_that_of_the_shipped_ones():
+    assert header(require_shipped("one")) == HEADER.read_text(), "run `python -m runtime.weights`"
+
+
+@pytest.mark.parametrize("name", ["gcc", "clang"])
+@pytest.mark.parametrize("file", ["onespp.c", "example.c", "fuzz.c"])
+def test_compilers_have_nothing_to_say(name, file, tmp_path):
+    if compiler(name) is None:
+        pytest.skip(f"{name} is not installed")
+    for flags in (("-Wpedantic",), ("-std=gnu17",)):  # the latter declares more names
+        command = [name, *STRICT, *flags, "-c", str(FOLDER / file), "-o", str(tmp_path / "it.o")]
+        subprocess.run(command, check=True)
+
+
+def test_it_neither_allocates_nor_has_global_state(tmp_path):
+    """As its symbols show: nothing of stdlib.h, and no variables."""
+    if compiler("nm") is None:
+        pytest.skip("nm is not installed")
+    target = tmp_path / "onespp.o"
+    subprocess.run([CC, *OPTIMISED, "-fno-pie", "-c", str(FOLDER / "onespp.c"), "-o", str(target)], check=True)
+    lines = subprocess.run(["nm", str(target)], check=True, capture_output=True, text=True).stdout.splitlines()
+    symbols = [line.split()[-2:] for line in lines]
+    assert {kind for kind, _ in symbols} <= set("TtrU")
+    assert {name for kind, name in symbols if kind == "T"} == {
+        f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "message")
+    }
+    needed = {name for kind, name in symbols if kind == "U"}
+    assert needed <= {
+        "memcpy",
+        "memmove",
+        "memset",
+        "expf",
+        "log",
+        "logf",
+        "fmax",
+        "sqrtf",
+        "floorf",
+        "__stack_chk_fail",
+    }
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (13, 7), (40, 56), (3, 190), (41, 70), (197, 24)])
+def test_it_computes_what_the_denoiser_does(library, one, size):
+    """With a moving camera, moving meshes, disocclusions and sky."""
+    compare(library, one, synthetic(4, size))
+
+
+def test_resets_and_changes_of_size(library, one):
+    sequence = [*synthetic(3), *synthetic(2, first=9), *synthetic(2, (24, 64), first=9), *synthetic(2, first=11)]
+    compare(library, one, sequence, resets=(0, 3))
+
+
+def test_frames_count_by_their_samples(library, one, frames):
+    counts = (1.0, 16.0, 0.25, 4096.0)
+    compare(library, one, [replace(f, spp=torch.full((1, 1, 1, 1), n)) for f, n in zip(frames, counts, strict=True)])
+
+
+def test_frames_without_any_surface_or_light(library, one, frames):
+    light = ("direct", "indirect")
+    empty = {name: torch.zeros_like(frames[1].channel(name)) for name in ("depth", "mesh_id", "normal", *light)}
+    dark = {name: empty[name] for name in light}
+    compare(library, one, [frames[0], frames[1].with_channels(empty), frames[2].with_channels(dark), frames[3]])
+
+
+def disturbed(frame: Frame, names: Sequence[str], values: Sequence[float], seed: int) -> Frame:
+    """The frame with some of the `values` in a tenth of the named channels' numbers."""
+    generator = torch.Generator().manual_seed(seed)
+    channels = {}
+    for name in names:
+        channel = frame.channel(name).clone()
+        hit = torch.rand(channel.shape, generator=generator) < 0.1
+        channel[hit] = torch.tensor(values)[torch.randint(len(values), (int(hit.sum()),), generator=generator)]
+        channels[name] = channel
+    return frame.with_channels(channels)
+
+
+@pytest.mark.parametrize("name", ["direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion"])
+def test_numbers_that_are_none_count_as_0(library, one, frames, name):
+    values = (torch.nan, torch.inf, -torch.inf)
+    compare(library, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
+
+
+def test_motion_may_lead_anywhere(library, one, frames):
+    values = (1e30, -1e30, 1e5, -70.25, 0.0)
+    compare(library, one, [disturbed(frame, ["motion"], values, index) for index, frame in enumerate(frames)])
+
+
+def test_light_may_be_of_any_size(library, one, frames):
+    for scale in (1e-12, 1e12):
+        bright = [f.with_channels({name: scale * f.channel(name) for name in ("direct", "indirect")}) for f in frames]
+        compare(library, one, bright)
+
+
+def test_meshes_without_a_pose_stand_still(library, one):
+    """As do those whose number is negative."""
+    generator = torch.Generator().manual_seed(1)
+    ids = torch.randint(1, 3 * MESHES, (1, 1, *SIZE), generator=generator).float()
+    light = [torch.rand(1, 3, *SIZE, generator=generator) for _ in range(4)]
+    sequence = chain([flat_frame(*SIZE, (0.5, 0.25), mesh_id=ids, irradiance=each) for each in light])
+    compare(library, one, sequence)
+    runtime = CRuntime(library, SIZE[1], SIZE[0])
+    for index, frame in enumerate(sequence):
+        output = runtime(disturbed(frame, ["mesh_id"], (-1.0, -(2.0**31), 2.0**31 - 128), index), index == 0)
+        assert output.isfinite().all()
+
+
+def test_optional_images(library, one, frames):
+    """Their values by default, and one mesh for all surfaces."""
+    ones, zeros = torch.ones_like(frames[0].depth), torch.zeros_like(frames[0].direct)
+    runtime, state = CRuntime(library, SIZE[1], SIZE[0]), None
+    for index, frame in enumerate(frames):
+        ids = (frame.depth > 0).float()
+        plain = {"indirect": zeros, "emission": zeros, "roughness": ones, "mesh_id": ids}
+        with torch.no_grad():
+            expected, state = one(frame.with_channels(plain), state)
+        actual = runtime(frame, index == 0, without=list(plain))
+        torch.testing.assert_close(actual, expected, rtol=0, atol=TOLERANCE * expected.amax().item())
+
+
+def test_images_may_be_interleaved(library, frames):
+    planar, interleaved = (CRuntime(library, SIZE[1], SIZE[0]) for _ in range(2))
+    for index, frame in enumerate(frames):
+        assert torch.equal(planar(frame, index == 0), interleaved(frame, index == 0, interleaved=True))
+
+
+def test_threads_change_nothing(library):
+    """Bit for bit, with more tasks than threads, and than rows."""
+    sequence = synthetic(3, (70, 33))
+
+    def run(tasks: int, threads: int) -> Tensor:
+        with ThreadPoolExecutor(threads) as pool:
+
+            def parallel_for(_: int, count: int, task: Task, argument: int) -> None:
+                list(pool.map(lambda index: task(argument, index), reversed(range(count))))
+
+            runtime = CRuntime(library, 33, 70, tasks=tasks, parallel_for=parallel_for)
+            return torch.cat([runtime(frame, index == 0) for index, frame in enumerate(sequence)])
+
+    alone = run(1, 1)
+    for tasks, threads in ((2, 2), (7, 3), (100, 4)):
+        assert torch.equal(run(tasks, threads), alone)
+
+
+def test_errors_leave_everything_as_it_was(library, frames):
+    runtime, other = (CRuntime(library, SIZE[1], SIZE[0]) for _ in range(2))
+    for index, frame in enumerate(frames):
+        output = np.full((3, *SIZE), 7, np.float32)
+        for changes in (
+            {"width": 0},
+            {"width": SIZE[1] + 1},
+            {"samples": np.nan},
+            {"samples": 0.0},
+            {"meshes": 65},
+            {},
+        ):
+            given = CFrame(**({"width": 8, "height": 8, "samples": 1.0} | changes))
+            error = runtime.call(given, Image(address(output), 0, 0, 0))
+            assert library.onespp_message(error).startswith(b"a size, a number")
+        assert (output == 7).all()
+        assert torch.equal(runtime(frame, index == 0), other(frame, index == 0))
+
+
+def test_bad_configurations(library):
+    fine = {"abi": 1, "max_width": 8, "max_height": 8, "max_meshes": 0, "tasks": 1}
+    memory = np.zeros(library.onespp_size(ctypes.byref(Config(**fine))), np.uint8)
+    denoiser = ctypes.c_void_p()
+
+    def create(size: int, **changes: int) -> int:
+        arguments = ctypes.byref(Config(**(fine | changes))), address(memory), ctypes.c_size_t(size)
+        return library.onespp_create(*arguments, ctypes.byref(denoiser))
+
+    assert create(memory.size) == 0
+    assert create(memory.size, abi=2) == 1
+    bad = ({"max_width": 0}, {"max_height": 1 << 20}, {"max_meshes": -1}, {"tasks": 0})
+    assert [create(memory.size, **changes) for changes in bad] == [2] * len(bad)
+    assert create(memory.size - 1) == 3
+
+
+def test_frames_of_4k_take_at_most_2_2_gb(library):
+    """So that a process with all inputs takes at most 3 GB."""
+    config = Config(1, 3840, 2160, 64, 4)
+    assert 0 < library.onespp_size(ctypes.byref(config)) <= 2.2e9
+
+
+def check_example(command: list[str], one: One, frames: list[Frame], folder: Path) -> None:
+    """Play the frames, with a cut at the end, through the example."""
+    sequence = [*frames, *synthetic(1, first=20)]
+    write_raw(sequence, folder / "frames.raw")
+    subprocess.run([*command, "frames.raw", "out.raw", "3"], cwd=folder, check=True, capture_output=True)
+    outputs = torch.from_numpy(np.fromfile(folder / "out.raw", np.float32).reshape(len(sequence), 1, 3, *SIZE))
+    state = None
+    for frame, output in zip(sequence, outputs, strict=True):
+        with torch.no_grad():
+            expected, state = one(frame, state)
+        torch.testing.assert_close(output, expected, rtol=0, atol=TOLERANCE * expected.amax().item())
+
+
+def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path):
+    sources = [str(FOLDER / name) for name in ("example.c", "onespp.c")]
+    subprocess.run([CC, *STRICT, *OPTIMISED, "-pthread", *sources, "-o", str(tmp_path / "example"), "-lm"], check=True)
+    check_example([str(tmp_path / "example")], one, frames, tmp_path)
+
+
+# --- Long proofs ------------------------------------------------------------------------------------------------------
+
+
+def shaky(index: int) -> Frame:
+    """Light on a wall before which the camera slides back and forth, by fractions of a pixel."""
+    generator = torch.Generator().manual_seed(index)
+    light = 4 * torch.rand(1, 3, 48, 72, generator=generator) ** 6
+    ids = torch.arange(72).div(9, rounding_mode="floor").add(1).expand(1, 1, 48, 72)
+    motion = [(0.5, 0.25), (-0.7, 0.1), (1.0, 0.0), (-1.3, -0.4)][index % 4]
+    return flat_frame(48, 72, motion, mesh_id=ids, irradiance=light)
+
+
+CLIPS = {
+    "synthetic": lambda: synthetic(50, (96, 128)),
+    "4 spp": lambda: [
+        replace(frame, spp=torch.full((1, 1, 1, 1), 4.0)) for frame in synthetic(50, (80, 176), first=100)
+    ],
+    "wall": lambda: chain([shaky(index) for index in range(50)]),
+    "cuts and sizes": lambda: [synthetic_frame(index, 64 + 16 * (index // 20 % 2), 90) for index in range(50)],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clip", CLIPS)
+def test_fifty_frames(library, one, clip):
+    worst = compare(library, one, CLIPS[clip](), resets=(0, 33) if clip == "cuts and sizes" else (0,))
+    print(f"{clip}: {worst:.1e}")
+
+
+@pytest.mark.slow
+def test_rendered_clips(library, one, tiny):
+    for clip in Dataset(tiny).clips("test"):
+        sequence = [read_frame(clip, index, one.reads, in_layers=False) for index in range(clip.frames)]
+        compare(library, one, sequence)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gcc", "clang"])
+def test_sanitizers_have_nothing_to_say(name, tmp_path):
+    """About random frames, with everything that numbers and sizes can be."""
+    if compiler(name) is None:
+        pytest.skip(f"{name} is not installed")
+    flags = ("-O2", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, *STRICT)
+    sources = [str(FOLDER / name) for name in ("fuzz.c", "onespp.c")]
+    subprocess.run([name, *flags, *sources, "-o", str(tmp_path / "fuzz"), "-lm"], check=True)
+    subprocess.run([str(tmp_path / "fuzz"), "60"], check=True)
+
+
+@pytest.mark.slow
+def test_it_runs_on_aarch64(one, frames, tmp_path):
+    """The example, emulated."""
+    cross, emulator = compiler("aarch64-linux-gnu-gcc"), compiler("qemu-aarch64")
+    if cross is None or emulator is None:
+        pytest.skip("aarch64-linux-gnu-gcc or qemu-aarch64 is not installed")
+    flags = (*STRICT, *OPTIMISED, "-static", "-pthread")
+    sources = [str(FOLDER / name) for name in ("example.c", "onespp.c")]
+    subprocess.run([cross, *flags, *sources, "-o", str(tmp_path / "example"), "-lm"], check=True)
+    check_example([emulator, str(tmp_path / "example")], one, frames, tmp_path)
+
+
+@pytest.mark.slow
+def test_cmake_and_make_build_it(tmp_path):
+    if compiler("cmake") is None or compiler("make") is None:
+        pytest.skip("cmake or make is not installed")
+    subprocess.run(["cmake", "-S", str(FOLDER), "-B", str(tmp_path / "build"), "-DBUILD_SHARED_LIBS=ON"], check=True)
+    subprocess.run(["cmake", "--build", str(tmp_path / "build")], check=True)
+    subprocess.run(["cmake", "--install", str(tmp_path / "build"), "--prefix", str(tmp_path / "installed")], check=True)
+    assert (tmp_path / "installed" / "include" / "onespp.h").exists()
+    copy = Path(shutil.copytree(FOLDER, tmp_path / "runtime"))
+    subprocess.run(["make", "-C", str(copy)], check=True)
+    assert (copy / "libonespp.a").exists() and (copy / "example").exists()
