@@ -18,9 +18,9 @@ from tabulate import tabulate
 from errors import BadInput
 from eval.bench.denoisers import BASELINE
 from eval.metrics import METRICS, Values, means
-from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, by_signal, of_one_spp, read_results
+from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, means_by_age, value_cell
+from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -53,7 +53,7 @@ def extract_eval(runs: Path) -> dict[str, Any]:
         for clip in clips
     ]
     facts = {key: content[key] for key in ("device", "versions", "dataset")}
-    return facts | {"clips": rows, "ages": means_by_age(by_signal(clips)["total"])}
+    return facts | {"clips": rows}
 
 
 def kept(values: Values) -> Values:
@@ -191,13 +191,6 @@ def quality(metric: str, signal: str = "total") -> str:
     return table(lines)
 
 
-def ages(*names: str, rows: dict[str, Any] | None = None) -> str:
-    """PSNR of the named denoisers, or of all, by the age of their history."""
-    rows = rows or measured("eval")["ages"]
-    texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
-    return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
-
-
 def shipped(metric: str, denoiser: str, network: str = "one") -> str:
     """A mean from the card of a network."""
     rows = read_json(measured_file(network))["means"]
@@ -274,9 +267,11 @@ def of_size(size: str) -> dict[str, Any]:
     return dict(sizes[size])
 
 
-def benchmark_ages(size: str, *names: str) -> str:
-    """PSNR of the benchmark's denoisers by the age of their history."""
-    return ages(*names, rows=of_size(size)["ages"])
+def ages(size: str, *names: str) -> str:
+    """PSNR of the benchmark's denoisers, or of the named ones, by the age of their history."""
+    rows = of_size(size)["ages"]
+    texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
+    return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
 
 
 def steady(size: str, *names: str) -> str:
@@ -354,8 +349,8 @@ def minutes(what: str) -> str:
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
-        *(ages, quality, shipped, times, samples, front, glass, stress, device, size, minutes),
-        *(benchmark_ages, steady, where, rendering),
+        *(quality, shipped, times, samples, front, glass, stress, device, size, minutes),
+        *(ages, steady, where, rendering),
     )
 }
 
