@@ -101,6 +101,11 @@ class Clip:
         return f"{checksum}-first-hits" if self.first_hits else checksum
 
     @property
+    def seconds(self) -> dict[str, float]:
+        """What rendering took, by step."""
+        return read_json(self.path / "timing.json")
+
+    @property
     def layers(self) -> Container[str]:
         """The channels that say what mirrors and glass show."""
         return {} if self.first_hits else self.channels

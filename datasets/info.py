@@ -13,7 +13,6 @@ from datasets.channels import CHANNELS, OPTIONAL_STEPS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.tonemap import psnr
 from errors import BadInput
-from files import read_json
 
 SecondsByStep = dict[str, float]
 
@@ -30,7 +29,7 @@ def summarise(root: Path) -> str:
             continue
         clip = Clip(path)
         clips.append(clip)
-        timings.append(read_json(path / "timing.json"))
+        timings.append(clip.seconds)
         rows[-1] |= {
             "frames": clip.frames,
             "size": f"{clip.height}x{clip.width}",

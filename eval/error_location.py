@@ -83,9 +83,9 @@ def squared_errors(output: Tensor, buffers: Tensor, masks: Shares) -> Shares:
 
 
 def normalised(sums: Shares) -> Shares:
-    """Sums over the total of their question."""
+    """Sums over the total of their question; 0 where there is no error at all."""
     totals = {question: sum(v for key, v in sums.items() if key[0] == question) for question, _ in sums}
-    return {key: value / totals[key[0]] for key, value in sums.items()}
+    return {key: value / totals[key[0]] if totals[key[0]] else torch.zeros(()) for key, value in sums.items()}
 
 
 @torch.no_grad()

@@ -103,12 +103,14 @@ def extract_benchmark(runs: Path) -> dict[str, Any]:
     if not files:
         raise BadInput(f"no {runs / 'benchmark' / 'benchmark.json'}")
     sizes = {}
+    devices: dict[str, None] = {}  # in order
     for file in files:
         content = read_json(file, ("device", "size", "by_age", "rendered", "where"))
         clips = steady_clips(file.parent, STEADY_FRAME)
         kept_keys = {key: content[key] for key in ("rendered", "where")}
         sizes[content["size"]] = {"ages": content["by_age"]["psnr"], "clips": clips} | kept_keys
-    return {"device": content["device"], "sizes": sizes}
+        devices[content["device"]] = None
+    return {"device": " and ".join(devices), "sizes": sizes}
 
 
 def extract_times(runs: Path) -> dict[str, Any]:

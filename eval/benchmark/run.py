@@ -14,12 +14,13 @@ from tabulate import tabulate
 from datasets.clip import Clip, Dataset
 from datasets.tonemap import psnr
 from errors import BadInput
+from eval.bench.denoisers import size_name
 from eval.error_location import error_shares
 from eval.harness import evaluate
 from eval.results import by_signal, read_results
 from eval.selection import evaluated
 from eval.tables import PRINTED, means_by_age
-from files import read_json, write_file, write_json
+from files import write_file, write_json
 from models.registry import channels_read
 from render.job.generate import generate
 from render.job.profiles import JUDGED
@@ -102,19 +103,20 @@ def render_scenes(scenes: Path, data: Path, clips: Format) -> dict[str, Path]:
 
 def rendered(clip: Clip) -> dict[str, Any]:
     """What a clip's references cost: samples a pixel, their noise floor as PSNR in dB, seconds of rendering in all."""
-    seconds = sum(read_json(clip.path / "timing.json").values())
     return {
         "scene": clip.scene,
         "judged": len(clip.judged),
         "reference_spp": clip.facts["reference_spp"],
         "floor": psnr(clip.facts["floor_mse"]),
-        "seconds": seconds,
+        "seconds": sum(clip.seconds.values()),
     }
 
 
 def located(clip: Clip, names: Sequence[str], runs: Path) -> dict[str, dict[str, dict[str, float]]]:
     """Shares of the pixels and of the squared error by denoiser, question and answer: see `onespp eval --where`."""
     shares: dict[str, dict[str, dict[str, float]]] = {}
+    if not names:  # which would stand for all denoisers
+        return shares
     for name, values in error_shares(clip, evaluated(names, runs, BUDGET)).items():
         for (question, answer), share in values.items():
             shares.setdefault(name, {}).setdefault(question, {})[answer] = float(share)
@@ -138,7 +140,7 @@ def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips
     content, results = read_results(runs)
     tested = [clip for folder in everything for clip in Dataset(folder).clips("test")]
     facts = {
-        "size": "x".join(map(str, clips.size)),
+        "size": size_name((clips.size[1], clips.size[0])),
         "by_age": {metric: means_by_age(by_signal(results)["total"], metric) for metric in PRINTED},
         "digests": {name: digests_of(scenes / name, folder) for name, folder in folders.items() if scenes},
         "rendered": [rendered(clip) for clip in tested],

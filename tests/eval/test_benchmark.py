@@ -12,7 +12,7 @@ from datasets.imported import ImportedFrame, write_dataset
 from errors import BadInput
 from eval.benchmark.page import write_page
 from eval.benchmark.published import aces_tone, published
-from eval.benchmark.run import Format, entries, list_scenes, run
+from eval.benchmark.run import Format, entries, list_scenes, located, run
 from files import read_json
 from scenes.camera import STILL, View, intrinsics, look_at
 from tests.helpers.scene_files import xml
@@ -45,6 +45,12 @@ def test_scenes_that_are_there_are_evaluated_and_the_others_named(benchmark):
     assert sum(content["where"]["kitchen"]["one"]["place"].values()) == pytest.approx(1)
     listed = list_scenes(root / "scenes")
     assert listed.count("missing") == len(entries()) - 2 and "Jay-Artist" in listed
+
+
+def test_without_names_no_errors_are_located(benchmark):
+    """Elsewhere no names stand for all denoisers."""
+    root, _ = benchmark
+    assert located(Dataset(root / "data" / "kitchen").clips("test")[0], [], root / "runs") == {}
 
 
 def test_a_folder_without_any_of_the_scenes_is_refused(tmp_path):

@@ -48,6 +48,10 @@ def test_errors_are_found_where_they_are_in_spite_of_noise(noise):
     assert shares["to 0.75"] == pytest.approx(1)
 
 
+def test_a_perfect_image_has_no_share_anywhere():
+    assert set(shares_of(torch.zeros(1, 3, SIZE, SIZE, dtype=torch.float64)).values()) == {0.0}
+
+
 def test_every_pixel_has_one_place():
     masks = places(frame_with_edges(), torch.rand(1, 3, SIZE, SIZE))
     for question in ("place", "roughness", "displayed"):
