@@ -34,8 +34,8 @@ from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, STRIP_PIXELS, pad_to_m
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
-NETWORK_REACH = 32  # rows above and below that what is predicted for a pixel depends on, in whole patches of 8
-NETWORK_SURFACE = ("albedo", "normal", "depth", "roughness", "mesh_id")
+NETWORK_REACH = 32  # rows above and below that predictions depend on: 28 by the network, 4 by means of its inputs
+NETWORK_SURFACE = ("albedo", "normal", "depth", "roughness", "mesh_id")  # channels that decoded_rows reads
 HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
 
 
@@ -272,7 +272,7 @@ class One(Denoiser):
         return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
 
     def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
-        """What the network predicts, the previous output reprojected, and the running scale.
+        """What the network predicts, the reprojected history, of large images its output alone, and the running scale.
 
         The filter needs nothing else: what only the network reads is freed on return.
         """
@@ -281,7 +281,7 @@ class One(Denoiser):
         history, has_history = fetched(before, frame, surface)
         height, width = frame.size
         if height * width <= STRIP_PIXELS or torch.is_grad_enabled():
-            return self.decoded_rows(frame, scale, noisy, history, has_history), history[:, :3].clone(), scale
+            return self.decoded_rows(frame, scale, noisy, history, has_history), history, scale
         # Large images in strips of rows: the network's activations would take most of the memory.
         rows = max(1, STRIP_PIXELS // 2 // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
         channels = *head_channels(len(self.steps)).values(), 3, 1
@@ -293,7 +293,7 @@ class One(Denoiser):
             strip = self.decoded_rows(part, scale, *(each[..., needed, :] for each in (noisy, history, has_history)))
             for image, values in zip(whole, strip, strict=True):
                 image[..., top : top + rows, :] = values[..., top - first : top - first + rows, :]
-        return whole, history[:, :3].clone(), scale
+        return whole, history[:, :3].clone(), scale  # what else there is of the history is freed
 
     def decoded_rows(
         self, frame: Frame, scale: RunningScale, noisy: Tensor, history: Tensor, has_history: Tensor
