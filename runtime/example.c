@@ -52,7 +52,7 @@ static void take_tasks(Pool *pool)
     }
 }
 
-static void *live(void *argument)
+static void *worker(void *argument)
 {
     Pool *pool = argument;
     pthread_mutex_lock(&pool->lock);
@@ -156,7 +156,7 @@ int main(int count, char **arguments)
     static Pool pool = {PTHREAD_MUTEX_INITIALIZER, PTHREAD_COND_INITIALIZER, PTHREAD_COND_INITIALIZER, 0, 0, 0, 0, 0};
     pthread_t thread;
     for (int i = 1; i < threads; i++)
-        if (pthread_create(&thread, NULL, live, &pool))
+        if (pthread_create(&thread, NULL, worker, &pool))
             return fail("a thread could not be started");
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */

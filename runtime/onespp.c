@@ -79,15 +79,15 @@ static const int TAP_SPACINGS[LEVELS] = {32, 16, 8, 4, 2, 1};
 
 /* --- Arithmetic --------------------------------------------------------------------------------------------------- */
 
-static inline float least(float a, float b) { return a < b ? a : b; }
+static inline float minf(float a, float b) { return a < b ? a : b; }
 
-static inline float most(float a, float b) { return a > b ? a : b; }
+static inline float maxf(float a, float b) { return a > b ? a : b; }
 
-static inline int lesser(int a, int b) { return a < b ? a : b; }
+static inline int mini(int a, int b) { return a < b ? a : b; }
 
-static inline int greater(int a, int b) { return a > b ? a : b; }
+static inline int maxi(int a, int b) { return a > b ? a : b; }
 
-static inline float clamped(float x, float limit) { return most(least(x, limit), -limit); }
+static inline float clamped(float x, float limit) { return maxf(minf(x, limit), -limit); }
 
 /* 0 for NaN and infinities. */
 static inline float finite_or_0(float x) { return fabsf(x) <= FLT_MAX ? clamped(x, MAX_MAGNITUDE) : 0; }
@@ -295,7 +295,7 @@ typedef struct {
     uint64_t used;
 } Arena;
 
-static void *take(Arena *arena, uint64_t count, size_t size)
+static void *allocate(Arena *arena, uint64_t count, size_t size)
 {
     void *memory = arena->base ? arena->base + arena->used : NULL;
     arena->used += (count * size + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
@@ -308,15 +308,15 @@ static ptrdiff_t pitch_of(int width) { return ((width + 15) / 16 | 1) * 16; }
 static Window window(Arena *arena, int channels, int width, int rows)
 {
     Window w = {NULL, pitch_of(PAD + rounded_up(width, LANES) + 1), channels, 0};
-    w.data = take(arena, (uint64_t)rows * (uint64_t)channels * (uint64_t)w.pitch, sizeof(float));
+    w.data = allocate(arena, (uint64_t)rows * (uint64_t)channels * (uint64_t)w.pitch, sizeof(float));
     return w;
 }
 
 /* A strip's height in rows of 1/8 of the resolution. */
 static int strip_height(const onespp_config *config)
 {
-    int rows = greater(MIN_STRIP_ROWS, ONESPP_STRIP_PIXELS / config->max_width) / 8;
-    return lesser(rows, rounded_up(config->max_height, 8) / 8);
+    int rows = maxi(MIN_STRIP_ROWS, ONESPP_STRIP_PIXELS / config->max_width) / 8;
+    return mini(rows, rounded_up(config->max_height, 8) / 8);
 }
 
 static void lay_out_strip(onespp *d, Arena *arena)
@@ -330,7 +330,7 @@ static void lay_out_strip(onespp *d, Arena *arena)
     d->c = window(arena, WIDTH_C, width / 8, rows + 2 * REACH_C);
     d->c_too = window(arena, WIDTH_C, width / 8, rows + 2 * REACH_C);
     d->sum_a = window(arena, WIDTH_A, width / 2, 4 * rows + 4);
-    d->zeros = take(arena, (uint64_t)d->a.pitch, sizeof(float));
+    d->zeros = allocate(arena, (uint64_t)d->a.pitch, sizeof(float));
 }
 
 static void lay_out_layers(onespp *d, Arena *arena)
@@ -342,7 +342,7 @@ static void lay_out_layers(onespp *d, Arena *arena)
         layer->inputs = LAYER_SIZES[i][1];
         count += (uint64_t)(layer->outputs * (layer->inputs + 1));
     }
-    d->parameters = take(arena, count, sizeof(float));
+    d->parameters = allocate(arena, count, sizeof(float));
 }
 
 /* Where everything is in memory. */
@@ -352,15 +352,15 @@ static void lay_out(onespp *d, Arena *arena)
     uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
     d->pitch = pitch_of(d->config.max_width);
     uint64_t pixels = height * (uint64_t)d->pitch;
-    d->texels = take(arena, pixels * TEXEL, sizeof(float));
-    d->rows = take(arena, pixels * ROW_LINES, sizeof(float));
-    d->depth = take(arena, pixels, sizeof(float));
-    d->mesh = take(arena, pixels, sizeof(int32_t));
-    d->object_to_world = take(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
-    d->motions = take(arena, (uint64_t)d->config.max_meshes + 1, sizeof(Motion));
-    d->blocks = take(arena, blocks, sizeof(double));
-    d->depths = take(arena, MAX_DEPTHS, sizeof(float));
-    d->scratch = take(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
+    d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
+    d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));
+    d->depth = allocate(arena, pixels, sizeof(float));
+    d->mesh = allocate(arena, pixels, sizeof(int32_t));
+    d->object_to_world = allocate(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
+    d->motions = allocate(arena, (uint64_t)d->config.max_meshes + 1, sizeof(Motion));
+    d->blocks = allocate(arena, blocks, sizeof(double));
+    d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
+    d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
     lay_out_layers(d, arena);
     lay_out_strip(d, arena);
 }
@@ -464,7 +464,7 @@ static void load_divisor(float *restrict line, const onespp_frame *frame, int ch
 {
     load(line, &frame->albedo, channel, y, x, n);
     for (int i = 0; i < n; i++)
-        line[i] = least(most(line[i], ALBEDO_FLOOR), MAX_REFLECTANCE);
+        line[i] = minf(maxf(line[i], ALBEDO_FLOOR), MAX_REFLECTANCE);
 }
 
 /* Noisy irradiance of one colour of n <= SPAN pixels, 0 for those that show no surface. */
@@ -477,7 +477,7 @@ static void load_irradiance(float *restrict line, const onespp_frame *frame, int
     load(depth, &frame->depth, 0, y, x, n);
     for (int i = 0; i < n; i++) {
         float irradiance = clamped((line[i] + indirect[i]) / divisor[i], MAX_IRRADIANCE);
-        line[i] = depth[i] > 0 ? most(irradiance, 0) : 0;
+        line[i] = depth[i] > 0 ? maxf(irradiance, 0) : 0;
     }
 }
 
@@ -492,9 +492,9 @@ static float *row_line(const onespp *d, int y, int line)
 /* Mean luminance of the surfaces of a block, -1 without any. */
 static double block_luminance(const onespp_frame *frame, int row, int column)
 {
-    int x = column * BLOCK, n = lesser(BLOCK, frame->width - x), surfaces = 0;
+    int x = column * BLOCK, n = mini(BLOCK, frame->width - x), surfaces = 0;
     float sum = 0;
-    for (int y = row * BLOCK; y < lesser((row + 1) * BLOCK, frame->height); y++) {
+    for (int y = row * BLOCK; y < mini((row + 1) * BLOCK, frame->height); y++) {
         float light[RGB][BLOCK], divisor[BLOCK], depth[BLOCK];
         for (int c = 0; c < RGB; c++) {
             load_irradiance(light[c], frame, c, y, x, n);
@@ -525,7 +525,7 @@ static void update(RunningMean *mean, double value)
 {
     if (!isfinite(value))
         return;
-    mean->count = lesser(mean->count + 1, 10);
+    mean->count = mini(mean->count + 1, 10);
     mean->value += ((float)value - mean->value) / (float)mean->count;
 }
 
@@ -562,7 +562,7 @@ static float median(const float *numbers, int count)
 /* ln of the median depth of surfaces; not finite without any. */
 static double log_depth(const onespp *d, const onespp_frame *frame)
 {
-    int step_y = greater(1, frame->height / MEDIAN_GRID), step_x = greater(1, frame->width / MEDIAN_GRID);
+    int step_y = maxi(1, frame->height / MEDIAN_GRID), step_x = maxi(1, frame->width / MEDIAN_GRID);
     int count = 0;
     for (int y = 0; y < frame->height; y += step_y)
         for (int x = 0; x < frame->width; x += step_x) {
@@ -724,7 +724,7 @@ static void fetch_box(const Job *job, const Surface *surface, int x, int y, floa
         }
     }
     for (int c = 0; c < TEXEL; c++)
-        texel[c] /= (float)greater(count, 1);
+        texel[c] /= (float)maxi(count, 1);
 }
 
 /* The history of a surface at position (x, y) of the previous frame, from the corners of pixels: 0 where there is none.
@@ -772,8 +772,8 @@ static void reproject(const Job *job, int y, int x0, int n, float (*restrict his
         float texel[TEXEL] = {0};
         if (depth[i] > 0) {
             /* Far outside the image an index would overflow; any place outside is as good. */
-            float x = most(least((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
-            float y_then = most(least((float)y + motion[1][i], (float)job->d->height + 1), -2);
+            float x = maxf(minf((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
+            float y_then = maxf(minf((float)y + motion[1][i], (float)job->d->height + 1), -2);
             float n_here[3] = {normal[0][i], normal[1][i], normal[2][i]};
             Surface surface = surface_before(job, x0 + i, y, depth[i], n_here, mesh[i]);
             fetch(job, &surface, x, y_then, texel);
@@ -793,7 +793,7 @@ static void read_row(const Job *job, Neighbourhood *around, int y, int x0)
     const onespp_frame *frame = &job->frame;
     int32_t *mesh = around->mesh[slot_of(y)];
     float(*pixels)[SPAN] = around->pixels[slot_of(y)];
-    int first = greater(x0 - HALO, 0), last = lesser(x0 + CHUNK + HALO, frame->width);
+    int first = maxi(x0 - HALO, 0), last = mini(x0 + CHUNK + HALO, frame->width);
     int left = first - (x0 - HALO), n = last - first;
     for (int i = 0; i < SPAN; i++)
         mesh[i] = -1;
@@ -804,7 +804,7 @@ static void read_row(const Job *job, Neighbourhood *around, int y, int x0)
     for (int c = 0; c < RGB; c++)
         load_irradiance(pixels[c] + left, frame, c, y, first, n);
     for (int i = 0; i < SPAN; i++) {
-        float bright = least(luminance(pixels[0][i], pixels[1][i], pixels[2][i]), MAX_LUMINANCE);
+        float bright = minf(luminance(pixels[0][i], pixels[1][i], pixels[2][i]), MAX_LUMINANCE);
         pixels[3][i] = bright;
         pixels[4][i] = bright * bright;
         pixels[5][i] = 1;
@@ -865,7 +865,7 @@ static inline void add_scaled(float *restrict line, float factor, const float *r
 static inline void rectify(float *restrict line)
 {
     for (int i = 0; i < LANES; i++)
-        line[i] = most(line[i], 0);
+        line[i] = maxf(line[i], 0);
 }
 
 typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
@@ -981,7 +981,7 @@ static void halve_rows(Job *job, Scratch *scratch, int first, int last)
         lines[i] = scratch->patches[i];
     for (int y = first; y < last; y++) {
         for (int x = 0; x < width; x += HALF_CHUNK) {
-            int n = lesser(HALF_CHUNK, width - x);
+            int n = mini(HALF_CHUNK, width - x);
             for (int i = 0; i < 2 * channels; i++) {
                 int even = i / channels * 2 * channels + i % channels;
                 const float *line = line_of(from, 2 * y + i / channels, i % channels) + 2 * x;
@@ -1003,7 +1003,7 @@ static void double_rows(Job *job, Scratch *scratch, int first, int last)
         for (int c = 0; c < from->channels; c++)
             lines[c] = line_of(from, y, c);
         for (int x = 0; x < width; x += HALF_CHUNK) {
-            int n = lesser(HALF_CHUNK, width - x);
+            int n = mini(HALF_CHUNK, width - x);
             multiply(&job->d->layers[job->layer], lines, x, n, scratch->patches[0], HALF_CHUNK, PLAIN);
             for (int i = 0; i < 2 * channels; i++) {
                 int even = i / channels * 2 * channels + i % channels;
@@ -1043,7 +1043,7 @@ enum {
 static void expose(float *restrict line, const float *restrict light, float exposure, int n)
 {
     for (int i = 0; i < n; i++)
-        line[i] = 1 + least(most(light[i], 0) * exposure, MAX_EXPOSED);
+        line[i] = 1 + minf(maxf(light[i], 0) * exposure, MAX_EXPOSED);
     for (int i = 0; i < n; i++)
         line[i] = logarithm(line[i]);
 }
@@ -1065,8 +1065,8 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
     }
     for (int i = 0; i < n; i++) {
         float bright = around->sums_9x9[3][HALO + i] / count[i];
-        float variance = most(around->sums_9x9[4][HALO + i] / count[i] - bright * bright, 0);
-        mean[i] = sqrtf(variance) / most(bright, MIN_MEAN);
+        float variance = maxf(around->sums_9x9[4][HALO + i] / count[i] - bright * bright, 0);
+        mean[i] = sqrtf(variance) / maxf(bright, MIN_MEAN);
     }
     expose(lines[DEVIATION_INPUT], mean, 1, n);
 }
@@ -1170,12 +1170,12 @@ static void enter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     const onespp_frame *frame = &job->frame;
     for (int x0 = 0; x0 < job->padded_width; x0 += CHUNK) {
-        int n = lesser(CHUNK, frame->width - x0), padded = lesser(CHUNK, job->padded_width - x0);
-        scratch->enter.around.first = scratch->enter.around.next = lesser(2 * first, frame->height - 1) - 4;
+        int n = mini(CHUNK, frame->width - x0), padded = mini(CHUNK, job->padded_width - x0);
+        scratch->enter.around.first = scratch->enter.around.next = mini(2 * first, frame->height - 1) - 4;
         for (int y = first; y < last; y++) {
             for (int i = 0; i < 2; i++) {
                 /* Below the image its last row is repeated. */
-                int row = 2 * y + i, source = lesser(row, frame->height - 1);
+                int row = 2 * y + i, source = mini(row, frame->height - 1);
                 fill_inputs(job, scratch, source, x0, n, scratch->enter.lines[i]);
                 if (row == source)
                     keep_row(job, scratch, row, x0, n, scratch->enter.lines[i]);
@@ -1206,9 +1206,9 @@ static void decode_level(
     float *restrict centre = sharpness + job->d->pitch, *restrict importance = centre + job->d->pitch;
     float shrunk[CHUNK]; /* of softplus */
     for (int i = 0; i < n; i++)
-        shrunk[i] = exponential(most(-fabsf(head[SHARPNESS_HEAD + level][i]), -MAX_EXPONENT));
+        shrunk[i] = exponential(maxf(-fabsf(head[SHARPNESS_HEAD + level][i]), -MAX_EXPONENT));
     for (int i = 0; i < n; i++) {
-        sharpness[i] = most(head[SHARPNESS_HEAD + level][i], 0) + logarithm(1 + shrunk[i]);
+        sharpness[i] = maxf(head[SHARPNESS_HEAD + level][i], 0) + logarithm(1 + shrunk[i]);
         centre[i] = clamped(head[CENTRE_HEAD + level][i], MAX_LOGIT);
         importance[i] = depth[i] > 0 ? clamped(head[IMPORTANCE_HEAD + level][i], MAX_LOGIT) : NO_WEIGHT;
     }
@@ -1222,7 +1222,7 @@ static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
     const float *head = scratch->leave.head[ALPHA_HEAD], *output_head = scratch->leave.head[ALPHA_HEAD + 1];
     float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0, *restrict length = row_line(d, y, LENGTH_LINE) + x0;
     for (int i = 0; i < n; i++) {
-        float past = most(length[i], MIN_LENGTH);
+        float past = maxf(length[i], MIN_LENGTH);
         float against = exponential(clamped(-head[i], MAX_EXPONENT)) * past / samples;
         float against_output = exponential(clamped(-output_head[i], MAX_EXPONENT));
         newest[i] = length[i] > 0 ? 1 / (1 + against) : 1;
@@ -1244,7 +1244,7 @@ static void decode_latent(const Job *job, float (*head)[CHUNK], int y, int x0, i
         float *restrict latent = row_line(job->d, y, LATENT_LINES + c) + x0;
         for (int i = 0; i < n; i++) { /* tanh */
             float x = head[LATENT_HEAD + c][i];
-            float shrunk = exponential(most(-2 * fabsf(x), -MAX_EXPONENT));
+            float shrunk = exponential(maxf(-2 * fabsf(x), -MAX_EXPONENT));
             float size = (1 - shrunk) / (1 + shrunk);
             latent[i] = x > 0 ? size : -size;
         }
@@ -1277,10 +1277,10 @@ static void leave_rows(Job *job, Scratch *scratch, int first, int last)
     for (int y = first; y < last; y++) {
         find_taps(taps, &d->sum_a, y, job->padded_height / 2, d->zeros);
         for (int x = 0; x < job->padded_width / 2; x += HALF_CHUNK) {
-            int x0 = 2 * x, n = lesser(CHUNK, job->frame.width - x0);
+            int x0 = 2 * x, n = mini(CHUNK, job->frame.width - x0);
             multiply(&d->layers[JOIN_A], taps, x, n / 2 + n % 2, scratch->leave.joined[0], HALF_CHUNK, RECTIFIED);
             multiply(&d->layers[LEAVE], joined, 0, n / 2 + n % 2, patches[0], HALF_CHUNK, PLAIN);
-            for (int row = 2 * y; row < lesser(2 * y + 2, job->frame.height); row++) {
+            for (int row = 2 * y; row < mini(2 * y + 2, job->frame.height); row++) {
                 int even = row % 2 * 2 * OUTPUTS;
                 for (int c = 0; c < OUTPUTS; c++)
                     join(scratch->leave.head[c], patches[even + c], patches[even + OUTPUTS + c], HALF_CHUNK);
@@ -1313,19 +1313,19 @@ static void run_layer(
     job->layer = layer;
     job->from = from;
     job->to = to;
-    run(job, work, greater(first, 0), lesser(last, height));
+    run(job, work, maxi(first, 0), mini(last, height));
 }
 
 /* Rows first to last - 1 at 1/8 of the resolution, after `entered` rows of 1/2; returns how many there are then. */
 static int run_strip(Job *job, int first, int last, int entered)
 {
     onespp *d = job->d;
-    int end = lesser(4 * last + REACH_A, job->padded_height / 2);
-    scroll(&d->a, greater(4 * first - REACH_A, 0), entered);
+    int end = mini(4 * last + REACH_A, job->padded_height / 2);
+    scroll(&d->a, maxi(4 * first - REACH_A, 0), entered);
     scroll(&d->hidden, 8 * first, 2 * entered);
-    d->b.first = d->b_too.first = greater(2 * (first - REACH_C) - 1, 0);
-    d->c.first = d->c_too.first = greater(first - REACH_C, 0);
-    d->sum_a.first = greater(4 * first - 2, 0);
+    d->b.first = d->b_too.first = maxi(2 * (first - REACH_C) - 1, 0);
+    d->c.first = d->c_too.first = maxi(first - REACH_C, 0);
+    d->sum_a.first = maxi(4 * first - 2, 0);
 
     run(job, enter_rows, entered, end);
     run_layer(job, halve_rows, DOWN_B, &d->a, &d->b, 2 * (first - REACH_C) - 1, 2 * (last + REACH_C) + 1);
@@ -1347,12 +1347,12 @@ static void run_network(Job *job)
     int rows = job->padded_height / 8, step = strip_height(&job->d->config), entered = 0;
     job->d->a.first = job->d->hidden.first = 0;
     for (int first = 0; first < rows; first += step)
-        entered = run_strip(job, first, lesser(first + step, rows), entered);
+        entered = run_strip(job, first, mini(first + step, rows), entered);
 }
 
 /* --- The filter --------------------------------------------------------------------------------------------------- */
 
-/* Where the lines of a level's output are: first in the texels, which nobody reads any more, then over the parameters
+/* Where the lines of a level's output are: first in the texels, which are no longer needed, then over the parameters
  * of the level before. */
 static float *filtered_lines(const onespp *d, int level, int y)
 {
@@ -1396,7 +1396,7 @@ static void add_weighted(
 static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n, int dx, int dy)
 {
     const onespp *d = job->d;
-    int first = greater(x0, -dx), last = lesser(x0 + n, job->frame.width - dx);
+    int first = maxi(x0, -dx), last = mini(x0 + n, job->frame.width - dx);
     int level_line = LEVEL_LINES + 3 * job->level;
     if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
         return;
@@ -1415,7 +1415,8 @@ static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0
 }
 
 /* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
- * the pixel times the squared distance of their features), and by exp(centre) for the pixel itself; 0 off surfaces. */
+ * the pixel times the squared distance of their features), and by exp(centre) for the pixel itself; 0 off surfaces.
+ * Isik et al. 2021, Eq. 4, with two weights more. */
 static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n)
 {
     const onespp *d = job->d;
@@ -1442,7 +1443,7 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
     float sums[4][CHUNK];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
-            int n = lesser(CHUNK, job->frame.width - x0);
+            int n = mini(CHUNK, job->frame.width - x0);
             filter_chunk(job, sums, y, x0, n);
             float *to = filtered_lines(job->d, job->level, y) + x0;
             for (int c = 0; c < RGB; c++)
@@ -1491,7 +1492,7 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
     float sums[4][CHUNK];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
-            int n = lesser(CHUNK, job->frame.width - x0);
+            int n = mini(CHUNK, job->frame.width - x0);
             const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
             const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
             filter_chunk(job, sums, y, x0, n);
@@ -1531,7 +1532,7 @@ size_t onespp_size(const onespp_config *config)
     if (config->abi != ONESPP_ABI || !is_valid(config))
         return 0;
     measured.config = *config;
-    take(&arena, 1, sizeof(onespp));
+    allocate(&arena, 1, sizeof(onespp));
     lay_out(&measured, &arena);
     arena.used += ALIGNMENT; /* the caller's memory may begin anywhere */
     return arena.used <= SIZE_MAX / 2 ? (size_t)arena.used : 0;
@@ -1548,7 +1549,7 @@ int onespp_create(const onespp_config *config, void *memory, size_t size, onespp
         return ONESPP_BAD_MEMORY;
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
-    onespp *d = take(&arena, 1, sizeof(onespp));
+    onespp *d = allocate(&arena, 1, sizeof(onespp));
     memset(d, 0, sizeof *d);
     d->config = *config;
     lay_out(d, &arena);

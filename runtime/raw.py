@@ -12,7 +12,10 @@ import numpy as np
 
 from datasets.clip import Clip
 from datasets.frame import Frame, Moment, read_frame
+from errors import BadInput
+from eval.bench.denoisers import parse_size
 from eval.bench.synthetic_frames import synthetic_frame
+from files import replacing
 from models.registry import prototype
 
 PLANES = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion")
@@ -31,22 +34,30 @@ def raw(frame: Frame, reset: bool) -> bytes:
 
 
 def write_raw(frames: Iterable[Frame], path: Path) -> None:
-    """A sequence; it resets wherever a frame does not follow the one before."""
+    """Write a sequence, which resets wherever a frame does not follow the one before. Atomic."""
     before: Moment | None = None
-    with path.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         for frame in frames:
             file.write(raw(frame, reset=before is None or not frame.follows(before)))
             before = frame.moment
 
 
 def main(source: str, count: int, path: Path) -> None:
+    """Raises BadInput where the source is neither a clip with so many frames nor a size."""
     if Path(source).is_dir():
         clip = Clip(Path(source))
+        if count > clip.frames:
+            raise BadInput(f"{source} has {clip.frames} frames, not {count}")
         write_raw((read_frame(clip, index, prototype("one").reads) for index in range(count)), path)
     else:
-        width, height = map(int, source.split("x"))
+        height, width = parse_size(source)
         write_raw((synthetic_frame(index, height, width) for index in range(count)), path)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    if len(sys.argv) != 4 or not sys.argv[2].isdecimal():
+        sys.exit(__doc__)
+    try:
+        main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    except BadInput as error:
+        sys.exit(f"error: {error}")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
 
+from files import write_file
 from models.registry import require_shipped
 
 HEADER = Path(__file__).with_name("onespp_weights.h")
@@ -58,7 +59,7 @@ def header(weights: Path) -> str:
 
 
 def main() -> None:
-    HEADER.write_text(header(require_shipped("one")))
+    write_file(HEADER, header(require_shipped("one")).encode())
 
 
 if __name__ == "__main__":

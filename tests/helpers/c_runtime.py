@@ -1,7 +1,6 @@
 """The C runtime, built by the C compiler and called through ctypes with Frames."""
 
 import ctypes
-import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from models.networks.one import One
 from models.registry import create, require_shipped
 from models.weights import load_weights
 from provenance import ROOT
+from runtime.raw import PLANES
 
 FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
@@ -48,27 +48,19 @@ class Ids(ctypes.Structure):
     _fields_ = (("data", ctypes.c_void_p), ("row", ctypes.c_ssize_t), ("column", ctypes.c_ssize_t))
 
 
-IMAGES = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion")
-
-
 class CFrame(ctypes.Structure):
     """onespp_frame."""
 
     _fields_ = (
         *((name, ctypes.c_int) for name in ("width", "height", "reset")),
         ("samples", ctypes.c_float),
-        *((name, Image) for name in IMAGES),
+        *((name, Image) for name in PLANES),
         ("mesh_id", Ids),
         ("K", ctypes.c_double * 9),
         ("camera_to_world", ctypes.c_double * 16),
         ("meshes", ctypes.c_int),
         ("object_to_world", ctypes.c_void_p),
     )
-
-
-def compiler(name: str) -> str | None:
-    """The path of a C compiler that is installed."""
-    return shutil.which(name)
 
 
 def build(target: Path, cc: str, flags: Sequence[str] = OPTIMISED) -> ctypes.CDLL:
@@ -125,7 +117,7 @@ class CRuntime:
         height, width = frame.size
         arrays: dict[str, Any] = {}
         given = CFrame(width=width, height=height, reset=reset, samples=frame.samples.item())
-        for name in IMAGES:
+        for name in PLANES:
             if name in without:
                 continue
             array = frame.channels[name][0].numpy()

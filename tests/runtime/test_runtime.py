@@ -1,12 +1,12 @@
 """The C runtime is `one`: frame by frame, at any size, on any number of threads, and whatever the frames contain."""
 
 import ctypes
-import shutil
 import subprocess
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree, which
 
 import numpy as np
 import pytest
@@ -32,12 +32,11 @@ from tests.helpers.c_runtime import (
     Task,
     address,
     build,
-    compiler,
     rounded_one,
 )
 from tests.helpers.frames import MESHES, chain, flat_frame
 
-CC = compiler("cc") or compiler("gcc") or compiler("clang")
+CC = which("cc") or which("gcc") or which("clang")
 TOLERANCE = 1e-4  # of the brightest pixel
 SIZE = (40, 56)
 STRIPS = "-DONESPP_STRIP_PIXELS=1"  # of 64 rows
@@ -86,8 +85,8 @@ def test_the_array_of_weights_is_that_of_the_shipped_ones():
 
 @pytest.mark.parametrize("name", ["gcc", "clang"])
 @pytest.mark.parametrize("file", ["onespp.c", "example.c", "fuzz.c"])
-def test_compilers_have_nothing_to_say(name, file, tmp_path):
-    if compiler(name) is None:
+def test_compiles_without_warnings(name, file, tmp_path):
+    if which(name) is None:
         pytest.skip(f"{name} is not installed")
     for flags in (("-Wpedantic",), ("-std=gnu17",)):  # the latter declares more names
         command = [name, *STRICT, *flags, "-c", str(FOLDER / file), "-o", str(tmp_path / "it.o")]
@@ -96,7 +95,7 @@ def test_compilers_have_nothing_to_say(name, file, tmp_path):
 
 def test_it_neither_allocates_nor_has_global_state(tmp_path):
     """As its symbols show: nothing of stdlib.h, and no variables."""
-    if compiler("nm") is None:
+    if which("nm") is None:
         pytest.skip("nm is not installed")
     target = tmp_path / "onespp.o"
     subprocess.run([CC, *OPTIMISED, "-fno-pie", "-c", str(FOLDER / "onespp.c"), "-o", str(target)], check=True)
@@ -321,9 +320,9 @@ def test_rendered_clips(library, one, tiny):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gcc", "clang"])
-def test_sanitizers_have_nothing_to_say(name, tmp_path):
-    """About random frames, with everything that numbers and sizes can be."""
-    if compiler(name) is None:
+def test_sanitizers_report_nothing(name, tmp_path):
+    """On random frames, with all extremes of numbers and sizes."""
+    if which(name) is None:
         pytest.skip(f"{name} is not installed")
     flags = ("-O2", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, *STRICT)
     sources = [str(FOLDER / name) for name in ("fuzz.c", "onespp.c")]
@@ -334,7 +333,7 @@ def test_sanitizers_have_nothing_to_say(name, tmp_path):
 @pytest.mark.slow
 def test_it_runs_on_aarch64(one, frames, tmp_path):
     """The example, emulated."""
-    cross, emulator = compiler("aarch64-linux-gnu-gcc"), compiler("qemu-aarch64")
+    cross, emulator = which("aarch64-linux-gnu-gcc"), which("qemu-aarch64")
     if cross is None or emulator is None:
         pytest.skip("aarch64-linux-gnu-gcc or qemu-aarch64 is not installed")
     flags = (*STRICT, *OPTIMISED, "-static", "-pthread")
@@ -345,12 +344,12 @@ def test_it_runs_on_aarch64(one, frames, tmp_path):
 
 @pytest.mark.slow
 def test_cmake_and_make_build_it(tmp_path):
-    if compiler("cmake") is None or compiler("make") is None:
+    if which("cmake") is None or which("make") is None:
         pytest.skip("cmake or make is not installed")
     subprocess.run(["cmake", "-S", str(FOLDER), "-B", str(tmp_path / "build"), "-DBUILD_SHARED_LIBS=ON"], check=True)
     subprocess.run(["cmake", "--build", str(tmp_path / "build")], check=True)
     subprocess.run(["cmake", "--install", str(tmp_path / "build"), "--prefix", str(tmp_path / "installed")], check=True)
     assert (tmp_path / "installed" / "include" / "onespp.h").exists()
-    copy = Path(shutil.copytree(FOLDER, tmp_path / "runtime"))
+    copy = Path(copytree(FOLDER, tmp_path / "runtime"))
     subprocess.run(["make", "-C", str(copy)], check=True)
     assert (copy / "libonespp.a").exists() and (copy / "example").exists()
