@@ -98,19 +98,19 @@ def extract_glass(runs: Path) -> dict[str, Any]:
 
 
 def extract_benchmark(runs: Path) -> dict[str, Any]:
-    """Results of the benchmark by size: by the age of the history, by scene once that is steady, and of rendering."""
+    """Results of RUNS/benchmark* by folder: by the age of the history, by scene once that is steady, and of rendering."""
     files = sorted(runs.glob("benchmark*/benchmark.json"))
     if not files:
         raise BadInput(f"no {runs / 'benchmark' / 'benchmark.json'}")
-    sizes = {}
+    folders = {}
     devices: dict[str, None] = {}  # in order
     for file in files:
-        content = read_json(file, ("device", "size", "by_age", "rendered", "where"))
+        content = read_json(file, ("device", "by_age", "rendered", "where"))
         clips = steady_clips(file.parent, STEADY_FRAME)
         kept_keys = {key: content[key] for key in ("rendered", "where")}
-        sizes[content["size"]] = {"ages": content["by_age"]["psnr"], "clips": clips} | kept_keys
+        folders[file.parent.name] = {"ages": content["by_age"]["psnr"], "clips": clips} | kept_keys
         devices[content["device"]] = None
-    return {"device": " and ".join(devices), "sizes": sizes}
+    return {"device": " and ".join(devices), "folders": folders}
 
 
 def extract_times(runs: Path) -> dict[str, Any]:
@@ -261,24 +261,24 @@ def glass() -> str:
     return table([line for alike in lines.values() for line in alike.values()])
 
 
-def of_size(size: str) -> dict[str, Any]:
-    """The benchmark's results at a size, such as 640x360. Raises BadInput where it was not measured."""
-    sizes = measured("benchmark")["sizes"]
-    if size not in sizes:
-        raise BadInput(f"not measured: `onespp benchmark run --size {size}`, then `python -m eval.pages RUNS`")
-    return dict(sizes[size])
+def benchmark(folder: str) -> dict[str, Any]:
+    """The results of `onespp benchmark run --runs RUNS/folder`. Raises BadInput where there are none."""
+    folders = measured("benchmark")["folders"]
+    if folder not in folders:
+        raise BadInput(f"not measured: `onespp benchmark run --runs runs/{folder}`, then `python -m eval.pages runs`")
+    return dict(folders[folder])
 
 
-def ages(size: str, *names: str) -> str:
+def ages(folder: str, *names: str) -> str:
     """PSNR of the benchmark's denoisers, or of the named ones, by the age of their history."""
-    rows = of_size(size)["ages"]
+    rows = benchmark(folder)["ages"]
     texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
     return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
 
 
-def steady(size: str, *names: str) -> str:
+def steady(folder: str, *names: str) -> str:
     """Means of the benchmark's clips with a steady history, and PSNR by scene; of the named denoisers, or of all."""
-    clips = of_size(size)["clips"]
+    clips = benchmark(folder)["clips"]
     lines = []
     for denoiser in (*names, NOISE_FLOOR) if names else clips[0]["results"]:
         values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
@@ -291,10 +291,10 @@ def steady(size: str, *names: str) -> str:
     return table(lines)
 
 
-def where(size: str, *questions: str) -> str:
+def where(folder: str, *questions: str) -> str:
     """Shares of the pixels and of the squared error of the benchmark's clips, by what `onespp eval --where` asks."""
     lines = []
-    for scene, shares in of_size(size)["where"].items():
+    for scene, shares in benchmark(folder)["where"].items():
         for share, answers in shares.items():
             line = {"clip": scene, "share of": share if share == "pixels" else f"`{share}`"}
             for question in questions:
@@ -305,7 +305,7 @@ def where(size: str, *questions: str) -> str:
     return table(lines)
 
 
-def rendering(size: str) -> str:
+def rendering(folder: str) -> str:
     """What the references of the benchmark's clips cost."""
     lines = [
         {
@@ -315,7 +315,7 @@ def rendering(size: str) -> str:
             "noise floor": f"{row['floor']:.1f} dB",
             "minutes": f"{row['seconds'] / 60:.1f}",
         }
-        for row in of_size(size)["rendered"]
+        for row in benchmark(folder)["rendered"]
     ]
     return table(lines)
 

@@ -24,7 +24,7 @@ What differs, since frames have 1 spp and noise-free features:
 - Positions are relative to the camera, in units of the running median depth.
 - Secondary features have about one scale, where the authors normalise by the training set.
 - Gradients are Sobel magnitudes; MADs are computed once per 2 x 2 pixels.
-- The filter's initial sharpness is s = ln(1 + e^-4): neither one pixel nor the whole window.
+- Before training it is a filter with the same sharpness everywhere, FIRST_WIDTHS.
 - Background is in no window and in no statistic.
 """
 
@@ -58,7 +58,9 @@ SECONDARY = KINDS * len(FEATURE_GROUPS) + 1
 HIDDEN_UNITS = 10
 MAX_POSITION = 1e3  # running median depths
 MIN_FEATURE_VARIANCE = 1e-4  # δ: for features without noise
-FIRST_BIAS = -4.0
+# Before training, weights are e^-0.5 at this distance: in the image, pixels, then in each of FEATURE_GROUPS. Visibility,
+# whose noise divides it, hardly counts.
+FIRST_WIDTHS = (4.0, 0.1, 0.2, 0.2, 0.2, 0.2)
 SPIKE = 2.0  # standard deviations
 SIDE = 2 * FILTER_RADIUS + 1
 
@@ -255,6 +257,13 @@ class LBFState(FilteredState):
         return AccumulatedState.pictures(self) | {"width of the filter (px)": width}
 
 
+def first_bias() -> Tensor:
+    """What the softplus of the last layer maps to the sharpness of FIRST_WIDTHS."""
+    sharpness = 0.5 * torch.tensor(FIRST_WIDTHS, dtype=torch.float64) ** -2
+    sharpness[1:] *= MIN_FEATURE_VARIANCE  # by which the sharpness of features is divided
+    return torch.log(torch.expm1(sharpness))
+
+
 class LBF(KernelPredictor):
     """Filters accumulated irradiance within its range since the last reset; takes seconds a frame."""
 
@@ -272,7 +281,8 @@ class LBF(KernelPredictor):
     def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
         last = nn.Linear(HIDDEN_UNITS, 1 + len(FEATURE_GROUPS))
-        nn.init.constant_(last.bias, FIRST_BIAS)
+        nn.init.zeros_(last.weight)
+        last.bias.data = first_bias().to(last.bias)
         self.network = nn.Sequential(nn.Linear(SECONDARY, HIDDEN_UNITS), nn.Sigmoid(), last, nn.Softplus())
 
     def sharpness(self, features: Tensor, variance: Tensor, surface: Tensor, samples: Tensor) -> Tensor:

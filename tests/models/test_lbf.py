@@ -210,8 +210,20 @@ def test_the_network_has_the_authors_shape():
     assert denoiser.parameter_count() == 36 * 10 + 10 + 10 * 6 + 6
     x = torch.randn(5, 36)
     first, _, last, _ = denoiser.network
+    torch.nn.init.normal_(last.weight)  # which are 0 before training
     expected = torch.log1p(torch.exp(last(1 / (1 + torch.exp(-first(x))))))
     torch.testing.assert_close(denoiser.network(x), expected)
+
+
+def test_before_training_widths_are_the_same_everywhere():
+    """4 px, position 0.1, the others 0.2: with noise-free features, weights of e^-0.5 at these distances."""
+    lbf = registry.create("lbf")
+    generator = torch.Generator().manual_seed(0)
+    features = torch.rand(1, sum(FEATURE_GROUPS), 12, 10, generator=generator)
+    surface, variance = torch.ones(1, 1, 12, 10), torch.zeros(1, len(FEATURE_GROUPS), 12, 10)
+    sharpness = lbf.sharpness(features, variance, surface, torch.ones(1, 1, 1, 1))
+    expected = torch.tensor([1 / 32, 50, 12.5, 12.5, 12.5, 12.5]).view(1, 6, 1, 1).expand_as(sharpness)
+    torch.testing.assert_close(sharpness, expected, rtol=1e-4, atol=0)
 
 
 def test_accumulated_light_is_filtered():
