@@ -22,7 +22,7 @@ CROPPED_ROWS = 28  # rows
 def import_noisebase(source: Path, out: Path, samples: int) -> int:
     """Make a dataset of the sequences below `source`, with the first `samples` of each pixel. Returns how many.
 
-    Raises BadInput, naming the file, where there is none, or one is damaged or has fewer samples.
+    Raises BadInput, naming the file, where there is none, or one is damaged, too small, or has fewer samples.
     """
     folders = sorted({path.parent for path in source.glob("**/frame[0-9][0-9][0-9][0-9].zip")})
     if not folders:
@@ -38,6 +38,8 @@ def frames_of(folder: Path, samples: int) -> Iterator[ImportedFrame]:
         _, height, width, count = arrays["color"].shape
         if count < samples:
             raise BadInput(f"{path} has {count} samples per pixel, not {samples}")
+        if height <= 2 * CROPPED_ROWS:
+            raise BadInput(f"{path} has {height} rows: nothing is left without the {CROPPED_ROWS} at top and bottom")
         to_pixels = np.array([[width / 2, 0, width / 2], [0, -height / 2, height / 2 - CROPPED_ROWS], [0, 0, 1]])
         normal = image_of(arrays["normal"][..., 0])
         yield ImportedFrame(

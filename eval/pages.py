@@ -277,8 +277,12 @@ def ages(folder: str, *names: str) -> str:
 
 
 def steady(folder: str, *names: str) -> str:
-    """Means of the benchmark's clips with a steady history, and PSNR by scene; of the named denoisers, or of all."""
+    """Means of the benchmark's clips with a steady history, and PSNR by scene; of the named denoisers, or of all.
+
+    With the mean PSNR of our own rooms, those of RUNS/folder-own, where they were measured.
+    """
     clips = benchmark(folder)["clips"]
+    own_clips = measured("benchmark")["folders"].get(f"{folder}-own", {}).get("clips", [])
     lines = []
     for denoiser in (*names, NOISE_FLOOR) if names else clips[0]["results"]:
         values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
@@ -287,6 +291,9 @@ def steady(folder: str, *names: str) -> str:
         line = {"denoiser": cell(row), "made from": row.made_from}
         line |= {METRICS[metric].title: row.text(metric) for metric in SHOWN_METRICS}
         line |= {scene: value_cell("psnr", each["psnr"]) for scene, each in values.items()}
+        if own_clips:
+            own = fmean(clip["results"][denoiser]["psnr"] for clip in own_clips)
+            line |= {f"{len(own_clips)} of ours": value_cell("psnr", own)}
         lines.append(line)
     return table(lines)
 

@@ -144,11 +144,8 @@ def encoded(radiance):
     return np.concatenate([np.round(radiance / scale * 255), exponent[None]]).astype("u1"), np.float32([low, high])
 
 
-@pytest.fixture
-def noisebase(tmp_path):
+def write_noisebase(folder, size):
     zarr = pytest.importorskip("zarr")
-    size = SIZE[0] + 2 * CROPPED_ROWS, SIZE[1]
-    folder = tmp_path / "files" / "bistro1"
     folder.mkdir(parents=True)
     for index in range(FRAMES):
         here = view(index, size)
@@ -171,6 +168,11 @@ def noisebase(tmp_path):
             group = zarr.create_group(store, zarr_format=2)
             for name, array in arrays.items():
                 group.create_array(name, data=np.ascontiguousarray(array))
+
+
+@pytest.fixture
+def noisebase(tmp_path):
+    write_noisebase(tmp_path / "files" / "bistro1", (SIZE[0] + 2 * CROPPED_ROWS, SIZE[1]))
     return tmp_path / "files"
 
 
@@ -203,3 +205,9 @@ def test_noisebase_files_with_too_few_samples_are_refused(noisebase, tmp_path):
         import_noisebase(noisebase, tmp_path / "data", samples=4)
     with pytest.raises(BadInput, match="has no sequence"):
         import_noisebase(tmp_path / "data", tmp_path / "other", samples=1)
+
+
+def test_noisebase_files_without_any_row_left_are_refused(tmp_path):
+    write_noisebase(tmp_path / "files" / "small", (2 * CROPPED_ROWS, 64))
+    with pytest.raises(BadInput, match=r"frame0000\.zip has 56 rows"):
+        import_noisebase(tmp_path / "files", tmp_path / "data", samples=1)
