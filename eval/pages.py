@@ -98,7 +98,7 @@ def extract_glass(runs: Path) -> dict[str, Any]:
 
 
 def extract_benchmark(runs: Path) -> dict[str, Any]:
-    """Results of RUNS/benchmark* by folder: by the age of the history, by scene once that is steady, and of rendering."""
+    """Results of RUNS/benchmark* by folder: by the age of the history, by scene once it is steady, and of rendering."""
     files = sorted(runs.glob("benchmark*/benchmark.json"))
     if not files:
         raise BadInput(f"no {runs / 'benchmark' / 'benchmark.json'}")

@@ -96,9 +96,9 @@ WSKP_BUDGETS = {
 NBGD_BUDGETS = WSKP_BUDGETS | {"tiny": WSKP_BUDGETS["tiny"] | {"rate": 2e-3}}
 # 436 weights learn from few pixels; each costs thousands of taps.
 LBF_BUDGETS: Budgets = {
-    "tiny": SHORT | {"epochs": 2, "crop": 32, "loss": DisplayedLoss()},
-    "quick": SHORT | {"epochs": 1, "crop": 64, "loss": DisplayedLoss()},
-    "release": RELEASE | {"epochs": 1},
+    "tiny": SHORT | {"epochs": 2, "rate": 3e-3, "crop": 32, "loss": DisplayedLoss()},
+    "quick": SHORT | {"epochs": 1, "rate": 3e-3, "crop": 64, "loss": DisplayedLoss()},
+    "release": RELEASE | {"epochs": 1, "rate": 3e-3},
 }
 NTD_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},

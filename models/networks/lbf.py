@@ -58,8 +58,8 @@ SECONDARY = KINDS * len(FEATURE_GROUPS) + 1
 HIDDEN_UNITS = 10
 MAX_POSITION = 1e3  # running median depths
 MIN_FEATURE_VARIANCE = 1e-4  # δ: for features without noise
-# Before training, weights are e^-0.5 at this distance: in the image, pixels, then in each of FEATURE_GROUPS. Visibility,
-# whose noise divides it, hardly counts.
+# Before training, weights are e^-0.5 at this distance: in pixels, then in each of FEATURE_GROUPS. Visibility, which its
+# variance divides, hardly counts.
 FIRST_WIDTHS = (4.0, 0.1, 0.2, 0.2, 0.2, 0.2)
 SPIKE = 2.0  # standard deviations
 SIDE = 2 * FILTER_RADIUS + 1
