@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.cameras import Cameras
+from datasets.frame import BOUNDED
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
@@ -139,6 +140,18 @@ def test_frames_of_background_alone_black_frames_and_radiance_that_is_not_finite
     broken.direct[0, :, 9, 3] = 6e4
     for frames in ([sky, frame, frame], [black, frame, black], [frame, sky, black], [frame, broken, frame]):
         check_equal(step, denoiser, frames)
+
+
+@each_kind
+def test_surfaces_count_as_at_most_100(weights, name):
+    step, denoiser = pair(weights, name)
+    frames = sequence((24, 32), frames=3)
+    for channel in {*BOUNDED} & {port.name for port in step.images}:
+        for frame in frames:
+            frame.channel(channel)[..., 5:7, 6:9] = 1e35
+    outputs = outputs_of(step, frames)
+    assert all(torch.isfinite(tensor).all() for each in outputs for tensor in each.values())
+    check_equal(step, denoiser, frames)
 
 
 def test_sample_counts_that_change_from_frame_to_frame(weights):
