@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -273,6 +274,15 @@ def files_of(step, folder):
     write_onnx(program, step, folder / "step.onnx")
     write_pt2(program, step, folder / "step.pt2")
     return run_onnx(folder / "step.onnx"), run_pt2(folder / "step.pt2")
+
+
+@each_kind
+def test_operators_are_named_alike_in_every_process(weights, tmp_path, name):
+    """By words, without the addresses at which Python's functions are in memory."""
+    step, _ = pair(weights, name)
+    operators = write_pt2(trace(step, synthetic_frame(0, 24, 32)), step, tmp_path / "step.pt2")
+    assert {"aten.conv2d.default", "sym_max", "getitem"} <= operators["kinds"].keys()
+    assert all(re.fullmatch(r"[\w.]+", kind) for kind in operators["kinds"])
 
 
 @slow_onnx
