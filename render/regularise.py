@@ -16,7 +16,6 @@ from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
 ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
-NESTED = (*ROUGH, *ROUGH.values(), "principled", "diffuse")  # BSDFs that are blurred within others
 Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
 
 
@@ -29,9 +28,11 @@ def at_least(roughness: Roughness, least: float) -> Roughness:
 
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, if it has one."""
-    parts = {key: value for key, value in bsdf.items() if isinstance(value, dict) and value.get("type") in NESTED}
-    nested = bsdf | {key: blurred(value) for key, value in parts.items()}
+    """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, as far as it or BSDFs in it have one.
+
+    Textures, which have none, come out as they are.
+    """
+    nested = {key: blurred(value) if isinstance(value, dict) else value for key, value in bsdf.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
         return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}

@@ -82,3 +82,19 @@ def test_blurred_materials_are_rough_and_others_unchanged():
     ramp = np.linspace(0, 1, 16).reshape(4, 4, 1)
     rough = blurred({"type": "roughconductor", "alpha": {"type": "bitmap", "data": ramp}})
     np.testing.assert_array_equal(rough["alpha"]["data"], np.maximum(ramp, 0.3))
+
+
+def test_materials_are_blurred_at_any_depth():
+    """Whatever they are nested in; what is not glossy there stays as it is."""
+    checks = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
+
+    def material(kind, **roughness):
+        metal = {"type": kind, "material": "Au", **roughness}
+        relief = {"type": "bumpmap", "texture": checks, "bsdf": metal}
+        shaded = {"type": "normalmap", "normalmap": checks, "bsdf": metal}
+        blend = {"type": "blendbsdf", "weight": checks, "a": relief, "b": shaded}
+        return {"type": "twosided", "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": blend}}
+
+    assert blurred(material("conductor")) == material("roughconductor", alpha=0.3)
+    assert blurred(material("roughconductor", alpha=0.1)) == material("roughconductor", alpha=0.3)
+    assert blurred(material("diffuse")) == material("diffuse")
