@@ -11,7 +11,7 @@ import numpy as np
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
-from render.materials import registry_index, registry_number, registry_table
+from render.materials import registry_index, registry_table
 from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
@@ -42,14 +42,16 @@ def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 class BlurredTable:
-    """The blurred versions of all BSDFs of a stage, by registry index."""
+    """The blurred versions of all BSDFs of a stage, by registry index; those that nothing describes as they are."""
 
     def __init__(self, stage: Stage):
-        described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
-        rows = {registry_number(mi.BSDFPtr(shape.bsdf())): row for row, (shape, _) in enumerate(described)}
-        self.row = registry_table(mi.UInt32, rows)
+        self.row = registry_table(mi.UInt32, {index: row for row, index in enumerate(stage.bsdfs)})
+        described = stage.bsdf_descriptions
         # Keeps objects alive, which pointers do not.
-        self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
+        self.bsdfs = [
+            mi.load_dict(to_mitsuba(blurred(described[index]))) if index in described else own
+            for index, own in stage.bsdfs.items()
+        ]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 
     def after_first(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> mi.BSDFPtr:
