@@ -17,13 +17,13 @@ from errors import BadInput
 
 Signal = Literal["total", "indirect"]
 MAX_MAGNITUDE = 1e35  # of a channel: the sum of two, divided by the smallest albedo, is still finite in float32
-MAX_REFLECTANCE = 100.0  # of albedo, roughness and components of normals: what networks make of them is finite
+MAX_SURFACE = 100.0  # of albedo, roughness and components of normals: what networks make of them is finite
 BOUNDED = ("albedo", "normal", "roughness")  # channels that it bounds, and so their other forms
 
 
 def largest_magnitude(name: str) -> float:
     """What the numbers of a channel count as at most."""
-    return MAX_REFLECTANCE if (CHANNELS[name].of or name) in BOUNDED else MAX_MAGNITUDE
+    return MAX_SURFACE if (CHANNELS[name].of or name) in BOUNDED else MAX_MAGNITUDE
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import BOUNDED, MAX_MAGNITUDE, MAX_REFLECTANCE, Frame
+from datasets.frame import BOUNDED, MAX_MAGNITUDE, MAX_SURFACE, Frame
 from models.denoiser import Denoiser
 from models.export.history import GraphGBuffer, reprojected
 from models.history.geometry import to_previous_camera
@@ -127,7 +127,7 @@ class Step(nn.Module):
 def bounded(x: dict[str, Tensor]) -> dict[str, Tensor]:
     """A step's inputs with the bounds that Frame.finite sets to surfaces."""
     names = [name for name in x if name.removeprefix(PREVIOUS) in BOUNDED]
-    return x | {name: x[name].clamp(-MAX_REFLECTANCE, MAX_REFLECTANCE) for name in names}
+    return x | {name: x[name].clamp(-MAX_SURFACE, MAX_SURFACE) for name in names}
 
 
 def demodulation(x: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
