@@ -17,6 +17,13 @@ from errors import BadInput
 
 Signal = Literal["total", "indirect"]
 MAX_MAGNITUDE = 1e35  # of a channel: the sum of two, divided by the smallest albedo, is still finite in float32
+MAX_SURFACE = 100.0  # of albedo, roughness and components of normals: what networks make of them is finite
+BOUNDED = ("albedo", "normal", "roughness")  # channels that it bounds, and so their other forms
+
+
+def largest_magnitude(name: str) -> float:
+    """What the numbers of a channel count as at most."""
+    return MAX_SURFACE if (CHANNELS[name].of or name) in BOUNDED else MAX_MAGNITUDE
 
 
 def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
@@ -149,15 +156,16 @@ class Frame:
         return None if self.depth.amin() > 0 else (self.depth > 0).to(self.depth)
 
     def finite(self) -> "Frame":
-        """The frame with 0 instead of NaN and infinities in all channels, and the rest clamped to +-MAX_MAGNITUDE.
+        """The frame with 0 instead of NaN and infinities in all channels, and the rest clamped to +-largest_magnitude.
 
-        The sum of a channel shows whether it has any such number, at a fraction of the cost of a test of every pixel.
+        The extremes of a channel show whether it has any such number, at a fraction of the cost of mending every pixel.
         """
-        mended = {
-            name: tensor.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(-MAX_MAGNITUDE, MAX_MAGNITUDE)
-            for name, tensor in self.channels.items()
-            if not tensor.sum().abs() < MAX_MAGNITUDE
-        }
+        mended = {}
+        for name, tensor in self.channels.items():
+            limit = largest_magnitude(name)
+            low, high = tensor.aminmax()
+            if not torch.maximum(-low, high) <= limit:  # NaN passes no comparison
+                mended[name] = tensor.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
         return self.with_channels(mended) if mended else self
 
     @property

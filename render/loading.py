@@ -118,7 +118,7 @@ class StockLoader:
 
     def __init__(self, unit: float = 1.0):
         self.unit = unit
-        self.loaded: dict[int, tuple[object, object]] = {}  # by id: description, kept alive, and object
+        self.loaded: dict[int, tuple[Bsdf, object]] = {}  # by id: description, kept alive, and object
         self.groups: list[mi.Shape] = []  # for instances
         self.grouped: list[mi.Shape] = []  # the shapes in groups
         self.notes: list[str] = []  # of omissions
@@ -140,7 +140,7 @@ class StockLoader:
         self.notes.append(f"{what}: this Mitsuba does not have {names}: left out")
         return self.made({key: value for key, value in description.items() if key not in unknown}, what)
 
-    def load(self, description: Mapping[str, Any]) -> Any:
+    def load(self, description: Bsdf) -> Any:
         if id(description) not in self.loaded:
             what = f"{description.get('filename', description['type'])}{description.get(PLACE, '')}"
             loaded = self.made(to_mitsuba(description, self.load), what)

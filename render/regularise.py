@@ -11,12 +11,11 @@ import numpy as np
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
-from render.materials import registry_index, registry_number, registry_table
+from render.materials import registry_index, registry_table
 from render.stage import Stage
 
 MIN_BLURRED_ALPHA = 0.3
 ROUGH = {"conductor": "roughconductor", "plastic": "roughplastic", "dielectric": "roughdielectric"}
-NESTED = (*ROUGH, *ROUGH.values(), "principled", "diffuse")  # BSDFs that are blurred within others
 Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dictionary
 
 
@@ -29,9 +28,11 @@ def at_least(roughness: Roughness, least: float) -> Roughness:
 
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, if it has one."""
-    parts = {key: value for key, value in bsdf.items() if isinstance(value, dict) and value.get("type") in NESTED}
-    nested = bsdf | {key: blurred(value) for key, value in parts.items()}
+    """The Mitsuba BSDF dictionary with a GGX alpha of at least MIN_BLURRED_ALPHA, as far as it or BSDFs in it have one.
+
+    Textures, which have none, come out as they are.
+    """
+    nested = {key: blurred(value) if isinstance(value, dict) else value for key, value in bsdf.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
         return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}
@@ -41,14 +42,16 @@ def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 class BlurredTable:
-    """The blurred versions of all BSDFs of a stage, by registry index."""
+    """The blurred versions of all BSDFs of a stage, by registry index; those that nothing describes as they are."""
 
     def __init__(self, stage: Stage):
-        described = [(shape, of.bsdf) for shape, of in zip(stage.shapes, stage.scene.meshes, strict=True) if of.bsdf]
-        rows = {registry_number(mi.BSDFPtr(shape.bsdf())): row for row, (shape, _) in enumerate(described)}
-        self.row = registry_table(mi.UInt32, rows)
+        self.row = registry_table(mi.UInt32, {index: row for row, index in enumerate(stage.bsdfs)})
+        described = stage.bsdf_descriptions
         # Keeps objects alive, which pointers do not.
-        self.bsdfs = [mi.load_dict(to_mitsuba(blurred(bsdf))) for _, bsdf in described]
+        self.bsdfs = [
+            mi.load_dict(to_mitsuba(blurred(described[index]))) if index in described else own
+            for index, own in stage.bsdfs.items()
+        ]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 
     def after_first(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32) -> mi.BSDFPtr:

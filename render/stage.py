@@ -105,7 +105,12 @@ class Stage:
         self.shapes = [by_name[shape.name] for shape in scene.meshes]
         described: list[StockShape | StockLight] = [*scene.stock, *scene.lights]
         self.stock = [StockParameters(stock, self.parameters, self.unit) for stock in described]
-        self.read_bsdfs(bsdfs_of([*self.shapes, *loader.grouped]))
+        self.bsdfs = bsdfs_of([*self.shapes, *loader.grouped])
+        self.read_bsdfs(self.bsdfs)
+        of_stock = [(loaded, text) for text, loaded in loader.loaded.values() if isinstance(loaded, mi.BSDF)]
+        of_shapes = [(shape.bsdf(), of.bsdf) for shape, of in zip(self.shapes, scene.meshes, strict=True) if of.bsdf]
+        # By registry index. Shapes in groups may have a default that nothing describes.
+        self.bsdf_descriptions = {registry_number(mi.BSDFPtr(bsdf)): text for bsdf, text in of_stock + of_shapes}
         mesh_ids = {registry_number(mi.ShapePtr(shape)): index for index, shape in enumerate(self.shapes, 1)}
         self.mesh_id_of_shape = registry_table(mi.UInt32, mesh_ids)
         self.has_instances = bool(loader.grouped)

@@ -467,6 +467,14 @@ static void load_divisor(float *restrict line, const onespp_frame *frame, int ch
         line[i] = minf(maxf(line[i], ALBEDO_FLOOR), MAX_REFLECTANCE);
 }
 
+/* A component of n normals, clamped. */
+static void load_normal(float *restrict line, const onespp_frame *frame, int component, int y, int x, int n)
+{
+    load(line, &frame->normal, component, y, x, n);
+    for (int i = 0; i < n; i++)
+        line[i] = clamped(line[i], MAX_REFLECTANCE);
+}
+
 /* Noisy irradiance of one colour of n <= SPAN pixels, 0 for those that show no surface. */
 static void load_irradiance(float *restrict line, const onespp_frame *frame, int channel, int y, int x, int n)
 {
@@ -765,7 +773,7 @@ static void reproject(const Job *job, int y, int x0, int n, float (*restrict his
     for (int c = 0; c < 2; c++)
         load(motion[c], &job->frame.motion, c, y, x0, n);
     for (int c = 0; c < 3; c++)
-        load(normal[c], &job->frame.normal, c, y, x0, n);
+        load_normal(normal[c], &job->frame, c, y, x0, n);
     load(depth, &job->frame.depth, 0, y, x0, n);
     load_mesh(mesh, &job->frame, y, x0, n);
     for (int i = 0; i < n; i++) {
@@ -1101,11 +1109,9 @@ static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict 
     float normal[3][CHUNK];
     for (int c = 0; c < 3; c++) {
         load(lines[ALBEDO_INPUT + c], &frame->albedo, c, y, x0, n);
-        load(normal[c], &frame->normal, c, y, x0, n);
-        for (int i = 0; i < n; i++) {
+        load_normal(normal[c], frame, c, y, x0, n);
+        for (int i = 0; i < n; i++)
             lines[ALBEDO_INPUT + c][i] = clamped(lines[ALBEDO_INPUT + c][i], MAX_REFLECTANCE);
-            normal[c][i] = clamped(normal[c][i], MAX_REFLECTANCE);
-        }
     }
     for (int c = 0; c < 3; c++) {
         const float *axis = job->to_view[c];
@@ -1476,7 +1482,7 @@ static void remember(const Job *job, int y, int x0, int n)
         for (int i = 0; i < n; i++)
             texels[i * TEXEL + c] = lines[c * d->pitch + i];
     for (int c = 0; c < 3; c++) {
-        load(normal, &job->frame.normal, c, y, x0, n);
+        load_normal(normal, &job->frame, c, y, x0, n);
         for (int i = 0; i < n; i++)
             texels[i * TEXEL + NORMAL + c] = normal[i];
     }

@@ -161,7 +161,9 @@ def turn_normals(turned: RGB, normal: RGB, turn: Matrix) -> None:
 @jit_with_reciprocals
 def predict_surface(taps: RowTaps, y: Index, first: Index, last: Index, pair: FramePair) -> None:
     """Where the surface points of a run's pixels were in the previous frame, and their normals."""
-    mesh = min(int(pair.mesh_id[y, first]), pair.to_then.shape[0] - 1)
+    number = pair.mesh_id[y, first]
+    # Meshes without a pose stand still, as background. Compared as it is: a huge number overflows an integer.
+    mesh = int(number) if number >= f32(0) and number < f32(pair.to_then.shape[0]) else BACKGROUND_ID
     across = pair.slopes[0, 0]
     offset = across * (f32(first) + f32(0.5)) + pair.slopes[0, 1]
     down = pair.slopes[1, 0] * (f32(y) + f32(0.5)) + pair.slopes[1, 1]

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import SIDE_MULTIPLE
 from models.export.history import updated_scale
-from models.export.step import Step, Warp, demodulation, image
+from models.export.step import Step, Warp, bounded, demodulation, image
 from models.filters.neighbours import means_of, summands
 from models.networks.one import HISTORY, PATCH, Decoded, One, PixelInputs, carried, decode, input_channels
 from models.operators import MAX_IRRADIANCE, MIN_DIVISOR
@@ -110,6 +110,7 @@ class OneStep(Step):
         self.requires_grad_(False)
 
     def forward(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
+        x = bounded(x)
         noisy, divisor, surface = demodulation(x)
         noisy = noisy.clamp(0.0, MAX_IRRADIANCE) * surface
         state, exposure, depth = updated_scale(x["scale"], noisy * divisor, x["depth"])

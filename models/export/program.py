@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from inspect import isroutine
 from pathlib import Path
 from typing import Any, Literal
 
@@ -93,7 +94,9 @@ def write_pt2(program: ExportedProgram, step: Step, path: Path) -> dict[str, Any
     """See write_onnx."""
 
     def calls(graph: torch.fx.Graph) -> list[str]:
-        return [str(node.target) for node in graph.nodes if node.op == "call_function"]
+        targets = [node.target for node in graph.nodes if node.op == "call_function"]
+        # Those of Python by name: they print their address in memory. Operators print theirs.
+        return [target.__name__ if isroutine(target) else str(target) for target in targets]
 
     with quiet():
         torch.export.save(program, path)

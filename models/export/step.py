@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import MAX_MAGNITUDE, Frame
+from datasets.frame import BOUNDED, MAX_MAGNITUDE, MAX_SURFACE, Frame
 from models.denoiser import Denoiser
 from models.export.history import GraphGBuffer, reprojected
 from models.history.geometry import to_previous_camera
@@ -18,6 +18,7 @@ Warp = Literal["inside", "outside"]
 HEIGHT = "height"
 WIDTH = "width"
 MESHES = "meshes_and_1"
+PREVIOUS = "previous_"  # begins the names of what is the previous frame's
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Step(nn.Module):
         # What each frame brings, then what is state. Of the outputs, the first is the radiance.
         self.images = tuple(ports[name] for name in dict.fromkeys(reads))
         previous = (
-            replace(port, name=f"previous_{port.name}", meaning="that of the previous frame", source=port.name)
+            replace(port, name=PREVIOUS + port.name, meaning="that of the previous frame", source=port.name)
             for port in self.images
             if port.name in GraphGBuffer._fields and warp == "inside"
         )
@@ -118,9 +119,15 @@ class Step(nn.Module):
         if self.warp == "outside":
             return x["history"]
         now, previous = (
-            GraphGBuffer(*(x[prefix + name] for name in GraphGBuffer._fields)) for prefix in ("", "previous_")
+            GraphGBuffer(*(x[prefix + name] for name in GraphGBuffer._fields)) for prefix in ("", PREVIOUS)
         )
         return reprojected(x["history"], now, previous, x["to_previous_camera"], x["motion"])
+
+
+def bounded(x: dict[str, Tensor]) -> dict[str, Tensor]:
+    """A step's inputs with the bounds that Frame.finite sets to surfaces."""
+    names = [name for name in x if name.removeprefix(PREVIOUS) in BOUNDED]
+    return x | {name: x[name].clamp(-MAX_SURFACE, MAX_SURFACE) for name in names}
 
 
 def demodulation(x: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:

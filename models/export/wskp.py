@@ -13,7 +13,7 @@ from models.compiled.accumulation import MIN_ALPHA
 from models.compiled.exponential import MIN_EXPONENT
 from models.compiled.fusion import OUTSIDE_LOGIT, SAFE_RANGE, WINDOWS
 from models.export.history import updated_scale
-from models.export.step import Step, Warp, demodulation, image
+from models.export.step import Step, Warp, bounded, demodulation, image
 from models.networks.repvgg import RepVGGBlock
 from models.networks.wskp import WSKP, feature_images
 from models.operators import MIN_DIVISOR
@@ -97,6 +97,7 @@ class WSKPStep(Step):
         self.network = plain_convolutions(denoiser.network)
 
     def forward(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
+        x = bounded(x)
         noisy, divisor, surface = demodulation(x)
         history, frames = self.reprojected_history(x).split([3, 1], dim=1)
         length = frames + 1

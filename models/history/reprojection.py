@@ -24,13 +24,15 @@ class Reprojection:
         self.image = image[item].flatten(1)  # (C, H W)
         self.gbuffer = torch.cat([gbuffer.depth[item], gbuffer.normal[item], gbuffer.mesh_id[item]]).flatten(1)
         self.previous_K = frame.previous.K[item]
-        self.mesh = frame.mesh_id[item, 0].long().flatten()  # (H W,)
+        self.mesh = frame.mesh_id[item, 0].flatten()  # (H W,)
         motion = frame.motion[item]
         x, y = pixel_centres(self.height, self.width, motion)
         self.position = torch.stack([x + motion[0], y + motion[1]]).flatten(1)  # (2, H W), in the previous frame
 
         # The expected position of each surface point and its normal, in the previous camera's frame.
-        matrix = to_previous_camera(frame.now, frame.previous, item).to(motion)[self.mesh]
+        matrices = to_previous_camera(frame.now, frame.previous, item).to(motion)
+        has_matrix = (self.mesh >= 0) & (self.mesh < len(matrices))  # meshes without a pose stand still, as background
+        matrix = matrices[torch.where(has_matrix, self.mesh, BACKGROUND_ID).long()]
         point = frame.depth[item].flatten()[:, None] * rays(frame.now.K[item], x.flatten(), y.flatten())
         to_camera = frame.now.camera_to_world[item, :3, :3].T.to(motion)
         self.point = torch.einsum("nij,nj->ni", matrix[:, :3, :3], point) + matrix[:, :3, 3]  # (H W, 3)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datasets.cameras import Cameras
+from datasets.frame import BOUNDED
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
@@ -141,6 +143,18 @@ def test_frames_of_background_alone_black_frames_and_radiance_that_is_not_finite
         check_equal(step, denoiser, frames)
 
 
+@each_kind
+def test_surfaces_count_as_at_most_100(weights, name):
+    step, denoiser = pair(weights, name)
+    frames = sequence((24, 32), frames=3)
+    for channel in {*BOUNDED} & {port.name for port in step.images}:
+        for frame in frames:
+            frame.channel(channel)[..., 5:7, 6:9] = 1e35
+    outputs = outputs_of(step, frames)
+    assert all(torch.isfinite(tensor).all() for each in outputs for tensor in each.values())
+    check_equal(step, denoiser, frames)
+
+
 def test_sample_counts_that_change_from_frame_to_frame(weights):
     counted = zip(sequence((13, 17), frames=3), (4.0, 1.0, 16.0), strict=True)
     frames = [replace(frame, spp=torch.full((1, 1, 1, 1), samples)) for frame, samples in counted]
@@ -260,6 +274,15 @@ def files_of(step, folder):
     write_onnx(program, step, folder / "step.onnx")
     write_pt2(program, step, folder / "step.pt2")
     return run_onnx(folder / "step.onnx"), run_pt2(folder / "step.pt2")
+
+
+@each_kind
+def test_operators_are_named_alike_in_every_process(weights, tmp_path, name):
+    """By words, without the addresses at which Python's functions are in memory."""
+    step, _ = pair(weights, name)
+    operators = write_pt2(trace(step, synthetic_frame(0, 24, 32)), step, tmp_path / "step.pt2")
+    assert {"aten.conv2d.default", "sym_max", "getitem"} <= operators["kinds"].keys()
+    assert all(re.fullmatch(r"[\w.]+", kind) for kind in operators["kinds"])
 
 
 @slow_onnx

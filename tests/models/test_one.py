@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame, read_frame
+from datasets.frame import BOUNDED, Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
 from models import compiled
 from models.compiled.one import FEATURES
@@ -138,6 +138,22 @@ def test_the_brightest_pixel_with_the_largest_weight_stays_finite(fresh):
     outputs, state = play(fresh, frames(images))
     assert all(torch.isfinite(output).all() for output in outputs)
     assert torch.isfinite(state.output).all() and torch.isfinite(state.accumulated).all()
+
+
+@pytest.mark.usefixtures("implementation")
+@pytest.mark.parametrize("name", BOUNDED)
+def test_surfaces_count_as_at_most_100(fresh, name):
+    """In a tenth of the pixels, also where a channel's sum shows nothing."""
+    hit = torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(2)) < 0.1
+    sequence = [synthetic_frame(index, *SIZE) for index in range(4)]
+    for value in (1e35, -1e35, 3e38, torch.tensor([1e35, -1e35]).repeat(SIZE[1] // 2)):
+        huge = torch.as_tensor(value)
+        outputs, expected = (
+            run(fresh, [frame.with_channels({name: torch.where(hit, x, frame.channel(name))}) for frame in sequence])
+            for x in (huge, huge.clamp(-100, 100))
+        )
+        assert all(torch.isfinite(output).all() for output in outputs)
+        torch.testing.assert_close(outputs, expected, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("height", [70, 200])

@@ -1,5 +1,7 @@
 """Reprojection against a slow version in float64, and the kernel against PyTorch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from datasets.frame import Frame, read_frame
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
-from tests.helpers.frames import flat_frame
+from tests.helpers.frames import MESHES, flat_frame
 from tests.helpers.windows import window
 
 pytestmark = pytest.mark.usefixtures("implementation")
@@ -60,6 +62,21 @@ def test_taps_of_another_depth_or_normal_are_invalid():
     turned.channels["normal"] = turned.normal.roll(1, dims=1)
     for other in (flat_frame(5, 5, depth=1.9), turned):
         assert not reproject(frame, torch.zeros(1, 1, 5, 5), GBuffer.of(other))[1].any()
+
+
+@pytest.mark.parametrize("number", [MESHES + 1.0, 5000.0, -1.0, -5000.0, 1e35, -1e35])
+def test_meshes_without_a_pose_stand_still(number):
+    """As a mesh that has a pose and does not move, while the last one moves."""
+    still, other = (flat_frame(12, 20, (1.0, 0.5), mesh_id=torch.full((1, 1, 12, 20), x)) for x in (1.0, number))
+    poses = still.previous.object_to_world.clone()
+    poses[:, -1, 2, 3] = 1.0
+    moved = replace(still.previous, object_to_world=poses)
+    history = torch.rand(1, 2, 12, 20, generator=torch.Generator().manual_seed(0))
+    expected, actual = (
+        reproject(replace(frame, previous=moved), history, GBuffer.of(frame)) for frame in (still, other)
+    )
+    assert expected[1].float().mean() > 0.8
+    assert torch.equal(actual[0], expected[0]) and torch.equal(actual[1], expected[1])
 
 
 def test_background_has_the_history_of_background():

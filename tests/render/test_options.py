@@ -1,18 +1,20 @@
 """The papers' options: Halton cycles are unbiased; regularised paths are biased by glossy things and nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from render.clip import Options, Sampling, render_clip
 from render.gbuffer import render_gbuffer
 from render.path import PathTracer
-from render.regularise import blurred
+from render.regularise import BlurredTable, blurred
 from render.sampler import CYCLE
 from render.stage import Stage
-from scenes.animation import frozen
+from scenes.animation import StockShape, frozen
 from scenes.cornell import repaint
 from scenes.registry import build_scene
-from tests.helpers.rendering import POSED_FRAME, assert_same_mean, stock_radiance
+from tests.helpers.rendering import POSED_FRAME, assert_same_mean, rgb, stock_radiance
 
 
 @pytest.mark.parametrize("cycles", [5, pytest.param(50, marks=pytest.mark.slow)])
@@ -82,3 +84,40 @@ def test_blurred_materials_are_rough_and_others_unchanged():
     ramp = np.linspace(0, 1, 16).reshape(4, 4, 1)
     rough = blurred({"type": "roughconductor", "alpha": {"type": "bitmap", "data": ramp}})
     np.testing.assert_array_equal(rough["alpha"]["data"], np.maximum(ramp, 0.3))
+
+
+def test_materials_are_blurred_at_any_depth():
+    """Whatever they are nested in; what is not glossy there stays as it is."""
+    checks = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
+
+    def material(kind, **roughness):
+        metal = {"type": kind, "material": "Au", **roughness}
+        relief = {"type": "bumpmap", "texture": checks, "bsdf": metal}
+        shaded = {"type": "normalmap", "normalmap": checks, "bsdf": metal}
+        blend = {"type": "blendbsdf", "weight": checks, "a": relief, "b": shaded}
+        return {"type": "twosided", "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": blend}}
+
+    assert blurred(material("conductor")) == material("roughconductor", alpha=0.3)
+    assert blurred(material("roughconductor", alpha=0.1)) == material("roughconductor", alpha=0.3)
+    assert blurred(material("diffuse")) == material("diffuse")
+
+
+def stage_with_instance(bsdf):
+    """The Cornell box and a ball that is an instance."""
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.5, **({"bsdf": bsdf} if bsdf else {})}}
+    ball = StockShape("ball", {"type": "instance", "group": group, "to_world": np.eye(4)}, None)
+    box = build_scene("cornell_box", 3, 2)
+    return Stage(replace(box, stock=(*box.stock, ball)), 32, 32)
+
+
+@pytest.mark.parametrize("bsdf", [None, {"type": "diffuse", "reflectance": rgb(0.9, 0.1, 0.1)}])
+def test_instances_keep_their_material(bsdf):
+    stage = stage_with_instance(bsdf)
+    ray = stage.rays(stage.view(0))
+    plain, regular = (PathTracer(stage, regularise=r).radiance(ray, 1, 16) for r in (False, True))
+    assert all(np.array_equal(a, b) for a, b in zip(plain, regular, strict=True))
+
+
+def test_materials_of_instances_are_blurred():
+    table = BlurredTable(stage_with_instance({"type": "conductor"}))
+    assert [bsdf.class_name() for bsdf in table.bsdfs].count("RoughConductor") == 1

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from datasets.clip import Dataset
-from datasets.frame import Frame, read_frame
+from datasets.frame import BOUNDED, Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
 from models.denoiser import State
 from models.networks.one import One
@@ -170,6 +170,12 @@ def test_light_may_be_of_any_size(library, one, frames):
     for scale in (1e-12, 1e12):
         bright = [f.with_channels({name: scale * f.channel(name) for name in ("direct", "indirect")}) for f in frames]
         compare(library, one, bright)
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+def test_surfaces_count_as_at_most_100(library, one, frames, name):
+    values = (1e35, -1e35, 3e38, 101.0)
+    compare(library, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
 
 
 def test_meshes_without_a_pose_stand_still(library, one):
