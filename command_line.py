@@ -44,6 +44,10 @@ Scenes = Annotated[
 Size = Annotated[str, arg(metavar="WxH", help="size of the images")]
 Threads = Annotated[int | None, arg(metavar="N", help="by default as many as PyTorch uses")]
 Flag = Annotated[bool, FlagCreatePairsOff]
+Models = Annotated[
+    Path | None,
+    arg(metavar="DIR", help="furnish rooms (of datasets, those to train on) from its *.sh3f (docs/data.md)"),
+]
 Png = Annotated[Path, arg(metavar="PNG", help="the image to write")]
 RUNS = Path("runs")
 DEFAULT_SPP = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -53,12 +57,15 @@ def data_folder(data: Path | None, name: str) -> Path:
     return data or Path("data") / name
 
 
-def preview(names: Scenes = (), out: Png = RUNS / "preview.png", seed: int = 0, spp: int = 64) -> None:
+def preview(
+    names: Scenes = (), out: Png = RUNS / "preview.png", seed: int = 0, spp: int = 64, models: Models = None
+) -> None:
     """Draw a contact sheet of scenes, by default of 16 rooms: the middle frame of each."""
     from eval.figures.contact_sheet import contact_sheet
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    contact_sheet(out, names or [f"room-{number}" for number in range(16)], seed, spp=spp)
+    rooms = [f"{'furnished-' if models else ''}room-{number}" for number in range(16)]
+    contact_sheet(out, names or rooms, seed, spp=spp, models=models)
     print(out)
 
 
@@ -69,6 +76,7 @@ def dataset(
     seed: int = 0,
     reads: Annotated[tuple[str, ...], arg(metavar="DENOISER...")] = (),
     part: Annotated[str, arg(metavar="K/N")] = "1/1",
+    models: Models = None,
     halton: Flag = False,
     regularise: Flag = False,
 ) -> None:
@@ -89,7 +97,8 @@ def dataset(
     folder = data_folder(data, scene.stem if scene else profile)
     source = str(scene.resolve()) if scene else profile
     channels = channels_read(reads or TRAINABLE)
-    rendered = generate(folder, source, seed, part, channels, Options(halton, regularise))
+    furniture = str(models.resolve()) if models else ""
+    rendered = generate(folder, source, seed, part, channels, Options(halton, regularise), furniture)
     print(f"{folder}: {rendered} clips rendered")
 
 

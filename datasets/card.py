@@ -37,6 +37,8 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
     used = [split for split, names in facts["splits"].items() if names]
     what = f"--scene {Path(facts['profile']).name}" if facts["source"] else f"--profile {facts['profile']}"
     options = "".join(f" --{name}" for name, on in facts["options"].items() if on)
+    models = facts.get("models", {})
+    options += " --models DIR" if models else ""
     return {
         "profile": Path(facts["profile"]).name,
         "seed": facts["seed"],
@@ -47,6 +49,7 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
         "licence": "that of its scene file" if facts["source"] else "CC0-1.0",
         "source": {Path(path).name: crc32 for path, crc32 in facts["source"].items()},
         "notes": facts["notes"],
+        "models": {name: models[name] for name in ("files", "credits") if models},
         "scenes": facts["scenes"],
         "bytes": sum(clip["bytes"] for clip in clips.values()),
         "splits": {split: split_facts([clips[f"{split}/{name}"] for name in facts["splits"][split]]) for split in used},
@@ -104,7 +107,8 @@ def page_of(card: dict[str, Any]) -> str:
         versions=", ".join(f"{name} {version}" for name, version in card["versions"].items()),
         reads=f" `--reads` left out {', '.join(left_out)}, but for tests." if left_out else "",
         options=", ".join(options) or "none",
-        notes="".join(f"\n- Not as in the scene file: {note}." for note in card["notes"]),
+        notes="".join(f"\n- Not as in the scene file: {note}." for note in card["notes"])
+        + "".join(f"\n- With {credit}." for credit in card["models"].get("credits", [])),
         splits=tabulate(splits, "keys", "github", disable_numparse=True),
         channels=tabulate(channels, ["channel", "axes", "unit", "in"], "github"),
         rows=tabulate(rows, "keys", "github", disable_numparse=True),

@@ -1,6 +1,8 @@
 """Furniture, decor and pictures for a room, at rest or moving."""
 
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -12,9 +14,10 @@ from scenes.layout import GAP, Group, Layout, bounds_of, pose
 from scenes.objects.decor import BODIES, VESSELS, make_basket
 from scenes.objects.fittings import make_floor_lamp, make_glazed_mirror, make_photo, make_picture
 from scenes.objects.furniture import CASES, make_column, make_pane, make_screen, make_showcase, make_table
+from scenes.objects.library import makers_of, open_libraries
 from scenes.objects.plants import make_floor_plant, make_small_plant
 from scenes.objects.seating import SEATS, UPHOLSTERED, make_bench, make_chair
-from scenes.objects.thing import Maker, Thing
+from scenes.objects.thing import Maker, Stock, Thing
 
 # Rooms draw from these in this order.
 FURNITURE: tuple[Maker, ...] = (
@@ -30,10 +33,27 @@ FURNITURE: tuple[Maker, ...] = (
 DECOR: tuple[Maker, ...] = (*VESSELS, *BODIES, make_small_plant, make_basket, make_photo)
 GLAZING: tuple[Maker, ...] = (make_showcase, make_pane)
 AGAINST_WALLS: tuple[Maker, ...] = (*UPHOLSTERED, *CASES, make_bench, make_screen)
+OWN_STOCK = Stock(FURNITURE, DECOR, AGAINST_WALLS)
+MODELS_TO_OWN = 2  # pieces of libraries for each of ours
 MIN_THINGS = 15
 
 
-def scatter(rng: Rng, support: Array, most: int) -> Group:
+@cache
+def stock_of(models: Path | None) -> Stock:
+    """Our own things, and mostly pieces of the furniture libraries in the folder `models`, if there is one.
+
+    Raises BadInput where it has no libraries or none that can furnish rooms.
+    """
+    if models is None:
+        return OWN_STOCK
+    found = makers_of(open_libraries(models))
+    floor, small, backed = (
+        (*own, *[maker] * MODELS_TO_OWN * len(own)) for own, maker in zip(OWN_STOCK, found, strict=True)
+    )
+    return Stock(floor, small, backed)
+
+
+def scatter(rng: Rng, small: Sequence[Maker], support: Array, most: int) -> Group:
     """Up to `most` small things with their poses on a support (2, 3), without overlap."""
     low, high = support[:, [0, 2]]
     level = support[0, 1] + GAP
@@ -42,7 +62,7 @@ def scatter(rng: Rng, support: Array, most: int) -> Group:
     for _ in range(2 * most):
         if len(placed) == most:
             break
-        thing = one_of(rng, DECOR)(rng)
+        thing = one_of(rng, small)(rng)
         angle = rng.uniform(-np.pi, np.pi)
         size = transformed_box(thing.bounds, pose(0, 0, 0, angle))
         room_low, room_high = low - size[0, [0, 2]], high - size[1, [0, 2]]
@@ -57,20 +77,22 @@ def scatter(rng: Rng, support: Array, most: int) -> Group:
     return placed
 
 
-def laden(rng: Rng, thing: Thing) -> Group:
+def laden(layout: Layout, thing: Thing) -> Group:
     """The thing with small ones on most of its supports."""
+    rng = layout.rng
     group = [(thing, np.eye(4))]
     for support in thing.supports:
         if rng.random() < 0.8:
-            group += scatter(rng, support, int(rng.integers(1, 6)))
+            group += scatter(rng, layout.stock.small, support, int(rng.integers(1, 6)))
     return group
 
 
 def against_walls(layout: Layout, count: int) -> None:
     """Add up to `count` pieces of furniture with their backs to a wall."""
     rng = layout.rng
-    for chosen in rng.integers(len(AGAINST_WALLS), size=count):
-        group = laden(rng, AGAINST_WALLS[chosen](rng))
+    backed = layout.stock.backed
+    for chosen in rng.integers(len(backed), size=count):
+        group = laden(layout, backed[chosen](rng))
         bounds = bounds_of(group)
         for _ in range(8):
             wall = int(rng.integers(4))
@@ -106,7 +128,8 @@ def random_motion(layout: Layout, start: Array) -> RigidMotion:
 def movers(layout: Layout, count: int) -> None:
     for _ in range(12 * count):
         if count > 0:
-            group = laden(layout.rng, one_of(layout.rng, FURNITURE + DECOR)(layout.rng))
+            maker = one_of(layout.rng, (*layout.stock.floor, *layout.stock.small))
+            group = laden(layout, maker(layout.rng))
             count -= layout.try_add(group, random_motion(layout, layout.floor_position(0.2)))
 
 
@@ -114,7 +137,7 @@ def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
     """Add up to `count` things anywhere on the floor."""
     rng = layout.rng
     for _ in range(count):
-        group = laden(rng, one_of(rng, makers)(rng))
+        group = laden(layout, one_of(rng, makers)(rng))
         for _ in range(4):
             if layout.try_add(group, still(layout.floor_position(0.15), rng.uniform(-np.pi, np.pi))):
                 break
@@ -122,7 +145,7 @@ def scattered(layout: Layout, makers: Sequence[Maker], count: int) -> None:
 
 def dining(layout: Layout) -> None:
     rng = layout.rng
-    group = laden(rng, make_table(rng))
+    group = laden(layout, make_table(rng))
     if not layout.try_add(group, still(layout.floor_position(1.0), rng.choice([0, np.pi / 2]))):
         return
     low, high = layout.boxes[-1]
@@ -152,11 +175,11 @@ def furnish(layout: Layout) -> None:
         movers(layout, int(rng.integers(2, 5)))
     if rng.random() < 0.6:
         dining(layout)
-    scattered(layout, FURNITURE, int(rng.integers(2, 8)))
+    scattered(layout, layout.stock.floor, int(rng.integers(2, 8)))
     hang_on_walls(layout, make_picture, int(rng.integers(0, 6)))
-    scattered(layout, DECOR, int(rng.integers(0, 8)))
+    scattered(layout, layout.stock.small, int(rng.integers(0, 8)))
     while len(layout.centres) < MIN_THINGS:
-        scattered(layout, DECOR, MIN_THINGS - len(layout.centres))
+        scattered(layout, layout.stock.small, MIN_THINGS - len(layout.centres))
     # Clear glass in a third of the rooms, by draws of its own: the others are as they were without it.
     (layout.rng,) = rng.spawn(1)
     if layout.rng.random() < 1 / 3:

@@ -11,7 +11,7 @@ from scenes.colours import Bsdf
 from scenes.draws import Rng
 from scenes.finish import finish
 from scenes.meshes import Surface
-from scenes.objects.thing import Thing
+from scenes.objects.thing import Stock, Thing
 
 MAX_THINGS = 54  # not counting what hangs
 GAP = 0.002  # m, between neighbouring things
@@ -38,6 +38,7 @@ class Layout:
     size: Array  # (3,) width, height, depth in metres
     frames: int
     gloss: float  # see scenes.finish
+    stock: Stock
     shapes: list[Shape] = field(default_factory=list)
     boxes: Array = field(default_factory=lambda: np.empty((0, 2, 3)))  # reserved
     centres: list[Array] = field(default_factory=list)  # (3,) of things
@@ -103,7 +104,7 @@ class Layout:
             size = float(np.ptp(thing.bounds, axis=0).max())
             self.centres.append(transformed_box(thing.bounds, motion.matrix(0) @ matrix).mean(axis=0))
             for slot, surface in thing.parts.items():
-                bsdf = finish(self.rng, slot, self.gloss, size)
+                bsdf = thing.materials.get(slot) or finish(self.rng, slot, self.gloss, size)
                 self.shapes.append(Shape(f"{name}-{slot}", surface.mesh(matrix), bsdf, None, motion, surface.smooth))
 
     def hang(self, thing: Thing, wall: int, x: float, y: float, z: float) -> None:

@@ -1,12 +1,14 @@
 """Scenes by name."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 
 from errors import BadInput
 from scenes.animation import Scene
 from scenes.cornell import EXTREME_SCENES, SceneBuilder, cornell_box, cornell_box_moving
+from scenes.furnishing import stock_of
 from scenes.glass import GLASS_SCENES
 from scenes.rooms import closeup, room
 
@@ -18,17 +20,21 @@ SCENES: dict[str, SceneBuilder] = {
 }
 
 
-def build_scene(name: str, seed: int, frames: int) -> Scene:
+def build_scene(name: str, seed: int, frames: int, models: Path | None = None) -> Scene:
     """The animated scene `name` for a clip of `frames` frames, with the camera flight and motions of `seed`.
 
     The name is one of SCENES, or `room-N` or `closeup-N` with any integer N, whose scenes depend on N instead of
-    `seed`. Raises BadInput for other names.
+    `seed`; with `furnished-` before it, from the furniture libraries in the folder `models`. Raises BadInput for other
+    names, and without such libraries.
     """
-    number = re.fullmatch(r"(room|closeup)-(-?\d+)", name)
+    number = re.fullmatch(r"(furnished-)?(room|closeup)-(-?\d+)", name)
     if number:
-        n = int(number[2])
+        if number[1] and models is None:
+            raise BadInput(f"scene '{name}' needs --models, the folder of the furniture libraries")
+        n = int(number[3])
         rng = np.random.default_rng(2 * n if n >= 0 else -2 * n - 1)
-        return room(rng, frames) if number[1] == "room" else closeup(rng, frames)
+        stock = stock_of(models if number[1] else None)
+        return (room if number[2] == "room" else closeup)(rng, frames, stock)
     if name not in SCENES:
         names = f"{', '.join(SCENES)}, room-N and closeup-N with any integer N"
         raise BadInput(f"unknown scene '{name}'; the scenes are {names}")

@@ -14,10 +14,11 @@ from scenes.colours import diffuse_bsdf, rgb
 from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
 from scenes.flight import aim_camera, flight_path
-from scenes.furnishing import against_walls, furnish
+from scenes.furnishing import OWN_STOCK, against_walls, furnish
 from scenes.layout import Layout
 from scenes.meshes import Surface, horizontal_rectangle, join, sheet, slab
 from scenes.objects.fittings import make_blind, make_curtain
+from scenes.objects.thing import Stock
 from scenes.textures import sky
 
 MAX_LAMPS = 4
@@ -142,10 +143,10 @@ def outside(layout: Layout, style: Style) -> Array | None:
     return sky(rng, sun=through @ [np.sin(aside), np.tan(elevation), -np.cos(aside)])
 
 
-def room(rng: Rng, frames: int) -> Scene:
+def room(rng: Rng, frames: int, stock: Stock = OWN_STOCK) -> Scene:
     """A random interior for a clip of `frames` frames, in metres: 15 to 60 things, 1 to 4 lamps or windows."""
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
-    layout = Layout(rng, size, frames, gloss=max(0.0, float(rng.uniform(-0.3, 0.5))))
+    layout = Layout(rng, size, frames, max(0.0, float(rng.uniform(-0.3, 0.5))), stock)
     style = STYLES[str(rng.choice(list(STYLES), p=[style.share for style in STYLES.values()]))]
     holes(layout, style)
     environment = outside(layout, style)
@@ -174,9 +175,9 @@ def room(rng: Rng, frames: int) -> Scene:
     return Scene(tuple(shapes), camera, depth, environment)
 
 
-def closeup(rng: Rng, frames: int) -> Scene:
+def closeup(rng: Rng, frames: int, stock: Stock = OWN_STOCK) -> Scene:
     """A random room through a longer lens, as finely resolved as in an image several times as wide."""
-    scene = room(rng, frames)
+    scene = room(rng, frames, stock)
     camera = scene.camera
     zoom = log_uniform(rng, MIN_ZOOM, MAX_ZOOM)
     across, up = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)  # to the right and upwards, in half image widths

@@ -19,21 +19,28 @@ TITLE_INCHES = 0.2  # height of the line above each picture
 
 
 def displayed_frame(
-    name: str, seed: int, frame: int, frames: int, height: int, width: int, spp: int
+    name: str, seed: int, frame: int, frames: int, height: int, width: int, spp: int, models: Path | None = None
 ) -> NDArray[np.float64]:
     """One frame of a scene as displayed, (H, W, 3) in [0, 1], with an exposure of its own.
 
-    `name` is that of a built-in scene or the path of a TOML. Raises BadInput for an unknown scene.
+    `name` is that of a built-in scene, which may need `models` (see build_scene), or the path of a TOML. Raises
+    BadInput for an unknown scene.
     """
     own = name.endswith(".toml")
-    scene = own_scene(Path(name)).clip("test", 0, frames, seed) if own else build_scene(name, seed, frames)
+    scene = own_scene(Path(name)).clip("test", 0, frames, seed) if own else build_scene(name, seed, frames, models)
     posed = PosedFrame(Stage(scene, height, width), frame)
     reflected = posed.reflected(seed, spp)
     return display(reflected + posed.emission, clip_exposure(luminance(reflected)))
 
 
 def contact_sheet(
-    path: Path, names: Sequence[str], seed: int = 0, frames: int = 24, size: tuple[int, int] = (192, 256), spp: int = 64
+    path: Path,
+    names: Sequence[str],
+    seed: int = 0,
+    frames: int = 24,
+    size: tuple[int, int] = (192, 256),
+    spp: int = 64,
+    models: Path | None = None,
 ) -> None:
     """Write a PNG of the scenes' middle frames in `size` (height, width). Raises BadInput for an unknown scene."""
     height, width = size
@@ -45,7 +52,8 @@ def contact_sheet(
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, name in zip(axes.flat, tqdm(names, "scenes", unit="scene"), strict=False):
-        axis.imshow(displayed_frame(name, seed, frames // 2, frames, height, width, spp), interpolation="nearest")
+        image = displayed_frame(name, seed, frames // 2, frames, height, width, spp, models)
+        axis.imshow(image, interpolation="nearest")
         axis.set_title(name, fontsize=8, pad=2)
     figure.subplots_adjust(
         left=0, right=1, bottom=0, top=1 - TITLE_INCHES / sheet_height, wspace=0.01, hspace=TITLE_INCHES * DPI / height

@@ -33,10 +33,12 @@ def generate(
     part: str = "1/1",
     reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
+    models: str = "",
 ) -> int:
     """Render the missing clips of the dataset at `root`, or of `part` "K/N" of them. Returns how many were rendered.
 
-    Clips for training and validation get the channels in `reads` and the essential ones.
+    Clips for training and validation get the channels in `reads` and the essential ones, and their rooms are furnished
+    from the furniture libraries in the folder `models`, if it is not empty.
 
     Several jobs may work on one folder; each clip is rendered by one of them. Folders of disjoint parts can be merged.
     A clip that fails is skipped. A complete dataset gets its card.
@@ -46,14 +48,14 @@ def generate(
     if seed < 0:
         raise BadInput(f"the seed {seed} is negative: use 0 or more")
     share_of([], part)
-    dataset = begun(root, profile, seed, reads, options)
+    dataset = begun(root, profile, seed, reads, options, models)
     missing = [clip for clip in share_of(dataset.planned(), part) if not is_clip(clip)]
     rendered = render_clips(missing, dataset) if missing else 0
     write_card(dataset)
     return rendered
 
 
-def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Options) -> Dataset:
+def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Options, models: str = "") -> Dataset:
     """The dataset of that plan at `root`, which may be new.
 
     Raises BadInput if `root` contains anything but a dataset, or one of another plan.
@@ -67,15 +69,15 @@ def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Op
     if facts.exists():  # its rooms are chosen
         needed_spp = read_json(facts).get("needed_spp", {})
     else:
-        needed_spp = choose_rooms(profile_of(profile), seed, options)
-    wanted = plan(profile, seed, reads, options, needed_spp)
+        needed_spp = choose_rooms(profile_of(profile, models), seed, options)
+    wanted = plan(profile, seed, reads, options, needed_spp, models)
     for note in wanted["notes"]:
         tqdm.write(note)
     root.mkdir(parents=True, exist_ok=True)
     if not facts.exists():
         write_json(facts, wanted)
     dataset = Dataset(root)
-    for key in ("profile", "seed", "generator", "splits", "channels", "options", "source"):
+    for key in ("profile", "seed", "generator", "splits", "channels", "options", "source", "models"):
         if dataset.facts.get(key, {}) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
     return dataset
@@ -101,7 +103,8 @@ def render_clips(clips: Sequence[Path], dataset: Dataset) -> int:
     """
     check_versions(dataset)
     facts = dataset.facts
-    profile, seed, options = profile_of(facts["profile"]), facts["seed"], Options(**facts["options"])
+    profile = profile_of(facts["profile"], facts.get("models", {}).get("folder", ""))
+    seed, options = facts["seed"], Options(**facts["options"])
     rendered, failures = 0, []
     for clip in tqdm(clips, "clips", unit="clip"):
         clip.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS, ClipKind
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
-from render.job.profiles import DataProfile, profile_of, source_of
+from render.job.profiles import DataProfile, furniture_of, profile_of, source_of
 from render.scene_file.load import own_scene
 from scenes.animation import Scene, frozen
 from scenes.registry import build_scene
@@ -25,10 +25,16 @@ FIRST_ROOM = {"train": 0, "val": 1000, "test": 2000}  # the number of a split's 
 ROOMS_OF_A_SEED = 10_000
 
 
+def furnishing(profile: DataProfile, split: str) -> str:
+    """What the names of a split's rooms begin with. Those to test on are the same with any furniture."""
+    return "furnished-" if profile.models and split != "test" else ""
+
+
 def rooms_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp) -> list[str]:
     """The rooms of a split, each as SCENE/CLIP: the first ones that are not skipped."""
     quality = profile.quality[split]
-    names = (f"room-{number}/000" for number in count(ROOMS_OF_A_SEED * seed + FIRST_ROOM[split]))
+    furnished = furnishing(profile, split)
+    names = (f"{furnished}room-{number}/000" for number in count(ROOMS_OF_A_SEED * seed + FIRST_ROOM[split]))
     if quality.skips_noisy_rooms:
         names = (name for name in names if needed_spp.get(f"{split}/{name}", 0) <= quality.most_spp)
     return list(islice(names, profile.rooms.get(split, 0)))
@@ -38,7 +44,8 @@ def clips_of(profile: DataProfile, split: str, seed: int, needed_spp: NeededSpp 
     """All clips of a split, each as SCENE/CLIP, for the dataset with that seed. Close-ups are of other rooms."""
     boxes = [f"{box}/{index:03d}" for box in BOXES for index in range(profile.boxes.get(split, 0))]
     first = ROOMS_OF_A_SEED * seed + FIRST_ROOM[split] + profile.rooms.get(split, 0)
-    closeups = [f"closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
+    furnished = furnishing(profile, split)
+    closeups = [f"{furnished}closeup-{number}/000" for number in range(first, first + profile.closeups.get(split, 0))]
     return boxes + rooms_of(profile, split, seed, needed_spp) + closeups + profile.special.get(split, [])
 
 
@@ -48,13 +55,14 @@ def plan(
     reads: Sequence[str] = USUAL_CHANNELS,
     options: Options = NO_OPTIONS,
     needed_spp: NeededSpp = NO_PILOTS,
+    models: str = "",
 ) -> dict[str, Any]:
     """The content of dataset.json.
 
     Clips for training and validation get the essential channels and those in `reads`; test clips get all for metrics,
     but sample buffers only if `reads` names them. Raises BadInput for an unknown profile.
     """
-    described = profile_of(profile)
+    described = profile_of(profile, models)
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are sampled together
         reads = (*reads, *SAMPLE_BUFFERS.values())
@@ -71,6 +79,7 @@ def plan(
         "channels": {"train": train, "val": train, "test": test},
         "splits": splits,
         "needed_spp": dict(needed_spp),
+        "models": furniture_of(described),
         "source": source_of(described),
         "notes": [] if described.own is None else own_scene(described.own).notes,
     }
@@ -86,7 +95,7 @@ def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tupl
     words = [dataset_seed, zlib.crc32(scene_name.encode()), zlib.crc32(split.encode()), kind.number]
     seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
     if profile.own is None:
-        scene = build_scene(scene_name, seed, profile.size[0])
+        scene = build_scene(scene_name, seed, profile.size[0], profile.models)
     else:
         scene = own_scene(profile.own).clip(split, kind.number, profile.size[0], seed)
     return (frozen(scene) if kind.still else scene), seed

@@ -2,9 +2,9 @@
 
 import re
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from msgspec.structs import asdict
 
@@ -12,6 +12,7 @@ from datasets.clip import SPLITS
 from errors import BadInput
 from render.scene_file.description import read_description
 from scenes.glass import SETTINGS
+from scenes.objects.library import open_libraries
 
 
 class SamplingQuality(NamedTuple):
@@ -34,6 +35,7 @@ class DataProfile:
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
     judged: tuple[int, ...] = ()  # the frames of test clips that get a reference; empty for all
     own: Path | None = None  # the TOML of a user's own scene, the only one
+    models: Path | None = None  # the furniture libraries that training and validation rooms are furnished from
 
 
 # The frames after a cut, and pairs of later ones: what changes in time needs two.
@@ -119,11 +121,28 @@ def source_of(profile: DataProfile) -> dict[str, str]:
         raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
 
 
-def profile_of(name: str) -> DataProfile:
+def furniture_of(profile: DataProfile) -> dict[str, Any]:
+    """The furniture libraries of a profile: their folder, files with crc32, and credits; else nothing.
+
+    Raises BadInput where the folder has none.
+    """
+    if profile.models is None:
+        return {}
+    libraries = open_libraries(profile.models)
+    files = {library.file.name: f"{zlib.crc32(library.file.read_bytes()):08x}" for library in libraries}
+    return {"folder": str(profile.models), "files": files, "credits": [library.credit() for library in libraries]}
+
+
+def profile_of(name: str, models: str = "") -> DataProfile:
     """The data profile of that name: one of DATA_PROFILES, `rooms-NxS` for N rooms of S spp, or the path of a TOML.
 
-    Raises BadInput for other names.
+    `models` is a folder of furniture libraries, or empty. Raises BadInput for other names.
     """
+    described = named_profile(name)
+    return replace(described, models=Path(models)) if models else described
+
+
+def named_profile(name: str) -> DataProfile:
     if name.endswith(".toml"):
         return own_profile(Path(name))
     if match := re.fullmatch(r"rooms-(\d+)x(\d+)", name):

@@ -1,12 +1,14 @@
 """Things, and functions that their makers share."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from scenes.boxes import bounding_box
 from scenes.camera import Array
+from scenes.colours import Bsdf
 from scenes.draws import Rng
 from scenes.meshes import Surface, join
 
@@ -25,6 +27,7 @@ class Thing:
     name: str
     parts: dict[str, Surface]  # by slot
     supports: Sequence[Array] = ()  # boxes (2, 3) for smaller things to stand in, infinitely high if open above
+    materials: Mapping[str, Bsdf] = field(default_factory=dict)  # by slot, where they are not drawn
 
     @property
     def bounds(self) -> Array:
@@ -32,6 +35,14 @@ class Thing:
 
 
 Maker = Callable[[Rng], Thing]
+
+
+class Stock(NamedTuple):
+    """What rooms are furnished with; each maker is drawn as often as the others of its kind."""
+
+    floor: Sequence[Maker]
+    small: Sequence[Maker]  # for supports and the floor
+    backed: Sequence[Maker]  # against walls
 
 
 def shifted(surfaces: SurfacesBySlot, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> SurfacesBySlot:

@@ -146,10 +146,10 @@ def test_a_clip_that_fails_does_not_stop_the_others(tiny_copy, monkeypatch):
     failing, other = remove_clips(tiny_copy, "val/cornell_box/000", "val/cornell_box_moving/000")
     genuine = render.job.plan.build_scene
 
-    def broken(name, seed, frames):
+    def broken(name, *arguments):
         if name == "cornell_box":
             raise RuntimeError("no such texture")
-        return genuine(name, seed, frames)
+        return genuine(name, *arguments)
 
     monkeypatch.setattr(render.job.plan, "build_scene", broken)
     with pytest.raises(BadInput, match=r"1 of 2 clips failed.*val/cornell_box/000: no such texture"):
