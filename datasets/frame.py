@@ -65,6 +65,7 @@ class Frame:
     previous: Cameras  # of the frame that motion vectors lead to
     source: str = ""  # names the clip in messages
     spp: Tensor | None = None  # samples per pixel of the noisy channels, (B, 1, 1, 1); None if unknown
+    parts: Tensor | None = None  # noisy radiance of parts of the light, as of lights, side by side: (B, 3 P, H, W)
     # In training alone:
     colour_gain: Tensor | None = None  # what networks multiply their exposure by (RAE §4.3), (B, 3, 1, 1); None for 1
     whole: Tensor | None = None  # what running_scale measures in the frame that this is a crop of, (B, 2)
@@ -166,7 +167,8 @@ class Frame:
             low, high = tensor.aminmax()
             if not torch.maximum(-low, high) <= limit:  # NaN passes no comparison
                 mended[name] = tensor.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
-        return self.with_channels(mended) if mended else self
+        parts = None if self.parts is None else torch.nan_to_num(self.parts, 0.0, 0.0, 0.0)
+        return replace(self.with_channels(mended), parts=parts) if mended or parts is not None else self
 
     @property
     def has_buffers(self) -> bool:
@@ -235,8 +237,9 @@ class Frame:
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device)
 
-        spp, gain, whole = (None if x is None else move(x) for x in (self.spp, self.colour_gain, self.whole))
-        moved = replace(self.map(move), spp=spp, colour_gain=gain, whole=whole)
+        others = (self.spp, self.parts, self.colour_gain, self.whole)
+        spp, parts, gain, whole = (None if x is None else move(x) for x in others)
+        moved = replace(self.map(move), spp=spp, parts=parts, colour_gain=gain, whole=whole)
         return replace(moved, now=self.now.map(move), previous=self.previous.map(move))
 
     @staticmethod

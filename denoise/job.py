@@ -14,6 +14,10 @@ Patterns = Annotated[tuple[str, ...], arg(metavar="PATTERN...")]  # such as 'fra
 Flag = Annotated[bool, FlagCreatePairsOff]
 LAYERS_HELP = "name layers yourself, such as albedo=MyAOV.albedo or motion=Vec.X,Vec.Y"
 MOTION_HELP = "the motion vectors' convention, such as XY,+x,-y,pixels, in the notation that is printed"
+AOV_HELP = (
+    "denoise these layers of the colour's files too, by the kernels of the colour: lights that add up to it, or single "
+    "channels such as A; needs --denoiser one"
+)
 ERROR_HELP = (
     "add the layer `error`, an estimate of each pixel's error; needs NAME+js and two sample buffers, and takes three "
     "passes instead of one"
@@ -38,6 +42,7 @@ class Job:
     pos: Annotated[Patterns, arg(help="positions in separate files, in the world")] = ()
     ids: Annotated[Patterns, arg(help="ids of objects or meshes in separate files")] = ()
     layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...", help=LAYERS_HELP)] = ()
+    aov: Annotated[tuple[str, ...], arg(metavar="LAYER...", help=AOV_HELP)] = ()
     motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT", help=MOTION_HELP)] = None
     ref: Annotated[Patterns, arg(aliases=["-r"], help="references to compare with")] = ()
     frame_range: Annotated[str | None, arg(name="frames", metavar="A-B", help="frame numbers to denoise")] = None

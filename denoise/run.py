@@ -23,6 +23,7 @@ from denoise.frames import FrameBuilder, OwnFrameBuilder
 from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers
 from denoise.motion_convention import MotionConvention
+from denoise.parts import Parts
 from denoise.sequence import FrameFiles, files_of, gaps, numbered, sequence_of, split_at_cuts
 from denoise.sources import Sources, find_sources, has_two_buffers
 from errors import BadInput, requires_extra
@@ -57,7 +58,8 @@ def denoise(job: Job) -> None:
     denoiser = build(spec, job.quality)
     estimates = job.error or job.until is not None
     estimator = error_estimator(job, denoiser, sources, first[COLOUR]) if estimates else None
-    sequence = SequenceDenoiser(job, spec, denoiser, estimator, shots, sources, first[COLOUR])
+    parts = Parts.named(job.aov, first[COLOUR], denoiser)
+    sequence = SequenceDenoiser(job, spec, denoiser, estimator, parts, shots, sources, first[COLOUR])
     print(sequence.introduction())
     check_settings(job.out, sequence.settings())
     nonfinite = list(sequence.play())
@@ -136,6 +138,7 @@ class SequenceDenoiser:
     spec: DenoiserSpec
     denoiser: Denoiser
     estimator: JamesStein | None  # the denoiser, where it is to estimate its error
+    parts: Parts | None  # layers that are denoised beside the colour
     shots: list[list[FrameFiles]]
     sources: Sources
     first: ExrImage  # the header of the first frame's colour
@@ -179,6 +182,7 @@ class SequenceDenoiser:
             "first frame": first.number,
             "reset-at": sorted(job.reset_at),
             "layers": sorted(job.layers),
+            "aov": sorted(job.aov) or None,
             "motion": str(job.motion if self.sources.is_ours else self.analysis.conventions.motion),
             "as": job.stored_as,
             "spp": job.spp,
@@ -230,8 +234,13 @@ class SequenceDenoiser:
         self, files: FrameFiles, image: ExrImage, frame: Frame, state: State | None, is_new: bool
     ) -> tuple[Tensor, State]:
         """The denoised frame and the next state; the error of a new frame goes into the table and its image."""
+        if self.parts:
+            frame = self.parts.added(frame, image)
         if not (self.estimator and is_new):
-            return self.denoiser(frame, state)
+            output, state = self.denoiser(frame, state)
+            if self.parts and is_new:
+                self.parts.write(image, frame, state, DTYPES[self.job.stored_as])
+            return output, state
         output, state, estimate = denoise_with_error(self.estimator, frame, state)
         self.errors.add(FrameError.of(files.number, estimate, self.job.until))
         if self.job.error:

@@ -111,8 +111,8 @@ class Denoiser(nn.Module):
         return self.run(frame.finite(), state)
 
     def run(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
-        """`forward`, for each layer of glass apart."""
-        if not frame.has_layers or self.blends_layers:
+        """`forward`, for each layer of glass apart, or for both as one where light comes in parts."""
+        if not frame.has_layers or self.blends_layers or frame.parts is not None:
             one_layer = blended(frame) if frame.has_layers else frame
             return cast(tuple[Tensor, State], super().__call__(one_layer, state))
         before = matching_state(state, LayeredState, frame)

@@ -27,7 +27,7 @@ STRIDE = 4  # features that are compared in one pass
 class Level(NamedTuple):
     """What a level filters, row after row (see models.networks.one), or the gradients of that."""
 
-    image: Image  # (B, 3, N)
+    image: Image  # (B, 3, N), or several images side by side, (B, 3 P, N)
     features: Image  # (B, F, N), F a multiple of STRIDE
     sharpness: Rows  # (B, N), as those below
     own: Rows
@@ -120,19 +120,23 @@ def taps_of_block(layout: TapLayout, first: Index, last: Index) -> Iterator[Taps
 def filter_block(
     out: Rows, total: Row, level: Level, layout: TapLayout, item: Index, first: Index, last: Index
 ) -> None:
-    """Pixels `first` to `last` - 1 of out (3, N) and total (N)."""
+    """Pixels `first` to `last` - 1 of out (3 P, N) and total (N)."""
     weights = np.empty(last - first, np.float32)
     distances = np.empty(last - first, np.float32)
+    ignored = np.zeros(last - first, np.float32)  # sums of the same weights, for further colours
     out[:, first:last] = f32(0)
     total[first:last] = f32(0)
     for taps in taps_of_block(layout, first, last):
         offset, low, high, _ = taps
         weight = weights[: high - low]
         weigh_taps(weight, distances[: high - low], level, layout, item, taps, first)
-        there = triple_of_lines(level.image[item], low + offset, high + offset)
-        add_weighted(triple_of_lines(out, low, high), total[low:high], weight, there)
+        for c in range(0, len(out), 3):
+            sums = total[low:high] if c == 0 else ignored[: high - low]
+            there = triple_of_lines(level.image[item, c : c + 3], low + offset, high + offset)
+            add_weighted(triple_of_lines(out[c : c + 3], low, high), sums, weight, there)
     scale_line(total[first:last], layout.surface[item, first:last])
-    normalise(triple_of_lines(out, first, last), total[first:last])
+    for c in range(0, len(out), 3):
+        normalise(triple_of_lines(out[c : c + 3], first, last), total[first:last])
 
 
 @jit_in_any_order

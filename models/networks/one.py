@@ -77,6 +77,7 @@ class OneState(State):
     gbuffer: GBuffer
     scale: RunningScale
     alpha: Tensor  # (B, 2, H, W), of accumulation and output; for debugging
+    parts: Tensor  # of the P parts of the light, output and accumulated irradiance, (B, 6 P, H, W)
 
     def pictures(self) -> dict[str, Tensor]:
         return {
@@ -185,12 +186,15 @@ def affinity_level(
 def carried(
     decoded: Decoded, past: Tensor, surface: Tensor, steps: Sequence[int], level: Callable[..., Tensor] = affinity_level
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`."""
+    """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
+
+    There may be images of parts of the light beside the accumulation, and beside the past output.
+    """
     image = decoded.accumulated
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
     for step, sharpness, centre, importance in zip(steps, *planes, strict=True):
         image = level(image, decoded.features, sharpness, centre, importance, surface, step)
-    output = torch.lerp(past[:, :3], image, decoded.alpha[:, 1:]) * surface
+    output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
     return output, decoded.accumulated, decoded.length, decoded.latent
 
 
@@ -236,14 +240,28 @@ def network_inputs(frame: Frame, scale: RunningScale, inputs: PixelInputs, hidde
     return patches_of(channels), pixels
 
 
-def fetched(before: OneState | None, frame: Frame, surface: Tensor) -> tuple[Tensor, Tensor]:
-    """The channels HISTORY of the previous frame, reprojected, and 1 where they are valid, else 0."""
+def fetched(before: OneState | None, frame: Frame, surface: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the previous frame, reprojected: the channels HISTORY, those of parts, and 1 where they are valid, else 0."""
     has_history = torch.zeros_like(surface)
     if before is None:
-        return has_history.expand(-1, sum(HISTORY), -1, -1), has_history
-    past = torch.cat([before.output, before.accumulated, before.length, before.latent], dim=1)
+        nothing = has_history.expand(-1, sum(HISTORY), -1, -1)
+        return nothing, has_history.expand(-1, 2 * count_of_parts(frame), -1, -1), has_history
+    past = torch.cat([before.output, before.accumulated, before.length, before.latent, before.parts], dim=1)
     history, valid = reproject(frame, past, before.gbuffer)
-    return history, valid.to(history) * surface
+    history, parts = history.split([sum(HISTORY), before.parts.shape[1]], dim=1)
+    return history, parts, valid.to(history) * surface
+
+
+def count_of_parts(frame: Frame) -> int:
+    """The channels of a frame's parts of the light."""
+    return 0 if frame.parts is None else frame.parts.shape[1]
+
+
+def part_irradiance(frame: Frame, whole: Tensor, clamped: Tensor) -> Tensor:
+    """Irradiance (B, 3 P, H, W) of the parts of the light, scaled where the `whole` (B, 3, H, W) was clamped."""
+    assert frame.parts is not None
+    kept = torch.where(whole == clamped, 1, clamped / torch.where(whole == 0, 1, whole))
+    return frame.parts * (kept / frame.divisor).repeat(1, frame.parts.shape[1] // 3, 1, 1)
 
 
 class One(Denoiser):
@@ -266,22 +284,41 @@ class One(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
+        if before and before.parts.shape[1] != 2 * count_of_parts(frame):
+            before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)
-        images = carried(decoded, past, surface, self.steps)
-        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach())
+        output, accumulated, length, latent = carried(decoded, past, surface, self.steps)
+        parts = torch.cat([output[:, 3:], accumulated[:, 3:]], dim=1)
+        images = output[:, :3], accumulated[:, :3], length, latent
+        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), parts)
 
     def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
         """What the network predicts, the reprojected history, of large images its output alone, and the running scale.
 
-        The filter needs nothing else: what only the network reads is freed on return.
+        The filter needs nothing else: what only the network reads is freed on return. Parts of the light, if there
+        are any, follow the whole in the accumulation, which has the same weights, and in the history's output.
         """
-        noisy = frame.irradiance(self.signal).clamp(0.0, MAX_IRRADIANCE) * surface
+        irradiance = frame.irradiance(self.signal)
+        noisy = irradiance.clamp(0.0, MAX_IRRADIANCE) * surface
         scale = running_scale(noisy * frame.divisor, frame.depth, before.scale if before else None, frame.whole)
-        history, has_history = fetched(before, frame, surface)
+        history, part_history, has_history = fetched(before, frame, surface)
+        decoded, past = self.decoded_frame(frame, scale, noisy, history, has_history)
+        if frame.parts is not None:
+            outputs, accumulated = part_history.chunk(2, dim=1)
+            parts = part_irradiance(frame, irradiance, noisy)
+            both = [decoded.accumulated, torch.lerp(accumulated, parts, decoded.alpha[:, :1])]
+            decoded = decoded._replace(accumulated=torch.cat(both, dim=1))
+            past = torch.cat([past[:, :3], outputs], dim=1)
+        return decoded, past, scale
+
+    def decoded_frame(
+        self, frame: Frame, scale: RunningScale, noisy: Tensor, history: Tensor, has_history: Tensor
+    ) -> tuple[Decoded, Tensor]:
+        """What the network predicts, and the history, of large images its output alone."""
         height, width = frame.size
         if height * width <= STRIP_PIXELS or torch.is_grad_enabled():
-            return self.decoded_rows(frame, scale, noisy, history, has_history), history, scale
+            return self.decoded_rows(frame, scale, noisy, history, has_history), history
         # Large images in strips of rows: the network's activations would take most of the memory.
         rows = max(1, STRIP_PIXELS // 2 // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
         channels = *head_channels(len(self.steps)).values(), 3, 1
@@ -293,7 +330,7 @@ class One(Denoiser):
             strip = self.decoded_rows(part, scale, *(each[..., needed, :] for each in (noisy, history, has_history)))
             for image, values in zip(whole, strip, strict=True):
                 image[..., top : top + rows, :] = values[..., top - first : top - first + rows, :]
-        return whole, history[:, :3].clone(), scale  # what else there is of the history is freed
+        return whole, history[:, :3].clone()  # what else there is of the history is freed
 
     def decoded_rows(
         self, frame: Frame, scale: RunningScale, noisy: Tensor, history: Tensor, has_history: Tensor
@@ -309,3 +346,13 @@ class One(Denoiser):
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         irradiance, after = self.predict(frame, state)
         return frame.remodulate(irradiance, self.signal), after
+
+    def parts(self, frame: Frame, state: State) -> Tensor:
+        """Denoised radiance (B, 3 P, H, W) of the parts of the light of a frame, of which it returned the `state`.
+
+        Kernels and weights of history are those of the whole, so parts that add up to the noisy light do so denoised.
+        """
+        assert isinstance(state, OneState) and frame.parts is not None
+        outputs = state.parts.chunk(2, dim=1)[0]
+        reflected = outputs * frame.divisor.repeat(1, outputs.shape[1] // 3, 1, 1)
+        return torch.where(frame.depth > 0, reflected, frame.parts)

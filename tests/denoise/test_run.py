@@ -491,3 +491,31 @@ def test_normals_in_the_range_of_colours_are_recognised(box, tmp_path, capsys):
     assert "scaled" not in capsys.readouterr().out
     assert error(denoised(tmp_path / "in", tmp_path / "out"), expected) < 1e-4
     assert "normal        scaled from [0, 1] to [-1, 1]" in capsys.readouterr().out
+
+
+def test_layers_that_add_up_to_the_colour_do_so_denoised(tiny, tmp_path):
+    clip = next(clip for clip in Dataset(tiny).clips("test") if clip.scene == "cornell_box_moving")
+    export_clip(clip.path, tmp_path / "in")
+    options = {"frame_range": "0-2", "stored_as": "float"}
+    lit = denoised(tmp_path / "in", tmp_path / "out", "one", aov=("direct", "indirect", "depth.Z"), **options)
+    direct, indirect, emission = (
+        images_in(tmp_path / "out", f"{name}.") for name in ("direct", "indirect", "emission")
+    )
+    for whole, *parts in zip(lit, direct, indirect, emission, strict=True):
+        torch.testing.assert_close(sum(parts), whole, rtol=1e-4, atol=1e-5 * float(whole.max()))
+    assert same(lit, denoised(tmp_path / "in", tmp_path / "alone", "one", **options))
+    before, after = (
+        foreign.read(tmp_path / folder / sorted(os.listdir(tmp_path / "in"))[0]) for folder in ("in", "out")
+    )
+    assert before["depth.Z"].min() <= after["depth.Z"].min() and after["depth.Z"].max() <= before["depth.Z"].max()
+
+
+@pytest.mark.parametrize(
+    ("denoiser", "layer", "message"),
+    [("svgf", "direct", "--denoiser one"), ("one", "key light", "no layer or channel 'key light'.*direct.BGR")],
+)
+def test_layers_that_cannot_be_denoised_are_refused(tiny, tmp_path, denoiser, layer, message):
+    clip = Dataset(tiny).clips("test")[0]
+    export_clip(clip.path, tmp_path / "in")
+    with pytest.raises(BadInput, match=message):
+        denoised(tmp_path / "in", tmp_path / "out", denoiser, aov=(layer,))
