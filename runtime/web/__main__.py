@@ -1,6 +1,6 @@
 """A page that denoises a clip live: the C runtime as WebAssembly and the clip, in one file that needs nothing else.
 
-`python -m runtime.web CLIP PAGE [FRAMES]` writes it; by default with the clip's first 2 million pixels.
+`python -m runtime.web CLIP PAGE [FRAMES]` writes it; by default with as many frames as fit into about 30 MB.
 """
 
 import base64
@@ -23,7 +23,7 @@ from runtime.raw import raw
 
 HERE = Path(__file__).parent
 MODULE = HERE / "onespp.wasm"
-MOST_PIXELS = 2_000_000  # of all frames, unless their number is given: about 30 MB
+MOST_PIXELS = 1_500_000  # of all frames, unless their number is given: each takes about 20 bytes
 REMEDY = "install Clang for WebAssembly, on Debian `apt-get install clang lld wasi-libc libclang-rt-dev-wasm32`"
 
 
