@@ -170,11 +170,14 @@ def report(
     runs: Runs = RUNS,
     megabytes: Annotated[float, arg(help="size of all images; where not all frames fit, every n-th is shown")] = 24,
 ) -> None:
-    """Write a self-contained page of all results, RUNS/report/index.html, and an animation of each clip."""
+    """Write a self-contained page of all results, RUNS/report/index.html, and an animation of each clip.
+
+    Where Clang for WebAssembly is installed, it links to a page that denoises a clip in the browser.
+    """
     from eval.report.page import report as make_report
 
-    page, *animations = make_report(runs, megabytes)
-    for path in animations:
+    page, *beside_it = make_report(runs, megabytes)
+    for path in beside_it:
         print(path)
     print(f"open {page} in a browser")
 

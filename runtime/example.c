@@ -1,33 +1,18 @@
 /* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS]
  *
- * SEQUENCE is what `python -m runtime.raw` writes: frames one after the other, each a header, the poses of its meshes
- * (4 x 4 doubles each) and planes of float32: direct, indirect, emission, albedo and normal (3 channels each), depth,
- * roughness and motion (2); then the mesh ids, of int32. OUTPUT becomes the denoised frames as planes of float32, three
- * per frame. Prints the time that each frame took.
+ * SEQUENCE is what `python -m runtime.raw` writes, see raw.h. OUTPUT becomes the denoised frames as planes of float32,
+ * three per frame. Prints the time that each frame took.
  */
 #define _POSIX_C_SOURCE 200809L
 
-#include "onespp.h"
+#include "raw.h"
 
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 #include <time.h>
 
-enum { MAX_MESHES = 4096, MAX_THREADS = 64, PLANES = 19 };
-
-typedef struct {
-    int32_t width, height, reset, meshes;
-    double samples, K[9], camera_to_world[16];
-} Header;
-
-typedef struct {
-    Header header;
-    double *poses;
-    float *planes;
-    int32_t *mesh_id;
-} Raw;
+enum { MAX_MESHES = 4096, MAX_THREADS = 64 };
 
 /* --- Threads that wait for tasks ---------------------------------------------------------------------------------- */
 
@@ -80,54 +65,21 @@ static void parallel_for(void *user, int count, onespp_task task, void *argument
 
 /* --- Frames ------------------------------------------------------------------------------------------------------- */
 
-/* Whether there is another frame, whose arrays are then allocated anew. */
-static int read_frame(FILE *file, Raw *raw)
+/* Whether there is another frame, which then replaces the one in memory. */
+static int read_frame(FILE *file, raw_header **raw)
 {
-    Header *header = &raw->header;
-    if (fread(header, sizeof *header, 1, file) != 1)
+    raw_header header;
+    if (fread(&header, sizeof header, 1, file) != 1)
         return 0;
-    if (header->width < 1 || header->width > ONESPP_MAX_SIDE || header->height < 1 || header->height > ONESPP_MAX_SIDE
-        || header->meshes < 0 || header->meshes > MAX_MESHES)
+    if (header.width < 1 || header.width > ONESPP_MAX_SIDE || header.height < 1 || header.height > ONESPP_MAX_SIDE
+        || header.meshes < 0 || header.meshes > MAX_MESHES)
         return 0;
-    size_t pixels = (size_t)header->width * (size_t)header->height, poses = 16 * (size_t)header->meshes;
-    raw->poses = realloc(raw->poses, sizeof(double) * (poses + 1));
-    raw->planes = realloc(raw->planes, sizeof(float) * PLANES * pixels);
-    raw->mesh_id = realloc(raw->mesh_id, sizeof(int32_t) * pixels);
-    return raw->poses && raw->planes && raw->mesh_id && fread(raw->poses, sizeof(double), poses, file) == poses
-        && fread(raw->planes, sizeof(float), PLANES * pixels, file) == PLANES * pixels
-        && fread(raw->mesh_id, sizeof(int32_t), pixels, file) == pixels;
-}
-
-/* Planes one after the other; moves on to what follows them. */
-static onespp_image image(const float **planes, const Header *header, int channels)
-{
-    ptrdiff_t size = (ptrdiff_t)header->width * header->height;
-    onespp_image result = {*planes, size, header->width, 1};
-    *planes += channels * size;
-    return result;
-}
-
-static onespp_frame described(const Raw *raw)
-{
-    const Header *header = &raw->header;
-    const float *planes = raw->planes;
-    onespp_frame frame = {.width = header->width, .height = header->height, .reset = header->reset};
-    frame.samples = (float)header->samples;
-    frame.direct = image(&planes, header, 3);
-    frame.indirect = image(&planes, header, 3);
-    frame.emission = image(&planes, header, 3);
-    frame.albedo = image(&planes, header, 3);
-    frame.normal = image(&planes, header, 3);
-    frame.depth = image(&planes, header, 1);
-    frame.roughness = image(&planes, header, 1);
-    frame.motion = image(&planes, header, 2);
-    onespp_ids ids = {raw->mesh_id, header->width, 1};
-    frame.mesh_id = ids;
-    memcpy(frame.K, header->K, sizeof frame.K);
-    memcpy(frame.camera_to_world, header->camera_to_world, sizeof frame.camera_to_world);
-    frame.meshes = header->meshes;
-    frame.object_to_world = raw->poses;
-    return frame;
+    size_t size = raw_size(&header);
+    *raw = realloc(*raw, size);
+    if (!*raw)
+        return 0;
+    **raw = header;
+    return fread(*raw + 1, size - sizeof header, 1, file) == 1;
 }
 
 static double seconds(void)
@@ -147,7 +99,7 @@ int main(int count, char **arguments)
 {
     int threads = count > 3 ? atoi(arguments[3]) : 2;
     FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL, *out = file ? fopen(arguments[2], "wb") : NULL;
-    Raw raw = {0};
+    raw_header *raw = NULL;
     if (!out || threads < 1 || threads > MAX_THREADS)
         return fail("usage: example SEQUENCE OUTPUT [THREADS]");
     if (!read_frame(file, &raw))
@@ -160,9 +112,8 @@ int main(int count, char **arguments)
             return fail("a thread could not be started");
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
-    onespp_config config = {ONESPP_ABI, raw.header.width, raw.header.height, MAX_MESHES, 2 * threads, parallel_for,
-                            &pool};
-    size_t size = onespp_size(&config), pixels = (size_t)raw.header.width * (size_t)raw.header.height;
+    onespp_config config = {ONESPP_ABI, raw->width, raw->height, MAX_MESHES, 2 * threads, parallel_for, &pool};
+    size_t size = onespp_size(&config), pixels = (size_t)raw->width * (size_t)raw->height;
     void *memory = malloc(size);
     float *radiance = malloc(sizeof(float) * 3 * pixels);
     onespp *denoiser;
@@ -170,7 +121,7 @@ int main(int count, char **arguments)
     if (error || !radiance)
         return fail(error ? onespp_message(error) : "out of memory");
     do {
-        onespp_frame frame = described(&raw);
+        onespp_frame frame = raw_frame(raw);
         onespp_output output = {radiance, (ptrdiff_t)frame.width * frame.height, frame.width, 1};
         double start = seconds();
         error = onespp_denoise(denoiser, &frame, &output);

@@ -25,6 +25,8 @@
 
 #if defined(__AVX512F__)
 enum { LANES = 64, AT_ONCE = 4 }; /* pixels and outputs that a layer sums in registers, see multiply_block */
+#elif defined(__wasm_simd128__)
+enum { LANES = 8, AT_ONCE = 4 };
 #else
 enum { LANES = 32, AT_ONCE = 2 };
 #endif

@@ -1,4 +1,4 @@
-"""Frames as the raw sequences that example.c reads.
+"""Frames as the raw sequences that raw.h describes.
 
 `python -m runtime.raw CLIP|WxH FRAMES FILE` writes a clip's frames, or synthetic ones of a size.
 """

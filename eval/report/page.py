@@ -1,6 +1,8 @@
 """`onespp report`: one HTML file with all results, and short animated pictures of clips, for slides."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from datasets.clip import is_clip
 from errors import BadInput, requires_extra
 from eval.metrics import METRICS, flip_map
 from eval.results import ClipResults, by_signal, folders_of, load_picture, of_one_spp, picture_path, read_results
@@ -17,6 +20,7 @@ from eval.tradeoff.trades import Times, dominated_by_name, times_of_first_size
 from files import replacing, write_file
 from models.spec import DenoiserSpec
 from plotting import Image, ImageDraw, ImageFont, data_uri, enlargement, plt, webp_uri
+from provenance import ROOT
 from timing import thread_count, threads_for
 
 with requires_extra("report"):
@@ -31,6 +35,7 @@ BEST_SHOWN = 2  # denoisers, in an animation
 MAX_FRAMES = 240
 MILLISECONDS = 83  # that each frame is shown
 BANNER = 22  # px above the panels, for their names
+LIVE_PAGE = "live.html"
 
 
 def four_digits(value: float | None) -> float | None:
@@ -125,7 +130,8 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, An
     return plots
 
 
-def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float) -> str:
+def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, megabytes: float, live: bool) -> str:
+    """The page; `live` says whether to link to LIVE_PAGE."""
     times = times_of_first_size(runs)
     paths = (path for clip in clips for folder in folders_of(runs, clip).values() for path in folder.glob("*.webp"))
     size = sum(path.stat().st_size for path in paths) * WITH_FLIP_MAPS * BASE64
@@ -153,6 +159,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
         mean=MEAN,
         times=times,
         figures=[{"name": path.stem.replace("-", " "), "uri": data_uri(path.read_bytes(), "png")} for path in figures],
+        live=LIVE_PAGE if live else None,
         has_error_maps=any(clip["errors"] for clip in pictures),
         data=data,
         style=Markup((page / "style.css").read_text()),
@@ -195,8 +202,27 @@ def save_animation(runs: Path, clip: ClipResults) -> Path:
     return path
 
 
+def save_live_page(runs: Path, data: Sequence[Path], clips: Sequence[ClipResults]) -> list[Path]:
+    """Write RUNS/report/live.html, which denoises the last clip of 1 spp in the browser.
+
+    Returns its path, or nothing where the clip or the C runtime is not at hand; prints why it cannot be compiled.
+    """
+    paths = (folder / "test" / clip.scene / clip.clip for clip in reversed(of_one_spp(clips)) for folder in data)
+    clip = next(filter(is_clip, paths), None)
+    if clip is None or not (ROOT / "runtime" / "web").is_dir():
+        return []
+    path = runs / "report" / LIVE_PAGE
+    # In a process of its own, since `runtime` is no package of onespp where that is installed.
+    command = [sys.executable, "-m", "runtime.web", str(clip.resolve()), str(path.resolve())]
+    finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if finished.returncode:
+        print(f"no {LIVE_PAGE}: {finished.stderr.strip().splitlines()[-1]}")
+        return []
+    return [path]
+
+
 def report(runs: Path, megabytes: float = 24) -> list[Path]:
-    """Write RUNS/report/index.html and an animated WebP per clip; returns their paths.
+    """Write RUNS/report/index.html, an animated WebP per clip and, if possible, live.html; returns their paths.
 
     Pictures take about `megabytes` at most: if all frames do not fit, the page shows every n-th. Raises BadInput
     without results and where they are damaged.
@@ -208,5 +234,6 @@ def report(runs: Path, megabytes: float = 24) -> list[Path]:
         raise BadInput(f"{runs / 'eval' / 'results.json'} has no rows: run `onespp eval` again")
     page = runs / "report" / "index.html"
     page.parent.mkdir(parents=True, exist_ok=True)
-    write_file(page, render(results, clips, runs, megabytes).encode())
-    return [page, *(save_animation(runs, clip) for clip in tqdm(clips, "animations", unit="clip"))]
+    live = save_live_page(runs, [Path(folder) for folder in results["dataset"].split(", ")], clips)
+    write_file(page, render(results, clips, runs, megabytes, live=bool(live)).encode())
+    return [page, *live, *(save_animation(runs, clip) for clip in tqdm(clips, "animations", unit="clip"))]

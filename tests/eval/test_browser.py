@@ -1,53 +1,34 @@
 """The report in a browser: it opens without errors, and does what a mouse and a keyboard ask for."""
 
-import shutil
 import time
 
 import pytest
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from eval.benchmark.page import write_page
+from tests.helpers.browser import chromium, needs_browser, no_errors, set_media
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        not (BROWSER and DRIVER), reason="needs Chromium and its driver: `apt-get install chromium chromium-driver`"
-    ),
-]
+pytestmark = [pytest.mark.slow, needs_browser]
 WIDTH = 1366
 HEIGHT = 768
 
 
 @pytest.fixture(scope="module")
 def browser():
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    yield driver
-    driver.quit()
+    with chromium() as driver:
+        yield driver
 
 
 @pytest.fixture(params=["light", "dark"])
 def page(request, browser, evaluated):
     """The report, freshly opened; no error may have come up at the end."""
-    size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
-    features = {"prefers-color-scheme": request.param, "prefers-reduced-motion": "reduce"}
-    media = {"features": [{"name": name, "value": value} for name, value in features.items()]}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    set_media(browser, WIDTH, HEIGHT, request.param)
     browser.get((evaluated / "report" / "index.html").as_uri())
     shows(browser, "slider")
     yield browser
-    assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []
+    assert no_errors(browser)
 
 
 def shows(page, *words) -> list[str]:
@@ -198,4 +179,4 @@ def test_the_blind_comparison_counts_votes(browser, tiny, tmp_path):
     rows = {row.text for row in browser.find_elements(By.CSS_SELECTOR, "#result tr")}
     assert "no difference 1" in rows
     assert rows > {"noisy 1", "accumulated 0"} or rows > {"noisy 0", "accumulated 1"}
-    assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []
+    assert no_errors(browser)

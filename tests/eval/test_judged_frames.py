@@ -55,7 +55,7 @@ def test_judged_frames_have_the_references_and_metrics_that_they_always_have(bot
 
 def test_what_needs_references_takes_the_judged_frames(both):
     root, _, (sparse, results) = both
-    page, animation = report(root / "some")
+    page, *_, animation = report(root / "some")
     assert page.exists() and animation.exists()
     assert results.reference.judged == JUDGED
     assert export_clip(sparse.path, root / "exr") == 5

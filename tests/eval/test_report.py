@@ -26,6 +26,7 @@ from eval.tables import TableRow, best_denoisers
 from eval.tradeoff.samples import with_samples
 from models.spec import DenoiserSpec
 from models.wrappers.error_estimate import denoise_with_error
+from provenance import ROOT
 
 
 class Page(HTMLParser):
@@ -79,7 +80,7 @@ def test_the_page_loads_nothing_and_has_its_figures(page, evaluated):
     assert ("img", "alt", "trade flip") in page.attributes
     for tag, name, value in page.attributes:
         if name in ("src", "href", "action", "poster", "srcset"):
-            assert value.startswith(("data:", "#")), (tag, name, value)
+            assert value.startswith(("data:", "#")) or value == "live.html", (tag, name, value)
     text = (evaluated / "report" / "index.html").read_text()
     assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", text)
     assert set(re.findall(r"https?://[\w./]*", text)) == {"http://www.w3.org/2000/svg"}  # a namespace, never loaded
@@ -228,6 +229,30 @@ def test_without_results_or_with_damaged_ones(evaluated, tmp_path, capsys):
     shutil.rmtree(runs / "eval" / "clips" / "cornell_box-000" / "eaw")
     with pytest.raises(BadInput, match=r"eaw/result.json is missing"):
         report(runs)
+
+
+def test_the_live_page_is_linked_where_it_can_be_made(evaluated, tmp_path, monkeypatch, capsys):
+    def links(runs: Path) -> bool:
+        linked = ("a", "href", "live.html") in Page(runs / "report" / "index.html").attributes
+        assert linked == (runs / "report" / "live.html").exists()
+        return linked
+
+    runs = shutil.copytree(evaluated, tmp_path / "runs", ignore=shutil.ignore_patterns("live.html"))
+    if links(evaluated):
+        assert '"name": "cornell_box_moving/000"' in (evaluated / "report" / "live.html").read_text()
+    # Without a compiler for WebAssembly: a copy of the runtime's sources, none of which is compiled.
+    shutil.copytree(ROOT / "runtime", tmp_path / "runtime", ignore=shutil.ignore_patterns("*.wasm"))
+    monkeypatch.setattr("eval.report.page.ROOT", tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("CLANG", "no-such-compiler")
+    report(runs, megabytes=1e-6)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("no live.html: ") and "no-such-compiler" in line and "libclang-rt-dev-wasm32" in line
+    assert not links(runs)
+    # Without the runtime, as in an installed package.
+    shutil.rmtree(tmp_path / "runtime")
+    report(runs, megabytes=1e-6)
+    assert capsys.readouterr().out == "" and not links(runs)
 
 
 def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
