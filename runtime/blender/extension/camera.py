@@ -1,13 +1,15 @@
 """The camera of a frame, from Blender's conventions to those of the runtime."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
-import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from .exr import BadFrame
+
+if TYPE_CHECKING:
+    import bpy
 
 Matrix = NDArray[np.float64]
 
@@ -19,10 +21,10 @@ class Camera:
     camera_to_world: Matrix  # (4, 4)
 
     @staticmethod
-    def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> "Camera":
+    def of(scene: "bpy.types.Scene", depsgraph: "bpy.types.Depsgraph") -> "Camera":
         """Of the frame that the dependency graph was evaluated for. Raises BadFrame unless it is a perspective one."""
         if scene.camera is None:
-            raise BadFrame(f"the scene {scene.name} has no camera: add one")
+            raise BadFrame(f"frame {scene.frame_current} has no camera: bind another by its marker")
         if scene.camera.data.type != "PERSP":
             raise BadFrame(f"the camera {scene.camera.name} is not a perspective one: nothing else can be denoised yet")
         evaluated = scene.camera.evaluated_get(depsgraph)

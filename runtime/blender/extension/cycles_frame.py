@@ -1,4 +1,4 @@
-"""One frame of Cycles as the denoiser takes it: the passes of a multi-layer OpenEXR file in the runtime's conventions."""
+"""One frame of Cycles as the denoiser takes it: the passes of a multi-layer file in the conventions of the runtime."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +83,9 @@ def layer_of(file: ExrReader) -> str:
     if len(complete) == 1:
         return complete[0]
     if complete:
-        raise BadFrame(f"{file.path} has the view layers {', '.join(complete)}: only one can be denoised; turn off the others")
+        raise BadFrame(
+            f"{file.path} has the view layers {', '.join(complete)}: only one can be denoised; turn off the others"
+        )
     missing = min(lacking.values(), key=len, default=list(NEEDED))
     raise BadFrame(
         f"{file.path} lacks the passes {', '.join(missing)}: set them by Denoise Animation and render again"

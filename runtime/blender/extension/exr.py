@@ -24,7 +24,7 @@ COMPRESSION_LEVEL = 4  # of zlib, as OpenEXR has it
 Plane = NDArray[np.float32]
 
 
-class BadFrame(ValueError):
+class BadFrame(ValueError):  # noqa: N818 - as of errors.BadInput
     """A frame that cannot be denoised; the message says what to do."""
 
 
@@ -209,7 +209,9 @@ def write_exr(path: Path, planes: Mapping[str, NDArray[np.floating]], texts: Map
         ("screenWindowWidth", "float", struct.pack("<f", 1)),
         *((name, "string", text.encode()) for name, text in texts.items()),
     ]
-    attributes = (struct.pack("<i", len(value)).join([f"{name}\0{kind}\0".encode(), value]) for name, kind, value in header)
+    attributes = (
+        struct.pack("<i", len(value)).join([f"{name}\0{kind}\0".encode(), value]) for name, kind, value in header
+    )
     head = MAGIC + struct.pack("<i", FORMAT) + b"".join(attributes) + b"\0"
     rows = np.concatenate([np.ascontiguousarray(planes[name]).view(np.uint8) for name in names], axis=1)
     starts = range(0, height, ROWS_IN_CHUNK["ZIP"])

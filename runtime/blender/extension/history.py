@@ -9,6 +9,7 @@ from onespp_runtime import Denoiser
 
 from .camera import Camera
 from .cycles_frame import CyclesFrame, Image
+from .supersampling import AlbedoMean, with_albedo
 
 SAME_ALBEDO = 0.1  # largest difference between frames of one surface, of any colour
 SAME_NORMAL = 0.9  # least cosine
@@ -32,6 +33,7 @@ class History:
     number: int | None = None  # of the last frame
     camera: str = ""
     frame: CyclesFrame | None = None
+    albedo: AlbedoMean | None = None
     denoiser: Denoiser | None = None
 
     def denoise(self, number: int, frame: CyclesFrame, camera: Camera) -> tuple[NDArray[np.float32], Begin]:
@@ -40,8 +42,13 @@ class History:
         height, width = frame.size
         if self.denoiser is None or (self.denoiser.height, self.denoiser.width) != frame.size:
             self.denoiser = Denoiser(width, height)
+        if self.albedo is None or begin != Begin.CONTINUED:
+            self.albedo = AlbedoMean.begin(frame)
+        else:
+            self.albedo = self.albedo.add(frame)
+        smooth = with_albedo(frame, self.albedo.mean)
         radiance = self.denoiser.denoise(
-            *(frame.color, frame.albedo, frame.normal, frame.depth, frame.motion),
+            *(smooth.color, smooth.albedo, frame.normal, frame.depth, frame.motion),
             K=camera.pixels(height, width),
             camera_to_world=camera.camera_to_world,
             emission=frame.emission,

@@ -106,7 +106,7 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
                 self.render(context, "EXEC_DEFAULT")
                 if Session.error:
                     raise BadFrame(Session.error)
-        except (BadFrame, OSError, MemoryError) as error:
+        except (BadFrame, OSError, MemoryError, RuntimeError) as error:
             return self.failed(error)
         return {"FINISHED"}
 
@@ -116,7 +116,7 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
             if context.scene.onespp.frames == "RENDER":
                 self.render(context, "INVOKE_DEFAULT")
                 return {"FINISHED"}
-        except BadFrame as error:
+        except (BadFrame, RuntimeError) as error:
             return self.failed(error)
         self.finished = denoise_finished(context)
         manager = context.window_manager
@@ -153,7 +153,11 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
         set_passes(context.scene)
         session = Session(context.scene, animation_of(context.scene))
         session.begin()
-        bpy.ops.render.render(call, animation=True)
+        try:
+            bpy.ops.render.render(call, animation=True)
+        except RuntimeError:  # which no handler is told of
+            session.end()
+            raise
 
 
 class ONESPP_PT_denoise(bpy.types.Panel):  # noqa: N801

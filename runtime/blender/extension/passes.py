@@ -11,6 +11,8 @@ def check(scene: bpy.types.Scene) -> None:
     """Raise BadFrame where rendering the scene would give frames that cannot be denoised."""
     if scene.render.engine != ENGINE:
         raise BadFrame(f"the render engine is {scene.render.engine}: choose Cycles")
+    if scene.camera is None:
+        raise BadFrame("the scene has no camera: add one")
     if scene.render.use_motion_blur:
         raise BadFrame("motion blur leaves no Vector pass: turn it off, and blur the denoised frames instead")
     if scene.frame_step != 1:
