@@ -13,7 +13,6 @@ import math
 import sys
 from pathlib import Path
 
-import addon_utils
 import bpy
 from render_room import build
 
@@ -53,8 +52,8 @@ def render_again(folder: Path, frames: range, spp: int, denoises: bool) -> None:
 
 
 def render(archive: str, out: Path, frames: int, size: str, spp: int) -> None:
+    build(frames)  # which also resets what is installed
     bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
-    build(frames)
     add_cuts(frames)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
@@ -71,7 +70,7 @@ def render(archive: str, out: Path, frames: int, size: str, spp: int) -> None:
 
 def finish(folder: Path, keeps: str = "yes") -> None:
     bpy.ops.wm.open_mainfile(filepath=str(folder.parent / BLEND))
-    addon_utils.enable("bl_ext.user_default.onespp")
+    bpy.ops.preferences.addon_enable(module="bl_ext.user_default.onespp")
     scene = bpy.context.scene
     scene.render.filepath = str(folder / "####")
     scene.onespp.frames = "FINISHED"

@@ -46,7 +46,7 @@ def press(tmp_path_factory):
         command = [str(BLENDER), str(SCRIPT), *map(str, arguments)]
         environment = os.environ | {"BLENDER_USER_RESOURCES": str(user)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0 or "Error: " in done.stderr, done.stderr
+        assert done.returncode == 0 or "RuntimeError: Error: " in done.stderr, done.stderr
         return done.stderr
 
     return run

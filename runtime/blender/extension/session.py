@@ -17,8 +17,9 @@ class Session:
     def __init__(self, scene: bpy.types.Scene, animation: Animation):
         self.scene_name = scene.name
         self.animation = animation
-        self.cameras: dict[int, Camera | BadFrame] = {}
+        self.camera: Camera | BadFrame | None = None  # of the frame that is being rendered
         self.events = [
+            (handlers.render_pre, self.forget_camera),
             (handlers.frame_change_post, self.remember_camera),
             (handlers.render_write, self.denoise),
             (handlers.render_complete, self.end),
@@ -38,19 +39,25 @@ class Session:
                 event.remove(handler)
         Session.running = None
 
+    def forget_camera(self, scene: bpy.types.Scene, *_: object) -> None:
+        if scene.name == self.scene_name:
+            self.camera = None
+
     def remember_camera(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        """Rendering evaluates a scene of its own, which the camera of other handlers is not part of."""
-        if scene.name == self.scene_name and not scene.frame_subframe:
+        """Of the first scene that is evaluated for a frame: others are its neighbours, for motion vectors.
+
+        Where one of those is beyond a marker, the scene keeps that marker's camera to the end of the frame.
+        """
+        if scene.name == self.scene_name and self.camera is None:
             try:
-                self.cameras[scene.frame_current] = Camera.of(scene, depsgraph)
+                self.camera = Camera.of(scene, depsgraph)
             except BadFrame as error:
-                self.cameras[scene.frame_current] = error
+                self.camera = error
 
     def denoise(self, scene: bpy.types.Scene, *_: object) -> None:
         if Session.error or scene.name != self.scene_name:
             return
-        number = scene.frame_current
-        camera = self.cameras.pop(number, None)
+        number, camera = scene.frame_current, self.camera
         try:
             if not isinstance(camera, Camera):
                 raise camera or BadFrame(f"frame {number} has no camera")
