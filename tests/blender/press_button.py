@@ -30,7 +30,6 @@ def add_cuts(frames: int) -> None:
     for frame, place, turn in views:
         other.location, other.rotation_euler = place, [math.radians(angle) for angle in turn]
         for path in ("location", "rotation_euler"):
-            other.keyframe_insert(path, frame=frame - 1)  # so that nothing moves before it
             other.keyframe_insert(path, frame=frame)
     for curve in other.animation_data.action.layers[0].strips[0].channelbags[0].fcurves:
         for point in curve.keyframe_points:

@@ -49,7 +49,7 @@ def write(path: Path, parts: list[dict[str, np.ndarray]], compression=OpenEXR.ZI
     if len(parts) == 1:
         OpenEXR.File(header, parts[0]).write(str(path))
     else:
-        OpenEXR.File([OpenEXR.Part(header, part, f"part{i}") for i, part in enumerate(parts)]).write(str(path))
+        OpenEXR.File([OpenEXR.Part(dict(header), part, f"part{i}") for i, part in enumerate(parts)]).write(str(path))
     return path
 
 

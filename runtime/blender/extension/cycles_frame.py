@@ -65,7 +65,7 @@ def read_cycles_frame(path: Path) -> CyclesFrame:
         albedo=np.where(surface, image("Denoising Albedo"), 1).clip(0, 1),
         normal=np.where(surface, normal / np.maximum(length, 1e-6), 0),  # a mean of samples is shorter than 1
         depth=np.where(surface, depth, 0),
-        motion=image("Vector")[..., :2] * np.float32([1, -1]),  # to the frame before, with y up
+        motion=image("Vector")[..., :2] * np.array([1, -1], np.float32),  # to the frame before, with y up
         emission=np.where(surface, seen, light[..., :3]),
         alpha=light[..., 3],
         samples=float(file.attribute(f"cycles.{layer}.samples") or 1),

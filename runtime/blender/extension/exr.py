@@ -77,6 +77,10 @@ class ExrReader:
             part = self.part_of(attributes, at)
             at += part.chunks.nbytes
             yield part
+            last = int(part.chunks.max()) + 4 * self.is_multi_part
+            end = last + 8 + struct.unpack_from("<i", self.content, last + 4)[0]
+            if part.chunks.min() < at or end > len(self.content):  # chunks that were not written are at 0
+                raise self.damaged()
 
     def read_attributes(self, at: int) -> tuple[dict[str, bytes], int]:
         """The attributes of a header by name, and the position after it."""
@@ -144,7 +148,8 @@ class ExrReader:
         target = rows[y - part.top : y - part.top + ROWS_IN_CHUNK[part.codec]]
         packed = self.content[at + 8 : at + 8 + size]
         is_packed = size < target.size  # what does not become smaller is stored as it is
-        target.flat = unpacked(packed) if is_packed else np.frombuffer(packed, np.uint8, target.size)
+        values = unpacked(packed) if is_packed else np.frombuffer(packed, np.uint8)
+        target[:] = values.reshape(target.shape)
 
 
 def channels_of(attribute: bytes) -> dict[str, np.dtype[Any]]:

@@ -1,6 +1,6 @@
 """The panel in the render properties, its options and its operators."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
@@ -55,7 +55,7 @@ def animation_of(scene: bpy.types.Scene) -> Animation:
     return Animation(path_of, folder, options.detects_cuts, options.keeps_noisy)
 
 
-def denoise_finished(context: bpy.types.Context) -> Iterator[int]:
+def denoise_finished(context: bpy.types.Context) -> Generator[int, None, None]:
     """Denoise the rendered frames of the scene where necessary; yields the number of each. Raises BadFrame without."""
     scene = context.scene
     animation = animation_of(scene)

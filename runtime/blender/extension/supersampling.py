@@ -95,7 +95,7 @@ def catmull_rom(image: Image, x: Image, y: Image) -> Image:
     return result
 
 
-def cubic_weights(t: Image) -> tuple[NDArray[np.float32], ...]:
+def cubic_weights(t: Image) -> tuple[NDArray[np.floating], ...]:
     """Of the pixels at -1, 0, 1 and 2, for a place t in [0, 1)."""
     t2, t3 = t * t, t * t * t
     return (-t3 + 2 * t2 - t) / 2, (3 * t3 - 5 * t2 + 2) / 2, (-3 * t3 + 4 * t2 + t) / 2, (t3 - t2) / 2
@@ -104,4 +104,4 @@ def cubic_weights(t: Image) -> tuple[NDArray[np.float32], ...]:
 def with_albedo(frame: CyclesFrame, albedo: Image) -> CyclesFrame:
     """The frame with another albedo under the same light."""
     ratio = np.maximum(albedo, ALBEDO_FLOOR) / np.maximum(frame.albedo, ALBEDO_FLOOR)
-    return replace(frame, color=frame.color * ratio, albedo=albedo)
+    return replace(frame, color=(frame.color * ratio).astype(np.float32), albedo=albedo)
