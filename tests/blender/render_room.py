@@ -99,4 +99,5 @@ def main() -> None:
     render(out / "reference", frames, spp, noisy=False)
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Builds the extension for Blender on this platform, with the runtime for Python as a wheel in it.
+
+`python -m runtime.blender OUT.zip` compiles for any processor of the platform, or as CFLAGS says.
+"""
+
+import platform
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from errors import BadInput
+from files import replacing
+
+HERE = Path(__file__).resolve().parent
+RUNTIME = HERE.parent
+SYSTEMS = {"Linux": "linux", "Darwin": "macos", "Windows": "windows"}
+MACHINES = {"x86_64": "x64", "AMD64": "x64", "aarch64": "arm64", "arm64": "arm64"}
+
+
+def blender_platform() -> str:
+    """This platform as Blender names it. Raises BadInput where there is no Blender for it."""
+    system, machine = platform.system(), platform.machine()
+    if system not in SYSTEMS or machine not in MACHINES:
+        raise BadInput(f"there is no Blender for {system} on {machine}")
+    return f"{SYSTEMS[system]}-{MACHINES[machine]}"
+
+
+def build_wheel(folder: Path) -> Path:
+    """Compile copies, so that nothing is left in the source tree. Raises BadInput where that fails."""
+    built = shutil.ignore_patterns("copies", "build", "*.egg-info", "_onespp.*", "__pycache__", HERE.name)
+    shutil.copytree(RUNTIME, folder / "runtime", ignore=built)
+    shutil.copyfile(RUNTIME.parent / "LICENSE", folder / "LICENSE")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps", "--no-index"]
+    try:
+        subprocess.run([*pip, "--no-build-isolation", "./runtime/python"], cwd=folder, check=True)
+    except subprocess.CalledProcessError:
+        raise BadInput("the runtime was not compiled, see above: it needs a C compiler, and setuptools") from None
+    [wheel] = folder.glob("*.whl")
+    return wheel
+
+
+def build(out: Path) -> None:
+    """Write the extension; atomic. Raises BadInput where the folder is missing, or see `build_wheel`."""
+    if not out.parent.is_dir():
+        raise BadInput(f"{out.parent} is no folder: make it first")
+    with TemporaryDirectory() as folder, replacing(out) as temporary:
+        wheel = build_wheel(Path(folder))
+        added = f'platforms = ["{blender_platform()}"]\nwheels = ["./wheels/{wheel.name}"]\n'
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.write(RUNTIME.parent / "LICENSE", "LICENSE")
+            archive.write(wheel, f"wheels/{wheel.name}")
+            for source in sorted((HERE / "extension").iterdir()):
+                if source.suffix == ".py":
+                    archive.write(source, source.name)
+                elif source.suffix == ".toml":
+                    archive.writestr(source.name, added + source.read_text())
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2 or not sys.argv[1].endswith(".zip"):
+        sys.exit(__doc__)
+    try:
+        build(Path(sys.argv[1]))
+    except BadInput as error:
+        sys.exit(str(error))
