@@ -48,7 +48,7 @@ def reflectance_of(spectrum: Callable[[Any], Any], si: Any) -> Any:
         return to_rgb(spectrum(si), None)
 
     def daylight(at: Any) -> Any:
-        return mi.cie_d65(at.wavelengths)
+        return type(at.wavelengths)(*map(mi.cie_d65, at.wavelengths))
 
     lit = radiance_of(lambda at: daylight(at) * mi.unpolarized_spectrum(spectrum(at)), si)
     return lit / radiance_of(daylight, si)

@@ -154,12 +154,12 @@ class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
             sampler.set_sample_count(spp)
         forward = opaque(mi.Vector3f(*map(float, camera.camera_to_world[:3, 2])))
         focal = opaque(mi.Float(abs(float(camera.K[0, 0]))))
-        block = pixel_block(film, len(self.aov_names()))
+        block, has_alpha = pixel_block(film), mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         for pixel in pixels_of(sampler, camera.size, seed):
             position, ray, weight = centre_ray(sensor, sampler, pixel, camera.size[1])
             found = self.trace(scene, sampler, ray, forward, focal)
             colour = to_rgb((found.light - found.emitted) * weight, ray.wavelengths) + found.guides["emission"]
-            alpha = [dr.select(found.valid, mi.Float(1), mi.Float(0))] if mi.has_flag(film.flags(), ALPHA) else []
+            alpha = [dr.select(found.valid, mi.Float(1), mi.Float(0))] if has_alpha else []
             block.put(position, [*components(colour), *alpha, mi.Float(1), *found.aovs()])
         film.put_block(block)
         image = film.develop() if develop else mi.TensorXf()
@@ -167,9 +167,6 @@ class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
             dr.eval(image)
             film.schedule_storage()
         return image
-
-
-ALPHA = mi.FilmFlags.Alpha
 
 
 def emission_of(scene: Any, si: Any, throughput: Any) -> tuple[Any, Any]:
@@ -181,9 +178,9 @@ def emission_of(scene: Any, si: Any, throughput: Any) -> tuple[Any, Any]:
     return emitter.eval(si) * by_spectrum, radiance_of(emitter.eval, si) * throughput
 
 
-def pixel_block(film: Any, aovs: int) -> Any:
+def pixel_block(film: Any) -> Any:
     """A block in which each sample counts for its own pixel alone, whatever the film's filter."""
-    channels = film.base_channels_count() + 1 + aovs  # with the weight
+    channels = film.create_block().channel_count()
     return mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, rfilter=mi.load_dict({"type": "box"}))
 
 
