@@ -229,12 +229,18 @@ def bsdfs_of(scene: Any) -> dict[int, Any]:
     return found
 
 
+def is_smooth_glass(bsdf: Any) -> bool:
+    flags = bsdf.flags()
+    return bool(mi.has_flag(flags, mi.BSDFFlags.Transmission)) and not mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
 class Surfaces:
     """What surface interactions of a scene look like. Numbers of BSDFs count as they were when it was made."""
 
     def __init__(self, scene: Any):
         self.bsdfs = bsdfs_of(scene)
         self.surfaces = [surface_of(bsdf) for bsdf in self.bsdfs.values()]
+        self.has_glass = any(map(is_smooth_glass, self.bsdfs.values()))
         self.position = {address: position for position, address in enumerate(self.bsdfs)}
         if is_scalar():
             return

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .bsdfs import Surfaces, registry_index
-from .camera import camera_of
+from .camera import Camera, camera_of
 from .colours import is_scalar, radiance_of, to_rgb
 from .sight import Sight, look_through
 
@@ -18,6 +18,22 @@ AXES = {"albedo": "RGB", "emission": "RGB", "normal": "XYZ", "depth": "T", "roug
 AXES["primitive"] = "I"
 # Light of a surface is less than its emission by rounding alone; otherwise the nested integrator hides it.
 ALMOST_ALL = 0.9999
+
+
+class Viewer(NamedTuple):
+    """Where rays come from: they start in front of the eye, at the near plane."""
+
+    eye: Any
+    forward: Any  # the viewing axis
+    focal: Any  # length in pixels
+
+    @staticmethod
+    def of(camera: Camera) -> "Viewer":
+        """As data: literals would be compiled into kernels, anew for each frame."""
+        axis, eye = (list(map(float, camera.camera_to_world[:3, column])) for column in (2, 3))
+        viewer = Viewer(mi.Point3f(eye), mi.Vector3f(axis), mi.Float(abs(float(camera.K[0, 0]))))
+        dr.make_opaque(viewer)
+        return viewer
 
 
 class Sample(NamedTuple):
@@ -36,12 +52,6 @@ class Sample(NamedTuple):
 
 def components(value: Any) -> list[Any]:
     return list(value) if dr.depth_v(value) > dr.depth_v(mi.Float) else [value]
-
-
-def opaque(value: Any) -> Any:
-    """As data: literals would be compiled into kernels, anew for each frame. Unchanged in scalar variants."""
-    dr.make_opaque(value)
-    return value
 
 
 class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
@@ -98,7 +108,8 @@ class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
         table = [0] * (max(numbers, default=0) + 1)
         for index, number in enumerate(numbers, 1):
             table[number] = index
-        self.shapes = opaque(mi.UInt32(table))
+        self.shapes = mi.UInt32(table)
+        dr.make_opaque(self.shapes)
 
     def shape_at(self, si: Any) -> Any:
         """The number of the shape, or of the instance that it belongs to; 0 for none."""
@@ -111,17 +122,16 @@ class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
         """(light, whether there is a surface, AOVs), as Mitsuba asks for; depth is along the ray."""
-        found = self.trace(scene, sampler, ray, ray.d, mi.Float(0), active)
+        found = self.trace(scene, sampler, ray, Viewer(ray.o, ray.d, mi.Float(0)), active)
         return found.light, found.valid, found.aovs()
 
-    def trace(self, scene: Any, sampler: Any, ray: Any, forward: Any, focal: Any, active: Any = True) -> Sample:
-        """Along a ray; `forward` is the viewing axis, `focal` the focal length in pixels."""
+    def trace(self, scene: Any, sampler: Any, ray: Any, viewer: Viewer, active: Any = True) -> Sample:
         self.read(scene)
         first = Sight.along(scene, ray, active)
-        seen = look_through(scene, self.surfaces, first, focal) if self.looks_through else first
+        seen = look_through(scene, self.surfaces, first, viewer.eye, viewer.focal) if self.looks_through else first
         hit, is_first = first.si.is_valid(), seen.beyond == 0
         guides = self.surface_guides(seen)
-        depth = dr.dot(first.si.p - ray.o, forward) + seen.beyond * dr.dot(ray.d, forward)
+        depth = dr.dot(first.si.p - viewer.eye, viewer.forward) + seen.beyond * dr.dot(ray.d, viewer.forward)
         guides["depth"] = dr.select(hit, depth, 0)
         guides["primitive"] = dr.select(hit & is_first, mi.Float(first.si.prim_index) + 1, 0)
         throughput = dr.select(is_first, mi.Color3f(1), mi.Color3f(0) if mi.is_spectral else seen.throughput)
@@ -152,12 +162,11 @@ class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
         sampler = sensor.sampler().clone()
         if spp:
             sampler.set_sample_count(spp)
-        forward = opaque(mi.Vector3f(*map(float, camera.camera_to_world[:3, 2])))
-        focal = opaque(mi.Float(abs(float(camera.K[0, 0]))))
+        viewer = Viewer.of(camera)
         block, has_alpha = pixel_block(film), mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         for pixel in pixels_of(sampler, camera.size, seed):
             position, ray, weight = centre_ray(sensor, sampler, pixel, camera.size[1])
-            found = self.trace(scene, sampler, ray, forward, focal)
+            found = self.trace(scene, sampler, ray, viewer)
             colour = to_rgb((found.light - found.emitted) * weight, ray.wavelengths) + found.guides["emission"]
             alpha = [dr.select(found.valid, mi.Float(1), mi.Float(0))] if has_alpha else []
             block.put(position, [*components(colour), *alpha, mi.Float(1), *found.aovs()])

@@ -12,7 +12,8 @@ import mitsuba as mi
 from .bsdfs import Surface, Surfaces
 from .colours import is_scalar, mean_rgb
 
-LONGEST_CHAIN = 8  # of mirrors and glass
+MAX_MIRRORS = 4  # along a ray
+LONGEST_CHAIN = 12  # in scenes with glass
 MAX_CUTOUTS = 32  # that a ray passes
 CUTOUT = 0.999  # least transmission of one
 MAX_MIRROR_ALPHA = 0.1  # GGX; rougher surfaces show nothing sharply but what touches them
@@ -148,12 +149,12 @@ def one_further(scene: Any, surfaces: Surfaces, sight: Sight, eye_distance: Any,
     return dr.select(goes_on, shown, replace(sight, goes_on=goes_on))  # type: ignore[no-any-return]
 
 
-def look_through(scene: Any, surfaces: Surfaces, first: Sight, focal: Any) -> Sight:
-    """What is shown behind all mirrors and glass along the ray of a first hit; `focal` is in pixels."""
-    eye_distance = first.si.t
+def look_through(scene: Any, surfaces: Surfaces, first: Sight, eye: Any, focal: Any) -> Sight:
+    """What is shown behind all mirrors and glass along the ray of a first hit; the focal length is in pixels."""
+    eye_distance = dr.norm(first.si.p - eye)
 
     def step(number: Any, sight: Sight) -> tuple[Any, Sight]:
         return number + 1, one_further(scene, surfaces, sight, eye_distance, focal)
 
-    start = mi.UInt32(0), first
-    return dr.while_loop(start, lambda number, sight: (number < LONGEST_CHAIN) & sight.goes_on, step)[1]
+    longest = LONGEST_CHAIN if surfaces.has_glass else MAX_MIRRORS
+    return dr.while_loop((mi.UInt32(0), first), lambda number, sight: (number < longest) & sight.goes_on, step)[1]
