@@ -1,4 +1,4 @@
-"""Turns the camera of any scene, at 1 spp: python turntable.py SCENE.xml FOLDER FRAMES DEGREES_PER_FRAME WIDTH HEIGHT"""
+"""Turn the camera of any scene, at 1 spp: python turntable.py SCENE.xml FOLDER FRAMES DEGREES_A_FRAME WIDTH HEIGHT."""
 
 import sys
 

@@ -21,7 +21,7 @@ Relief = Callable[[Any, Any], Any]
 """From a surface interaction and a mask to the shading normal in its shading frame, on either side."""
 
 
-class Parts(mi.TraversalCallback):  # type: ignore[misc]
+class Parts(mi.TraversalCallback):
     """The textures, nested BSDFs and numbers of a BSDF."""
 
     def __init__(self, bsdf: Any):
@@ -79,7 +79,9 @@ def nonlinear_plastic(parts: Parts, si: Any, active: Any) -> tuple[Any, Any]:
 def conductor(parts: Parts, si: Any, active: Any) -> tuple[Any, Any]:
     def at_normal(at: Any) -> Any:
         eta, k = (parts.textures[name].eval(at, active) for name in ("eta", "k"))
-        tint = parts.textures["specular_reflectance"].eval(at, active) if "specular_reflectance" in parts.textures else 1
+        tint = (
+            parts.textures["specular_reflectance"].eval(at, active) if "specular_reflectance" in parts.textures else 1
+        )
         return tint * (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
 
     return reflectance_of(at_normal, si), parts.alpha(si, active)
@@ -114,7 +116,10 @@ KNOWN: dict[str, Callable[[Parts, Any, Any], tuple[Any, Any]]] = {
 def unknown(bsdf: Any) -> Look:
     """By Mitsuba's own estimate of the albedo, and as rough as can be unless all is perfectly specular."""
     alpha = 1.0 if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) else 0.0
-    return lambda si, active: (reflectance_of(lambda at: bsdf.eval_diffuse_reflectance(at, active), si), mi.Float(alpha))
+    return lambda si, active: (
+        reflectance_of(lambda at: bsdf.eval_diffuse_reflectance(at, active), si),
+        mi.Float(alpha),
+    )
 
 
 def mixture(first: Look, second: Look, weight: Callable[[Any, Any], Any]) -> Look:
@@ -132,14 +137,16 @@ def look_of(bsdf: Any) -> Look:
     parts, kind = Parts(bsdf), bsdf.class_name()
     nested = parts.nested
     if kind == "TwoSidedBRDF" and len(nested) == 2:
-        return mixture(*map(look_of, nested), lambda si, _: dr.select(si.wi.z < 0, mi.Float(1), mi.Float(0)))
+        front, back = map(look_of, nested)
+        return mixture(front, back, lambda si, _: dr.select(si.wi.z < 0, mi.Float(1), mi.Float(0)))
     if kind in ("TwoSidedBRDF", "NormalMap", "BumpMap"):
         return look_of(nested[0])
     if kind == "MaskBSDF":
         white = mi.Color3f(1), mi.Float(0)
         return mixture(lambda *_: white, look_of(nested[0]), lambda *at: parts.number("opacity", *at))
     if kind == "BlendBSDF":
-        return mixture(*map(look_of, nested), lambda *at: parts.number("weight", *at))
+        first, second = map(look_of, nested)
+        return mixture(first, second, lambda *at: parts.number("weight", *at))
     if kind not in KNOWN:
         return unknown(bsdf)
     # Mitsuba reports whether a plastic is nonlinear only in its description.
@@ -198,12 +205,12 @@ def surface_of(bsdf: Any) -> Callable[[Any, Any], Surface]:
     return surface
 
 
-class Children(mi.TraversalCallback):  # type: ignore[misc]
+class Children(mi.TraversalCallback):
     """The objects that an object has as parameters."""
 
     def __init__(self, parent: Any):
         super().__init__()
-        self.found = [parent.bsdf()] if isinstance(parent, mi.Shape) else []
+        self.found: list[Any] = [parent.bsdf()] if isinstance(parent, mi.Shape) else []
         parent.traverse(self)  # calls `put`
 
     def put(self, _: str, value: object, *__: object) -> None:

@@ -170,7 +170,7 @@ class Denoiser:
             return images["normals"], images["depth"]
         if "normals" not in images:
             return np.full((self.height, self.width, 3), TOWARDS_VIEWER), np.ones((self.height, self.width))
-        normals = images["normals"]
+        normals: Any = images["normals"]
         if to_sensor is not None:
             normals = normals @ host(to_sensor.matrix)[:3, :3].T
         return normals, normals.any(axis=2).astype(np.float32)  # background has none

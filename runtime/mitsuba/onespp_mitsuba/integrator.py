@@ -54,7 +54,7 @@ def components(value: Any) -> list[Any]:
     return list(value) if dr.depth_v(value) > dr.depth_v(mi.Float) else [value]
 
 
-class GuidesIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
+class GuidesIntegrator(mi.SamplingIntegrator):
     """Parameters: a nested SamplingIntegrator, without which there is emission alone, and `look_through` (true).
 
     Every ray passes through the centre of its pixel, so that guides are free of noise and fit the light: images are not
@@ -189,8 +189,9 @@ def emission_of(scene: Any, si: Any, throughput: Any) -> tuple[Any, Any]:
 
 def pixel_block(film: Any) -> Any:
     """A block in which each sample counts for its own pixel alone, whatever the film's filter."""
-    channels = film.create_block().channel_count()
-    return mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, rfilter=mi.load_dict({"type": "box"}))
+    channels, box = film.create_block().channel_count(), mi.load_dict({"type": "box"})
+    # Normals are negative, which is no reason to warn.
+    return mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, box, warn_negative=False, warn_invalid=False)
 
 
 def pixels_of(sampler: Any, size: tuple[int, int], seed: Any) -> Iterator[Any]:
@@ -211,7 +212,7 @@ def pixels_of(sampler: Any, size: tuple[int, int], seed: Any) -> Iterator[Any]:
 def centre_ray(sensor: Any, sampler: Any, pixel: Any, width: int) -> tuple[Any, Any, Any]:
     """(position on the film, ray, weight) of a sample."""
     film = sensor.film()
-    centre = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
+    centre: Any = mi.Point2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5)
     wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0.5)
     within = centre / mi.ScalarVector2f(film.crop_size())
     ray, weight = sensor.sample_ray(sensor.shutter_open(), wavelength, within, mi.Point2f(0.5))

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Array, Camera, camera_of, host, project, unproject
+from .camera import Array, camera_of, host, project, unproject
 
 CORNERS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])
 
@@ -97,9 +97,7 @@ def points_before(
     return points
 
 
-def flow_between(
-    now: Snapshot, before: Snapshot, depth: Any, shape: Any = None, primitive: Any = None
-) -> Array:
+def flow_between(now: Snapshot, before: Snapshot, depth: Any, shape: Any = None, primitive: Any = None) -> Array:
     """Optical flow (H, W, 2): x and y, in pixels, by which surfaces have moved in the image since the frame before.
 
     The guides `depth`, `shape` and `primitive` (H, W) are those of the frame now; without the latter two, nothing but

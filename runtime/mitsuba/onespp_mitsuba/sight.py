@@ -131,10 +131,10 @@ def one_further(scene: Any, surfaces: Surfaces, sight: Sight, eye_distance: Any,
     here = sight.si
     event = event_at(sight, surfaces.at(here))
     across = dr.normalize(event.direction - sight.ray.d)
-    axes = [
+    x, y, z = (
         dr.select(event.reflects, flipped(axis, across), turned(axis, sight.ray.d, event.direction))
         for axis in (sight.x, sight.y, sight.z)
-    ]
+    )
     index = sight.index * event.eta
     onward = past_cutouts(scene, here.spawn_ray(event.direction), event.shows)
     there = scene.ray_intersect(onward, mi.RayFlags.All, False, event.shows)
@@ -145,8 +145,9 @@ def one_further(scene: Any, surfaces: Surfaces, sight: Sight, eye_distance: Any,
     is_sharp = blur * focal < MAX_BLUR * (eye_distance + beyond)
     goes_on = sight.goes_on & event.shows & there.is_valid() & is_sharp
     tint, throughput = sight.tint * event.tint, sight.throughput * event.throughput
-    shown = Sight(there, onward, beyond, spread, blur, tint, *axes, index, throughput, goes_on)
-    return dr.select(goes_on, shown, replace(sight, goes_on=goes_on))  # type: ignore[no-any-return]
+    shown = Sight(there, onward, beyond, spread, blur, tint, x, y, z, index, throughput, goes_on)
+    result: Sight = dr.select(goes_on, shown, replace(sight, goes_on=goes_on))
+    return result
 
 
 def look_through(scene: Any, surfaces: Surfaces, first: Sight, eye: Any, focal: Any) -> Sight:
