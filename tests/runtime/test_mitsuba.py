@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 
@@ -195,6 +196,9 @@ def test_a_bitmap_gives_what_tensors_do(package):
     guides = {name: found[name] for name in ("depth", "roughness", "shape", "primitive", "emission")}
     by_tensor = new()(image[..., :3], found["albedo"], found["normal"], sensor=sensor, **guides)
     np.testing.assert_array_equal(np.array(by_name), np.array(by_tensor))
+    half = mi.Bitmap(np.zeros((HEIGHT, WIDTH, 3), np.float16))
+    with pytest.raises(ValueError, match="scene: the bitmap holds float16; set component_format"):
+        new()(half, **package.GUIDES, sensor=sensor, scene=scene)
     with pytest.raises(ValueError, match="depth_ch: the bitmap has no channel 'far'; it has <root>, albedo"):
         new()(bitmap, "albedo", "normal", depth_ch="far", sensor=sensor)
 
@@ -294,6 +298,12 @@ def test_variants_agree(by_variant, variant, tolerance):
     means = [each["image"][..., :3].clip(0, 0.3).mean() for each in (ours, theirs)]  # of independent samples
     assert means[0] == pytest.approx(means[1], rel=0.1)
     np.testing.assert_array_equal(theirs["outputs"], ours["outputs"])
+
+
+def test_the_example_of_the_page(environment, tmp_path):
+    [code] = re.findall(r"```python\n(.*?)```", (FOLDER / "mitsuba" / "README.md").read_text(), re.DOTALL)
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, env=environment, timeout=300)
+    assert len(list(tmp_path.glob("*.exr"))) == 8
 
 
 def test_the_turntable_turns(environment, tmp_path):

@@ -192,8 +192,11 @@ class Denoiser:
     ) -> Any:
         """The same, as a Bitmap, for a Bitmap of all images: arguments ending with `_ch` are the names of channels.
 
-        Those of guides are `depth_ch` and so on. Raises ValueError also for a name that the bitmap lacks.
+        Those of guides are `depth_ch` and so on. Raises ValueError also for a name that the bitmap lacks, and for a
+        `scene` with a bitmap of float16, in which triangles have no exact numbers.
         """
+        if scene is not None and noisy.component_format() == mi.Struct.Type.Float16:
+            raise ValueError("scene: the bitmap holds float16; set component_format of the film to float32")
         names = {"noisy_ch": noisy_ch, "albedo_ch": albedo_ch, "normals_ch": normals_ch, "flow_ch": flow_ch, **guide_ch}
         given = {name.removesuffix("_ch"): image for name, image in named_channels(noisy, names).items()}
         return mi.Bitmap(self.denoise(**given, to_sensor=to_sensor, sensor=sensor, scene=scene, samples=samples))
