@@ -180,8 +180,8 @@ def walk(package) -> dict[str, float]:
 
 def test_denoising_improves_and_history_too(walk):
     assert walk["each by itself"] > walk["noisy"] + 5
-    assert walk["temporal"] > walk["each by itself"] + 0.2
-    assert walk["as OptiX"] > walk["noisy"] + 5
+    assert walk["temporal"] > walk["each by itself"] + 2
+    assert walk["as OptiX"] > walk["each by itself"] + 2
 
 
 def test_a_bitmap_gives_what_tensors_do(package):
