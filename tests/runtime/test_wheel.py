@@ -8,7 +8,7 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
-from shutil import copyfile, copytree, ignore_patterns, which
+from shutil import which
 
 import numpy as np
 import pytest
@@ -16,7 +16,6 @@ import torch
 
 from datasets.frame import Frame
 from eval.bench.synthetic_frames import synthetic_frame
-from provenance import ROOT
 from runtime.raw import PLANES
 from tests.helpers.c_runtime import FOLDER, STRICT, CRuntime, build
 
@@ -62,30 +61,6 @@ if child == 0:
     os._exit(0 if same else 1)
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
-
-
-def pip(*arguments: str, cwd: Path) -> None:
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
-    subprocess.run(command, cwd=cwd, check=True, env=os.environ | {"CC": CC}, capture_output=True)
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Built from copies, so that nothing is left in the source tree."""
-    folder = tmp_path_factory.mktemp("wheel")
-    built = ignore_patterns("copies", "build", "*.egg-info", "_onespp.*")
-    copytree(FOLDER, folder / "runtime", ignore=built)
-    copyfile(ROOT / "LICENSE", folder / "LICENSE")
-    pip("wheel", "--no-deps", "--no-index", "--no-build-isolation", "./runtime/python", cwd=folder)
-    [file] = folder.glob("*.whl")
-    return file
-
-
-@pytest.fixture(scope="module")
-def unpacked(wheel, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("unpacked")
-    zipfile.ZipFile(wheel).extractall(folder)
-    return folder
 
 
 @pytest.fixture
