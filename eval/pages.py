@@ -20,7 +20,7 @@ from eval.bench.denoisers import BASELINE
 from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, value_cell
+from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -229,7 +229,8 @@ def samples() -> str:
     lines: dict[str, dict[str, str]] = {}
     for row in (Trade(**row) for row in measured("trade")["samples"]):
         if row.signal == "total":
-            lines.setdefault(row.denoiser, {"denoiser": f"`{row.denoiser}`"})[f"{row.spp} spp"] = row.cell("psnr")
+            facts = {"denoiser": f"`{row.denoiser}`", "made from": source_of_denoiser(row.denoiser)}
+            lines.setdefault(row.denoiser, facts)[f"{row.spp} spp"] = row.cell("psnr")
     return table([*lines.values()])
 
 
@@ -237,7 +238,12 @@ def front() -> str:
     """Where milliseconds of rendering and filtering are best spent."""
     rows = [Trade(**row) for row in measured("trade")["samples"]]
     lines = [
-        {"ms": f"{ms:.0f}", "spent on": f"`{row.denoiser}`, {row.spp} spp", "PSNR": row.cell("psnr")}
+        {
+            "ms": f"{ms:.0f}",
+            "spent on": f"`{row.denoiser}`, {row.spp} spp",
+            "made from": source_of_denoiser(row.denoiser),
+            "PSNR": row.cell("psnr"),
+        }
         for ms, row in psnr_front(rows, "total")
     ]
     return table(lines)
@@ -254,7 +260,8 @@ def glass() -> str:
                 return fmean(c["results"][name][metric] for c in clips if scene in c["scene"])
 
             floor = denoiser == NOISE_FLOOR
-            line = {"denoiser": FLOOR if floor else f"`{denoiser}`", "guides": "" if floor else guides}
+            row = TableRow("mean", FLOOR if floor else denoiser, "total", {}, {})
+            line = {"denoiser": cell(row), "made from": row.made_from, "guides": "" if floor else guides}
             line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
             line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
             lines.setdefault(denoiser, {})[line["guides"]] = line
@@ -273,7 +280,9 @@ def ages(folder: str, *names: str) -> str:
     """PSNR of the benchmark's denoisers, or of the named ones, by the age of their history."""
     rows = benchmark(folder)["ages"]
     texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
-    return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
+    return table(
+        [{"denoiser": f"`{name}`", "made from": source_of_denoiser(name)} | row for name, row in texts.items()]
+    )
 
 
 def steady(folder: str, *names: str) -> str:
