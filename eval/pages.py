@@ -16,7 +16,6 @@ from typing import Any
 from tabulate import tabulate
 
 from errors import BadInput
-from eval.bench.denoisers import BASELINE
 from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
@@ -210,16 +209,31 @@ def times() -> str:
     """Milliseconds and memory of a frame, fastest first, with the signals that denoisers usually return."""
     usual = (row for row in timed_rows() if "(indirect)" not in row["denoiser"])
     rows = sorted(usual, key=lambda row: row["ms_median"])
-    baseline = next(row["ms_median"] for row in rows if row["denoiser"] == BASELINE)
     lines = [
         {
             "denoiser": f"`{row['denoiser']}`",
             "precision": row["dtype"],
             "ms": f"{row['ms_median']:.3g}",
-            f"times `{BASELINE}`": f"{row['ms_median'] / baseline:.2f}",
             "peak MB": f"{row['peak_mb']:.0f}" if row["peak_mb"] is not None else "-",
         }
         for row in rows
+    ]
+    return table(lines)
+
+
+def milliseconds(denoiser: str) -> str:
+    """Of one frame by a denoiser, at the first size of the bench."""
+    return f"{next(row['ms_median'] for row in timed_rows() if row['denoiser'] == denoiser):.0f}"
+
+
+def metrics(*names: str) -> str:
+    """The named metrics of the denoisers of `onespp trade` at 1 spp, where `+js` does nothing."""
+    rows = [Trade(**row) for row in measured("trade")["samples"]]
+    lines = [
+        {"denoiser": f"`{row.denoiser}`", "made from": source_of_denoiser(row.denoiser)}
+        | {METRICS[name].title: row.cell(name) for name in names}
+        for row in rows
+        if (row.signal, row.spp) == ("total", 1) and not row.denoiser.endswith("+js")
     ]
     return table(lines)
 
@@ -367,7 +381,7 @@ def minutes(what: str) -> str:
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
-        *(quality, shipped, times, samples, front, glass, stress, device, size, minutes),
+        *(quality, shipped, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
         *(ages, steady, where, rendering),
     )
 }

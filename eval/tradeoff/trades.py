@@ -42,11 +42,11 @@ class Times:
             if (row["height"], row["width"], row["threads"]) == (*size, self.threads)
         }
         if not self.ms:
-            rows = bench["rows"]  # which measuring anew replaces
-            sizes = dict.fromkeys([*(size_name((row["height"], row["width"])) for row in rows), self.name])
+            sizes = dict.fromkeys([*(size_name((row["height"], row["width"])) for row in bench["rows"]), self.name])
+            command = f"onespp bench denoisers --size {' '.join(sizes)} --runs {runs} --threads {self.threads}"
             raise BadInput(
-                f"{path} has no times of {self.name} with {self.threads} threads: measure them with `onespp bench denoisers "
-                f"--size {' '.join(sizes)} --runs {runs} --threads {self.threads}`, or name a size that it has with --size"
+                f"{path} has no times of {self.name} with {self.threads} threads: measure them with `{command}`, or "
+                "name a size that it has with --size"
             )
 
     def of(self, spec: DenoiserSpec) -> float | None:
