@@ -70,6 +70,6 @@ def read_rgb(path: Path) -> Image:
         with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             channels = file.channels()
             planes = [np.array(channels[name].pixels, np.float32) for name in "RGB"]
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, ValueError, KeyError) as error:
         raise BadInput(f"{path} is damaged or has no R, G and B ({error}): get it again") from None
     return np.nan_to_num(np.stack(planes, axis=-1), posinf=0, neginf=0)
