@@ -44,7 +44,7 @@ eval: $(READY)
 	$(BIN)/onespp eval --budget $(BUDGET) --data $(DATA) --runs $(RUNS)
 
 bench: $(READY)
-	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 --runs $(RUNS)
+	$(BIN)/onespp bench denoisers --size 1280x720 1920x1080 128x128 --runs $(RUNS)  # the last is that of clips, for trade
 
 stress: $(READY)
 	$(BIN)/onespp stress --long --budget $(BUDGET) --runs $(RUNS)
@@ -60,13 +60,22 @@ test: $(READY)
 	$(PYTEST)
 	@mkdir -p $(RUNS) && echo $(SECONDS) > $(RUNS)/test.seconds
 
-# Blender as a Python module, which needs another numpy: test-all renders with Cycles where it is installed.
-blender:
-	$(PYTHON) -m venv .venv-blender
-	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check bpy==5.0.1
+# Blender as a Python module, with which test-all renders. It needs Python 3.11 and another numpy, so an environment of
+# its own. `make test-all BLENDER=` goes without.
+BLENDER ?= .venv-blender/.ready
+BLENDER_PYTHON ?= $(PYTHON)
 
-test-all: $(READY)
-	$(PYTEST) -m '' --hypothesis-profile thorough
+blender: .venv-blender/.ready
+
+.venv-blender/.ready:
+	$(BLENDER_PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+		{ echo "bpy needs Python 3.11: set BLENDER_PYTHON=/path/to/python3.11, or BLENDER= to go without"; exit 1; }
+	$(BLENDER_PYTHON) -m venv .venv-blender
+	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check bpy==5.0.1
+	@touch $@
+
+test-all: $(READY) $(BLENDER)
+	$(PYTEST) -m '' --hypothesis-profile thorough $(if $(BLENDER),,--ignore tests/blender)
 
 lint: $(READY)
 	$(BIN)/ruff check

@@ -25,8 +25,8 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,benchmark,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, the release (days), long clips, scenes of glass, "
+        metavar="{tiny,quick,release,release-256,benchmark,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, long clips, glass, "
         "or N small rooms with references of S spp",
     ),
 ]
@@ -367,11 +367,18 @@ def import_(
     print(f"{folder}: {clips} clips")
 
 
-def benchmark_list(scenes: Annotated[Path | None, arg(metavar="DIR", help="say which are there")] = None) -> None:
-    """List the scenes by other people: author, licence, and where to get them."""
-    from eval.benchmark.run import list_scenes
+def benchmark_list(
+    scenes: Annotated[
+        Path | None, arg(metavar="DIR", help="say which are there, and whether they are those we used")
+    ] = None,
+    toml: Annotated[
+        str | None, arg(metavar="FOLDER", help="print the description of this scene's clip instead")
+    ] = None,
+) -> None:
+    """List the scenes by other people, and ours: author, licence, and how to get them."""
+    from eval.benchmark.run import list_scenes, toml_of
 
-    print(list_scenes(scenes))
+    print(toml_of(toml) if toml else list_scenes(scenes))
 
 
 def benchmark_run(

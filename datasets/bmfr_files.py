@@ -13,6 +13,7 @@ import numpy as np
 import OpenEXR
 from tqdm import tqdm
 
+from datasets.exr import silenced
 from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
 from errors import BadInput
 from scenes.camera import Array
@@ -66,9 +67,9 @@ def read_rgb(path: Path) -> Image:
     if not path.exists():
         raise BadInput(f"{path} is missing")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             channels = file.channels()
             planes = [np.array(channels[name].pixels, np.float32) for name in "RGB"]
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, ValueError, KeyError) as error:
         raise BadInput(f"{path} is damaged or has no R, G and B ({error}): get it again") from None
     return np.nan_to_num(np.stack(planes, axis=-1), posinf=0, neginf=0)

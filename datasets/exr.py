@@ -1,7 +1,9 @@
 """OpenEXR exchange: one multi-layer file per frame, which other tools read, and back without loss."""
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,19 @@ from files import replacing
 from scenes.camera import inverse_pose
 
 FACTS_ATTRIBUTE = "onespp"  # of the header: JSON, in which float64 keeps all its digits
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """A context in which the OpenEXR library prints nothing: of a damaged file it writes many lines."""
+    stderr = os.dup(2)
+    with open(os.devnull, "w") as null, redirect_stdout(null):
+        os.dup2(null.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
 
 
 def layers_of(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:

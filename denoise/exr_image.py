@@ -1,8 +1,6 @@
 """An OpenEXR file of any program in memory: its planes by name, its header, and writing it with changes."""
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +8,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from datasets.exr import write_file
+from datasets.exr import silenced, write_file
 from datasets.writer import FLOAT16_MAX
 from errors import BadInput
-
-
-@contextmanager
-def silenced() -> Iterator[None]:
-    """A context in which the OpenEXR library prints nothing: of a damaged file it writes many lines."""
-    stderr = os.dup(2)
-    with open(os.devnull, "w") as null, redirect_stdout(null):
-        os.dup2(null.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
 
 
 def plane_name(part: str, channel: str, several: bool) -> str:

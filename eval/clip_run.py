@@ -191,7 +191,7 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
                 run.frames.append({})
                 run.before = None
                 continue
-            comparison = Comparison(output, reference, clip.exposure, hidden, run.before, still)
+            comparison = Comparison(output, reference, clip.exposure, hidden, run.before, still, frame.motion)
             run.frames.append(run.values(comparison))
             run.before = comparison.luminances
             save_picture(picture_path(folder, index), as_displayed(output, clip.exposure))

@@ -29,6 +29,7 @@ class Comparison:
     disoccluded: Tensor | None = None
     before: Luminances | None = None  # luminances of the previous frame; None on the first one
     still: bool = False  # whether nothing moves in the clip
+    motion: Tensor | None = None  # from a pixel to where its surface was in the previous frame, (1, 2, H, W) in px
 
     @cached_property
     def output(self) -> Tensor:

@@ -29,8 +29,14 @@ def video(folder: Path, frames: Sequence[int]) -> Tensor:
     return torch.from_numpy(pictures).permute(3, 0, 1, 2)[None]
 
 
+def frame_rate(clip: ClipResults) -> int | None:
+    """Frames per second at which a clip is compared; None where only some frames have a reference: as stills."""
+    whole = len(clip.reference.judged) == len(clip.reference.frames)
+    return FRAMES_PER_SECOND if whole else None
+
+
 def jod_of_clip(metric: Any, runs: Path, clip: ClipResults) -> dict[str, float]:
-    """JOD of each denoiser: of the video, or where only some frames have a reference, the mean of these as stills.
+    """JOD of each denoiser: of the video, or the mean of the judged frames as stills, see `frame_rate`.
 
     Raises BadInput where the images are too small.
     """
@@ -39,16 +45,14 @@ def jod_of_clip(metric: Any, runs: Path, clip: ClipResults) -> dict[str, float]:
     reference = video(folders.pop(NOISE_FLOOR), frames)
     if min(reference.shape[-2:]) < MIN_SIDE:
         raise BadInput(f"{clip.name} is too small for JOD: evaluate clips of {MIN_SIDE} x {MIN_SIDE} pixels or more")
-    whole = len(frames) == len(clip.reference.frames)
+    rate = frame_rate(clip)
     values = {}
     for name, folder in folders.items():
         output = video(folder, frames)
-        if whole:
-            pairs = [(output, reference)]
-        else:
+        pairs = [(output, reference)]
+        if rate is None:
             pairs = list(zip(output.split(1, dim=2), reference.split(1, dim=2), strict=True))
-        rate = FRAMES_PER_SECOND if whole else 0
-        jods = [metric.predict(*pair, dim_order="BCFHW", frames_per_second=rate)[0].item() for pair in pairs]
+        jods = [metric.predict(*pair, dim_order="BCFHW", frames_per_second=rate or 0)[0].item() for pair in pairs]
         values[name] = float(np.mean(jods))
     return values
 
@@ -64,7 +68,12 @@ def jod_table(runs: Path) -> str:
     metric = cvvdp(display_name=DISPLAY, quiet=True)
     clips = read_results(runs)[1]
     values = {clip.name: jod_of_clip(metric, runs, clip) for clip in tqdm(clips, "JOD", unit="clip", leave=False)}
-    facts = {"metric": metric.get_info_string(), "frames_per_second": FRAMES_PER_SECOND}
+    rates = {clip.name: frame_rate(clip) for clip in clips}  # None: as stills
+    facts = {"metric": metric.get_info_string(), "frames_per_second": rates}
     write_json(runs / "eval" / "jod.json", facts | {"clips": values})
-    lines = [{"clip": name} | {key: f"{jod:.2f}" for key, jod in row.items()} for name, row in values.items()]
-    return f"JOD ({facts['metric']}, {FRAMES_PER_SECOND} Hz)\n{tabulate(lines, 'keys', disable_numparse=True)}"
+    lines = [
+        {"clip": name, "shown": f"at {rates[name]} Hz" if rates[name] else "as stills"}
+        | {key: f"{jod:.2f}" for key, jod in row.items()}
+        for name, row in values.items()
+    ]
+    return f"JOD ({facts['metric']})\n{tabulate(lines, 'keys', disable_numparse=True)}"

@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from datasets.tonemap import psnr
-from eval.comparison import Comparison
+from eval.comparison import Comparison, Luminances
+from models.operators import sampling_grid
 
 EPSILON = 0.01
 FLICKER_BLOCK = 16  # px
@@ -148,25 +149,46 @@ def relative_mse_floor(c: Comparison) -> float:
     return float((c.noise.square() / (reference.square() + EPSILON)).mean())
 
 
-def mean_change(change: Tensor, block: int) -> float:
-    """The mean absolute value of a change (1, 1, H, W), or of its means over blocks of `block` x `block` pixels."""
-    return float((F.avg_pool2d(change, block, ceil_mode=True) if block > 1 else change).abs().mean())
+def temporal_error(c: Comparison) -> float | None:
+    """Mean absolute difference between the change of luminance and the reference's; None on the first frame."""
+    return None if c.change is None else float((c.change.output - c.change.reference).abs().mean())
 
 
-def temporal_error(c: Comparison, block: int = 1) -> float | None:
-    """Mean absolute difference between the change of luminance and the reference's; None on the first frame.
-
-    With `block`, that of the means over blocks: what is seen as blotches that come and go.
-    """
-    return None if c.change is None else mean_change(c.change.output - c.change.reference, block)
-
-
-def temporal_error_floor(c: Comparison, block: int = 1) -> float | None:
+def temporal_error_floor(c: Comparison) -> float | None:
     """Half the temporal error between the buffers."""
     if c.change is None:
         return None
     a, b = c.change.buffers.split(1)
-    return mean_change(a - b, block) / 2
+    return float((a - b).abs().mean()) / 2
+
+
+def mean_block_change(c: Comparison, error_of: Callable[[Luminances], Tensor]) -> float | None:
+    """Mean absolute change of an error (1, 1, H, W) of luminances, in means over blocks of 16 x 16 pixels.
+
+    The error of the previous frame is fetched along the motion, bilinearly: what stays on a surface does not count.
+    Pixels that the previous frame did not show are left out, and blocks without any other; None where none is left.
+    """
+    if c.before is None or c.motion is None:
+        return None
+    grid = sampling_grid(c.motion.double())
+    seen = (grid.abs() <= 1).all(dim=-1)[:, None]
+    if c.disoccluded is not None:
+        seen = seen & ~c.disoccluded
+    before = F.grid_sample(error_of(c.before), grid, padding_mode="border", align_corners=False)
+    change = (error_of(c.luminances) - before) * seen
+    total, share = (F.avg_pool2d(image.double(), FLICKER_BLOCK, ceil_mode=True) for image in (change, seen))
+    return float((total / share)[share > 0].abs().mean()) if seen.any() else None
+
+
+def block_flicker(c: Comparison) -> float | None:
+    """Blotches that come and go: see mean_block_change."""
+    return mean_block_change(c, lambda luminances: luminances.output - luminances.reference)
+
+
+def block_flicker_floor(c: Comparison) -> float | None:
+    """Half that of the difference between the buffers."""
+    value = mean_block_change(c, lambda luminances: luminances.buffers[:1] - luminances.buffers[1:])
+    return None if value is None else value / 2
 
 
 def flicker(c: Comparison) -> float | None:
@@ -239,12 +261,7 @@ METRICS = {
     ),
     "energy": Metric("energy", "{:+.1%}", of=energy, floor=energy_error, edge=twice, floor_is_error=True),
     "detail": Metric("detail", "{:.3f}", more_is_better=True, of=detail, floor=None),
-    "block_flicker": Metric(
-        "block flicker",
-        "{:.4f}",
-        of=lambda c: temporal_error(c, FLICKER_BLOCK),
-        floor=lambda c: temporal_error_floor(c, FLICKER_BLOCK),
-    ),
+    "block_flicker": Metric("block flicker", "{:.4f}", of=block_flicker, floor=block_flicker_floor),
     "flicker": Metric("flicker", "{:.4f}", of=flicker, floor=None),
     "l1": Metric(
         "L1",

@@ -16,11 +16,10 @@ from typing import Any
 from tabulate import tabulate
 
 from errors import BadInput
-from eval.bench.denoisers import BASELINE
 from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
 from eval.shipped import measured_file
-from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, value_cell
+from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -210,16 +209,31 @@ def times() -> str:
     """Milliseconds and memory of a frame, fastest first, with the signals that denoisers usually return."""
     usual = (row for row in timed_rows() if "(indirect)" not in row["denoiser"])
     rows = sorted(usual, key=lambda row: row["ms_median"])
-    baseline = next(row["ms_median"] for row in rows if row["denoiser"] == BASELINE)
     lines = [
         {
             "denoiser": f"`{row['denoiser']}`",
             "precision": row["dtype"],
             "ms": f"{row['ms_median']:.3g}",
-            f"times `{BASELINE}`": f"{row['ms_median'] / baseline:.2f}",
             "peak MB": f"{row['peak_mb']:.0f}" if row["peak_mb"] is not None else "-",
         }
         for row in rows
+    ]
+    return table(lines)
+
+
+def milliseconds(denoiser: str) -> str:
+    """Of one frame by a denoiser, at the first size of the bench."""
+    return f"{next(row['ms_median'] for row in timed_rows() if row['denoiser'] == denoiser):.0f}"
+
+
+def metrics(*names: str) -> str:
+    """The named metrics of the denoisers of `onespp trade` at 1 spp, where `+js` does nothing."""
+    rows = [Trade(**row) for row in measured("trade")["samples"]]
+    lines = [
+        {"denoiser": f"`{row.denoiser}`", "made from": source_of_denoiser(row.denoiser)}
+        | {METRICS[name].title: row.cell(name) for name in names}
+        for row in rows
+        if (row.signal, row.spp) == ("total", 1) and not row.denoiser.endswith("+js")
     ]
     return table(lines)
 
@@ -229,7 +243,8 @@ def samples() -> str:
     lines: dict[str, dict[str, str]] = {}
     for row in (Trade(**row) for row in measured("trade")["samples"]):
         if row.signal == "total":
-            lines.setdefault(row.denoiser, {"denoiser": f"`{row.denoiser}`"})[f"{row.spp} spp"] = row.cell("psnr")
+            facts = {"denoiser": f"`{row.denoiser}`", "made from": source_of_denoiser(row.denoiser)}
+            lines.setdefault(row.denoiser, facts)[f"{row.spp} spp"] = row.cell("psnr")
     return table([*lines.values()])
 
 
@@ -237,7 +252,12 @@ def front() -> str:
     """Where milliseconds of rendering and filtering are best spent."""
     rows = [Trade(**row) for row in measured("trade")["samples"]]
     lines = [
-        {"ms": f"{ms:.0f}", "spent on": f"`{row.denoiser}`, {row.spp} spp", "PSNR": row.cell("psnr")}
+        {
+            "ms": f"{ms:.0f}",
+            "spent on": f"`{row.denoiser}`, {row.spp} spp",
+            "made from": source_of_denoiser(row.denoiser),
+            "PSNR": row.cell("psnr"),
+        }
         for ms, row in psnr_front(rows, "total")
     ]
     return table(lines)
@@ -254,7 +274,8 @@ def glass() -> str:
                 return fmean(c["results"][name][metric] for c in clips if scene in c["scene"])
 
             floor = denoiser == NOISE_FLOOR
-            line = {"denoiser": FLOOR if floor else f"`{denoiser}`", "guides": "" if floor else guides}
+            row = TableRow("mean", FLOOR if floor else denoiser, "total", {}, {})
+            line = {"denoiser": cell(row), "made from": row.made_from, "guides": "" if floor else guides}
             line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
             line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
             lines.setdefault(denoiser, {})[line["guides"]] = line
@@ -273,7 +294,9 @@ def ages(folder: str, *names: str) -> str:
     """PSNR of the benchmark's denoisers, or of the named ones, by the age of their history."""
     rows = benchmark(folder)["ages"]
     texts = {name: {age: value_cell("psnr", psnr) for age, psnr in rows[name].items()} for name in names or rows}
-    return table([{"denoiser": f"`{name}`"} | row for name, row in texts.items()])
+    return table(
+        [{"denoiser": f"`{name}`", "made from": source_of_denoiser(name)} | row for name, row in texts.items()]
+    )
 
 
 def steady(folder: str, *names: str) -> str:
@@ -358,7 +381,7 @@ def minutes(what: str) -> str:
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
-        *(quality, shipped, times, samples, front, glass, stress, device, size, minutes),
+        *(quality, shipped, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
         *(ages, steady, where, rendering),
     )
 }

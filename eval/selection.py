@@ -1,5 +1,6 @@
 """Which denoisers a command runs, which weights they take, and why others cannot run."""
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,7 +31,9 @@ def choose(names: Sequence[str], default: Iterable[DenoiserName], *obstacles: Ob
         if reason and names:
             raise BadInput(f"{name}: {reason}")
         if reason:
-            skipped.setdefault(reason.replace(name.base, "NAME"), []).append(name)
+            # Names of packages and their extras contain those of denoisers, too.
+            alike_for_others = re.sub(rf"(?<![\w\[]){re.escape(name.base)}(?!\w)", "NAME", reason)
+            skipped.setdefault(alike_for_others, []).append(name)
         else:
             chosen.append(name)
     for reason, alike in skipped.items():

@@ -11,7 +11,10 @@ from eval.metrics import METRICS, Values, mean_floor, means, within_floor
 from eval.results import FLOOR, ClipResults, by_signal, of_one_spp, results_of
 from models.registry import prototype
 
-PRINTED = ("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1")
+PRINTED = (
+    *("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1"),
+    *("energy", "detail", "block_flicker"),
+)
 NEAR_FLOOR = "≈"
 LEGEND = f"{NEAR_FLOOR} within the noise floor: as close to the truth as the reference; differences are not significant"
 MEAN = "mean of clips of 1 spp"  # instead of a clip's name
@@ -71,6 +74,14 @@ def scores_of(clips: Sequence[ClipResults], denoiser: str) -> ClipScores:
     return ClipScores([result.metrics for result, _ in pairs], [reference.metrics for _, reference in pairs])
 
 
+def source_of_denoiser(name: str) -> str:
+    """What the implementation of a denoiser follows, for tables that rank; "-" for one that is here no more."""
+    try:
+        return prototype(name).made_from
+    except BadInput:
+        return "-"
+
+
 def value_cell(metric: str, value: float | None, floor: float | None = None) -> str:
     """A number, marked if it is within its noise floor."""
     if value is None:
@@ -102,11 +113,8 @@ class TableRow:
 
     @property
     def made_from(self) -> str:
-        """What the implementation of its denoiser follows; "-" for one that is here no more."""
-        try:
-            return "-" if self.is_floor else prototype(self.denoiser).made_from
-        except BadInput:
-            return "-"
+        """See source_of_denoiser; "-" for the noise floor."""
+        return "-" if self.is_floor else source_of_denoiser(self.denoiser)
 
     def text(self, metric: str) -> str:
         """The value, marked if it is within its noise floor, or a noise floor that is a standard error."""
@@ -164,11 +172,15 @@ def best_denoisers(rows: Sequence[TableRow], metric: str) -> set[str]:
 def results_table(clips: Sequence[ClipResults]) -> str:
     """One row per clip, signal and denoiser, with the noise floor below each signal."""
     lines = [
-        [row.clip, row.denoiser, row.signal, *map(row.text, PRINTED), "" if row.is_floor else row.nonfinite]
+        [
+            *(row.clip, row.denoiser, row.made_from, row.signal),
+            *map(row.text, PRINTED),
+            "" if row.is_floor else row.nonfinite,
+        ]
         for clip in clips
         for row in clip_rows(clip)
     ]
-    head = ["clip", "denoiser", "signal", *(METRICS[metric].title for metric in PRINTED), "non-finite"]
+    head = ["clip", "denoiser", "made from", "signal", *(METRICS[metric].title for metric in PRINTED), "non-finite"]
     return with_legend(tabulate(lines, head, disable_numparse=True))
 
 
@@ -177,6 +189,9 @@ def table_by_age(clips: Sequence[ClipResults]) -> str:
     tables = []
     for signal, ours in by_signal(clips).items():
         rows = means_by_age(ours)
-        lines = [[name, signal, *(value_cell("psnr", value) for value in row.values())] for name, row in rows.items()]
-        tables.append(tabulate(lines, ["PSNR dB", "signal", *AGES], disable_numparse=True))
+        lines = [
+            [name, source_of_denoiser(name), signal, *(value_cell("psnr", value) for value in row.values())]
+            for name, row in rows.items()
+        ]
+        tables.append(tabulate(lines, ["PSNR dB", "made from", "signal", *AGES], disable_numparse=True))
     return "\n\n".join(tables)

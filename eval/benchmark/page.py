@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from datasets.clip import Clip, Dataset
+from errors import BadInput
 from eval.clip_run import as_displayed, play
 from eval.selection import evaluated
 from files import write_file
@@ -27,9 +28,11 @@ def video(clip: Clip, spec: DenoiserSpec) -> list[str]:
 def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget: str) -> Path:
     """Write RUNS/compare.html, one file that works offline. Returns its path.
 
-    Raises BadInput as `onespp eval`.
+    Raises BadInput as `onespp eval`, and for one denoiser named twice.
     """
     specs = evaluated(names, runs, budget)
+    if len(specs) < 2:
+        raise BadInput(f"{names[0]} is named twice: name two denoisers to compare")
     clips = [
         {
             "name": f"{clip.scene}/{clip.name}",

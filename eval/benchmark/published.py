@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,24 +39,37 @@ class Protocol:
     tone: Callable[[Tensor], Tensor]
     warm_up: int  # frames of each clip that do not count
     rows: dict[str, tuple[float, ...]]
+    note: str  # printed below the table
 
 
-# By the profile of an imported dataset. Sources: Fan et al. 2021, Table 2; Noisebase, docs/benchmarks/rendering_v1.md.
+NOISEBASE_NOTE = "Noisebase also publishes FVVDP, which is not computed here"
+# By the profile of an imported dataset. Sources: Fan et al. 2021, averages of Table 1 (PSNR) and Table 2 (SSIM);
+# Noisebase, docs/benchmarks/rendering_v1.md.
 PROTOCOLS = {
     "bmfr": Protocol(
         lambda radiance: radiance.clamp(min=0) ** 0.454545,
         warm_up=0,
         rows={
-            "KP (Fan et al. 2021)": (30.33,),
-            "WSKP6 (Fan et al. 2021)": (30.32,),
-            "NBGD (Meng et al. 2020)": (29.47,),
-            "BMFR (Koskela et al. 2019)": (25.58,),
-            "SVGF (Schied et al. 2017)": (22.26,),
+            "KP (Fan et al. 2021)": (30.332, 0.951),
+            "WSKP6 (Fan et al. 2021)": (30.323, 0.951),
+            "MR-KP (Meng et al. 2020)": (30.322, 0.952),
+            "WSKP3 (Fan et al. 2021)": (29.637, 0.946),
+            "NBGD (Meng et al. 2020)": (29.474, 0.940),
+            "NFOR (Bitterli et al. 2016)": (26.889, 0.910),
+            "BMFR (Koskela et al. 2019)": (25.575, 0.904),
+            "SVGF (Schied et al. 2017)": (22.264, 0.901),
         },
+        note="All rows are by Fan et al. 2021, who do not say of what they take SSIM; ours is that of luminance",
     ),
-    "noisebase at 2 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (28.3952, 0.87283, 0.10702)}),
-    "noisebase at 4 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (29.3461, 0.88300, 0.09624)}),
-    "noisebase at 8 spp": Protocol(aces_tone, 16, {"NPPD (Bálint et al. 2023)": (30.3686, 0.89657, 0.08451)}),
+    "noisebase at 2 spp": Protocol(
+        aces_tone, 16, {"NPPD (Bálint et al. 2023)": (28.3952, 0.87283, 0.10702)}, f"{NOISEBASE_NOTE}: 7.36 of NPPD"
+    ),
+    "noisebase at 4 spp": Protocol(
+        aces_tone, 16, {"NPPD (Bálint et al. 2023)": (29.3461, 0.88300, 0.09624)}, NOISEBASE_NOTE
+    ),
+    "noisebase at 8 spp": Protocol(
+        aces_tone, 16, {"NPPD (Bálint et al. 2023)": (30.3686, 0.89657, 0.08451)}, NOISEBASE_NOTE
+    ),
 }
 
 
@@ -82,14 +96,26 @@ def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[floa
     return rows
 
 
+def protocol_of(dataset: Dataset) -> Protocol:
+    """How others score a dataset. Raises BadInput where none of its clips or samples were scored by others."""
+    profile = dataset.facts["profile"]
+    if profile in PROTOCOLS:
+        return PROTOCOLS[profile]
+    if profile.startswith("noisebase"):
+        known = ", ".join(name.split()[-2] for name in PROTOCOLS if name.startswith("noisebase"))
+        raise BadInput(
+            f"{dataset.path} is {profile}, of which nothing is published: import it again with --spp, one of {known}"
+        )
+    raise BadInput(f"{dataset.path} was not made by `onespp import`: there are no published results to compare with")
+
+
 def published(names: Sequence[str], data: Path, runs: Path, budget: str) -> str:
-    """A table of denoisers and published rows. Raises BadInput where the data set has no rules of its own."""
+    """A table of denoisers and published rows. Raises BadInput as `protocol_of` and `onespp eval`."""
     dataset = Dataset(data)
-    protocol = PROTOCOLS.get(dataset.facts["profile"])
-    if protocol is None:
-        raise BadInput(f"{data} was not made by `onespp import`: there are no published results to compare with")
-    lines = [[name, *(f"{value:.4g}" for value in row)] for name, row in protocol.rows.items()]
+    protocol = protocol_of(dataset)
+    rows: list[list[Any]] = [[name, "published", *row] for name, row in protocol.rows.items()]
     for spec in evaluated(names, runs, budget):
         clips = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in dataset.clips("test")]
-        lines.append([spec.name, *(f"{mean:.4g}" for mean in np.mean(clips, axis=0))])
-    return tabulate(lines, ["", *PUBLISHED_METRICS], disable_numparse=True)
+        rows.append([spec.name, spec.facts.made_from, *np.mean(clips, axis=0)])
+    lines = [[name, source, *(f"{mean:.4g}" for mean in means)] for name, source, *means in rows]
+    return f"{tabulate(lines, ['', 'made from', *PUBLISHED_METRICS], disable_numparse=True)}\n{protocol.note}"

@@ -12,7 +12,7 @@ from errors import BadInput
 from eval.bench.denoisers import Size, results_file, size_name
 from eval.metrics import METRICS, Values
 from eval.results import ClipResults, by_signal
-from eval.tables import scores_of, value_cell, with_legend
+from eval.tables import scores_of, source_of_denoiser, value_cell, with_legend
 from files import read_json
 from models.spec import DenoiserSpec
 
@@ -42,9 +42,11 @@ class Times:
             if (row["height"], row["width"], row["threads"]) == (*size, self.threads)
         }
         if not self.ms:
+            sizes = dict.fromkeys([*(size_name((row["height"], row["width"])) for row in bench["rows"]), self.name])
+            command = f"onespp bench denoisers --size {' '.join(sizes)} --runs {runs} --threads {self.threads}"
             raise BadInput(
-                f"{path} has no times of {self.name} with {self.threads} threads: measure them with "
-                f"`{self.command} --threads {self.threads}`"
+                f"{path} has no times of {self.name} with {self.threads} threads: measure them with `{command}`, or "
+                "name a size that it has with --size"
             )
 
     def of(self, spec: DenoiserSpec) -> float | None:
@@ -149,7 +151,8 @@ def front_table(rows: Sequence[Trade]) -> str:
     """One line per row, fastest first, with the denoiser that dominates it in each metric or "front"."""
     lines = []
     for row in sorted(rows, key=lambda row: (row.ms is None, row.ms)):
-        line = {"denoiser": row.denoiser, "dtype": row.dtype, "ms": "-" if row.ms is None else f"{row.ms:.4g}"}
+        line = {"denoiser": row.denoiser, "made from": source_of_denoiser(row.denoiser), "dtype": row.dtype}
+        line |= {"ms": "-" if row.ms is None else f"{row.ms:.4g}"}
         line |= {METRICS[metric].title: row.cell(metric) for metric in TRADED}
         line |= {f"dominated in {METRICS[metric].title.split()[0]} by": row.standing(metric) for metric in TRADED}
         lines.append(line)
@@ -166,7 +169,8 @@ def samples_table(rows: Sequence[Trade]) -> str:
     """PSNR of each denoiser at each number of samples, and the front of PSNR against milliseconds."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
-        line = lines.setdefault((row.signal, row.label), {"signal": row.signal, "denoiser": row.label})
+        facts = {"signal": row.signal, "denoiser": row.label, "made from": source_of_denoiser(row.denoiser)}
+        line = lines.setdefault((row.signal, row.label), facts)
         line[f"{row.spp} spp"] = row.cell("psnr")
     text = f"PSNR dB\n{tabulate([*lines.values()], 'keys', disable_numparse=True)}"
     for signal in dict.fromkeys(row.signal for row in rows):

@@ -16,6 +16,8 @@ Where the paper leaves it open, we choose:
   has to be estimated from other pixels, where texture would count as noise.
 - σ² is the variance of each colour over 9 x 9 pixels of the same mesh: that of the pixel as it is, whatever its number
   of samples.
+- The risk is that of the frame as it is, not of a reconstruction-filtered one: our frames have no reconstruction
+  filter, each sample counts for its own pixel alone.
 - The risk of a filter is the mean over colours, smoothed by a filter of the bank's kind with σ_s = 8.
 - The features of background are far from those of all surfaces, so that no surface gathers from it.
 """

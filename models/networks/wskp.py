@@ -246,7 +246,10 @@ class WSKPMR(MultiResolution):
 
 
 class MRKP(MultiResolution):
-    """The paper's other baseline (§6.1): the network of wskp-mr, and a 5 x 5 kernel per pixel at each resolution."""
+    """The network of wskp-mr with a 5 x 5 kernel per pixel at each resolution, as the paper describes it (§6.1).
+
+    Ours, after the code of Meng et al. 2020; their published baseline has five levels of 48 channels, and filters four.
+    """
 
     made_from = "ours, after code"
     maps = 25

@@ -76,6 +76,17 @@ DATA_PROFILES = {
         },
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
     ),
+    # The same at the size that other people's trainers want: the default loss of OIDN's needs more than 160 px.
+    "release-256": DataProfile(
+        size=(12, 256, 256),
+        rooms={"train": 128, "val": 8, "test": 6},
+        closeups={"train": 128, "val": 4},
+        quality={
+            "train": SamplingQuality(realisations=8, reference_spp=32),
+            "val": SamplingQuality(realisations=8, reference_spp=64),
+            "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
+        },
+    ),
     # Scenes that no training uses, at a size at which people look, until the history is steady.
     "benchmark": DataProfile(
         size=(49, 360, 640),

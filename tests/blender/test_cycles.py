@@ -15,15 +15,14 @@ BLENDER = ROOT / ".venv-blender" / "bin" / "python"
 FRAMES = 12
 SIZE = "240x135"
 REFERENCE_SPP = 64
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not BLENDER.exists(), reason="needs Blender's Python module: `make blender`"),
-]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def cycles(tmp_path_factory):
     """Noisy frames with Cycles' own denoised image, references, and the noisy ones denoised by `one`."""
+    if not BLENDER.exists():
+        pytest.fail("needs Blender's Python module: `make blender`, or `make test-all BLENDER=` to go without")
     folder = tmp_path_factory.mktemp("cycles")
     script = Path(__file__).with_name("render_room.py")
     arguments = [BLENDER, script, folder, str(FRAMES), SIZE, str(REFERENCE_SPP)]

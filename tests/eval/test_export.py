@@ -1,15 +1,12 @@
 """`onespp export` and its bench, from the command line on."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from command_line import main
-from models.export.page import TEXTS
-from provenance import ROOT
 from tests.eval.conftest import untrained
 from tests.helpers.exports import check_page
 from tests.test_cli import fails
@@ -40,9 +37,3 @@ def test_trained_weights_become_a_file_in_place_of_an_older_one(capsys, tmp_path
     assert files == {"manifest.json", "README.md", "wskp3.pt2", *(f"golden/00{n}.npz" for n in range(4))}
     assert [path.name for path in (tmp_path / "export").iterdir()] == ["wskp3@tiny-pt2"]
     check_page(export, lambda array: torch.from_numpy(np.ascontiguousarray(array)), 1e-4)
-
-
-def test_the_docs_have_the_calls_that_are_tested():
-    page = Path(ROOT / "docs" / "export.md").read_text()
-    python, cpp = ((TEXTS / f"{name}.txt").read_text() for name in ("onnx", "cpp"))
-    assert python in page and cpp.replace("FILE", "wskp6.onnx") in page

@@ -4,6 +4,7 @@ import importlib
 import shutil
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -27,10 +28,19 @@ class MeanDifference:
         self.calls.append((tuple(output.shape), frames_per_second))
         return 10 - (output.float() - reference.float()).abs().mean(), {}
 
+    def get_info_string(self):
+        return "mean difference"
+
 
 @pytest.fixture
 def clip(evaluated):
     return read_results(evaluated)[1][0]
+
+
+def with_two_references(clip):
+    """The clip, of which only two frames were judged."""
+    frames = [values if index in (0, 5) else {} for index, values in enumerate(clip.reference.frames)]
+    return replace(clip, reference=replace(clip.reference, frames=frames))
 
 
 def test_a_clip_is_one_video(evaluated, clip):
@@ -42,10 +52,21 @@ def test_a_clip_is_one_video(evaluated, clip):
 
 
 def test_frames_between_which_references_are_missing_are_stills(evaluated, clip):
-    frames = [values if index in (0, 5) else {} for index, values in enumerate(clip.reference.frames)]
     metric = MeanDifference()
-    values = jod_of_clip(metric, evaluated, replace(clip, reference=replace(clip.reference, frames=frames)))
+    values = jod_of_clip(metric, evaluated, with_two_references(clip))
     assert metric.calls == [((1, 3, 1, 64, 64), 0)] * 2 * len(values)
+
+
+def test_the_table_and_the_file_say_how_each_clip_was_shown(evaluated, clip, tmp_path, monkeypatch):
+    shutil.copytree(evaluated / "eval", tmp_path / "eval")
+    clips = [replace(clip, scene="whole"), replace(with_two_references(clip), scene="some")]
+    monkeypatch.setattr(jod, "read_results", lambda runs: ({}, clips))
+    monkeypatch.setattr(jod, "jod_of_clip", lambda *_: {"noisy": 5.0})
+    monkeypatch.setitem(sys.modules, "pycvvdp", SimpleNamespace(cvvdp=lambda **_: MeanDifference()))
+    title, *lines = jod_table(tmp_path).splitlines()
+    assert "Hz" not in title
+    assert [line.split("  ")[1].strip() for line in lines[2:]] == ["at 24 Hz", "as stills"]
+    assert read_json(tmp_path / "eval" / "jod.json")["frames_per_second"] == {"whole/000": 24, "some/000": None}
 
 
 def test_a_clip_of_one_pixel_is_refused(evaluated, clip, monkeypatch):

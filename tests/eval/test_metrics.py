@@ -175,12 +175,56 @@ def test_blocks_flicker_where_their_means_change():
     flat = torch.full((1, 3, 64, 64), 0.3)
     blotch, noise = flat.clone(), flat + 0.01 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(0))
     blotch[..., 16:32, 32:48] *= 1.5
-    before = Comparison(flat, buffers, 1.0).luminances
-    values = [measure(Comparison(image, buffers, 1.0, before=before)) for image in (flat, noise, blotch)]
+    before, rest = Comparison(flat, buffers, 1.0).luminances, torch.zeros(1, 2, 64, 64)
+    values = [measure(Comparison(image, buffers, 1.0, None, before, motion=rest)) for image in (flat, noise, blotch)]
     still, white, grown = (value["block_flicker"] for value in values)
     change = float(display(torch.tensor(0.45), 1.0) - display(torch.tensor(0.3), 1.0))
     assert still == 0 and white < 0.1 * values[1]["temporal_error"]
     assert grown == pytest.approx(change / 16, rel=1e-4) == values[2]["temporal_error"]
+
+
+def test_an_error_that_stays_on_a_surface_does_not_flicker():
+    """The picture, with a blotch on it, moves by (5, 3) pixels from one frame to the next."""
+    rng = np.random.default_rng(4)
+    truth = torch.from_numpy(rng.uniform(0.2, 0.6, (1, 3, 80, 80)))
+    wrong = truth.clone()
+    wrong[..., 20:44, 24:50] *= 1.3
+
+    def moved(image: torch.Tensor) -> torch.Tensor:
+        return torch.roll(image, (3, 5), (2, 3))
+
+    before = Comparison(wrong, truth.repeat(2, 1, 1, 1), 1.0).luminances
+    arguments = (moved(wrong), moved(truth).repeat(2, 1, 1, 1), 1.0, None, before, False)
+    motion = torch.tensor([-5.0, -3.0])[None, :, None, None].expand(1, 2, 80, 80)
+    along, at_rest = (METRICS["block_flicker"].of(Comparison(*arguments, m)) for m in (motion, 0 * motion))
+    assert along == pytest.approx(0, abs=1e-12) and at_rest > 0.003
+    assert METRICS["block_flicker"].of(Comparison(*arguments)) is None  # without motion
+
+
+@pytest.mark.parametrize("size", [(32, 48), (37, 21), (5, 3)])
+def test_block_flicker_pixel_by_pixel(size):
+    """In numpy: motion by whole pixels, of which some lead out of the image; some pixels were hidden."""
+    rng = np.random.default_rng(5)
+    images = [torch.from_numpy(rng.uniform(0.1, 0.6, (3, 3, *size))) for _ in range(2)]
+    motion = rng.integers(-4, 5, (2, *size))
+    hidden = rng.random(size) < 0.2
+    before, now = (Comparison(image[:1], image[1:], 1.0) for image in images)
+    found = Comparison(
+        *(images[1][:1], images[1][1:], 1.0, torch.from_numpy(hidden)[None, None]),
+        *(before.luminances, False, torch.from_numpy(motion)[None].float()),
+    )
+    errors, differences = [], []
+    for each in (before.luminances, now.luminances):
+        a, b = each.buffers[:, 0].numpy()
+        errors.append((each.output - each.reference)[0, 0].numpy())
+        differences.append((a - b) / 2)
+    for metric, (old, new) in ((METRICS["block_flicker"].of, errors), (METRICS["block_flicker"].floor, differences)):
+        blocks: dict[tuple[int, int], list[float]] = {}
+        for y, x in np.ndindex(size):
+            v, u = y + motion[1, y, x], x + motion[0, y, x]
+            if not hidden[y, x] and 0 <= v < size[0] and 0 <= u < size[1]:
+                blocks.setdefault((y // 16, x // 16), []).append(new[y, x] - old[v, u])
+        assert metric(found) == pytest.approx(np.mean([abs(np.mean(changes)) for changes in blocks.values()]))
 
 
 # --- Noise floors -----------------------------------------------------------------------------------------------------

@@ -13,8 +13,9 @@ from datasets.channels import HIT_CHANNELS
 from datasets.frame import to_tensor
 from eval.bench.synthetic_frames import synthetic_frame
 from models.filters.aaf import AAF, band_limit, filter_lines, pack_geometry, penumbra, widths
+from models.registry import create
 from tests.helpers import foreign
-from tests.helpers.frames import FOCAL_LENGTH, flat_frame, run
+from tests.helpers.frames import FOCAL_LENGTH, chain, flat_frame, run
 from tests.helpers.plates import SIZE, TO_THE_EYE, TO_THE_WALL, frames_of, plate
 
 pytestmark = pytest.mark.usefixtures("implementation")
@@ -162,3 +163,14 @@ def test_extremes_stay_within_the_range_of_the_input(hits, depth, level):
     low, high = sorted((min(level, 1e16), 1.0))
     assert torch.isfinite(output).all()
     assert low * (1 - 1e-5) <= output.min() and output.max() <= high * (1 + 1e-5)
+
+
+def test_accumulated_light_is_filtered():
+    """The second of two frames at rest is that of one whose light is their mean."""
+    lights = torch.rand(2, 1, 3, 12, 14, generator=torch.Generator().manual_seed(0))
+    frames = chain([flat_frame(12, 14, irradiance=light) for light in lights])
+    _, second = run(create("aaf"), frames)
+    (expected,) = run(create("aaf"), [flat_frame(12, 14, irradiance=lights.mean(dim=0))])
+    (alone,) = run(create("aaf"), [flat_frame(12, 14, irradiance=lights[1])])
+    torch.testing.assert_close(second, expected)
+    assert not torch.allclose(second, alone, atol=1e-2)

@@ -8,8 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.filters.neighbours import mesh_variance
 from models.filters.sbf import BANK, best_filtered, filter_with_risk, guides
-from tests.helpers.frames import flat_frame
+from models.registry import create
+from tests.helpers.frames import chain, flat_frame, run
 
 pytestmark = pytest.mark.usefixtures("implementation")
 
@@ -102,3 +104,15 @@ def test_features_are_in_units_of_the_paper_s_deviations():
     )
     squares = (guides(frame)[0, :, 0, 1] - guides(frame)[0, :, 0, 0]).square()
     torch.testing.assert_close(2 * squares, torch.tensor([1.0, 0, 0, 1, 0, 1, 1]))
+
+
+def test_accumulated_light_is_filtered():
+    """The second of two frames at rest: the filter's output for the mean of their light."""
+    lights = torch.rand(2, 1, 3, 12, 14, generator=torch.Generator().manual_seed(0))
+    frames = chain([flat_frame(12, 14, irradiance=light) for light in lights])
+    _, second = run(create("sbf"), frames)
+    mean, frame = lights.mean(dim=0), frames[1]
+    expected = best_filtered(mean, mesh_variance(mean, frame.mesh_id), guides(frame))
+    torch.testing.assert_close(second, expected)
+    alone = best_filtered(lights[1], mesh_variance(lights[1], frame.mesh_id), guides(frame))
+    assert not torch.allclose(second, alone, atol=1e-2)

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
 from train.loop import train_network
-from train.recipes import task_for
+from train.recipes import TRAINABLE, task_for
 from train.task import WEIGHTS_FILE, Task
 from train.training import Training
 
@@ -54,6 +55,29 @@ def test_it_begins_with_the_general_network_bit_for_bit(tiny, tmp_path, general)
     for denoiser in (training.loss.module.denoiser, training.judged.denoiser):
         begun = denoiser.state_dict()
         assert begun.keys() == wanted.keys() and all(torch.equal(begun[key], wanted[key]) for key in wanted)
+
+
+# The others take longer.
+QUICK = ("wskp3", "rae", "nbgd", "one")
+EVERY_NETWORK = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TRAINABLE]
+
+
+@pytest.mark.parametrize("name", EVERY_NETWORK)
+def test_no_network_ends_worse_than_it_began(tiny, tmp_path, name):
+    """By the validation loss, at a rate a thousand times too high; the weights kept are those of that loss."""
+    task = replace(task_for(name, tiny, tmp_path, "tiny"), precision="float32")
+    task = replace(task, recipe=replace(task.recipe, **few_steps(task), rate=1e3, ramp=0))
+    start = Training(task).validate()
+    weights = train_network(task)
+    kept = json.loads(metadata(weights)["recipe"])["validation"]
+    assert kept <= start
+    again = Training(replace(task, folder=tmp_path / "again", start=weights))
+    assert again.validate() == pytest.approx(kept, rel=1e-3)
+
+
+def few_steps(task: Task) -> dict[str, Any]:
+    """Changes to a recipe: one epoch, of sequences or of a few crops a frame."""
+    return {"epochs": 1} if task.recipe.length > 1 else {"epochs": 1, "crops": (2, 1)}
 
 
 @pytest.mark.parametrize("name", ["wskp3", "rae"])
