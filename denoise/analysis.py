@@ -12,7 +12,7 @@ from datasets.channels import CHANNELS
 from datasets.tonemap import luminance
 from denoise.foreign_frame import ForeignFrame, Image, read_foreign_frame
 from denoise.frames import InputConventions, are_encoded, camera_conventions
-from denoise.layers import QUANTITIES
+from denoise.layers import QUANTITIES, normalised
 from denoise.motion_convention import ConventionDetector, MotionConvention
 from denoise.sequence import FrameFiles
 from denoise.sources import Sources
@@ -31,12 +31,16 @@ class Analysis:
 
 
 def analyse(
-    shots: Sequence[Sequence[FrameFiles]], sources: Sources, reads: Sequence[str], given: MotionConvention | None
+    shots: Sequence[Sequence[FrameFiles]],
+    sources: Sources,
+    reads: Sequence[str],
+    given: MotionConvention | None,
+    albedo: str | None = None,
 ) -> Analysis:
     """Analyse the first frames of a foreign sequence for a denoiser that `reads` channels.
 
-    `given` is the convention of motion vectors, if the user names it. Raises BadInput for a channel that only onespp
-    renders.
+    `given` is the convention of motion vectors, and `albedo` "exact" or "sampled", if the user names them. Raises
+    BadInput for a channel that only onespp renders.
     """
     if ours := [channel for channel in reads if CHANNELS[channel].renderer_only]:
         raise BadInput(f"the denoiser reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
@@ -49,7 +53,16 @@ def analyse(
         convention, reason = motion_convention(shots, sources, given)
         conventions = replace(conventions, motion=convention)
         report.append(("convention", reason))
+    if sources.has("albedo") and (albedo or usual_albedo(sources)) == "sampled":
+        conventions = replace(conventions, albedo_is_sampled=True)
+        report.append(("", "albedo has the frame's samples, and is averaged along the motion"))
     return Analysis(conventions, report + derived_and_missing(first, sources, conventions, reads))
+
+
+def usual_albedo(sources: Sources) -> str:
+    """How an albedo of that name is rendered: Cycles' has the samples of the light."""
+    name = normalised(sources.quantities["albedo"].layer.name.rpartition(".")[2])
+    return "sampled" if name == "denoisingalbedo" else "exact"
 
 
 def derived_and_missing(

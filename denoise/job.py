@@ -18,6 +18,10 @@ AOV_HELP = (
     "denoise these layers of the colour's files too, by the kernels of the colour: lights that add up to it, or single "
     "channels such as A; needs --denoiser one"
 )
+ALBEDO_HELP = (
+    "whether albedo is free of noise and antialiased, or has the light's samples at random places of the pixel and is "
+    "averaged over frames; by default sampled for Cycles' Denoising Albedo"
+)
 ERROR_HELP = (
     "add the layer `error`, an estimate of each pixel's error; needs NAME+js and two sample buffers, and takes three "
     "passes instead of one"
@@ -44,6 +48,7 @@ class Job:
     layers: Annotated[tuple[str, ...], arg(metavar="QUANTITY=LAYER...", help=LAYERS_HELP)] = ()
     aov: Annotated[tuple[str, ...], arg(metavar="LAYER...", help=AOV_HELP)] = ()
     motion: Annotated[str | None, arg(metavar="PAIR,SIGNx,SIGNy,UNIT", help=MOTION_HELP)] = None
+    albedo: Annotated[Literal["exact", "sampled"] | None, arg(help=ALBEDO_HELP)] = None
     ref: Annotated[Patterns, arg(aliases=["-r"], help="references to compare with")] = ()
     frame_range: Annotated[str | None, arg(name="frames", metavar="A-B", help="frame numbers to denoise")] = None
     reset_at: Annotated[tuple[int, ...], arg(metavar="N...", help="frame numbers at which history is reset")] = ()

@@ -146,7 +146,7 @@ class SequenceDenoiser:
     @cached_property
     def analysis(self) -> Analysis:
         given = MotionConvention.parse(self.job.motion) if self.job.motion else None
-        return analyse(self.shots, self.sources, self.denoiser.reads, given)
+        return analyse(self.shots, self.sources, self.denoiser.reads, given, self.job.albedo)
 
     @cached_property
     def exposure(self) -> float:
@@ -183,6 +183,7 @@ class SequenceDenoiser:
             "reset-at": sorted(job.reset_at),
             "layers": sorted(job.layers),
             "aov": sorted(job.aov) or None,
+            "albedo": job.albedo,
             "motion": str(job.motion if self.sources.is_ours else self.analysis.conventions.motion),
             "as": job.stored_as,
             "spp": job.spp,

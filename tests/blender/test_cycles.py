@@ -56,5 +56,5 @@ def test_frames_of_cycles_are_denoised_with_history(cycles, capsys):
         for row in zip(noisy, blender, ours, strict=True):
             print("  ".join(f"{value:.2f}" for value in row))
     assert min(np.subtract(ours, noisy)) > 6
-    # History makes up for the start: by the end the lead over OIDN has grown.
-    assert np.mean(np.subtract(ours, blender)[-3:]) > ours[0] - blender[0]
+    # History, and albedo supersampled along with it, make up for the start.
+    assert np.mean(np.subtract(ours, blender)[9:]) > 1

@@ -1,0 +1,79 @@
+"""Albedo of few samples at random places of the pixel, averaged along motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from datasets.frame import Frame
+from denoise.supersampling import MOST_BEFORE, AlbedoMean
+from tests.helpers.frames import flat_frame
+
+SIZE = (16, 32)
+SPEED = 0.3  # pixels per frame, to the right
+DARK, BRIGHT = 0.2, 0.8
+
+
+def edge(frame: int) -> float:
+    """Where dark becomes bright, in pixels from the left."""
+    return 10.4 + SPEED * frame
+
+
+def frame_of_edge(number: int, albedo: torch.Tensor) -> Frame:
+    """A wall in constant light that moves to the right, with that albedo (H, W)."""
+    given = albedo.expand(1, 3, *SIZE).float().contiguous()
+    frame = flat_frame(*SIZE, (-SPEED, 0.0))
+    return frame.with_channels({"albedo": given, "direct": 2 * given, "indirect": torch.zeros_like(given)})
+
+
+def sampled(number: int, rng: np.random.Generator) -> torch.Tensor:
+    places = np.arange(SIZE[1]) + rng.random(SIZE)
+    return torch.from_numpy(np.where(places < edge(number), DARK, BRIGHT))
+
+
+def coverage(number: int) -> torch.Tensor:
+    bright = np.clip(np.arange(SIZE[1]) + 1 - edge(number), 0, 1)
+    return torch.from_numpy(DARK + (BRIGHT - DARK) * np.tile(bright, (SIZE[0], 1)))
+
+
+def test_edges_become_antialiased_and_light_stays_what_it_is():
+    rng = np.random.default_rng(0)
+    average = AlbedoMean()
+    errors = []
+    for number in range(24):
+        noisy = frame_of_edge(number, sampled(number, rng))
+        frame = average.add(noisy)
+        torch.testing.assert_close(frame.direct / frame.albedo, torch.full_like(frame.direct, 2.0))
+        assert frame.albedo.min() >= DARK - 1e-6 and frame.albedo.max() <= BRIGHT + 1e-6
+        truth = coverage(number)
+        errors.append([float((each.albedo[0, 0] - truth).square().mean()) for each in (noisy, frame)])
+    alone, averaged = np.array(errors)[8:].mean(axis=0)
+    # A mean of so many frames, with weights 1 / (MOST_BEFORE + 1) for the newest, has at best this share of the noise.
+    assert averaged < 0.5 * alone and averaged > 0.5 * alone / (2 * MOST_BEFORE + 1)
+
+
+def test_an_exact_albedo_at_rest_stays_exact():
+    average = AlbedoMean()
+    exact = coverage(0)
+    for _ in range(5):
+        frame = frame_of_edge(0, exact).with_channels({"motion": torch.zeros(1, 2, *SIZE)})
+        torch.testing.assert_close(average.add(frame).albedo, frame.albedo)
+
+
+def test_what_was_hidden_begins_anew_and_background_is_left_alone():
+    average = AlbedoMean()
+    before = frame_of_edge(0, torch.full(SIZE, DARK))
+    average.add(before)
+    depth = before.depth.clone()
+    depth[..., :4] = 0
+    now = frame_of_edge(1, torch.full(SIZE, BRIGHT)).with_channels({"depth": depth})
+    frame = average.add(now)
+    # Neighbours show nothing dark: the old albedo is clamped to theirs.
+    torch.testing.assert_close(frame.albedo, now.albedo)
+    torch.testing.assert_close(frame.direct, now.direct)
+
+
+def test_frames_without_motion_are_themselves():
+    frame = frame_of_edge(0, coverage(0))
+    still = replace(frame, channels={name: t for name, t in frame.channels.items() if name != "motion"})
+    assert AlbedoMean().add(still) is still
