@@ -1,9 +1,9 @@
-/* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS]
+/* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]
  *
  * SEQUENCE is what `python -m runtime.raw` writes: frames one after the other, each a header, the poses of its meshes
  * (4 x 4 doubles each) and planes of float32: direct, indirect, emission, albedo and normal (3 channels each), depth,
  * roughness and motion (2); then the mesh ids, of int32. OUTPUT becomes the denoised frames as planes of float32, three
- * per frame. Prints the time that each frame took.
+ * per frame. MAX_ISA is that of onespp_config. Prints the instruction set, and the time that each frame took.
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -146,10 +146,11 @@ static int fail(const char *message)
 int main(int count, char **arguments)
 {
     int threads = count > 3 ? atoi(arguments[3]) : 2;
+    int max_isa = count > 4 ? atoi(arguments[4]) : ONESPP_ISA_ANY;
     FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL, *out = file ? fopen(arguments[2], "wb") : NULL;
     Raw raw = {0};
     if (!out || threads < 1 || threads > MAX_THREADS)
-        return fail("usage: example SEQUENCE OUTPUT [THREADS]");
+        return fail("usage: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]");
     if (!read_frame(file, &raw))
         return fail("there is no frame");
 
@@ -161,7 +162,7 @@ int main(int count, char **arguments)
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
     onespp_config config = {ONESPP_ABI, raw.header.width, raw.header.height, MAX_MESHES, 2 * threads, parallel_for,
-                            &pool};
+                            &pool, max_isa};
     size_t size = onespp_size(&config), pixels = (size_t)raw.header.width * (size_t)raw.header.height;
     void *memory = malloc(size);
     float *radiance = malloc(sizeof(float) * 3 * pixels);
@@ -169,6 +170,9 @@ int main(int count, char **arguments)
     int error = onespp_create(&config, memory, size, &denoiser);
     if (error || !radiance)
         return fail(error ? onespp_message(error) : "out of memory");
+    static const char *const names[] = {
+        [ONESPP_ISA_BASELINE] = "baseline", [ONESPP_ISA_AVX2] = "AVX2", [ONESPP_ISA_AVX512] = "AVX-512"};
+    printf("%s\n", names[onespp_isa(denoiser)]);
     do {
         onespp_frame frame = described(&raw);
         onespp_output output = {radiance, (ptrdiff_t)frame.width * frame.height, frame.width, 1};
