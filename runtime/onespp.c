@@ -440,14 +440,17 @@ static void run(Job *job, void (*work)(Job *, Scratch *, int, int), int first, i
             run_task(job, i);
 }
 
-/* n pixels of a row of an image, from x on. */
+/* n pixels of a row of an image, from x on. Compilers vectorise the loop over pixels side by side. */
 static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
 {
     ptrdiff_t step = image->column;
-    const float *from = image->data + image->channel * channel + image->row * y + step * x;
-    float constant = finite_or_0(*from);
-    for (int i = 0; i < n; i++)
-        line[i] = step ? finite_or_0(from[i * step]) : constant;
+    const float *restrict from = image->data + image->channel * channel + image->row * y + step * x;
+    if (step == 1)
+        for (int i = 0; i < n; i++)
+            line[i] = finite_or_0(from[i]);
+    else
+        for (int i = 0; i < n; i++)
+            line[i] = finite_or_0(from[i * step]);
 }
 
 /* Mesh ids of n pixels; negative ones, which stand for pixels outside the image here, count as one mesh. */
@@ -1068,7 +1071,7 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
 {
     int slot = slot_of(y);
     const float *count = around->sums_9x9[5] + HALO;
-    float mean[CHUNK];
+    float mean[CHUNK], square[CHUNK];
     for (int c = 0; c < RGB; c++) {
         expose(lines[NOISY_INPUT + c], around->pixels[slot][c] + HALO, job->exposure, n);
         for (int i = 0; i < n; i++)
@@ -1079,9 +1082,13 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
         expose(lines[MEAN_9X9_INPUT + c], mean, job->exposure, n);
     }
     for (int i = 0; i < n; i++) {
-        float bright = around->sums_9x9[3][HALO + i] / count[i];
-        float variance = maxf(around->sums_9x9[4][HALO + i] / count[i] - bright * bright, 0);
-        mean[i] = sqrtf(variance) / maxf(bright, MIN_MEAN);
+        mean[i] = around->sums_9x9[3][HALO + i] / count[i];
+        square[i] = mean[i] * mean[i];
+    }
+    for (int i = 0; i < n; i++) {
+        /* Of pixels that are all alike this is exactly 0, as long as the square is rounded: it has a loop of its own. */
+        float variance = maxf(around->sums_9x9[4][HALO + i] / count[i] - square[i], 0);
+        mean[i] = sqrtf(variance) / maxf(mean[i], MIN_MEAN);
     }
     expose(lines[DEVIATION_INPUT], mean, 1, n);
 }
