@@ -440,17 +440,14 @@ static void run(Job *job, void (*work)(Job *, Scratch *, int, int), int first, i
             run_task(job, i);
 }
 
-/* n pixels of a row of an image, from x on. Compilers vectorise the loop over pixels side by side. */
+/* n pixels of a row of an image, from x on. */
 static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
 {
     ptrdiff_t step = image->column;
-    const float *restrict from = image->data + image->channel * channel + image->row * y + step * x;
-    if (step == 1)
-        for (int i = 0; i < n; i++)
-            line[i] = finite_or_0(from[i]);
-    else
-        for (int i = 0; i < n; i++)
-            line[i] = finite_or_0(from[i * step]);
+    const float *from = image->data + image->channel * channel + image->row * y + step * x;
+    float constant = finite_or_0(*from);
+    for (int i = 0; i < n; i++)
+        line[i] = step ? finite_or_0(from[i * step]) : constant;
 }
 
 /* Mesh ids of n pixels; negative ones, which stand for pixels outside the image here, count as one mesh. */
