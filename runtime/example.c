@@ -1,7 +1,7 @@
-/* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS]
+/* Denoises a raw sequence: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]
  *
  * SEQUENCE is what `python -m runtime.raw` writes, see raw.h. OUTPUT becomes the denoised frames as planes of float32,
- * three per frame. Prints the time that each frame took.
+ * three per frame. MAX_ISA is that of onespp_config. Prints the instruction set, and the time that each frame took.
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -98,10 +98,11 @@ static int fail(const char *message)
 int main(int count, char **arguments)
 {
     int threads = count > 3 ? atoi(arguments[3]) : 2;
+    int max_isa = count > 4 ? atoi(arguments[4]) : ONESPP_ISA_ANY;
     FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL, *out = file ? fopen(arguments[2], "wb") : NULL;
     raw_header *raw = NULL;
     if (!out || threads < 1 || threads > MAX_THREADS)
-        return fail("usage: example SEQUENCE OUTPUT [THREADS]");
+        return fail("usage: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]");
     if (!read_frame(file, &raw))
         return fail("there is no frame");
 
@@ -112,7 +113,7 @@ int main(int count, char **arguments)
             return fail("a thread could not be started");
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
-    onespp_config config = {ONESPP_ABI, raw->width, raw->height, MAX_MESHES, 2 * threads, parallel_for, &pool};
+    onespp_config config = {ONESPP_ABI, raw->width, raw->height, MAX_MESHES, 2 * threads, parallel_for, &pool, max_isa};
     size_t size = onespp_size(&config), pixels = (size_t)raw->width * (size_t)raw->height;
     void *memory = malloc(size);
     float *radiance = malloc(sizeof(float) * 3 * pixels);
@@ -120,6 +121,9 @@ int main(int count, char **arguments)
     int error = onespp_create(&config, memory, size, &denoiser);
     if (error || !radiance)
         return fail(error ? onespp_message(error) : "out of memory");
+    static const char *const names[] = {
+        [ONESPP_ISA_BASELINE] = "baseline", [ONESPP_ISA_AVX2] = "AVX2", [ONESPP_ISA_AVX512] = "AVX-512"};
+    printf("%s\n", names[onespp_isa(denoiser)]);
     do {
         onespp_frame frame = raw_frame(raw);
         onespp_output output = {radiance, (ptrdiff_t)frame.width * frame.height, frame.width, 1};

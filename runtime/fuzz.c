@@ -99,9 +99,9 @@ static void *allocated(size_t size)
 }
 
 /* A denoiser in memory that begins anywhere and is filled with NaN. */
-static onespp *created(int tasks, uint32_t offset, unsigned char **memory)
+static onespp *created(int tasks, int max_isa, uint32_t offset, unsigned char **memory)
 {
-    onespp_config config = {ONESPP_ABI, SIDE, SIDE, MESHES, tasks, NULL, NULL};
+    onespp_config config = {ONESPP_ABI, SIDE, SIDE, MESHES, tasks, NULL, NULL, max_isa};
     onespp *denoiser;
     size_t size = onespp_size(&config);
     *memory = allocated(size + offset);
@@ -118,7 +118,9 @@ static void play(Source *source)
     int32_t *ids = allocated(room);
     double poses[16 * MESHES];
     unsigned char *memory[2];
-    onespp *denoisers[2] = {created(1, draw(source, 65), &memory[0]), created(5, draw(source, 65), &memory[1])};
+    int max_isa = (int)draw(source, ONESPP_ISA_AVX512 + 1);
+    onespp *denoisers[2] = {created(1, max_isa, draw(source, 65), &memory[0]),
+                            created(5, max_isa, draw(source, 65), &memory[1])};
     for (int i = 0; i < FRAMES; i++) {
         onespp_frame frame = frame_of(source, planes, ids, poses);
         int count = 3 * frame.width * frame.height;

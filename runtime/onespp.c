@@ -14,6 +14,9 @@
  * Images are stored in lines: a row of an image is one line of floats per channel, and all loops that matter run along
  * lines, where compilers vectorise them. What reprojection fetches is stored in texels: all channels of a pixel side by
  * side, in one cache line.
+ *
+ * onespp_avx2.c and onespp_avx512.c compile this file once more for these instruction sets, as far as `Engine` goes; the
+ * interface at the end then chooses between the three.
  */
 #include "onespp.h"
 
@@ -21,9 +24,11 @@
 #include <math.h>
 #include <string.h>
 
+#if !defined(ONESPP_AVX2) && !defined(ONESPP_AVX512)
 #include "onespp_weights.h"
+#endif
 
-#if defined(__AVX512F__)
+#if defined(__AVX512F__) || defined(ONESPP_AVX512)
 enum { LANES = 64, AT_ONCE = 4 }; /* pixels and outputs that a layer sums in registers, see multiply_block */
 #elif defined(__wasm_simd128__)
 enum { LANES = 8, AT_ONCE = 4 };
@@ -264,7 +269,16 @@ typedef union {
     } leave;
 } Scratch;
 
+/* This file, compiled for an instruction set. */
+typedef struct {
+    int isa;
+    uint64_t (*measure)(const onespp_config *config); /* bytes of memory */
+    onespp *(*create)(const onespp_config *config, void *memory, const uint16_t *weights);
+    int (*denoise)(onespp *d, const onespp_frame *frame, const onespp_output *radiance);
+} Engine;
+
 struct onespp {
+    const Engine *engine; /* set by the interface */
     onespp_config config;
     Layer layers[LAYERS];
 
@@ -380,13 +394,6 @@ static const uint16_t *unpack(Layer *layer, int outputs, float *to, const uint16
     layer->bias = to;
     layer->weights = weights;
     return from;
-}
-
-static int is_valid(const onespp_config *config)
-{
-    return config->max_width >= 1 && config->max_width <= ONESPP_MAX_SIDE && config->max_height >= 1
-        && config->max_height <= ONESPP_MAX_SIDE && config->max_meshes >= 0 && config->max_meshes <= ONESPP_MAX_MESHES
-        && config->tasks >= 1 && config->tasks <= ONESPP_MAX_TASKS;
 }
 
 /* --- Frames ------------------------------------------------------------------------------------------------------- */
@@ -1063,7 +1070,7 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
 {
     int slot = slot_of(y);
     const float *count = around->sums_9x9[5] + HALO;
-    float mean[CHUNK];
+    float mean[CHUNK], square[CHUNK];
     for (int c = 0; c < RGB; c++) {
         expose(lines[NOISY_INPUT + c], around->pixels[slot][c] + HALO, job->exposure, n);
         for (int i = 0; i < n; i++)
@@ -1074,9 +1081,13 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
         expose(lines[MEAN_9X9_INPUT + c], mean, job->exposure, n);
     }
     for (int i = 0; i < n; i++) {
-        float bright = around->sums_9x9[3][HALO + i] / count[i];
-        float variance = maxf(around->sums_9x9[4][HALO + i] / count[i] - bright * bright, 0);
-        mean[i] = sqrtf(variance) / maxf(bright, MIN_MEAN);
+        mean[i] = around->sums_9x9[3][HALO + i] / count[i];
+        square[i] = mean[i] * mean[i];
+    }
+    for (int i = 0; i < n; i++) {
+        /* Of pixels that are all alike this is exactly 0, as long as the square is rounded: it has a loop of its own. */
+        float variance = maxf(around->sums_9x9[4][HALO + i] / count[i] - square[i], 0);
+        mean[i] = sqrtf(variance) / maxf(mean[i], MIN_MEAN);
     }
     expose(lines[DEVIATION_INPUT], mean, 1, n);
 }
@@ -1516,45 +1527,20 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
         }
 }
 
-/* --- The interface ------------------------------------------------------------------------------------------------ */
+/* --- The engine --------------------------------------------------------------------------------------------------- */
 
-int onespp_abi(void) { return ONESPP_ABI; }
-
-const char *onespp_message(int code)
-{
-    static const char *const messages[] = {
-        "no error",
-        "compiled with another version of onespp.h",
-        "a size or number of tasks is out of range",
-        "the memory is missing or too small",
-        "a size, a number of samples or an image is missing or out of range",
-        "a camera is not finite, or its focal length is 0",
-    };
-    return code >= 0 && code < (int)(sizeof messages / sizeof *messages) ? messages[code] : "unknown error";
-}
-
-size_t onespp_size(const onespp_config *config)
+static uint64_t measure_memory(const onespp_config *config)
 {
     onespp measured;
     Arena arena = {NULL, 0};
-    if (config->abi != ONESPP_ABI || !is_valid(config))
-        return 0;
     measured.config = *config;
     allocate(&arena, 1, sizeof(onespp));
     lay_out(&measured, &arena);
-    arena.used += ALIGNMENT; /* the caller's memory may begin anywhere */
-    return arena.used <= SIZE_MAX / 2 ? (size_t)arena.used : 0;
+    return arena.used + ALIGNMENT; /* the caller's memory may begin anywhere */
 }
 
-int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser)
+static onespp *create(const onespp_config *config, void *memory, const uint16_t *weights)
 {
-    if (config->abi != ONESPP_ABI)
-        return ONESPP_BAD_ABI;
-    size_t needed = onespp_size(config);
-    if (needed == 0)
-        return ONESPP_BAD_CONFIG;
-    if (!memory || size < needed)
-        return ONESPP_BAD_MEMORY;
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
     onespp *d = allocate(&arena, 1, sizeof(onespp));
@@ -1563,13 +1549,11 @@ int onespp_create(const onespp_config *config, void *memory, size_t size, onespp
     lay_out(d, &arena);
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
     float *to = d->parameters;
-    const uint16_t *from = onespp_weights;
     for (int i = 0; i < LAYERS; i++) {
-        from = unpack(&d->layers[i], LAYER_SIZES[i][0], to, from);
+        weights = unpack(&d->layers[i], LAYER_SIZES[i][0], to, weights);
         to += d->layers[i].outputs * (d->layers[i].inputs + 1);
     }
-    *denoiser = d;
-    return ONESPP_OK;
+    return d;
 }
 
 static int check(const onespp *d, const onespp_frame *frame, const onespp_output *radiance)
@@ -1602,7 +1586,7 @@ static void reset(onespp *d)
     d->log_depth = depth;
 }
 
-int onespp_denoise(onespp *d, const onespp_frame *frame, const onespp_output *radiance)
+static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *radiance)
 {
     static const float zero = 0, one = 1;
     int error = check(d, frame, radiance);
@@ -1631,3 +1615,99 @@ int onespp_denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
         memcpy(d->object_to_world, frame->object_to_world, sizeof(double) * 16 * (size_t)frame->meshes);
     return ONESPP_OK;
 }
+
+#if defined(ONESPP_AVX512)
+
+const Engine onespp_avx512 = {ONESPP_ISA_AVX512, measure_memory, create, denoise};
+
+#elif defined(ONESPP_AVX2)
+
+const Engine onespp_avx2 = {ONESPP_ISA_AVX2, measure_memory, create, denoise};
+
+#else
+
+/* --- The interface ------------------------------------------------------------------------------------------------ */
+
+static const Engine baseline = {ONESPP_ISA_BASELINE, measure_memory, create, denoise};
+
+/* Flags for AVX-512 leave no choice. GCC for Windows does not align the stack for AVX (its bug 54412). */
+#if defined(ONESPP_DISPATCH) && defined(__x86_64__) && defined(__GNUC__) && !defined(_WIN32) && !defined(__AVX512F__)
+
+extern const Engine onespp_avx2, onespp_avx512;
+
+/* The fastest engine for this processor and operating system. */
+static const Engine *engine_of(const onespp_config *config)
+{
+    int most = config->max_isa == ONESPP_ISA_ANY ? ONESPP_ISA_AVX512 : config->max_isa;
+    int has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+    int has_avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw")
+        && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
+    if (most >= ONESPP_ISA_AVX512 && has_avx2 && has_avx512)
+        return &onespp_avx512;
+    return most >= ONESPP_ISA_AVX2 && has_avx2 ? &onespp_avx2 : &baseline;
+}
+
+#else
+
+static const Engine *engine_of(const onespp_config *config)
+{
+    (void)config;
+    return &baseline;
+}
+
+#endif
+
+int onespp_abi(void) { return ONESPP_ABI; }
+
+int onespp_isa(const onespp *denoiser) { return denoiser->engine->isa; }
+
+const char *onespp_message(int code)
+{
+    static const char *const messages[] = {
+        "no error",
+        "compiled with another version of onespp.h",
+        "a size or number of tasks is out of range",
+        "the memory is missing or too small",
+        "a size, a number of samples or an image is missing or out of range",
+        "a camera is not finite, or its focal length is 0",
+    };
+    return code >= 0 && code < (int)(sizeof messages / sizeof *messages) ? messages[code] : "unknown error";
+}
+
+static int is_valid(const onespp_config *config)
+{
+    return config->max_width >= 1 && config->max_width <= ONESPP_MAX_SIDE && config->max_height >= 1
+        && config->max_height <= ONESPP_MAX_SIDE && config->max_meshes >= 0 && config->max_meshes <= ONESPP_MAX_MESHES
+        && config->tasks >= 1 && config->tasks <= ONESPP_MAX_TASKS && config->max_isa >= ONESPP_ISA_ANY
+        && config->max_isa <= ONESPP_ISA_AVX512;
+}
+
+size_t onespp_size(const onespp_config *config)
+{
+    if (config->abi != ONESPP_ABI || !is_valid(config))
+        return 0;
+    uint64_t size = engine_of(config)->measure(config);
+    return size <= SIZE_MAX / 2 ? (size_t)size : 0;
+}
+
+int onespp_create(const onespp_config *config, void *memory, size_t size, onespp **denoiser)
+{
+    if (config->abi != ONESPP_ABI)
+        return ONESPP_BAD_ABI;
+    size_t needed = onespp_size(config);
+    if (needed == 0)
+        return ONESPP_BAD_CONFIG;
+    if (!memory || size < needed)
+        return ONESPP_BAD_MEMORY;
+    const Engine *engine = engine_of(config);
+    *denoiser = engine->create(config, memory, onespp_weights);
+    (*denoiser)->engine = engine;
+    return ONESPP_OK;
+}
+
+int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_output *radiance)
+{
+    return denoiser->engine->denoise(denoiser, frame, radiance);
+}
+
+#endif

@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define ONESPP_ABI 1 /* changes whenever a program has to be compiled anew */
+#define ONESPP_ABI 2 /* changes whenever a program has to be compiled anew */
 
 enum {
     ONESPP_OK = 0,
@@ -32,6 +32,14 @@ enum {
 #define ONESPP_MAX_TASKS 1024
 #define ONESPP_MIN_SAMPLES 1e-3f
 #define ONESPP_MAX_SAMPLES 1e9f
+
+/* Instruction sets, in order. Results of two of them differ by rounding errors. */
+enum {
+    ONESPP_ISA_ANY = 0,      /* the fastest that there is */
+    ONESPP_ISA_BASELINE = 1, /* that of the compiler's flags */
+    ONESPP_ISA_AVX2 = 2,     /* with FMA */
+    ONESPP_ISA_AVX512 = 3    /* F, BW, DQ and VL */
+};
 
 /* An image of floats: pixel (x, y) of a channel is data[channel * c + row * y + column * x]. Planes of W x H pixels
  * have the strides {W * H, W, 1}, interleaved pixels of three channels {1, 3 * W, 3}; strides of 0 repeat one value. */
@@ -91,6 +99,7 @@ typedef struct {
     int tasks;                        /* that each step is split into: 1, or at least as many as there are threads */
     onespp_parallel_for parallel_for; /* NULL: tasks run one after the other */
     void *user;                       /* handed to parallel_for */
+    int max_isa;                      /* use no instruction set above this one; 0 for the fastest */
 } onespp_config;
 
 typedef struct onespp onespp;
@@ -107,6 +116,9 @@ int onespp_create(const onespp_config *config, void *memory, size_t size, onespp
 /* Denoises one frame: writes 3 channels of radiance. The result does not depend on tasks and threads. The output may
  * overlap no input. After an error nothing was written, and the state is what it was. */
 int onespp_denoise(onespp *denoiser, const onespp_frame *frame, const onespp_output *radiance);
+
+/* The instruction set that it uses. */
+int onespp_isa(const onespp *denoiser);
 
 /* A code in words, in English. */
 const char *onespp_message(int code);

@@ -10,9 +10,10 @@ from setuptools.command.build_ext import build_ext
 
 HERE = Path(__file__).resolve().parent
 COPIES = HERE / "copies"  # of files above this folder: an sdist has only what lies below it
-SOURCES = [HERE.parent / name for name in ("onespp.c", "onespp.h", "onespp_weights.h")]
+C_FILES = ["onespp.c", "onespp_avx2.c", "onespp_avx512.c"]
+SOURCES = [HERE.parent / name for name in (*C_FILES, "onespp.h", "onespp_weights.h")]
 LICENSE = HERE.parents[1] / "LICENSE"
-EXPORTED = ["abi", "size", "create", "denoise", "message", "pool_create", "pool_run", "pool_destroy"]
+EXPORTED = ["abi", "size", "create", "denoise", "isa", "message", "pool_create", "pool_run", "pool_destroy"]
 
 
 def copy_sources() -> None:
@@ -29,7 +30,6 @@ class BuildLibrary(build_ext):  # type: ignore[misc]
     def build_extensions(self) -> None:
         is_msvc = self.compiler.compiler_type == "msvc"
         for extension in self.extensions:
-            # Those of runtime/Makefile, but for any processor: users may add -march=native by CFLAGS.
             flags = ["-std=c99", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-pthread"]
             extension.extra_compile_args = ["/std:c11", "/O2"] if is_msvc else flags
             extension.extra_link_args = [] if is_msvc else ["-pthread", "-lm"]
@@ -54,7 +54,8 @@ class AnyPythonWheel(bdist_wheel):  # type: ignore[misc]
 copy_sources()
 LIBRARY = Extension(
     "onespp_runtime._onespp",
-    ["copies/onespp.c", "threads.c"],
+    [*(f"copies/{name}" for name in C_FILES), "threads.c"],
+    define_macros=[("ONESPP_DISPATCH", None)],
     include_dirs=["copies"],
     depends=["copies/onespp.h", "copies/onespp_weights.h"],
     export_symbols=[f"onespp_{name}" for name in EXPORTED],

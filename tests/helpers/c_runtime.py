@@ -19,8 +19,10 @@ from runtime.raw import PLANES
 
 FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
-OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno")
-ABI = 1
+OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-DONESPP_DISPATCH")
+SOURCES = tuple(str(FOLDER / name) for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
+ABI = 2
+ISAS = {"any": 0, "baseline": 1, "avx2": 2, "avx512": 3}
 
 Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int)
 ParallelFor = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, Task, ctypes.c_void_p)
@@ -33,6 +35,7 @@ class Config(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("abi", "max_width", "max_height", "max_meshes", "tasks")),
         ("parallel_for", ParallelFor),
         ("user", ctypes.c_void_p),
+        ("max_isa", ctypes.c_int),
     )
 
 
@@ -63,11 +66,16 @@ class CFrame(ctypes.Structure):
     )
 
 
-def build(target: Path, cc: str, flags: Sequence[str] = OPTIMISED) -> ctypes.CDLL:
+class Library(ctypes.CDLL):
+    """The runtime, whose denoisers use at most the instruction set max_isa."""
+
+    max_isa = ISAS["any"]
+
+
+def build(target: Path, cc: str, flags: Sequence[str] = OPTIMISED, sources: Sequence[str] = SOURCES) -> Library:
     """The runtime as a shared library."""
-    sources = (str(FOLDER / "onespp.c"), "-o", str(target), "-lm")
-    subprocess.run([cc, *STRICT, *flags, "-shared", "-fPIC", *sources], check=True)
-    library = ctypes.CDLL(str(target))
+    subprocess.run([cc, *STRICT, *flags, "-shared", "-fPIC", *sources, "-o", str(target), "-lm"], check=True)
+    library = Library(str(target))
     library.onespp_size.restype = ctypes.c_size_t
     library.onespp_message.restype = ctypes.c_char_p
     return library
@@ -93,7 +101,7 @@ class CRuntime:
 
     def __init__(
         self,
-        library: ctypes.CDLL,
+        library: Library,
         width: int,
         height: int,
         meshes: int = 64,
@@ -102,12 +110,16 @@ class CRuntime:
     ):
         self.library = library
         callback = ParallelFor(parallel_for) if parallel_for else ParallelFor()
-        self.config = Config(ABI, width, height, meshes, tasks, callback, None)
+        self.config = Config(ABI, width, height, meshes, tasks, callback, None, library.max_isa)
         self.size = library.onespp_size(ctypes.byref(self.config))
         self.memory = np.full(self.size, 0xFF, np.uint8)  # NaN, wherever something is read before it was written
         self.denoiser = ctypes.c_void_p()
         arguments = ctypes.byref(self.config), address(self.memory), ctypes.c_size_t(self.size)
         assert library.onespp_create(*arguments, ctypes.byref(self.denoiser)) == 0
+
+    @property
+    def isa(self) -> int:
+        return self.library.onespp_isa(self.denoiser)
 
     def call(self, frame: CFrame, output: Image) -> int:
         return self.library.onespp_denoise(self.denoiser, ctypes.byref(frame), ctypes.byref(output))

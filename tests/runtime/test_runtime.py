@@ -22,13 +22,17 @@ from models.registry import require_shipped
 from runtime.raw import write_raw
 from runtime.weights import HEADER, header
 from tests.helpers.c_runtime import (
+    ABI,
     FOLDER,
+    ISAS,
     OPTIMISED,
+    SOURCES,
     STRICT,
     CFrame,
     Config,
     CRuntime,
     Image,
+    Library,
     Task,
     address,
     build,
@@ -39,15 +43,35 @@ from tests.helpers.frames import MESHES, chain, flat_frame
 CC = which("cc") or which("gcc") or which("clang")
 TOLERANCE = 1e-4  # of the brightest pixel
 SIZE = (40, 56)
+ISA_TOLERANCE = 1e-5
 STRIPS = "-DONESPP_STRIP_PIXELS=1"  # of 64 rows
-NATIVE = "-march=native"
 
 pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
 
 
-@pytest.fixture(scope="module", params=[(), (NATIVE, STRIPS)], ids=["generic", "native, in strips"])
-def library(request, tmp_path_factory) -> ctypes.CDLL:
-    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", CC, (*OPTIMISED, *request.param))
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Library:
+    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", CC)
+
+
+@pytest.fixture(scope="module")
+def built_in_strips(tmp_path_factory) -> Library:
+    return build(tmp_path_factory.mktemp("strips") / "libonespp.so", CC, (*OPTIMISED, STRIPS))
+
+
+@pytest.fixture(params=["baseline", "avx2", "avx512 in strips"])
+def library(request, built, built_in_strips) -> Library:
+    """Of each instruction set that this machine has."""
+    isa, _, strips = request.param.partition(" ")
+    library = built_in_strips if strips else built
+    return limited(library, isa)
+
+
+def limited(library: Library, isa: str) -> Library:
+    library.max_isa = ISAS[isa]
+    if CRuntime(library, 8, 8).isa != library.max_isa:
+        pytest.skip(f"there is no {isa} here")
+    return library
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +89,7 @@ def synthetic(count: int, size: tuple[int, int] = SIZE, first: int = 0) -> list[
 
 
 @torch.no_grad()
-def compare(library: ctypes.CDLL, one: One, frames: Iterable[Frame], resets: Sequence[int] = (0,)) -> float:
+def compare(library: Library, one: One, frames: Iterable[Frame], resets: Sequence[int] = (0,)) -> float:
     """The largest difference of the sequence, relative to the brightest pixel of its frame."""
     runtime = CRuntime(library, 200, 200)
     state: State | None = None
@@ -84,40 +108,51 @@ def test_the_array_of_weights_is_that_of_the_shipped_ones():
 
 
 @pytest.mark.parametrize("name", ["gcc", "clang"])
-@pytest.mark.parametrize("file", ["onespp.c", "example.c", "fuzz.c"])
+@pytest.mark.parametrize("file", [*SOURCES, "example.c", "fuzz.c"])
 def test_compiles_without_warnings(name, file, tmp_path):
     if which(name) is None:
         pytest.skip(f"{name} is not installed")
-    for flags in (("-Wpedantic",), ("-std=gnu17",)):  # the latter declares more names
+    for flags in (("-Wpedantic",), ("-std=gnu17", "-DONESPP_DISPATCH")):  # gnu17 declares more names
         command = [name, *STRICT, *flags, "-c", str(FOLDER / file), "-o", str(tmp_path / "it.o")]
         subprocess.run(command, check=True)
 
 
-def test_it_neither_allocates_nor_has_global_state(tmp_path):
+@pytest.mark.parametrize("file", SOURCES)
+def test_it_neither_allocates_nor_has_global_state(file, tmp_path):
     """As its symbols show: nothing of stdlib.h, and no variables."""
     if which("nm") is None:
         pytest.skip("nm is not installed")
-    target = tmp_path / "onespp.o"
-    subprocess.run([CC, *OPTIMISED, "-fno-pie", "-c", str(FOLDER / "onespp.c"), "-o", str(target)], check=True)
+    target = tmp_path / "it.o"
+    subprocess.run([CC, *OPTIMISED, "-fno-pie", "-c", file, "-o", str(target)], check=True)
     lines = subprocess.run(["nm", str(target)], check=True, capture_output=True, text=True).stdout.splitlines()
     symbols = [line.split()[-2:] for line in lines]
-    assert {kind for kind, _ in symbols} <= set("TtrU")
-    assert {name for kind, name in symbols if kind == "T"} == {
-        f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "message")
-    }
+    assert {kind for kind, _ in symbols} <= set("TtRrU")
+    functions = {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
+    assert {name for kind, name in symbols if kind == "T"} == (functions if file.endswith("onespp.c") else set())
     needed = {name for kind, name in symbols if kind == "U"}
-    assert needed <= {
-        "memcpy",
-        "memmove",
-        "memset",
-        "expf",
-        "log",
-        "logf",
-        "fmax",
-        "sqrtf",
-        "floorf",
-        "__stack_chk_fail",
-    }
+    engines = {"onespp_avx2", "onespp_avx512", "__cpu_model"}  # the last one is the compiler's
+    arithmetic = {"expf", "log", "logf", "fmax", "sqrtf", "floorf"}
+    assert needed <= {"memcpy", "memmove", "memset", "__stack_chk_fail"} | arithmetic | engines
+
+
+def test_instruction_sets_differ_by_rounding(built, one, frames):
+    """The fastest one is the last."""
+    outputs = []
+    for isa in ("baseline", "avx2", "avx512", "any"):
+        built.max_isa = ISAS[isa]
+        runtime = CRuntime(built, SIZE[1], SIZE[0])
+        assert runtime.isa <= ISAS[isa] or isa == "any"
+        outputs.append(torch.cat([runtime(frame, index == 0) for index, frame in enumerate(frames)]))
+    brightest = outputs[0].amax().item()
+    for output in outputs[1:]:
+        torch.testing.assert_close(output, outputs[0], rtol=0, atol=ISA_TOLERANCE * brightest)
+    assert torch.equal(outputs[-1], outputs[-2])
+
+
+def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
+    library = build(tmp_path / "libonespp.so", CC, ["-O3"], SOURCES[:1])
+    assert CRuntime(library, 8, 8).isa == ISAS["baseline"]
+    compare(library, one, frames)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (13, 7), (40, 56), (3, 190), (41, 70), (197, 24)])
@@ -248,7 +283,7 @@ def test_errors_leave_everything_as_it_was(library, frames):
 
 
 def test_bad_configurations(library):
-    fine = {"abi": 1, "max_width": 8, "max_height": 8, "max_meshes": 0, "tasks": 1}
+    fine = {"abi": ABI, "max_width": 8, "max_height": 8, "max_meshes": 0, "tasks": 1, "max_isa": library.max_isa}
     memory = np.zeros(library.onespp_size(ctypes.byref(Config(**fine))), np.uint8)
     denoiser = ctypes.c_void_p()
 
@@ -257,15 +292,15 @@ def test_bad_configurations(library):
         return library.onespp_create(*arguments, ctypes.byref(denoiser))
 
     assert create(memory.size) == 0
-    assert create(memory.size, abi=2) == 1
-    bad = ({"max_width": 0}, {"max_height": 1 << 20}, {"max_meshes": -1}, {"tasks": 0})
+    assert create(memory.size, abi=ABI + 1) == 1
+    bad = ({"max_width": 0}, {"max_height": 1 << 20}, {"max_meshes": -1}, {"tasks": 0}, {"max_isa": -1}, {"max_isa": 4})
     assert [create(memory.size, **changes) for changes in bad] == [2] * len(bad)
     assert create(memory.size - 1) == 3
 
 
 def test_frames_of_4k_take_at_most_2_2_gb(library):
     """So that a process with all inputs takes at most 3 GB."""
-    config = Config(1, 3840, 2160, 64, 4)
+    config = Config(ABI, 3840, 2160, 64, 4)
     assert 0 < library.onespp_size(ctypes.byref(config)) <= 2.2e9
 
 
@@ -283,7 +318,7 @@ def check_example(command: list[str], one: One, frames: list[Frame], folder: Pat
 
 
 def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path):
-    sources = [str(FOLDER / name) for name in ("example.c", "onespp.c")]
+    sources = [str(FOLDER / "example.c"), *SOURCES]
     subprocess.run([CC, *STRICT, *OPTIMISED, "-pthread", *sources, "-o", str(tmp_path / "example"), "-lm"], check=True)
     check_example([str(tmp_path / "example")], one, frames, tmp_path)
 
@@ -330,9 +365,9 @@ def test_sanitizers_report_nothing(name, tmp_path):
     """On random frames, with all extremes of numbers and sizes."""
     if which(name) is None:
         pytest.skip(f"{name} is not installed")
-    flags = ("-O2", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, *STRICT)
-    sources = [str(FOLDER / name) for name in ("fuzz.c", "onespp.c")]
-    subprocess.run([name, *flags, *sources, "-o", str(tmp_path / "fuzz"), "-lm"], check=True)
+    flags = ("-O2", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", STRIPS, "-DONESPP_DISPATCH")
+    sources = [str(FOLDER / "fuzz.c"), *SOURCES]
+    subprocess.run([name, *STRICT, *flags, *sources, "-o", str(tmp_path / "fuzz"), "-lm"], check=True)
     subprocess.run([str(tmp_path / "fuzz"), "60"], check=True)
 
 
@@ -343,7 +378,7 @@ def test_it_runs_on_aarch64(one, frames, tmp_path):
     if cross is None or emulator is None:
         pytest.skip("aarch64-linux-gnu-gcc or qemu-aarch64 is not installed")
     flags = (*STRICT, *OPTIMISED, "-static", "-pthread")
-    sources = [str(FOLDER / name) for name in ("example.c", "onespp.c")]
+    sources = [str(FOLDER / "example.c"), *SOURCES]
     subprocess.run([cross, *flags, *sources, "-o", str(tmp_path / "example"), "-lm"], check=True)
     check_example([emulator, str(tmp_path / "example")], one, frames, tmp_path)
 

@@ -17,7 +17,8 @@ import torch
 from datasets.frame import Frame
 from eval.bench.synthetic_frames import synthetic_frame
 from runtime.raw import PLANES
-from tests.helpers.c_runtime import FOLDER, STRICT, CRuntime, build
+from tests.helpers.c_runtime import FOLDER, ISAS, STRICT, CRuntime, build
+from tests.helpers.c_runtime import SOURCES as C_SOURCES
 
 CC = which("cc") or which("gcc") or which("clang")
 MOST_BYTES = 3_000_000
@@ -131,8 +132,8 @@ def test_a_source_distribution_has_all_it_needs(wheel, library, tmp_path):
     subprocess.run(command, cwd=wheel.parent / "runtime" / "python", check=True, capture_output=True)
     [archive] = tmp_path.glob("*.zip")
     names = {name.split("/", 1)[1] for name in zipfile.ZipFile(archive).namelist()}
-    assert {"setup.py", "threads.c"} | {f"copies/{name}" for name in ("onespp.c", "onespp.h", "LICENSE")} <= names
-    assert "copies/onespp_weights.h" in names and not any(".." in name for name in names)
+    copies = {f"copies/{Path(name).name}" for name in (*C_SOURCES, "onespp.h", "onespp_weights.h", "LICENSE")}
+    assert {"setup.py", "threads.c"} | copies <= names and not any(".." in name for name in names)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -153,6 +154,14 @@ def test_the_example_smooths(unpacked, numpy_alone, tmp_path):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
 def test_a_fork_works_without_threads(unpacked, numpy_alone, tmp_path):
     isolated(FORK, unpacked, numpy_alone, cwd=tmp_path)
+
+
+def test_instruction_sets(module, library, frames, expected):
+    """The fastest one is that of the C runtime; a lower one differs by rounding errors."""
+    fastest, lowest = (module.Denoiser(SIZE[1], SIZE[0], max_meshes=64, max_isa=isa) for isa in ("any", "baseline"))
+    assert lowest.isa == "baseline" and ISAS[fastest.isa] == CRuntime(library, 8, 8).isa
+    output = lowest.denoise(**arguments(frames[0]))
+    np.testing.assert_allclose(output, expected[0], rtol=0, atol=1e-5 * expected[0].max())
 
 
 def test_arrays_of_any_library_and_layout(module, frames, expected):
@@ -296,6 +305,7 @@ def test_errors_of_the_library(module):
         ({"height": 1 << 40}, "height: expected"),
         ({"max_meshes": -1}, "max_meshes: expected"),
         ({"threads": 0}, "threads: expected 1 to 512, got 0"),
+        ({"max_isa": "mmx"}, "max_isa: expected one of any, baseline, avx2, avx512, got 'mmx'"),
     ],
 )
 def test_bad_sizes(module, given, message):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Array, to_colour, to_ids, to_image, to_matrices, to_poses
-from .library import FrameInputs, Handle, strided_image
+from .library import ISAS, FrameInputs, Handle, strided_image
 
 # Limits of onespp.h. Each thread has two tasks.
 MAX_SIDE = 16384
@@ -29,18 +29,26 @@ class Denoiser:
     as many as there are processors for this process; where the platform has no POSIX threads it is 1. The result has
     the same bits for any number of threads.
 
+    `isa` is the instruction set that it uses: "avx512", "avx2", or "baseline", that of the compiler's flags. `max_isa`
+    is the highest one it may use; results differ by rounding errors.
+
     Several denoisers can work at the same time. Calls of one wait for each other.
 
-    Raises ValueError for numbers out of range.
+    Raises ValueError for numbers out of range, and unknown instruction sets.
     """
 
-    def __init__(self, width: int, height: int, *, max_meshes: int = 0, threads: int | None = None):
+    def __init__(
+        self, width: int, height: int, *, max_meshes: int = 0, threads: int | None = None, max_isa: str = "any"
+    ):
         self.width = whole_number("width", width, 1, MAX_SIDE)
         self.height = whole_number("height", height, 1, MAX_SIDE)
         self.max_meshes = whole_number("max_meshes", max_meshes, 0, MAX_MESHES)
         wanted = min(processors(), MAX_THREADS) if threads is None else whole_number("threads", threads, 1, MAX_THREADS)
-        self._handle = Handle(self.width, self.height, self.max_meshes, wanted)
+        if max_isa not in ISAS:
+            raise ValueError(f"max_isa: expected one of {', '.join(ISAS)}, got {max_isa!r}")
+        self._handle = Handle(self.width, self.height, self.max_meshes, wanted, max_isa)
         self.threads = self._handle.threads
+        self.isa = self._handle.isa
         self._lock = threading.Lock()
 
     def denoise(

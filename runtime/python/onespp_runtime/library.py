@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-ABI = 1
+ABI = 2
+ISAS = ("any", "baseline", "avx2", "avx512")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 
 
@@ -20,6 +21,7 @@ class Config(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("abi", "max_width", "max_height", "max_meshes", "tasks")),
         ("parallel_for", ctypes.c_void_p),
         ("user", ctypes.c_void_p),
+        ("max_isa", ctypes.c_int),
     )
 
 
@@ -83,6 +85,7 @@ def load() -> ctypes.CDLL:
     library.onespp_size.argtypes, library.onespp_size.restype = [pointer], ctypes.c_size_t
     library.onespp_create.argtypes = [pointer, pointer, ctypes.c_size_t, pointer]
     library.onespp_denoise.argtypes = [pointer, pointer, pointer]
+    library.onespp_isa.argtypes = [pointer]
     library.onespp_pool_create.restype = pointer
     library.onespp_pool_destroy.argtypes, library.onespp_pool_destroy.restype = [pointer], None
     return library
@@ -109,16 +112,17 @@ class ThreadPool:
 class Handle:
     """An onespp: the denoiser with the memory it takes and its threads. Raises MemoryError without enough."""
 
-    def __init__(self, width: int, height: int, max_meshes: int, threads: int):
+    def __init__(self, width: int, height: int, max_meshes: int, threads: int, max_isa: str):
         self.pool = ThreadPool(threads)
         self.threads = threads if self.pool.handle else 1
         tasks = 2 * self.threads if self.threads > 1 else 1  # twice as many even out their work
         run = ctypes.cast(LIBRARY.onespp_pool_run, ctypes.c_void_p) if self.pool.handle else None
-        config = Config(ABI, width, height, max_meshes, tasks, run, self.pool.handle)
+        config = Config(ABI, width, height, max_meshes, tasks, run, self.pool.handle, ISAS.index(max_isa))
         self.memory: NDArray[Any] = np.empty(LIBRARY.onespp_size(ctypes.byref(config)), np.uint8)
         self.pointer = ctypes.c_void_p()
         memory = self.memory.ctypes.data, self.memory.size
         check(LIBRARY.onespp_create(ctypes.byref(config), *memory, ctypes.byref(self.pointer)))
+        self.isa = ISAS[LIBRARY.onespp_isa(self.pointer)]
 
     def denoise(self, frame: FrameInputs, radiance: StridedImage) -> None:
         check(LIBRARY.onespp_denoise(self.pointer, ctypes.byref(frame), ctypes.byref(radiance)))
