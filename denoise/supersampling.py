@@ -13,7 +13,7 @@ from datasets.channels import ALBEDO_FLOOR
 from datasets.frame import Frame
 
 MOST_BEFORE = 4  # frames that the mean before counts as at most: each fetch blurs it a little
-NEEDED = ("albedo", "depth", "motion", "direct", "indirect")
+SAMPLED_CHANNELS = ("albedo", "depth", "motion", "direct", "indirect")
 
 
 class AlbedoMean:
@@ -25,7 +25,7 @@ class AlbedoMean:
 
     def add(self, frame: Frame) -> Frame:
         """The next frame of the shot with the mean albedo, under the same light; itself if it lacks motion."""
-        if any(name not in frame.channels for name in NEEDED):
+        if any(name not in frame.channels for name in SAMPLED_CHANNELS):
             return frame
         surface = (frame.depth > 0).to(frame.albedo)
         mean, count = frame.albedo, surface
