@@ -20,7 +20,7 @@ from tests.helpers import foreign
 def frames_of(folder: Path) -> list[Frame]:
     files = sequence_of({"colour": [str(folder / "*.exr")]})
     sources = find_sources(open_passes(files[0], header_only=True), {})
-    builder = FrameBuilder(analyse([files], sources, READS, None).conventions, READS, "test")
+    builder = FrameBuilder(analyse([files], sources, READS, None, "exact").conventions, READS, "test")
     return [builder.build(read_foreign_frame(each, sources)[0]) for each in files]
 
 

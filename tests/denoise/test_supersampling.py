@@ -3,10 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from datasets.frame import Frame
+from denoise.job import Job
+from denoise.run import denoise
 from denoise.supersampling import MOST_BEFORE, AlbedoMean
+from tests.helpers import foreign
 from tests.helpers.frames import flat_frame
 
 SIZE = (16, 32)
@@ -77,3 +81,10 @@ def test_frames_without_motion_are_themselves():
     frame = frame_of_edge(0, coverage(0))
     still = replace(frame, channels={name: t for name, t in frame.channels.items() if name != "motion"})
     assert AlbedoMean().add(still) is still
+
+
+@pytest.mark.parametrize(("albedo", "is_averaged"), [(None, True), ("sampled", True), ("exact", False)])
+def test_the_albedo_of_cycles_is_averaged_unless_it_is_exact(spheres, tmp_path, capsys, albedo, is_averaged):
+    foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
+    denoise(Job((str(tmp_path / "in" / "*.exr"),), "svgf", tmp_path / "out", albedo=albedo))
+    assert ("averaged along the motion" in capsys.readouterr().out) == is_averaged
