@@ -113,7 +113,8 @@ int main(int count, char **arguments)
             return fail("a thread could not be started");
 
     /* All frames are as large as the first one, or smaller. Twice as many tasks as threads even out their work. */
-    onespp_config config = {ONESPP_ABI, raw->width, raw->height, MAX_MESHES, 2 * threads, parallel_for, &pool, max_isa};
+    onespp_config config = {.abi = ONESPP_ABI, .max_width = raw->width, .max_height = raw->height, .max_isa = max_isa,
+                            .max_meshes = MAX_MESHES, .tasks = 2 * threads, .parallel_for = parallel_for, .user = &pool};
     size_t size = onespp_size(&config), pixels = (size_t)raw->width * (size_t)raw->height;
     void *memory = malloc(size);
     float *radiance = malloc(sizeof(float) * 3 * pixels);

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { SIDE = 110, MOST_PIXELS = 1500, MESHES = 3, PLANES = 19, FRAMES = 3 };
+enum { SIDE = 110, MOST_PIXELS = 1500, MESHES = 3, PLANES = 19, FRAMES = 3, PARTS = 2, OUTPUTS = 3 * (1 + PARTS) };
 
 static const float EXTREMES[] = {0,     -0.f,   1,     -1,    NAN,    INFINITY, -INFINITY, 1e30f, -1e30f,
                                  3e38f, -3e38f, 1e35f, 1e16f, 1e-20f, 1e-38f,   1e-45f,    0.01f};
@@ -87,6 +87,7 @@ static onespp_frame frame_of(Source *source, float *planes, int32_t *ids, double
     for (int i = 0; i < frame.meshes; i++)
         fill_pose(source, poses + 16 * i);
     frame.object_to_world = poses;
+    frame.parts = (int)draw(source, PARTS + 1);
     return frame;
 }
 
@@ -101,7 +102,8 @@ static void *allocated(size_t size)
 /* A denoiser in memory that begins anywhere and is filled with NaN. */
 static onespp *created(int tasks, int max_isa, uint32_t offset, unsigned char **memory)
 {
-    onespp_config config = {ONESPP_ABI, SIDE, SIDE, MESHES, tasks, NULL, NULL, max_isa};
+    onespp_config config = {.abi = ONESPP_ABI, .max_width = SIDE, .max_height = SIDE, .max_meshes = MESHES,
+                            .tasks = tasks, .max_isa = max_isa, .max_parts = PARTS};
     onespp *denoiser;
     size_t size = onespp_size(&config);
     *memory = allocated(size + offset);
@@ -114,7 +116,7 @@ static onespp *created(int tasks, int max_isa, uint32_t offset, unsigned char **
 static void play(Source *source)
 {
     size_t room = sizeof(float) * MOST_PIXELS;
-    float *planes = allocated(PLANES * room), *one = allocated(3 * room), *two = allocated(3 * room);
+    float *planes = allocated(PLANES * room), *one = allocated(OUTPUTS * room), *two = allocated(OUTPUTS * room);
     int32_t *ids = allocated(room);
     double poses[16 * MESHES];
     unsigned char *memory[2];
@@ -123,10 +125,20 @@ static void play(Source *source)
                             created(5, max_isa, draw(source, 65), &memory[1])};
     for (int i = 0; i < FRAMES; i++) {
         onespp_frame frame = frame_of(source, planes, ids, poses);
-        int count = 3 * frame.width * frame.height;
-        onespp_output output = {one, (ptrdiff_t)frame.width * frame.height, frame.width, 1}, again = output;
+        int pixels = frame.width * frame.height, count = 3 * pixels * (1 + frame.parts);
+        onespp_output output = {one, pixels, frame.width, 1}, again = output;
         again.data = two;
+        onespp_part parts[2][PARTS];
+        for (int part = 0; part < frame.parts; part++) {
+            parts[0][part].noisy = parts[1][part].noisy = part ? frame.direct : frame.normal; /* of either sign */
+            parts[0][part].radiance = output;
+            parts[1][part].radiance = again;
+            parts[0][part].radiance.data += 3 * pixels * (part + 1);
+            parts[1][part].radiance.data += 3 * pixels * (part + 1);
+        }
+        frame.part = parts[0];
         int error = onespp_denoise(denoisers[0], &frame, &output);
+        frame.part = parts[1];
         if (onespp_denoise(denoisers[1], &frame, &again) != error)
             abort();
         if (error)

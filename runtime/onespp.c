@@ -69,6 +69,7 @@ enum {
 #define MAX_MAGNITUDE 1e35f   /* of a channel: two of them, divided by the smallest albedo, are finite */
 #define MAX_REFLECTANCE 100.f /* albedo, roughness and components of normals are clamped: the network stays finite */
 #define MAX_IRRADIANCE 1e30f
+#define MAX_PART 1e32f /* irradiance of parts of the light, which may cancel each other */
 #define MAX_LUMINANCE 1e16f /* its square must be finite */
 #define MAX_EXPOSED 1e13f
 #define MIDDLE_GREY 0.18f /* the exposed geometric mean of luminance */
@@ -214,6 +215,11 @@ enum {
     TEXEL = 16
 };
 
+/* Lines of a row of a part of the light. Levels of the filter write to the last two images in turn. */
+enum { PART_OUTPUT = 0, PART_ACCUMULATED = RGB, PART_FILTERED = 2 * RGB, PART_LINES = 4 * RGB, PART_HISTORY = 2 * RGB };
+
+enum { MAX_PART_HISTORY = PART_HISTORY * ONESPP_MAX_PARTS };
+
 /* Some rows of an image at the network's resolutions, surrounded by zeros. */
 typedef struct {
     float *data;
@@ -255,6 +261,7 @@ typedef union {
     struct {
         Neighbourhood around;
         float history[HISTORY][CHUNK];
+        float parts[MAX_PART_HISTORY][CHUNK];
         float lines[2][INPUTS][CHUNK];
         float patches[PATCH * INPUTS][HALF_CHUNK];
         float entered[WIDTH_A][HALF_CHUNK];
@@ -286,15 +293,16 @@ struct onespp {
     int width, height; /* 0 before the first frame */
     RunningMean log_luminance, log_depth;
     double K[9], camera_to_world[16];
-    int meshes;
+    int meshes, parts;
     double *object_to_world;
     float *texels;
+    float *part_texels; /* PART_HISTORY of each part */
     float *depth;
     int32_t *mesh;
 
     /* What a frame needs. */
     ptrdiff_t pitch; /* of lines of rows, and of depth and mesh */
-    float *rows;
+    float *rows, *part_rows;
     Window a, b, b_too, c, c_too; /* activations at 1/2, 1/4 and 1/8 of the resolution, of a strip */
     Window sum_a;                 /* of `a` and what comes from 1/4 */
     Window hidden;                /* of the per-pixel layers */
@@ -370,6 +378,8 @@ static void lay_out(onespp *d, Arena *arena)
     uint64_t pixels = height * (uint64_t)d->pitch;
     d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
     d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));
+    d->part_texels = allocate(arena, pixels * PART_HISTORY * (uint64_t)d->config.max_parts, sizeof(float));
+    d->part_rows = allocate(arena, pixels * PART_LINES * (uint64_t)d->config.max_parts, sizeof(float));
     d->depth = allocate(arena, pixels, sizeof(float));
     d->mesh = allocate(arena, pixels, sizeof(int32_t));
     d->object_to_world = allocate(arena, (uint64_t)d->config.max_meshes * 16, sizeof(double));
@@ -498,10 +508,32 @@ static void load_irradiance(float *restrict line, const onespp_frame *frame, int
     }
 }
 
+/* Noisy irradiance of one colour of a part of the light, cut by as much as that of the whole. */
+static void load_part(float *restrict line, const onespp_frame *frame, int part, int channel, int y, int x, int n)
+{
+    float direct[CHUNK], indirect[CHUNK], divisor[CHUNK], depth[CHUNK];
+    load(line, &frame->part[part].noisy, channel, y, x, n);
+    load(direct, &frame->direct, channel, y, x, n);
+    load(indirect, &frame->indirect, channel, y, x, n);
+    load_divisor(divisor, frame, channel, y, x, n);
+    load(depth, &frame->depth, 0, y, x, n);
+    for (int i = 0; i < n; i++) {
+        float whole = (direct[i] + indirect[i]) / divisor[i], kept = maxf(clamped(whole, MAX_IRRADIANCE), 0);
+        float share = whole == kept ? 1 : kept / whole;
+        line[i] = depth[i] > 0 ? clamped(line[i] * share / divisor[i], MAX_PART) : 0;
+    }
+}
+
 /* Where a row's line begins. */
 static float *row_line(const onespp *d, int y, int line)
 {
     return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch;
+}
+
+/* The same of a part of the light. */
+static float *part_line(const onespp *d, int y, int part, int line)
+{
+    return d->part_rows + (((ptrdiff_t)y * d->config.max_parts + part) * PART_LINES + line) * d->pitch;
 }
 
 /* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
@@ -724,13 +756,18 @@ static int is_consistent(const Job *job, const Surface *surface, int x, int y)
 
 static void add_texel(float *restrict sum, float weight, const Job *job, int x, int y)
 {
-    const float *restrict texel = job->d->texels + ((ptrdiff_t)y * job->d->pitch + x) * TEXEL;
+    ptrdiff_t pixel = (ptrdiff_t)y * job->d->pitch + x;
+    int of_parts = PART_HISTORY * job->frame.parts;
+    const float *restrict texel = job->d->texels + pixel * TEXEL;
+    const float *restrict parts = job->d->part_texels + pixel * of_parts;
     for (int c = 0; c < TEXEL; c++)
         sum[c] += weight * texel[c];
+    for (int c = 0; c < of_parts; c++)
+        sum[TEXEL + c] += weight * parts[c];
 }
 
 /* The mean of the consistent ones among 3 x 3 pixels. */
-static void fetch_box(const Job *job, const Surface *surface, int x, int y, float texel[TEXEL])
+static void fetch_box(const Job *job, const Surface *surface, int x, int y, float *texel)
 {
     int count = 0;
     for (int tap = 0; tap < 9; tap++) {
@@ -740,21 +777,21 @@ static void fetch_box(const Job *job, const Surface *surface, int x, int y, floa
             count++;
         }
     }
-    for (int c = 0; c < TEXEL; c++)
+    for (int c = 0; c < TEXEL + PART_HISTORY * job->frame.parts; c++)
         texel[c] /= (float)maxi(count, 1);
 }
 
-/* The history of a surface at position (x, y) of the previous frame, from the corners of pixels: 0 where there is none.
+/* The history of a surface at position (x, y) of the previous frame, from the corners of pixels, added to a texel of 0
+ * and those of parts: nothing where there is none.
  *
  * The weights of taps that fail are spread evenly over the others (SVGF, section 4.1). */
-static void fetch(const Job *job, const Surface *surface, float x, float y, float texel[TEXEL])
+static void fetch(const Job *job, const Surface *surface, float x, float y, float *texel)
 {
     int left = (int)floorf(x), top = (int)floorf(y);
     float fx = x - (float)left, fy = y - (float)top;
     float weights[4] = {(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy};
     int good[4], count = 0;
     float failed = 0;
-    memset(texel, 0, sizeof(float) * TEXEL);
     for (int tap = 0; tap < 4; tap++) {
         good[tap] = is_consistent(job, surface, left + tap % 2, top + tap / 2);
         count += good[tap];
@@ -770,13 +807,15 @@ static void fetch(const Job *job, const Surface *surface, float x, float y, floa
 }
 
 /* The history of n pixels of a row, from x0 on; 0 where there is none. */
-static void reproject(const Job *job, int y, int x0, int n, float (*restrict history)[CHUNK])
+static void reproject(
+    const Job *job, int y, int x0, int n, float (*restrict history)[CHUNK], float (*restrict parts)[CHUNK])
 {
-    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK];
+    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK], texel[TEXEL + MAX_PART_HISTORY];
     int32_t mesh[CHUNK];
+    int of_parts = PART_HISTORY * job->frame.parts;
     if (!job->has_history) {
-        for (int c = 0; c < HISTORY; c++)
-            memset(history[c], 0, sizeof history[c]);
+        memset(history, 0, sizeof *history * HISTORY);
+        memset(parts, 0, sizeof *parts * (size_t)of_parts);
         return;
     }
     for (int c = 0; c < 2; c++)
@@ -786,7 +825,7 @@ static void reproject(const Job *job, int y, int x0, int n, float (*restrict his
     load(depth, &job->frame.depth, 0, y, x0, n);
     load_mesh(mesh, &job->frame, y, x0, n);
     for (int i = 0; i < n; i++) {
-        float texel[TEXEL] = {0};
+        memset(texel, 0, sizeof(float) * (size_t)(TEXEL + of_parts));
         if (depth[i] > 0) {
             /* Far outside the image an index would overflow; any place outside is as good. */
             float x = maxf(minf((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
@@ -797,6 +836,8 @@ static void reproject(const Job *job, int y, int x0, int n, float (*restrict his
         }
         for (int c = 0; c < HISTORY; c++)
             history[c][i] = texel[c];
+        for (int c = 0; c < of_parts; c++)
+            parts[c][i] = texel[TEXEL + c];
     }
 }
 
@@ -1145,7 +1186,7 @@ static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict 
 static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, float (*restrict lines)[CHUNK])
 {
     sum_neighbours(job, &scratch->enter.around, y, x0);
-    reproject(job, y, x0, n, scratch->enter.history);
+    reproject(job, y, x0, n, scratch->enter.history, scratch->enter.parts);
     fill_statistics(job, &scratch->enter.around, y, n, lines);
     fill_history(job, scratch->enter.history, n, lines);
     fill_surface(job, y, x0, n, lines);
@@ -1161,6 +1202,10 @@ static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, flo
     const float *inputs[INPUTS];
     for (int c = OUTPUT; c <= LENGTH; c++)
         memcpy(row_line(d, y, OUTPUT_LINES + c) + x0, scratch->enter.history[c], sizeof(float) * (size_t)n);
+    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++) {
+        float *to = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
+        memcpy(to, scratch->enter.parts[c], sizeof(float) * (size_t)n);
+    }
     for (int c = 0; c < INPUTS; c++)
         inputs[c] = lines[c];
     multiply(&d->layers[DETAIL_1], inputs, 0, n, line_of(&d->hidden, y, 0) + x0, d->hidden.pitch, RECTIFIED);
@@ -1252,6 +1297,12 @@ static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
     for (int c = 0; c < RGB; c++) {
         float *restrict accumulated = row_line(d, y, ACCUMULATED_LINES + c) + x0;
         const float *restrict noisy = scratch->leave.noisy[c];
+        for (int i = 0; i < n; i++)
+            accumulated[i] = newest[i] * noisy[i] + (1 - newest[i]) * accumulated[i];
+    }
+    for (int c = 0; c < RGB * job->frame.parts; c++) {
+        float noisy[CHUNK], *restrict accumulated = part_line(d, y, c / RGB, PART_ACCUMULATED + c % RGB) + x0;
+        load_part(noisy, &job->frame, c / RGB, c % RGB, y, x0, n);
         for (int i = 0; i < n; i++)
             accumulated[i] = newest[i] * noisy[i] + (1 - newest[i]) * accumulated[i];
     }
@@ -1411,6 +1462,24 @@ static void add_weighted(
     }
 }
 
+/* The same image of a part of the light. */
+static const float *part_image(const onespp *d, int level, int part, int y)
+{
+    return part_line(d, y, part, level == 0 ? PART_ACCUMULATED : PART_FILTERED + RGB * ((level - 1) % 2));
+}
+
+/* Adds weighted colours of parts of the light at pixels from x on, whose sums follow those of the whole. */
+static void add_parts(
+    const Job *job, float (*restrict sums)[CHUNK], int at, const float *restrict weight, int y, int x, int n)
+{
+    for (int c = 0; c < RGB * job->frame.parts; c++) {
+        const float *restrict line = part_image(job->d, job->level, c / RGB, y) + c % RGB * job->d->pitch + x;
+        float *restrict sum = sums[4 + c] + at;
+        for (int i = 0; i < n; i++)
+            sum[i] += weight[i] * line[i];
+    }
+}
+
 /* Adds the tap (dx, dy) of a chunk of a row, where it is in the image. */
 static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n, int dx, int dy)
 {
@@ -1431,6 +1500,7 @@ static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0
     }
     const float *image = image_lines(d, job->level, y + dy) + first + dx;
     add_weighted(sums, first - x0, weight, image, d->pitch, count);
+    add_parts(job, sums, first - x0, weight, y + dy, first + dx, count);
 }
 
 /* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
@@ -1442,10 +1512,12 @@ static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, i
     int step = TAP_SPACINGS[job->level];
     const float *centre = row_line(d, y, LEVEL_LINES + 3 * job->level + 1) + x0, *importance = centre + d->pitch;
     float weight[CHUNK];
-    memset(sums, 0, sizeof(float) * 4 * CHUNK);
+    int channels = 4 + RGB * job->frame.parts;
+    memset(sums, 0, sizeof *sums * (size_t)channels);
     for (int i = 0; i < n; i++)
         weight[i] = exponential(centre[i]);
     add_weighted(sums, 0, weight, image_lines(d, job->level, y) + x0, d->pitch, n);
+    add_parts(job, sums, 0, weight, y, x0, n);
     for (int tap = 0; tap < 9; tap++)
         if (tap != 4)
             add_tap(job, sums, y, x0, n, (tap % 3 - 1) * step, (tap / 3 - 1) * step);
@@ -1453,13 +1525,17 @@ static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, i
         float scale = importance[i] > NO_WEIGHT ? 1 / sums[3][i] : 0;
         for (int c = 0; c < RGB; c++)
             sums[c][i] *= scale;
+        weight[i] = scale;
     }
+    for (int c = 4; c < channels; c++)
+        for (int i = 0; i < n; i++)
+            sums[c][i] *= weight[i];
 }
 
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
-    float sums[4][CHUNK];
+    float sums[4 + RGB * ONESPP_MAX_PARTS][CHUNK];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
@@ -1467,6 +1543,10 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
             float *to = filtered_lines(job->d, job->level, y) + x0;
             for (int c = 0; c < RGB; c++)
                 memcpy(to + c * job->d->pitch, sums[c], sizeof(float) * (size_t)n);
+            for (int c = 0; c < RGB * job->frame.parts; c++) {
+                to = part_line(job->d, y, c / RGB, PART_FILTERED + RGB * (job->level % 2) + c % RGB) + x0;
+                memcpy(to, sums[4 + c], sizeof(float) * (size_t)n);
+            }
         }
 }
 
@@ -1499,8 +1579,32 @@ static void remember(const Job *job, int y, int x0, int n)
         for (int i = 0; i < n; i++)
             texels[i * TEXEL + NORMAL + c] = normal[i];
     }
+    int of_parts = PART_HISTORY * job->frame.parts;
+    for (int c = 0; c < of_parts; c++) {
+        const float *line = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
+        for (int i = 0; i < n; i++)
+            d->part_texels[(pixel + i) * of_parts + c] = line[i];
+    }
     load(d->depth + pixel, &job->frame.depth, 0, y, x0, n);
     load_mesh(d->mesh + pixel, &job->frame, y, x0, n);
+}
+
+/* A colour of a part of the light, blended and written: where no surface is, it stays as it is. */
+static void finish_part(const Job *job, int part, int channel, const float *restrict filtered, int y, int x0, int n)
+{
+    float divisor[CHUNK], noisy[CHUNK];
+    const float *restrict alpha = row_line(job->d, y, ALPHA_LINE) + x0;
+    const float *restrict importance = row_line(job->d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
+    float *restrict output = part_line(job->d, y, part, PART_OUTPUT + channel) + x0;
+    const onespp_output *image = &job->frame.part[part].radiance;
+    float *to = image->data + image->channel * channel + image->row * y + image->column * x0;
+    load_divisor(divisor, &job->frame, channel, y, x0, n);
+    load(noisy, &job->frame.part[part].noisy, channel, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        int is_surface = importance[i] > NO_WEIGHT;
+        output[i] = is_surface ? output[i] + alpha[i] * (filtered[i] - output[i]) : 0;
+        to[i * image->column] = is_surface ? output[i] * divisor[i] : noisy[i];
+    }
 }
 
 /* The last level: its output is blended into that of the previous frame. */
@@ -1508,7 +1612,7 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
     const onespp *d = job->d;
-    float sums[4][CHUNK];
+    float sums[4 + RGB * ONESPP_MAX_PARTS][CHUNK];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
@@ -1523,6 +1627,8 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
                 }
                 write_radiance(job, c, output, y, x0, n);
             }
+            for (int c = 0; c < RGB * job->frame.parts; c++)
+                finish_part(job, c / RGB, c % RGB, sums[4 + c], y, x0, n);
             remember(job, y, x0, n);
         }
 }
@@ -1562,6 +1668,9 @@ static int check(const onespp *d, const onespp_frame *frame, const onespp_output
         && frame->height <= d->config.max_height && frame->meshes >= 0 && frame->meshes <= d->config.max_meshes;
     int complete = frame->direct.data && frame->albedo.data && frame->normal.data && frame->depth.data
         && frame->motion.data && radiance->data && (frame->meshes == 0 || frame->object_to_world);
+    complete = complete && frame->parts >= 0 && frame->parts <= d->config.max_parts && (frame->parts == 0 || frame->part);
+    for (int i = 0; complete && i < frame->parts; i++)
+        complete = frame->part[i].noisy.data && frame->part[i].radiance.data;
     if (!fits || !complete || !(frame->samples >= ONESPP_MIN_SAMPLES && frame->samples <= ONESPP_MAX_SAMPLES))
         return ONESPP_BAD_FRAME;
     for (int i = 0; i < 16; i++)
@@ -1595,7 +1704,8 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     Job job = {.d = d, .frame = *frame, .radiance = *radiance};
     job.padded_width = rounded_up(frame->width, 8);
     job.padded_height = rounded_up(frame->height, 8);
-    job.has_history = !frame->reset && frame->width == d->width && frame->height == d->height;
+    job.has_history = !frame->reset && frame->width == d->width && frame->height == d->height
+        && frame->parts == d->parts;
     set_default(&job.frame.indirect, &zero);
     set_default(&job.frame.emission, &zero);
     set_default(&job.frame.roughness, &one);
@@ -1609,6 +1719,7 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     d->width = frame->width;
     d->height = frame->height;
     d->meshes = frame->meshes;
+    d->parts = frame->parts;
     memcpy(d->K, frame->K, sizeof d->K);
     memcpy(d->camera_to_world, frame->camera_to_world, sizeof d->camera_to_world);
     if (frame->meshes)
@@ -1679,7 +1790,7 @@ static int is_valid(const onespp_config *config)
     return config->max_width >= 1 && config->max_width <= ONESPP_MAX_SIDE && config->max_height >= 1
         && config->max_height <= ONESPP_MAX_SIDE && config->max_meshes >= 0 && config->max_meshes <= ONESPP_MAX_MESHES
         && config->tasks >= 1 && config->tasks <= ONESPP_MAX_TASKS && config->max_isa >= ONESPP_ISA_ANY
-        && config->max_isa <= ONESPP_ISA_AVX512;
+        && config->max_isa <= ONESPP_ISA_AVX512 && config->max_parts >= 0 && config->max_parts <= ONESPP_MAX_PARTS;
 }
 
 size_t onespp_size(const onespp_config *config)

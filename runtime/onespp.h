@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define ONESPP_ABI 2 /* changes whenever a program has to be compiled anew */
+#define ONESPP_ABI 3 /* changes whenever a program has to be compiled anew */
 
 enum {
     ONESPP_OK = 0,
@@ -30,6 +30,7 @@ enum {
 #define ONESPP_MAX_SIDE 16384   /* pixels */
 #define ONESPP_MAX_MESHES 65536 /* that move */
 #define ONESPP_MAX_TASKS 1024
+#define ONESPP_MAX_PARTS 16 /* of the light */
 #define ONESPP_MIN_SAMPLES 1e-3f
 #define ONESPP_MAX_SAMPLES 1e9f
 
@@ -58,6 +59,13 @@ typedef struct {
     ptrdiff_t row, column;
 } onespp_ids;
 
+/* A part of the light, such as that of one lamp: it is denoised by the kernels that are chosen for the whole, so parts
+ * whose noisy radiance adds up to `direct` plus `indirect` do so denoised. Background stays as it is. */
+typedef struct {
+    onespp_image noisy;     /* 3 channels of radiance, of either sign */
+    onespp_output radiance; /* 3; may be the noisy image itself, and overlap no other input */
+} onespp_part;
+
 /* One frame. Radiance is linear RGB in any unit; lengths are in any unit, always the same. Matrices are row by row.
  *
  * Camera space has x to the left, y up and z forward. With p a point in camera space, pixel = (K p) / p_z, where x goes
@@ -85,6 +93,9 @@ typedef struct {
     double camera_to_world[16];    /* rigid */
     int meshes;                    /* at most max_meshes */
     const double *object_to_world; /* meshes x 16, rigid, entry mesh_id - 1; NULL for 0 meshes. Others do not move */
+
+    int parts; /* at most max_parts; another number than before resets */
+    const onespp_part *part;
 } onespp_frame;
 
 /* Calls task(argument, i) once for each i from 0 to count - 1, in any order and on any threads, and returns when all
@@ -100,6 +111,7 @@ typedef struct {
     onespp_parallel_for parallel_for; /* NULL: tasks run one after the other */
     void *user;                       /* handed to parallel_for */
     int max_isa;                      /* use no instruction set above this one; 0 for the fastest */
+    int max_parts;                    /* of the light, per frame; 0 where only the whole is denoised */
 } onespp_config;
 
 typedef struct onespp onespp;

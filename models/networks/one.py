@@ -36,6 +36,7 @@ DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
 NETWORK_REACH = 32  # rows above and below that predictions depend on: 28 by the network, 4 by means of its inputs
 NETWORK_SURFACE = ("albedo", "normal", "depth", "roughness", "mesh_id")  # channels that decoded_rows reads
+MAX_PART = 100 * MAX_IRRADIANCE  # of either sign: parts of the light may cancel each other
 HISTORY = (3, 3, 1, LATENT)  # channels: output and accumulated irradiance, the latter's effective length, latent
 
 
@@ -261,7 +262,8 @@ def part_irradiance(frame: Frame, whole: Tensor, clamped: Tensor) -> Tensor:
     """Irradiance (B, 3 P, H, W) of the parts of the light, scaled where the `whole` (B, 3, H, W) was clamped."""
     assert frame.parts is not None
     kept = torch.where(whole == clamped, 1, clamped / torch.where(whole == 0, 1, whole))
-    return frame.parts * (kept / frame.divisor).repeat(1, frame.parts.shape[1] // 3, 1, 1)
+    parts = frame.parts * (kept / frame.divisor).repeat(1, frame.parts.shape[1] // 3, 1, 1)
+    return parts.clamp(-MAX_PART, MAX_PART)
 
 
 class One(Denoiser):

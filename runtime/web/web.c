@@ -12,7 +12,8 @@ static float *radiance;
 /* Where to write frames of a size, raw.h. NULL where they cannot be denoised or memory is short. To be called once. */
 raw_header *EXPORT(create)(int width, int height, int meshes)
 {
-    onespp_config config = {ONESPP_ABI, width, height, meshes, 1, NULL, NULL, ONESPP_ISA_ANY};
+    onespp_config config = {
+        .abi = ONESPP_ABI, .max_width = width, .max_height = height, .max_meshes = meshes, .tasks = 1};
     raw_header header = {.width = width, .height = height, .meshes = meshes};
     size_t size = onespp_size(&config), output = sizeof(float) * 3 * (size_t)width * (size_t)height;
     if (!size)

@@ -21,7 +21,7 @@ FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
 OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-DONESPP_DISPATCH")
 SOURCES = tuple(str(FOLDER / name) for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
-ABI = 2
+ABI = 3
 ISAS = {"any": 0, "baseline": 1, "avx2": 2, "avx512": 3}
 
 Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int)
@@ -36,6 +36,7 @@ class Config(ctypes.Structure):
         ("parallel_for", ParallelFor),
         ("user", ctypes.c_void_p),
         ("max_isa", ctypes.c_int),
+        ("max_parts", ctypes.c_int),
     )
 
 
@@ -43,6 +44,12 @@ class Image(ctypes.Structure):
     """onespp_image, and onespp_output."""
 
     _fields_ = (("data", ctypes.c_void_p), *((name, ctypes.c_ssize_t) for name in ("channel", "row", "column")))
+
+
+class Part(ctypes.Structure):
+    """onespp_part."""
+
+    _fields_ = (("noisy", Image), ("radiance", Image))
 
 
 class Ids(ctypes.Structure):
@@ -63,6 +70,8 @@ class CFrame(ctypes.Structure):
         ("camera_to_world", ctypes.c_double * 16),
         ("meshes", ctypes.c_int),
         ("object_to_world", ctypes.c_void_p),
+        ("parts", ctypes.c_int),
+        ("part", ctypes.POINTER(Part)),
     )
 
 
@@ -107,10 +116,11 @@ class CRuntime:
         meshes: int = 64,
         tasks: int = 1,
         parallel_for: Callable[..., None] | None = None,
+        parts: int = 0,
     ):
         self.library = library
         callback = ParallelFor(parallel_for) if parallel_for else ParallelFor()
-        self.config = Config(ABI, width, height, meshes, tasks, callback, None, library.max_isa)
+        self.config = Config(ABI, width, height, meshes, tasks, callback, None, library.max_isa, parts)
         self.size = library.onespp_size(ctypes.byref(self.config))
         self.memory = np.full(self.size, 0xFF, np.uint8)  # NaN, wherever something is read before it was written
         self.denoiser = ctypes.c_void_p()
@@ -142,8 +152,15 @@ class CRuntime:
         given.K[:] = frame.now.K[0].flatten().tolist()
         given.camera_to_world[:] = frame.now.camera_to_world[0].flatten().tolist()
         given.meshes, given.object_to_world = len(poses), address(poses)
+        given.parts = 0 if frame.parts is None else frame.parts.shape[1] // 3
+        parts = np.empty((0, height, width), np.float32)
+        if frame.parts is not None:  # which are denoised in place
+            parts = frame.parts[0].numpy().copy()
+            images = [strided(part, False) for part in np.split(parts, given.parts)]
+            given.part = (Part * given.parts)(*(Part(image, image) for image in images))
         output = np.full((height, width, 3) if interleaved else (3, height, width), np.nan, np.float32)
         assert self.call(given, strided(output, interleaved)) == 0
+        self.parts = torch.from_numpy(parts)[None]
         return torch.from_numpy(np.moveaxis(output, -1, 0).copy() if interleaved else output)[None]
 
 

@@ -91,7 +91,7 @@ def synthetic(count: int, size: tuple[int, int] = SIZE, first: int = 0) -> list[
 @torch.no_grad()
 def compare(library: Library, one: One, frames: Iterable[Frame], resets: Sequence[int] = (0,)) -> float:
     """The largest difference of the sequence, relative to the brightest pixel of its frame."""
-    runtime = CRuntime(library, 200, 200)
+    runtime = CRuntime(library, 200, 200, parts=3)
     state: State | None = None
     worst = 0.0
     for index, frame in enumerate(frames):
@@ -100,6 +100,9 @@ def compare(library: Library, one: One, frames: Iterable[Frame], resets: Sequenc
         difference = (actual - expected).abs().amax() / expected.abs().amax().clamp(min=1e-6)
         worst = max(worst, difference.item())
         assert difference <= TOLERANCE, f"frame {index} differs by {difference:.1e} of the brightest pixel"
+        if frame.parts is not None:
+            parts = one.parts(frame.finite(), state)
+            torch.testing.assert_close(runtime.parts, parts, rtol=0, atol=TOLERANCE * float(parts.abs().amax()))
     return worst
 
 
@@ -164,6 +167,40 @@ def test_it_computes_what_the_denoiser_does(library, one, size):
 def test_resets_and_changes_of_size(library, one):
     sequence = [*synthetic(3), *synthetic(2, first=9), *synthetic(2, (24, 64), first=9), *synthetic(2, first=11)]
     compare(library, one, sequence, resets=(0, 3))
+
+
+def in_parts(frame: Frame, count: int) -> Frame:
+    """The frame with parts that add up to its light, of which the first has either sign."""
+    light = frame.direct + frame.indirect
+    shares = torch.rand(count, *light.shape, generator=torch.Generator().manual_seed(count)) - 0.3
+    shares[-1] = 1 - shares[:-1].sum(dim=0)
+    return replace(frame, parts=torch.cat([*(shares * light)], dim=1))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (13, 7), (41, 70), (197, 24)])
+def test_parts_of_the_light(library, one, size):
+    frames = [in_parts(frame, count) for frame, count in zip(synthetic(5, size), (2, 2, 3, 3, 1), strict=True)]
+    compare(library, one, frames)
+    runtime = CRuntime(library, size[1], size[0], parts=3)
+    for frame in frames:
+        whole = runtime(frame, reset=False) - frame.emission
+        summed = runtime.parts.unflatten(1, (-1, 3)).sum(dim=1)
+        torch.testing.assert_close(summed, whole, rtol=1e-5, atol=1e-5 * float(whole.abs().amax()))
+
+
+def test_the_whole_is_the_same_with_and_without_parts(library, frames):
+    runtimes = [CRuntime(library, SIZE[1], SIZE[0], parts=count) for count in (0, 2)]
+    for frame in frames:
+        assert torch.equal(runtimes[0](frame, False), runtimes[1](in_parts(frame, 2), False))
+
+
+def test_parts_of_light_of_any_size_are_finite(library, one, frames):
+    extreme = []
+    for index, frame in enumerate(frames):
+        parts = in_parts(disturbed(frame, ["direct"], (1e34, -1e30, 0.0), index), 2).parts
+        parts[..., ::3, ::5] = torch.tensor([1e35, -1e35, float("nan"), float("inf")])[index]
+        extreme.append(replace(frame, parts=parts))
+    compare(library, one, extreme)
 
 
 def test_frames_count_by_their_samples(library, one, frames):

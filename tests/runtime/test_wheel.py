@@ -321,3 +321,29 @@ def test_threads_compile_without_warnings(compiler, tmp_path):
     for flags in (("-Wpedantic",), ("-std=gnu17",), ("-U__unix__",)):  # the last as where there are no POSIX threads
         command = [compiler, *STRICT, *flags, f"-I{FOLDER}", "-c", source, "-o", str(tmp_path / "it.o")]
         subprocess.run(command, check=True)
+
+
+def test_parts_of_the_light_are_denoised_in_place(module, frames):
+    height, width = SIZE
+    plain, denoiser = (module.Denoiser(width, height, max_meshes=64, max_parts=count) for count in (0, 2))
+    for frame in frames[:3]:
+        given = arguments(frame)
+        light = np.asarray(given["color"]) + np.asarray(given["indirect"])
+        parts = [np.ascontiguousarray(share * light, np.float32) for share in (0.25, 0.75)]
+        radiance = denoiser.denoise(**given, parts=parts)
+        assert np.array_equal(radiance, plain.denoise(**given))
+        np.testing.assert_allclose(sum(parts) + np.asarray(given["emission"]), radiance, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("parts", "error", "message"),
+    [
+        ([np.zeros((*SIZE, 3))], TypeError, "float32"),
+        ([np.zeros((*SIZE, 1), np.float32)], ValueError, "shape"),
+        ([np.zeros((*SIZE, 3), np.float32)] * 3, ValueError, "max_parts is 2"),
+    ],
+)
+def test_bad_parts(module, frames, parts, error, message):
+    denoiser = module.Denoiser(SIZE[1], SIZE[0], max_meshes=64, max_parts=2)
+    with pytest.raises(error, match=message):
+        denoiser.denoise(**arguments(frames[0]), parts=parts)

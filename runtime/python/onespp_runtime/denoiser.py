@@ -4,6 +4,7 @@ import operator
 import os
 import sys
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from .library import ISAS, FrameInputs, Handle, strided_image
 MAX_SIDE = 16384
 MAX_MESHES = 65536
 MAX_THREADS = 512
+MAX_PARTS = 16
 MIN_SAMPLES, MAX_SAMPLES = 1e-3, 1e9
 
 ROOM_FOR_MESHES = 4096  # of the state that `denoise` makes: few bytes each
@@ -30,7 +32,8 @@ class Denoiser:
     the same bits for any number of threads.
 
     `isa` is the instruction set that it uses: "avx512", "avx2", or "baseline", that of the compiler's flags. `max_isa`
-    is the highest one it may use; results differ by rounding errors.
+    is the highest one it may use; results differ by rounding errors. `max_parts` is the largest number of parts of the
+    light per frame, at most 16.
 
     Several denoisers can work at the same time. Calls of one wait for each other.
 
@@ -38,7 +41,14 @@ class Denoiser:
     """
 
     def __init__(
-        self, width: int, height: int, *, max_meshes: int = 0, threads: int | None = None, max_isa: str = "any"
+        self,
+        width: int,
+        height: int,
+        *,
+        max_meshes: int = 0,
+        threads: int | None = None,
+        max_isa: str = "any",
+        max_parts: int = 0,
     ):
         self.width = whole_number("width", width, 1, MAX_SIDE)
         self.height = whole_number("height", height, 1, MAX_SIDE)
@@ -46,7 +56,8 @@ class Denoiser:
         wanted = min(processors(), MAX_THREADS) if threads is None else whole_number("threads", threads, 1, MAX_THREADS)
         if max_isa not in ISAS:
             raise ValueError(f"max_isa: expected one of {', '.join(ISAS)}, got {max_isa!r}")
-        self._handle = Handle(self.width, self.height, self.max_meshes, wanted, max_isa)
+        self.max_parts = whole_number("max_parts", max_parts, 0, MAX_PARTS)
+        self._handle = Handle(self.width, self.height, self.max_meshes, wanted, max_isa, self.max_parts)
         self.threads = self._handle.threads
         self.isa = self._handle.isa
         self._lock = threading.Lock()
@@ -68,6 +79,7 @@ class Denoiser:
         object_to_world: Array | None = None,
         samples: float = 1.0,
         reset: bool = False,
+        parts: Sequence[NDArray[np.float32]] = (),
     ) -> NDArray[np.float32]:
         """The denoised radiance (H, W, 3) of the next frame.
 
@@ -94,6 +106,9 @@ class Denoiser:
           without a pose do not move
         - samples: per pixel, in the color, from 1e-3 to 1e9; 1 where unknown
         - reset: whether to forget all frames before, as after a cut
+        - parts, float32 arrays (H, W, 3): noisy radiance of parts of the light, such as that of one lamp, of either
+          sign. They are replaced by denoised radiance: parts that add up to the color and indirect light do so
+          afterwards. Another number of parts than before resets
 
         Raises ValueError for a wrong shape, or a number that is out of range, and TypeError for what is no array of
         such numbers on the CPU. After an error the state is what it was.
@@ -118,10 +133,22 @@ class Denoiser:
             frame.set_poses(to_poses("object_to_world", object_to_world, (-1, 4, 4)))
         if frame.meshes > self.max_meshes:
             raise ValueError(f"object_to_world: {frame.meshes} poses, but max_meshes is {self.max_meshes}")
+        if len(parts) > self.max_parts:
+            raise ValueError(f"parts: {len(parts)}, but max_parts is {self.max_parts}")
+        frame.set_parts([in_place(part, size) for part in parts])
         radiance = np.empty((*size, 3), np.float32)
         with self._lock:
             self._handle.denoise(frame, strided_image(radiance))
         return radiance
+
+
+def in_place(part: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """The part. Raises TypeError for what is no writable array of float32, and ValueError for another shape."""
+    if not isinstance(part, np.ndarray) or part.dtype != np.float32 or not part.flags.writeable:
+        raise TypeError("parts: expected writable numpy arrays of float32, which are denoised in place")
+    if part.shape != (*size, 3):
+        raise ValueError(f"parts: expected the shape {(*size, 3)}, got {part.shape}")
+    return part
 
 
 def set_camera(frame: FrameInputs, K: Array, camera_to_world: Array) -> None:

@@ -3,13 +3,14 @@
 import ctypes
 import sys
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-ABI = 2
+ABI = 3
 ISAS = ("any", "baseline", "avx2", "avx512")
 SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 
@@ -22,6 +23,7 @@ class Config(ctypes.Structure):
         ("parallel_for", ctypes.c_void_p),
         ("user", ctypes.c_void_p),
         ("max_isa", ctypes.c_int),
+        ("max_parts", ctypes.c_int),
     )
 
 
@@ -29,6 +31,12 @@ class StridedImage(ctypes.Structure):
     """onespp_image, and onespp_output."""
 
     _fields_ = (("data", ctypes.c_void_p), *((name, ctypes.c_ssize_t) for name in ("channel", "row", "column")))
+
+
+class Part(ctypes.Structure):
+    """onespp_part."""
+
+    _fields_ = (("noisy", StridedImage), ("radiance", StridedImage))
 
 
 class StridedIds(ctypes.Structure):
@@ -58,6 +66,8 @@ class FrameInputs(ctypes.Structure):
         ("camera_to_world", ctypes.c_double * 16),
         ("meshes", ctypes.c_int),
         ("object_to_world", ctypes.c_void_p),
+        ("parts", ctypes.c_int),
+        ("part", ctypes.POINTER(Part)),
     )
 
     def __init__(self, **numbers: float):
@@ -71,6 +81,12 @@ class FrameInputs(ctypes.Structure):
     def set_ids(self, array: NDArray[np.int32]) -> None:
         self.kept.append(array)
         self.mesh_id = StridedIds(array.ctypes.data, *(stride // array.itemsize for stride in array.strides))
+
+    def set_parts(self, arrays: Sequence[NDArray[np.float32]]) -> None:
+        """Parts of the light, which are denoised in place."""
+        self.kept += arrays
+        images = map(strided_image, arrays)
+        self.parts, self.part = len(arrays), (Part * len(arrays))(*(Part(image, image) for image in images))
 
     def set_poses(self, poses: NDArray[np.float64]) -> None:
         self.kept.append(poses)
@@ -112,12 +128,12 @@ class ThreadPool:
 class Handle:
     """An onespp: the denoiser with the memory it takes and its threads. Raises MemoryError without enough."""
 
-    def __init__(self, width: int, height: int, max_meshes: int, threads: int, max_isa: str):
+    def __init__(self, width: int, height: int, max_meshes: int, threads: int, max_isa: str, max_parts: int):
         self.pool = ThreadPool(threads)
         self.threads = threads if self.pool.handle else 1
         tasks = 2 * self.threads if self.threads > 1 else 1  # twice as many even out their work
         run = ctypes.cast(LIBRARY.onespp_pool_run, ctypes.c_void_p) if self.pool.handle else None
-        config = Config(ABI, width, height, max_meshes, tasks, run, self.pool.handle, ISAS.index(max_isa))
+        config = Config(ABI, width, height, max_meshes, tasks, run, self.pool.handle, ISAS.index(max_isa), max_parts)
         self.memory: NDArray[Any] = np.empty(LIBRARY.onespp_size(ctypes.byref(config)), np.uint8)
         self.pointer = ctypes.c_void_p()
         memory = self.memory.ctypes.data, self.memory.size
