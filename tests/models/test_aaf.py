@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from datasets.channels import HIT_CHANNELS
@@ -110,8 +110,11 @@ def naive_weight(geometry, width, p, q):
         return 1.0
     difference = geometry[:3, *q] - geometry[:3, *p]
     exponent = (difference @ difference - (difference @ geometry[3:, *p]) ** 2) / (2 * width**2)
-    same = geometry[3:, *p] @ geometry[3:, *q] > math.cos(math.radians(5))
-    return math.exp(-exponent) if same and exponent <= 4 and math.sqrt(difference @ difference) < 5.6 * width else 0.0
+    cosine, distance = geometry[3:, *p] @ geometry[3:, *q], math.sqrt(difference @ difference)
+    limit = math.cos(math.radians(5))
+    # Where rounding decides whether a tap counts, single precision may differ.
+    assume(abs(cosine - limit) > 1e-6 and abs(exponent - 4) > 1e-3 and abs(distance - 5.6 * width) > 1e-4 * width)
+    return math.exp(-exponent) if cosine > limit and exponent <= 4 and distance < 5.6 * width else 0.0
 
 
 def naive_pass(image, width, max_width, geometry, down):
@@ -126,6 +129,7 @@ def naive_pass(image, width, max_width, geometry, down):
 
 @settings(max_examples=8, deadline=None)
 @given(size=st.tuples(st.integers(1, 12), st.integers(1, 12)), seed=st.integers(0, 999), down=st.booleans())
+@example(size=(12, 9), seed=318, down=False)  # a cosine at its limit
 def test_passes_are_gaussians_of_world_distances(size, seed, down):
     rng = np.random.default_rng(seed)
     frame = synthetic_frame(seed % 20, *size)
