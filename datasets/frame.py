@@ -167,8 +167,10 @@ class Frame:
             low, high = tensor.aminmax()
             if not torch.maximum(-low, high) <= limit:  # NaN passes no comparison
                 mended[name] = tensor.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit)
-        parts = None if self.parts is None else torch.nan_to_num(self.parts, 0.0, 0.0, 0.0)
-        return replace(self.with_channels(mended), parts=parts) if mended or parts is not None else self
+        frame = self.with_channels(mended) if mended else self
+        if frame.parts is None or torch.isfinite(frame.parts.sum()):
+            return frame
+        return replace(frame, parts=torch.nan_to_num(frame.parts, 0.0, 0.0, 0.0))
 
     @property
     def has_buffers(self) -> bool:

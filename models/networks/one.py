@@ -78,7 +78,8 @@ class OneState(State):
     gbuffer: GBuffer
     scale: RunningScale
     alpha: Tensor  # (B, 2, H, W), of accumulation and output; for debugging
-    parts: Tensor  # of the P parts of the light, output and accumulated irradiance, (B, 6 P, H, W)
+    part_output: Tensor  # of the P parts of the light, (B, 3 P, H, W)
+    part_accumulated: Tensor
 
     def pictures(self) -> dict[str, Tensor]:
         return {
@@ -247,9 +248,10 @@ def fetched(before: OneState | None, frame: Frame, surface: Tensor) -> tuple[Ten
     if before is None:
         nothing = has_history.expand(-1, sum(HISTORY), -1, -1)
         return nothing, has_history.expand(-1, 2 * count_of_parts(frame), -1, -1), has_history
-    past = torch.cat([before.output, before.accumulated, before.length, before.latent, before.parts], dim=1)
+    images = before.output, before.accumulated, before.length, before.latent
+    past = torch.cat([*images, before.part_output, before.part_accumulated], dim=1)
     history, valid = reproject(frame, past, before.gbuffer)
-    history, parts = history.split([sum(HISTORY), before.parts.shape[1]], dim=1)
+    history, parts = history.split([sum(HISTORY), 2 * count_of_parts(frame)], dim=1)
     return history, parts, valid.to(history) * surface
 
 
@@ -261,9 +263,10 @@ def count_of_parts(frame: Frame) -> int:
 def part_irradiance(frame: Frame, whole: Tensor, clamped: Tensor) -> Tensor:
     """Irradiance (B, 3 P, H, W) of the parts of the light, scaled where the `whole` (B, 3, H, W) was clamped."""
     assert frame.parts is not None
-    kept = torch.where(whole == clamped, 1, clamped / torch.where(whole == 0, 1, whole))
-    parts = frame.parts * (kept / frame.divisor).repeat(1, frame.parts.shape[1] // 3, 1, 1)
-    return parts.clamp(-MAX_PART, MAX_PART)
+    factor = 1 / frame.divisor
+    if not torch.equal(whole, clamped):
+        factor = factor * torch.where(whole == clamped, 1, clamped / torch.where(whole == 0, 1, whole))
+    return (frame.parts.unflatten(1, (-1, 3)) * factor[:, None]).flatten(1, 2).clamp_(-MAX_PART, MAX_PART)
 
 
 class One(Denoiser):
@@ -286,14 +289,14 @@ class One(Denoiser):
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
         before = matching_state(state, OneState, frame)
-        if before and before.parts.shape[1] != 2 * count_of_parts(frame):
+        if before and before.part_output.shape[1] != count_of_parts(frame):
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)
         output, accumulated, length, latent = carried(decoded, past, surface, self.steps)
-        parts = torch.cat([output[:, 3:], accumulated[:, 3:]], dim=1)
         images = output[:, :3], accumulated[:, :3], length, latent
-        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), parts)
+        parts = output[:, 3:], accumulated[:, 3:]
+        return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts)
 
     def decoded(self, frame: Frame, before: OneState | None, surface: Tensor) -> tuple[Decoded, Tensor, RunningScale]:
         """What the network predicts, the reprojected history, of large images its output alone, and the running scale.
@@ -355,6 +358,5 @@ class One(Denoiser):
         Kernels and weights of history are those of the whole, so parts that add up to the noisy light do so denoised.
         """
         assert isinstance(state, OneState) and frame.parts is not None
-        outputs = state.parts.chunk(2, dim=1)[0]
-        reflected = outputs * frame.divisor.repeat(1, outputs.shape[1] // 3, 1, 1)
-        return torch.where(frame.depth > 0, reflected, frame.parts)
+        reflected = (state.part_output.unflatten(1, (-1, 3)) * frame.divisor[:, None]).flatten(1, 2)
+        return reflected if frame.surface is None else torch.where(frame.surface > 0, reflected, frame.parts)
