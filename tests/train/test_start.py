@@ -58,7 +58,7 @@ def test_it_begins_with_the_general_network_bit_for_bit(tiny, tmp_path, general)
 
 
 # The others take longer.
-QUICK = ("wskp3", "nbgd", "one")
+QUICK = ("wskp3", "nbgd")
 EVERY_NETWORK = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TRAINABLE]
 
 
