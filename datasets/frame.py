@@ -35,6 +35,11 @@ def disoccluded(motion: Tensor, dual_motion: Tensor) -> Tensor:
     return (dual_motion - motion).abs().amax(dim=1, keepdim=True) > 1 / 64
 
 
+def times_each(images: Tensor, factor: Tensor) -> Tensor:
+    """Images side by side, (B, 3 P, H, W), each times `factor` (B, 3, H, W)."""
+    return (images.unflatten(1, (-1, 3)) * factor[:, None]).flatten(1, 2)
+
+
 class ChannelTensor:
     """A channel as an attribute of Frame. Raises BadInput where it was not loaded."""
 

@@ -53,7 +53,8 @@ def analyse(
         convention, reason = motion_convention(shots, sources, given)
         conventions = replace(conventions, motion=convention)
         report.append(("convention", reason))
-    if sources.has("albedo") and (albedo or usual_albedo(sources)) == "sampled":
+    sampled = sources.has("albedo") and (albedo or usual_albedo(sources)) == "sampled"
+    if sampled and conventions.has_history and {"albedo", "depth", "motion"} <= set(reads):
         conventions = replace(conventions, albedo_is_sampled=True)
         report.append(("", "albedo has the frame's samples, and is averaged along the motion"))
     return Analysis(conventions, report + derived_and_missing(first, sources, conventions, reads))

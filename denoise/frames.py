@@ -20,7 +20,6 @@ from denoise.cameras import in_the_world, is_own_space, view_of_header, view_of_
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import ForeignFrame, Image
 from denoise.motion_convention import MotionConvention
-from denoise.supersampling import AlbedoMean
 from errors import BadInput
 from scenes.camera import STILL, Array, View, look_at, motion_vectors, pixel_centres, unproject
 
@@ -99,7 +98,6 @@ class FrameBuilder:
         self.view: View | None = None
         self.depth: Image | None = None  # (H, W)
         self.had_camera = False
-        self.albedo_mean = AlbedoMean() if conventions.albedo_is_sampled else None
 
     def build(self, foreign: ForeignFrame) -> Frame:
         views = views_of(foreign, self.conventions)
@@ -133,8 +131,7 @@ class FrameBuilder:
         self.depth = depth
         previous = before if self.conventions.has_history else NOWHERE
         spp = self.spp * (2 if "buffer_b" in foreign.arrays else 1)
-        frame = frame_of(channels, self.reads, view, previous, self.source, spp)
-        return self.albedo_mean.add(frame) if self.albedo_mean and self.conventions.has_history else frame
+        return frame_of(channels, self.reads, view, previous, self.source, spp)
 
     def given_normal(self, foreign: ForeignFrame) -> Image | None:
         """The renderer's normals (H, W, 3) in [-1, 1]; None where there are none."""

@@ -26,6 +26,7 @@ from denoise.motion_convention import MotionConvention
 from denoise.parts import Parts
 from denoise.sequence import FrameFiles, files_of, gaps, numbered, sequence_of, split_at_cuts
 from denoise.sources import Sources, find_sources, has_two_buffers
+from denoise.supersampling import AlbedoMean
 from errors import BadInput, requires_extra
 from eval.bench.memory import status_mb
 from files import read_json, replacing, write_json
@@ -217,6 +218,8 @@ class SequenceDenoiser:
         """The frames of a shot, of which those before `start` are finished."""
         state: State | None = None
         builder = self.builder()
+        is_sampled = not self.sources.is_ours and self.analysis.conventions.albedo_is_sampled
+        albedo = AlbedoMean() if is_sampled else None
         has_history = self.sources.is_ours or self.analysis.conventions.has_history
         for index, files in enumerate(shot):
             needs_state = has_history and (index == 0 or type(state) is not State)
@@ -225,7 +228,12 @@ class SequenceDenoiser:
                 if frame.size != (self.first.height, self.first.width):
                     size = f"{image.width}x{image.height}"
                     raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
-                output, state = self.step(files, image, frame.to(self.denoiser.device), state, index >= start)
+                frame = frame.to(self.denoiser.device)
+                if self.parts:
+                    frame = self.parts.added(frame, image)
+                if albedo:
+                    frame = albedo.add(frame)
+                output, state = self.step(files, image, frame, state, index >= start)
                 if index >= start:
                     self.write(files, image, image_of(output))
                     yield nonfinite
@@ -235,8 +243,6 @@ class SequenceDenoiser:
         self, files: FrameFiles, image: ExrImage, frame: Frame, state: State | None, is_new: bool
     ) -> tuple[Tensor, State]:
         """The denoised frame and the next state; the error of a new frame goes into the table and its image."""
-        if self.parts:
-            frame = self.parts.added(frame, image)
         if not (self.estimator and is_new):
             output, state = self.denoiser(frame, state)
             if self.parts and is_new:

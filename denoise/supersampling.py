@@ -5,15 +5,16 @@ its own samples and multiplied by the mean albedo of this frame and those before
 2014, "High Quality Temporal Supersampling"): fetched along the motion, and clamped to what neighbours show.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from datasets.channels import ALBEDO_FLOOR
-from datasets.frame import Frame
+from datasets.channels import ALBEDO_FLOOR, CHANNELS
+from datasets.frame import Frame, times_each
 
 MOST_BEFORE = 4  # frames that the mean before counts as at most: each fetch blurs it a little
-SAMPLED_CHANNELS = ("albedo", "depth", "motion", "direct", "indirect")
 
 
 class AlbedoMean:
@@ -24,9 +25,7 @@ class AlbedoMean:
         self.count: Tensor | None = None
 
     def add(self, frame: Frame) -> Frame:
-        """The next frame of the shot with the mean albedo, under the same light; itself if it lacks motion."""
-        if any(name not in frame.channels for name in SAMPLED_CHANNELS):
-            return frame
+        """The next frame of the shot, with motion, with the mean albedo under the same light."""
         surface = (frame.depth > 0).to(frame.albedo)
         mean, count = frame.albedo, surface
         if self.mean is not None and self.count is not None:
@@ -38,15 +37,17 @@ class AlbedoMean:
             mean = torch.where(count > 1, torch.lerp(fetched, frame.albedo, 1 / count.clamp(min=1)), frame.albedo)
         self.mean, self.count = mean, count
         ratio = mean.clamp(min=ALBEDO_FLOOR) / frame.albedo.clamp(min=ALBEDO_FLOOR)
-        light = {name: frame.channels[name] * ratio for name in ("direct", "indirect")}
-        return frame.with_channels({"albedo": mean, **light})
+        light = {name: light * ratio for name, light in frame.channels.items() if CHANNELS[name].is_reflected}
+        parts = None if frame.parts is None else times_each(frame.parts, ratio)
+        return replace(frame.with_channels({"albedo": mean, **light}), parts=parts)
 
 
 def places(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Where motion (1, 2, H, W) leads, as grid_sample wants it, and whether that is in the image (1, 1, H, W)."""
     height, width = motion.shape[-2:]
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    size = torch.tensor([width, height]).view(1, 2, 1, 1)
+    rows, columns = (torch.arange(side, device=motion.device) + 0.5 for side in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    size = motion.new_tensor([width, height]).view(1, 2, 1, 1)
     place = 2 * (torch.stack([x, y])[None] + motion) / size - 1
     return place.movedim(1, -1), (place.abs() <= 1).all(dim=1, keepdim=True)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from datasets.frame import Frame, Signal
+from datasets.frame import Frame, Signal, times_each
 from models import compiled
 from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
@@ -266,7 +266,7 @@ def part_irradiance(frame: Frame, whole: Tensor, clamped: Tensor) -> Tensor:
     factor = 1 / frame.divisor
     if not torch.equal(whole, clamped):
         factor = factor * torch.where(whole == clamped, 1, clamped / torch.where(whole == 0, 1, whole))
-    return (frame.parts.unflatten(1, (-1, 3)) * factor[:, None]).flatten(1, 2).clamp_(-MAX_PART, MAX_PART)
+    return times_each(frame.parts, factor).clamp_(-MAX_PART, MAX_PART)
 
 
 class One(Denoiser):
@@ -358,5 +358,5 @@ class One(Denoiser):
         Kernels and weights of history are those of the whole, so parts that add up to the noisy light do so denoised.
         """
         assert isinstance(state, OneState) and frame.parts is not None
-        reflected = (state.part_output.unflatten(1, (-1, 3)) * frame.divisor[:, None]).flatten(1, 2)
+        reflected = times_each(state.part_output, frame.divisor)
         return reflected if frame.surface is None else torch.where(frame.surface > 0, reflected, frame.parts)

@@ -77,10 +77,56 @@ def test_what_was_hidden_begins_anew_and_background_is_left_alone():
     torch.testing.assert_close(frame.direct, now.direct)
 
 
-def test_frames_without_motion_are_themselves():
-    frame = frame_of_edge(0, coverage(0))
-    still = replace(frame, channels={name: t for name, t in frame.channels.items() if name != "motion"})
-    assert AlbedoMean().add(still) is still
+def test_all_reflected_light_follows_the_albedo():
+    """Sample buffers and parts of the light, too: what is divided by the new albedo must contain it."""
+    average = AlbedoMean()
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        frame = frame_of_edge(number, sampled(number, rng))
+        buffers = torch.stack([0.5 * frame.direct, 1.5 * frame.direct], dim=1)
+        parts = torch.cat([0.25 * frame.direct, 0.75 * frame.direct], dim=1)
+        frame = average.add(replace(frame.with_channels({"direct_buffers": buffers}), parts=parts))
+    assert not torch.equal(frame.albedo, frame_of_edge(2, coverage(2)).albedo)
+    torch.testing.assert_close(frame.direct_buffers.mean(dim=1), frame.direct)
+    torch.testing.assert_close(frame.parts[:, :3] + frame.parts[:, 3:], frame.direct)
+    torch.testing.assert_close(frame.direct, 2 * frame.albedo)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (3, 2)])
+def test_extremes(size):
+    average = AlbedoMean()
+    for motion in (0.0, 1e30, -65504.0):
+        frame = flat_frame(*size).with_channels({"motion": torch.full((1, 2, *size), motion)})
+        frame.albedo[:] = torch.tensor([0.0, 1.0, 0.5]).view(1, 3, 1, 1)
+        torch.testing.assert_close(average.add(frame).albedo, frame.albedo)
+
+
+def test_without_motion_nothing_is_averaged_nor_said_to_be(spheres, tmp_path, capsys):
+    foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
+    for albedo in ("sampled", "exact"):
+        denoise(Job((str(tmp_path / "in" / "*.exr"),), "noisy", tmp_path / albedo, albedo=albedo))
+    assert "averaged" not in capsys.readouterr().out
+    for path in sorted((tmp_path / "exact").glob("*.exr")):
+        expected, actual = foreign.read(path), foreign.read(tmp_path / "sampled" / path.name)
+        assert all(np.array_equal(actual[name], plane, equal_nan=True) for name, plane in expected.items())
+
+
+def test_lights_of_a_sampled_albedo_add_up(spheres, tmp_path):
+    """Two light groups beside Cycles' passes, denoised with the colour."""
+    for index, frame in enumerate(spheres):
+        layers = foreign.blender(frame)
+        image = layers["ViewLayer.Noisy Image.RGBA"][..., :3]
+        lights = {"ViewLayer.Key.RGB": 0.25 * image, "ViewLayer.Fill.RGB": 0.75 * image}
+        rng = np.random.default_rng(index)
+        layers["ViewLayer.Denoising Albedo.RGB"] *= rng.uniform(0.8, 1, (*image.shape[:2], 1))
+        foreign.write(tmp_path / "in" / f"{index}.exr", layers | lights)
+    job = Job((str(tmp_path / "in" / "*.exr"),), "one", tmp_path / "out", aov=("ViewLayer.Key", "ViewLayer.Fill"))
+    denoise(job)
+    for path in sorted((tmp_path / "out").glob("*.exr")):
+        planes = foreign.read(path)
+        for c in "RGB":
+            summed = planes[f"ViewLayer.Key.{c}"] + planes[f"ViewLayer.Fill.{c}"]
+            np.testing.assert_allclose(summed, planes[f"ViewLayer.Combined.{c}"], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("albedo", "is_averaged"), [(None, True), ("sampled", True), ("exact", False)])
