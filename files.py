@@ -5,12 +5,18 @@ import fcntl
 import io
 import json
 import os
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from errors import BadInput
+
+
+def crc32_of(path: Path) -> str:
+    """The checksum of a file, 8 hex digits."""
+    return f"{zlib.crc32(path.read_bytes()):08x}"
 
 
 def cache_folder() -> Path:

@@ -46,10 +46,10 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
         "generator": facts["generator"],
         "versions": facts["versions"],
         "options": facts["options"],
-        "licence": "that of its scene file" if facts["source"] else "CC0-1.0",
+        "licence": licence_of(facts),
         "source": {Path(path).name: crc32 for path, crc32 in facts["source"].items()},
         "notes": facts["notes"],
-        "models": {name: models[name] for name in ("files", "credits") if models},
+        "models": models,
         "scenes": facts["scenes"],
         "bytes": sum(clip["bytes"] for clip in clips.values()),
         "splits": {split: split_facts([clips[f"{split}/{name}"] for name in facts["splits"][split]]) for split in used},
@@ -64,6 +64,13 @@ def card_of(dataset: Dataset) -> dict[str, Any]:
         },
         "clips": clips,
     }
+
+
+def licence_of(facts: dict[str, Any]) -> str:
+    """Of the images: that of what they show, where it is not ours."""
+    if facts["source"]:
+        return "that of its scene file"
+    return "CC0-1.0, but for pictures of furniture, see below" if facts.get("models") else "CC0-1.0"
 
 
 def clip_facts(clip: Clip) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import re
 import resource
-import zlib
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS, MIRRORED, NOISY_CHANNELS, SECOND, SECOND_LAYER
 from errors import BadInput
-from files import read_json
+from files import crc32_of, read_json
 from scenes.camera import View, motion_vectors, pixel_centres
 
 SCHEMA = 1
@@ -97,7 +96,7 @@ class Clip:
     @property
     def fingerprint(self) -> str:
         """The checksum (crc32, 8 hex digits) of clip.json, which contains those of all channels."""
-        checksum = f"{zlib.crc32((self.path / 'clip.json').read_bytes()):08x}"
+        checksum = crc32_of(self.path / "clip.json")
         return f"{checksum}-first-hits" if self.first_hits else checksum
 
     @property

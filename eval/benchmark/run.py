@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import tomllib
-import zlib
 from collections.abc import Sequence
 from functools import partial
 from importlib import resources
@@ -22,7 +21,7 @@ from eval.harness import evaluate
 from eval.results import by_signal, read_results
 from eval.selection import cannot_run, choose, evaluated, untrained
 from eval.tables import PRINTED, means_by_age
-from files import write_file, write_json
+from files import crc32_of, write_file, write_json
 from models.registry import channels_read, parse_name
 from render.job.generate import generate
 from render.job.profiles import BENCHMARK_SCENES, JUDGED
@@ -47,10 +46,6 @@ def scene_file(scenes: Path, name: str) -> Path | None:
     """The file of a scene, whose folder may also have `_` for `-` in its name; None where it is not there."""
     folders = dict.fromkeys((name, name.replace("-", "_")))
     return next((path for folder in folders for file in FILES if (path := scenes / folder / file).exists()), None)
-
-
-def crc32_of(file: Path) -> str:
-    return f"{zlib.crc32(file.read_bytes()):08x}"
 
 
 def same_file(name: str, file: Path) -> str:

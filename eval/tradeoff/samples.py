@@ -39,8 +39,7 @@ def scene_of(clip: Clip, dataset: Dataset) -> tuple[Scene, int]:
     if dataset.facts["generator"] != GENERATOR:
         raise BadInput(f"{dataset.path} was rendered by another version: render it again with `onespp dataset`")
     check_versions(dataset)
-    models = dataset.facts.get("models", {})
-    profile = profile_of(dataset.facts["profile"], models.get("folder", ""))
+    profile = profile_of(dataset.facts["profile"])
     if source_of(profile) != dataset.facts.get("source", {}):
         raise BadInput(f"{dataset.path} was rendered from another {profile.own}: render it again with `onespp dataset`")
     return scene_of_clip(clip.path, profile, dataset.facts["seed"])

@@ -50,7 +50,7 @@ def generate(
     share_of([], part)
     dataset = begun(root, profile, seed, reads, options, models)
     missing = [clip for clip in share_of(dataset.planned(), part) if not is_clip(clip)]
-    rendered = render_clips(missing, dataset) if missing else 0
+    rendered = render_clips(missing, dataset, models) if missing else 0
     write_card(dataset)
     return rendered
 
@@ -77,7 +77,7 @@ def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Op
     if not facts.exists():
         write_json(facts, wanted)
     dataset = Dataset(root)
-    for key in ("profile", "seed", "generator", "splits", "channels", "options", "source", "models"):
+    for key in ("profile", "seed", "generator", "models", "splits", "channels", "options", "source"):
         if dataset.facts.get(key, {}) != wanted[key]:
             raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
     return dataset
@@ -95,7 +95,7 @@ def check_versions(dataset: Dataset) -> None:
         raise BadInput(f"{dataset.path} was begun with {'; '.join(changed)}: install those or start a new folder")
 
 
-def render_clips(clips: Sequence[Path], dataset: Dataset) -> int:
+def render_clips(clips: Sequence[Path], dataset: Dataset, models: str = "") -> int:
     """Render clips unless other processes render them or have done so. Returns how many were rendered.
 
     Reports the others. Raises BadInput at the end if the renderer failed for any, OSError at once: a full disk concerns
@@ -103,7 +103,7 @@ def render_clips(clips: Sequence[Path], dataset: Dataset) -> int:
     """
     check_versions(dataset)
     facts = dataset.facts
-    profile = profile_of(facts["profile"], facts.get("models", {}).get("folder", ""))
+    profile = profile_of(facts["profile"], models)
     seed, options = facts["seed"], Options(**facts["options"])
     rendered, failures = 0, []
     for clip in tqdm(clips, "clips", unit="clip"):

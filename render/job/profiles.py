@@ -1,7 +1,6 @@
 """Data profiles: which clips a dataset has, and how well they are sampled."""
 
 import re
-import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ from msgspec.structs import asdict
 
 from datasets.clip import SPLITS
 from errors import BadInput
+from files import crc32_of
 from render.scene_file.description import read_description
 from scenes.glass import SETTINGS
 from scenes.objects.library import open_libraries
@@ -43,6 +43,12 @@ JUDGED = (0, 4, 15, 16, 31, 32, 47, 48)
 BENCHMARK_SCENES = ("room-3000", "room-3001", "room-3002", "glass-table", "glass-vitrine")
 TEST_OF_SMALL_ROOMS = SamplingQuality(1, reference_spp=64, floor=40, most_spp=256, skips_noisy_rooms=True)
 
+RELEASE_QUALITY = {
+    "train": SamplingQuality(realisations=8, reference_spp=32),
+    "val": SamplingQuality(realisations=8, reference_spp=64),
+    "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
+}
+
 DATA_PROFILES = {
     "tiny": DataProfile(
         size=(8, 64, 64),
@@ -69,11 +75,7 @@ DATA_PROFILES = {
         boxes={"test": 1},
         rooms={"train": 128, "val": 8, "test": 6},
         closeups={"train": 128, "val": 4},
-        quality={
-            "train": SamplingQuality(realisations=8, reference_spp=32),
-            "val": SamplingQuality(realisations=8, reference_spp=64),
-            "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
-        },
+        quality=RELEASE_QUALITY,
         special={"test": [f"cornell_box_moving/{clip}" for clip in ("still", "000-4spp", "000-64spp", "000-256spp")]},
     ),
     # The same at the size that other people's trainers want: the default loss of OIDN's needs more than 160 px.
@@ -81,11 +83,7 @@ DATA_PROFILES = {
         size=(12, 256, 256),
         rooms={"train": 128, "val": 8, "test": 6},
         closeups={"train": 128, "val": 4},
-        quality={
-            "train": SamplingQuality(realisations=8, reference_spp=32),
-            "val": SamplingQuality(realisations=8, reference_spp=64),
-            "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
-        },
+        quality=RELEASE_QUALITY,
     ),
     # Scenes that no training uses, at a size at which people look, until the history is steady.
     "benchmark": DataProfile(
@@ -127,21 +125,21 @@ def source_of(profile: DataProfile) -> dict[str, str]:
         return {}
     files = [profile.own, profile.own.parent / read_description(profile.own).file]
     try:
-        return {str(file): f"{zlib.crc32(file.read_bytes()):08x}" for file in files}
+        return {str(file): crc32_of(file) for file in files}
     except OSError as error:
         raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
 
 
 def furniture_of(profile: DataProfile) -> dict[str, Any]:
-    """The furniture libraries of a profile: their folder, files with crc32, and credits; else nothing.
+    """The furniture libraries of a profile: their files with crc32, and credits; else nothing.
 
     Raises BadInput where the folder has none.
     """
     if profile.models is None:
         return {}
     libraries = open_libraries(profile.models)
-    files = {library.file.name: f"{zlib.crc32(library.file.read_bytes()):08x}" for library in libraries}
-    return {"folder": str(profile.models), "files": files, "credits": [library.credit() for library in libraries]}
+    files = {library.file.name: crc32_of(library.file) for library in libraries}
+    return {"files": files, "credits": [library.credit() for library in libraries]}
 
 
 def profile_of(name: str, models: str = "") -> DataProfile:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 import trimesh
 
-from errors import BadInput
+from errors import BadInput, requires_extra
 from scenes.camera import Array
 from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, Bsdf, bitmap, diffuse_bsdf, rgb, srgb_to_linear
 from scenes.draws import Rng, log_uniform, one_of
@@ -89,6 +90,8 @@ def usable(entry: dict[str, str], archive: ZipFile) -> bool:
 
 def open_library(file: Path) -> Library:
     """The catalogue of a .sh3f file. Raises BadInput, naming the file, where it has none."""
+    with requires_extra("report"):
+        import PIL.Image  # noqa: F401 - without it trimesh would leave out textures
     try:
         with ZipFile(file) as archive:
             found = entries(archive.read(CATALOGUE).decode("latin-1"))
@@ -207,13 +210,13 @@ def make_piece(rng: Rng, pieces: Sequence[Piece]) -> Thing:
         piece = one_of(rng, pieces)
         try:
             parts = model_of(piece)
-        except (ValueError, IndexError, KeyError, TypeError, AttributeError, OSError):
+        except (ValueError, IndexError, KeyError, TypeError, AttributeError, OSError, BadZipFile):
             continue  # models of all kinds of tools: those that trimesh cannot read are passed over
         width, _, depth = piece.size
         supports = [top_support(width, depth, piece.support, margin=0.15 * min(width, depth))] if piece.support else []
         thing = standing(Path(piece.model).stem, {name: [surface] for name, (surface, _) in parts.items()})
         materials = {name: material_of_obj(rng, name, material) for name, (_, material) in parts.items()}
-        return Thing(thing.name, thing.parts, supports, materials)
+        return replace(thing, supports=supports, materials=materials)
     raise ValueError(f"none of {ATTEMPTS} pieces of {pieces[0].library.parent} can be used")
 
 

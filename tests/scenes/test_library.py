@@ -1,6 +1,7 @@
 """Furniture from libraries that the tests write: sizes, materials, what is passed over, and the rooms made of it."""
 
 import io
+import shutil
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -8,7 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from datasets.card import licence_of
+from datasets.channels import USUAL_CHANNELS
 from errors import BadInput
+from render.clip import NO_OPTIONS
+from render.job.generate import begun
 from render.job.plan import plan
 from scenes.colours import srgb_to_linear
 from scenes.objects.library import make_piece, model_of, open_libraries, open_library
@@ -150,3 +155,18 @@ def test_training_rooms_are_furnished_and_test_rooms_are_not(libraries: Path):
     assert all(name.startswith("room-") for name in made["splits"]["test"])
     assert made["models"]["credits"] == ["furniture of test.sh3f (CC0), by Ada"]
     assert plan("rooms-2x4", 0)["models"] == {}
+
+
+def test_a_dataset_may_be_rendered_from_copies_of_the_libraries(libraries: Path, tmp_path: Path):
+    """Machines that share a folder may have them in different places; others than it was begun with are refused."""
+    root, copies = tmp_path / "data", tmp_path / "copies"
+    shutil.copytree(libraries, copies, ignore=shutil.ignore_patterns("data", "copies"))
+    for folder in (libraries, copies):
+        assert begun(root, "release", 0, USUAL_CHANNELS, NO_OPTIONS, str(folder)).facts["models"]
+    with pytest.raises(BadInput, match="another models"):
+        begun(root, "release", 0, USUAL_CHANNELS, NO_OPTIONS)
+
+
+def test_the_card_has_another_licence_for_pictures_of_furniture(libraries: Path):
+    facts = plan("release", 0, models=str(libraries))
+    assert licence_of(facts).startswith("CC0-1.0, but") and licence_of(plan("release", 0)) == "CC0-1.0"
