@@ -16,7 +16,7 @@ from tqdm import tqdm
 from datasets.clip import Clip
 from datasets.frame import Frame, Signal, disoccluded, read_frame, to_tensor
 from datasets.tonemap import display
-from eval.comparison import Comparison, Luminances
+from eval.comparison import Comparison, Previous
 from eval.metrics import Values, mean_floor, means, measure, noise_floors, temporal_error_floor
 from eval.results import MAX_SHOWN_ERROR, NOISE_FLOOR, Result, picture_path, result_key, save_picture
 from models.denoiser import Denoiser, State
@@ -66,7 +66,7 @@ class NamedDenoiser:
 class DenoiserRun:
     evaluated: NamedDenoiser
     state: State | None = None
-    before: Luminances | None = None
+    before: Previous | None = None
     frames: list[Values] = field(default_factory=list)
     nonfinite: int = 0
     error: Tensor | None = None  # estimated for the last frame, (1, H, W), in radiance
@@ -133,7 +133,7 @@ class ReferenceRun:
     signal: Signal
     name: str = NOISE_FLOOR
     reads: tuple[str, ...] = ()
-    before: Luminances | None = None
+    before: Previous | None = None
     frames: list[Values] = field(default_factory=list)
     crops: list[dict[str, int]] = field(default_factory=list)
 
@@ -193,7 +193,7 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
                 continue
             comparison = Comparison(output, reference, clip.exposure, hidden, run.before, still, frame.motion)
             run.frames.append(run.values(comparison))
-            run.before = comparison.luminances
+            run.before = comparison.as_previous()
             save_picture(picture_path(folder, index), as_displayed(output, clip.exposure))
             if isinstance(run, DenoiserRun) and run.error is not None:
                 error = (clip.exposure * run.error)[0].numpy() / MAX_SHOWN_ERROR

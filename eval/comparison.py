@@ -18,6 +18,14 @@ class Luminances(NamedTuple):
     buffers: Tensor
 
 
+class Previous(NamedTuple):
+    """What temporal metrics need of the frame before."""
+
+    luminances: Luminances
+    error: Tensor  # of the displayed output, (1, 3, H, W)
+    noise: Tensor  # of the displayed reference, (1, 3, H, W)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """A denoised frame, its reference and the previous frame. Images are float64."""
@@ -27,7 +35,7 @@ class Comparison:
     exposure: float  # the clip's
     # the pixels (1, 1, H, W) that were hidden in the previous frame; None where unknown
     disoccluded: Tensor | None = None
-    before: Luminances | None = None  # luminances of the previous frame; None on the first one
+    before: Previous | None = None  # None on the first frame
     still: bool = False  # whether nothing moves in the clip
     motion: Tensor | None = None  # from a pixel to where its surface was in the previous frame, (1, 2, H, W) in px
 
@@ -69,9 +77,14 @@ class Comparison:
         return self.exposure * (self.buffers[0] - self.buffers[1]) / 2
 
     @cached_property
+    def error(self) -> Tensor:
+        """That of the displayed output, (1, 3, H, W)."""
+        return self.displayed - self.displayed_reference
+
+    @cached_property
     def mse(self) -> float:
         """Mean squared error of the displayed output."""
-        return (self.displayed - self.displayed_reference).square().mean().item()
+        return self.error.square().mean().item()
 
     @cached_property
     def noise_mse(self) -> float:
@@ -88,4 +101,8 @@ class Comparison:
         """Change of the luminances since the previous frame."""
         if self.before is None:
             return None
-        return Luminances(*(now - before for now, before in zip(self.luminances, self.before, strict=True)))
+        return Luminances(*(now - before for now, before in zip(self.luminances, self.before.luminances, strict=True)))
+
+    def as_previous(self) -> Previous:
+        """What the next frame's comparison needs of this one."""
+        return Previous(self.luminances, self.error, self.displayed_noise)

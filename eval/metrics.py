@@ -41,6 +41,11 @@ def root_two_times(floor: float) -> float:
     return math.sqrt(2) * floor
 
 
+def three_decibels_below(floor: float) -> float:
+    """Those of a PSNR add up as well."""
+    return floor - 10 * math.log10(2)
+
+
 @dataclass(frozen=True)
 class Metric:
     title: str  # its heading in tables
@@ -162,6 +167,15 @@ def temporal_error_floor(c: Comparison) -> float | None:
     return float((a - b).abs().mean()) / 2
 
 
+def temporal_psnr(c: Comparison) -> float | None:
+    """tPSNR, the PSNR of the change of the displayed error (Bálint et al. 2023, Noisebase); None on the first frame."""
+    return None if c.before is None else psnr(float((c.error - c.before.error).square().mean()))
+
+
+def temporal_psnr_floor(c: Comparison) -> float | None:
+    return None if c.before is None else psnr(float((c.displayed_noise - c.before.noise).square().mean()))
+
+
 def mean_block_change(c: Comparison, error_of: Callable[[Luminances], Tensor]) -> float | None:
     """Mean absolute change of an error (1, 1, H, W) of luminances, in means over blocks of 16 x 16 pixels.
 
@@ -174,7 +188,7 @@ def mean_block_change(c: Comparison, error_of: Callable[[Luminances], Tensor]) -
     seen = (grid.abs() <= 1).all(dim=-1)[:, None]
     if c.disoccluded is not None:
         seen = seen & ~c.disoccluded
-    before = F.grid_sample(error_of(c.before), grid, padding_mode="border", align_corners=False)
+    before = F.grid_sample(error_of(c.before.luminances), grid, padding_mode="border", align_corners=False)
     change = (error_of(c.luminances) - before) * seen
     total, share = (F.avg_pool2d(image.double(), FLICKER_BLOCK, ceil_mode=True) for image in (change, seen))
     return float((total / share)[share > 0].abs().mean()) if seen.any() else None
@@ -238,7 +252,7 @@ METRICS = {
         more_is_better=True,
         of=lambda c: psnr(c.mse),
         floor=lambda c: psnr(c.noise_mse),
-        edge=lambda floor: floor - 10 * math.log10(2),
+        edge=three_decibels_below,
     ),
     "ssim": Metric(
         "SSIM",
@@ -253,6 +267,14 @@ METRICS = {
         "unbiased MSE", "{:.2e}", of=mse_unbiased, floor=mse_unbiased_error, edge=twice, floor_is_error=True
     ),
     "temporal_error": Metric("temporal error", "{:.4f}", of=temporal_error, floor=temporal_error_floor),
+    "tpsnr": Metric(
+        "tPSNR dB",
+        "{:.2f}",
+        more_is_better=True,
+        of=temporal_psnr,
+        floor=temporal_psnr_floor,
+        edge=three_decibels_below,
+    ),
     "disocclusion_l1": Metric(
         "disocclusion L1",
         "{:.4f}",

@@ -13,7 +13,7 @@ from models.registry import prototype
 
 PRINTED = (
     *("rmse", "psnr", "ssim", "flip", "mse_unbiased", "temporal_error", "disocclusion_l1"),
-    *("energy", "detail", "block_flicker"),
+    *("energy", "detail", "tpsnr", "block_flicker"),
 )
 NEAR_FLOOR = "≈"
 LEGEND = f"{NEAR_FLOOR} within the noise floor: as close to the truth as the reference; differences are not significant"

@@ -115,15 +115,20 @@ def flat(*displayed: float) -> torch.Tensor:
 
 def test_temporal_metrics_by_hand():
     first = Comparison(flat(0.2), flat(0.3, 0.3), 1.0, still=True)
-    assert all(METRICS[name].of(first) is None for name in ("temporal_error", "flicker"))
+    assert all(METRICS[name].of(first) is None for name in ("temporal_error", "tpsnr", "flicker"))
     assert temporal_error_floor(first) is None
-    second = Comparison(flat(0.5), flat(0.4, 0.4), 1.0, before=first.luminances, still=True)
+    second = Comparison(flat(0.5), flat(0.4, 0.4), 1.0, before=first.as_previous(), still=True)
     assert METRICS["temporal_error"].of(second) == pytest.approx(0.2, abs=1e-6)  # 0.3 of change against 0.1
     assert METRICS["flicker"].of(second) == pytest.approx(0.3, abs=1e-6)
     assert temporal_error_floor(second) == pytest.approx(0, abs=1e-7)
-    third = Comparison(flat(0.5), flat(0.5, 0.3), 1.0, before=second.luminances, still=False)
+    third = Comparison(flat(0.5), flat(0.5, 0.3), 1.0, before=second.as_previous(), still=False)
     assert temporal_error_floor(third) == pytest.approx(0.1, abs=1e-6)
     assert METRICS["flicker"].of(third) is None
+    assert METRICS["tpsnr"].of(second) == pytest.approx(-20 * math.log10(0.2), abs=1e-4)  # errors of -0.1, then 0.1
+    same = Comparison(flat(0.8), flat(0.7, 0.7), 1.0, before=second.as_previous())
+    assert METRICS["tpsnr"].of(same) == pytest.approx(100)  # 0.1 again
+    # Noise of 0, then of (0.5 - 0.3) / 2.
+    assert METRICS["tpsnr"].floor(third) == pytest.approx(-20 * math.log10(0.1), abs=1e-4)
 
 
 def test_disocclusion_counts_only_where_vectors_differ():
@@ -175,7 +180,7 @@ def test_blocks_flicker_where_their_means_change():
     flat = torch.full((1, 3, 64, 64), 0.3)
     blotch, noise = flat.clone(), flat + 0.01 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(0))
     blotch[..., 16:32, 32:48] *= 1.5
-    before, rest = Comparison(flat, buffers, 1.0).luminances, torch.zeros(1, 2, 64, 64)
+    before, rest = Comparison(flat, buffers, 1.0).as_previous(), torch.zeros(1, 2, 64, 64)
     values = [measure(Comparison(image, buffers, 1.0, None, before, motion=rest)) for image in (flat, noise, blotch)]
     still, white, grown = (value["block_flicker"] for value in values)
     change = float(display(torch.tensor(0.45), 1.0) - display(torch.tensor(0.3), 1.0))
@@ -193,7 +198,7 @@ def test_an_error_that_stays_on_a_surface_does_not_flicker():
     def moved(image: torch.Tensor) -> torch.Tensor:
         return torch.roll(image, (3, 5), (2, 3))
 
-    before = Comparison(wrong, truth.repeat(2, 1, 1, 1), 1.0).luminances
+    before = Comparison(wrong, truth.repeat(2, 1, 1, 1), 1.0).as_previous()
     arguments = (moved(wrong), moved(truth).repeat(2, 1, 1, 1), 1.0, None, before, False)
     motion = torch.tensor([-5.0, -3.0])[None, :, None, None].expand(1, 2, 80, 80)
     along, at_rest = (METRICS["block_flicker"].of(Comparison(*arguments, m)) for m in (motion, 0 * motion))
@@ -211,7 +216,7 @@ def test_block_flicker_pixel_by_pixel(size):
     before, now = (Comparison(image[:1], image[1:], 1.0) for image in images)
     found = Comparison(
         *(images[1][:1], images[1][1:], 1.0, torch.from_numpy(hidden)[None, None]),
-        *(before.luminances, False, torch.from_numpy(motion)[None].float()),
+        *(before.as_previous(), False, torch.from_numpy(motion)[None].float()),
     )
     errors, differences = [], []
     for each in (before.luminances, now.luminances):
@@ -294,7 +299,7 @@ def test_floors_at_the_extremes():
     floors = floors_of(black)
     assert floors.pop("psnr") == 100 and floors.pop("ssim") == pytest.approx(1)
     undefined = {name for name in floors if floors[name] is None}
-    assert undefined == {"disocclusion_l1", "temporal_error", "block_flicker", "energy"}
+    assert undefined == {"disocclusion_l1", "temporal_error", "tpsnr", "block_flicker", "energy"}
     assert {floors[name] for name in floors.keys() - undefined} == {0.0}
     one = floors_of(torch.tensor([0.2, 0.4])[:, None, None, None].expand(2, 3, 1, 1))
     assert one["ssim"] is None and one["rel_mse"] == pytest.approx(0.1**2 / (0.3**2 + 0.01))
