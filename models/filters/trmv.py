@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from datasets.frame import Frame
-from models.denoiser import State, matching_state
+from models.denoiser import Signal, State, matching_state
 from models.filters.atrous import ATROUS_STEPS
 from models.filters.neighbours import mesh_sums_9x9
 from models.filters.svgf import SVGF, Integrated, estimate_variance, integrate, irradiances, pack_geometry, svgf_levels
@@ -69,6 +69,7 @@ class TRMV(SVGF):
     """Filters direct and indirect irradiance separately, each within its own [min, max] since the last reset."""
 
     made_from = "abstract, accounts"
+    baseline_for: tuple[Signal, ...] = ("indirect",)
     reads: tuple[str, ...] = (*SVGF.reads, "roughness", "dual_motion", "shadow_motion", "reflection_motion")
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
