@@ -333,6 +333,25 @@ def denoise(job: Annotated[Job, arg(name="")], runs: Runs = RUNS, threads: Threa
         denoise_sequence(replace(job, weights=weights))
 
 
+def relight(
+    frames: Annotated[tuple[str, ...], Positional, arg(metavar="PATTERN...")],
+    lights: Annotated[tuple[str, ...], arg(metavar="LAYER...")],
+    out: Annotated[Path, arg(metavar="PAGE")] = Path("relight.html"),
+    frame_range: Annotated[str | None, arg(name="frames", metavar="A-B")] = None,
+) -> None:
+    """Write a page on which the denoised lights of a sequence are dimmed and coloured; one file that works offline.
+
+    Args:
+        frames: files that `onespp denoise --aov LAYER...` has written.
+        lights: the layers of lights, which add up to the picture.
+        frame_range: frame numbers to show.
+    """
+    from denoise.relight import write_relight_page
+
+    write_relight_page(frames, lights, out, frame_range)
+    print(out)
+
+
 def weights(
     name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="show the card of this network")] = None,
     card: Annotated[Path | None, arg(metavar="RUNS")] = None,
@@ -426,7 +445,7 @@ Commands = dict[str, "Command | Commands"]
 GROUPS: dict[str, Commands] = {
     "Pipeline": {"preview": preview, "dataset": dataset, "train": train, "eval": evaluate, "report": report},
     "Datasets": {"info": info, "verify": verify, "exr": exr, "import": import_},
-    "Your own frames": {"denoise": denoise, "weights": weights, "export": export},
+    "Your own frames": {"denoise": denoise, "relight": relight, "weights": weights, "export": export},
     "Comparisons": {
         "show": show,
         "trade": trade,

@@ -18,7 +18,6 @@ from tabulate import tabulate
 from errors import BadInput
 from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
-from eval.shipped import measured_file
 from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
@@ -190,12 +189,6 @@ def quality(metric: str, signal: str = "total") -> str:
         values = {title: rows[title][index].text(metric) for title in columns}
         lines.append({"denoiser": cell(row), "made from": row.made_from} | values)
     return table(lines)
-
-
-def shipped(metric: str, denoiser: str, network: str = "one") -> str:
-    """A mean from the card of a network."""
-    rows = read_json(measured_file(network))["means"]
-    return str(next(row[METRICS[metric].title] for row in rows if row["denoiser"] == denoiser))
 
 
 def timed_rows() -> list[dict[str, Any]]:
@@ -381,7 +374,7 @@ def minutes(what: str) -> str:
 GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
-        *(quality, shipped, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
+        *(quality, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
         *(ages, steady, where, rendering),
     )
 }

@@ -100,7 +100,7 @@ def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu"
 
 
 def baselines() -> tuple[str, ...]:
-    """The names of the denoisers with which those of total light are compared, also with what is evaluated after them."""
+    """The names of the denoisers with which those of total light are compared, and what is evaluated after them."""
     plain = [name for name in DENOISERS if "total" in prototype(name).baseline_for]
     return tuple(each for name in plain for each in (name, *(f"{name}+{s}" for s in prototype(name).evaluated_with)))
 

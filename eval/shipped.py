@@ -87,7 +87,8 @@ def measurements(name: str, runs: Path) -> dict[str, Any]:
         "device": results["device"],
         "versions": version_list(results["versions"]),
         "means": [
-            {"denoiser": row.denoiser, "made from": row.made_from} | {METRICS[metric].title: row.text(metric) for metric in PRINTED}
+            {"denoiser": row.denoiser, "made from": row.made_from}
+            | {METRICS[metric].title: row.text(metric) for metric in PRINTED}
             for row in mean_rows(alike)
         ],
         "psnr": [

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame
-from models.denoiser import Signal, State, matching_state
+from datasets.frame import Frame, Signal
+from models.denoiser import State, matching_state
 from models.filters.atrous import ATROUS_STEPS
 from models.filters.neighbours import mesh_sums_9x9
 from models.filters.svgf import SVGF, Integrated, estimate_variance, integrate, irradiances, pack_geometry, svgf_levels

@@ -3,11 +3,8 @@
 `python -m runtime.web CLIP PAGE [FRAMES]` writes it; by default with as many frames as fit into about 30 MB.
 """
 
-import base64
-import json
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +17,7 @@ from errors import BadInput
 from files import write_file
 from models.registry import prototype
 from runtime.raw import raw
+from web_page import deflated, filled, packed
 
 HERE = Path(__file__).parent
 MODULE = HERE / "onespp.wasm"
@@ -38,17 +36,6 @@ def module() -> bytes:
         reason = next(iter(error.stderr.splitlines()), "")
         raise BadInput(f"the runtime cannot be compiled to WebAssembly ({reason}): {REMEDY}") from None
     return MODULE.read_bytes()
-
-
-def deflated(content: bytes) -> str:
-    """In base64."""
-    return base64.b64encode(zlib.compress(content, 9)).decode()
-
-
-def packed(words: bytes) -> str:
-    """32-bit words as their differences, the lowest bytes of all first: so images deflate to a tenth and less."""
-    differences = np.diff(np.frombuffer(words, "<u4"), prepend=np.uint32(0))
-    return deflated(differences.view(np.uint8).reshape(-1, 4).T.tobytes())
 
 
 def page_frame(clip: Clip, index: int) -> dict[str, str | None]:
@@ -75,9 +62,8 @@ def page(clip: Clip, frames: int) -> str:
         "module": deflated(module()),
         "frames": [page_frame(clip, index) for index in range(frames)],
     }
-    html = (HERE / "page.html").read_text()
-    html = html.replace("/* WORKER */", (HERE / "worker.js").read_text())
-    return html.replace("/* CLIP */ null", json.dumps(content).replace("</", "<\\/"))
+    template = (HERE / "page.html").read_text().replace("/* WORKER */", (HERE / "worker.js").read_text())
+    return filled(template, content)
 
 
 def write_live_page(source: Path, path: Path, frames: int | None = None) -> None:
