@@ -20,7 +20,16 @@ from tests.eval.conftest import untrained
 
 KEYS = {
     *("mse", "rmse", "l1", "psnr", "ssim", "flip", "mse_unbiased", "smape", "rel_mse"),
-    *("temporal_error", "temporal_error_floor", "flicker", "disocclusion_l1", "energy", "detail", "block_flicker"),
+    *(
+        "temporal_error",
+        "temporal_error_floor",
+        "flicker",
+        "disocclusion_l1",
+        "energy",
+        "detail",
+        "tpsnr",
+        "block_flicker",
+    ),
 }
 ROWS = {
     *(("noisy", "total"), ("accumulated", "total"), ("eaw", "total")),

@@ -276,6 +276,7 @@ def files_of(step, folder):
     return run_onnx(folder / "step.onnx"), run_pt2(folder / "step.pt2")
 
 
+@pytest.mark.slow
 @each_kind
 def test_operators_are_named_alike_in_every_process(weights, tmp_path, name):
     """By words, without the addresses at which Python's functions are in memory."""

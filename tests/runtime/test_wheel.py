@@ -126,6 +126,7 @@ def test_the_wheel_is_small_and_serves_every_python(wheel):
     assert any(name.endswith("LICENSE") for name in names) and not any(name.endswith((".c", ".h")) for name in names)
 
 
+@pytest.mark.slow
 def test_a_source_distribution_has_all_it_needs(wheel, library, tmp_path):
     """As its manifest shows: what compiles the wheel lies below its folder."""
     command = [sys.executable, "setup.py", "-q", "sdist", "--formats=zip", "--dist-dir", str(tmp_path)]
