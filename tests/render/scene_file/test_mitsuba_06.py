@@ -176,10 +176,12 @@ OTHERS = {
     "default": ('<default name="n" value="4"/>' + integrator("path", values("integer", maxDepth="$n")), ""),
     "alias": ('<bsdf type="diffuse" id="a"/><alias id="a" as="b"/>' + shape("cube", '<ref id="b"/>'), ""),
 }
-IOR_CASES = {ior: (bsdf("dielectric", strings(intIOR=ior)), "") for ior in IORS.split(", ")}
-METAL_CASES = {metal: (bsdf("conductor", strings(material=metal)), "") for metal in METALS.split()}
-CASES: dict[str, tuple[str, str]] = {}
-for cases in (BSDFS, TEXTURES, IOR_CASES, METAL_CASES):
+NAMED = {
+    "iors": [bsdf("dielectric", strings(intIOR=ior)) for ior in IORS.split(", ")],
+    "metals": [bsdf("conductor", strings(material=metal)) for metal in METALS.split()],
+}
+CASES: dict[str, tuple[str, str]] = {name: (old_xml(*map(partial(shape, "sphere"), parts)), "") for name, parts in NAMED.items()}
+for cases in (BSDFS, TEXTURES):
     CASES |= {name: (old_xml(shape=painted(part)), words) for name, (part, words) in cases.items()}
 for cases in (SHAPES, OTHERS):
     CASES |= {name: (old_xml(part), words) for name, (part, words) in cases.items()}
