@@ -180,7 +180,9 @@ NAMED = {
     "iors": [bsdf("dielectric", strings(intIOR=ior)) for ior in IORS.split(", ")],
     "metals": [bsdf("conductor", strings(material=metal)) for metal in METALS.split()],
 }
-CASES: dict[str, tuple[str, str]] = {name: (old_xml(*map(partial(shape, "sphere"), parts)), "") for name, parts in NAMED.items()}
+CASES: dict[str, tuple[str, str]] = {
+    name: (old_xml(*map(partial(shape, "sphere"), parts)), "") for name, parts in NAMED.items()
+}
 for cases in (BSDFS, TEXTURES):
     CASES |= {name: (old_xml(shape=painted(part)), words) for name, (part, words) in cases.items()}
 for cases in (SHAPES, OTHERS):
