@@ -23,6 +23,8 @@ RGB9E5_BITS = 9
 RGB9E5_BIAS = 15
 RGB9E5_MAX = (1 - 2.0**-RGB9E5_BITS) * 2.0 ** (31 - RGB9E5_BIAS)
 
+MOST_PAGE_PIXELS = 100_000_000  # of all lights and frames; a browser takes four bytes for each
+
 
 def shared_exponents(radiance: NDArray[np.floating]) -> NDArray[np.uint32]:
     """Radiance (H, W, 3) as RGB9E5 (H, W): to within 1/1024 of the largest channel; negative and NaN become 0."""
@@ -36,13 +38,13 @@ def shared_exponents(radiance: NDArray[np.floating]) -> NDArray[np.uint32]:
     return red | green << RGB9E5_BITS | blue << 2 * RGB9E5_BITS | biased << 3 * RGB9E5_BITS
 
 
-def lights_of(path: Path, layers: Sequence[str], size: tuple[int, int] | None) -> list[NDArray[np.float32]]:
+def lights_of(path: Path, layers: Sequence[str], size: tuple[int, int]) -> list[NDArray[np.float32]]:
     """The radiance (H, W, 3) of the named layers of a file.
 
     Raises BadInput where one is missing or has a single channel, or the image is not (width, height) = `size`.
     """
     image = ExrImage(path)
-    if size and size != (image.width, image.height):
+    if size != (image.width, image.height):
         raise BadInput(f"{path} has {image.width} x {image.height} pixels, the frames before {size[0]} x {size[1]}")
     found = [part_layer(name, image) for name in layers]
     if single := [layer.name for layer in found if len(layer.channels) == 1]:
@@ -51,20 +53,30 @@ def lights_of(path: Path, layers: Sequence[str], size: tuple[int, int] | None) -
 
 
 def relit(patterns: Sequence[str], layers: Sequence[str], frames: str | None = None) -> dict[str, Any]:
-    """What the page shows: the layers' names, and packed frames by layer. Raises BadInput as `lights_of`."""
+    """What the page shows: the layers' names, and packed frames by layer.
+
+    Raises BadInput as `lights_of`, and for more frames than a browser could hold.
+    """
     files = [frame.passes[COLOUR] for frame in sequence_of({COLOUR: patterns}, frames)]
-    size: tuple[int, int] | None = None
-    exposure = 1.0
-    packs: list[list[str]] = []
-    for path in tqdm(files, "reading", unit="frame", leave=False):
-        lights = lights_of(path, layers, size)
-        if size is None:
-            height, width = lights[0].shape[:2]
-            size = (width, height)
-            exposure = clip_exposure(luminance(np.nan_to_num(np.sum(lights, axis=0))))
-        packs.append([packed(shared_exponents(light).tobytes()) for light in lights])
-    assert size
-    return {"layers": [*layers], "width": size[0], "height": size[1], "exposure": exposure, "frames": packs}
+    first = ExrImage(files[0], header_only=True)
+    size = first.width, first.height
+    pixels = len(layers) * first.width * first.height
+    if len(files) * pixels > MOST_PAGE_PIXELS:
+        most = max(1, MOST_PAGE_PIXELS // pixels)
+        raise BadInput(f"{len(files)} frames are too many for a page: show {most} of them with --frames A-B")
+    whole = np.sum(lights_of(files[0], layers, size), axis=0)
+    content = {
+        "layers": [*layers],
+        "width": size[0],
+        "height": size[1],
+        "exposure": clip_exposure(luminance(np.nan_to_num(whole))),
+    }
+    reading = tqdm(files, "reading", unit="frame", leave=False)
+    return content | {"frames": [packed_lights(lights_of(path, layers, size)) for path in reading]}
+
+
+def packed_lights(lights: Sequence[NDArray[np.float32]]) -> list[str]:
+    return [packed(shared_exponents(light).tobytes()) for light in lights]
 
 
 def write_relight_page(patterns: Sequence[str], layers: Sequence[str], out: Path, frames: str | None = None) -> None:

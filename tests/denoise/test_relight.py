@@ -15,6 +15,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from command_line import main
 from datasets.tonemap import clip_exposure, display, luminance
+from denoise import relight
 from denoise.relight import RGB9E5_MAX, shared_exponents
 from tests.helpers.browser import chromium, needs_browser, no_errors, set_media
 from tests.test_cli import fails
@@ -116,6 +117,13 @@ def test_the_page_adds_lights_as_they_are_set(browser, page, lights):
     find(By.ID, "play").click()
     WebDriverWait(browser, 20).until(lambda _: find(By.ID, "canvas").get_attribute("data-shown") == "0")
     assert no_errors(browser)
+
+
+def test_more_frames_than_a_browser_holds_are_refused(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(relight, "MOST_PAGE_PIXELS", 2 * 12 * 16 + 1)
+    arguments = ["relight", str(folder / "*.exr"), "--lights", *LIGHTS, "--out", str(tmp_path / "page.html")]
+    assert "2 frames are too many for a page: show 1 of them with --frames A-B" in fails(capsys, *arguments)
+    main([*arguments, "--frames", "1"])
 
 
 def test_what_is_no_light_is_refused(folder, tmp_path, capsys):
