@@ -21,7 +21,8 @@ def packed(words: bytes) -> str:
 
 
 def filled(template: str, data: Any) -> str:
-    """A template with JSON in place of `/* DATA */ null`, and the functions that unpack what is packed in it."""
-    unpacking = resources.files("web_page").joinpath("unpack.js").read_text()
-    page = template.replace("/* UNPACK */", unpacking)
+    """A template with JSON in place of `/* DATA */ null`, our style, and the functions that unpack what is packed."""
+    files = resources.files("web_page")
+    page = template.replace("/* STYLE */", files.joinpath("style.css").read_text())
+    page = page.replace("/* UNPACK */", files.joinpath("unpack.js").read_text())
     return page.replace("/* DATA */ null", json.dumps(data).replace("</", "<\\/"))

@@ -1,6 +1,5 @@
 """A page on which a person compares two unnamed denoisers, clip by clip."""
 
-import json
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -14,6 +13,7 @@ from eval.selection import evaluated
 from files import write_file
 from models.spec import DenoiserSpec
 from plotting import webp_uri
+from web_page import filled
 
 QUALITY = 92  # of the lossy WebP of a frame
 
@@ -43,9 +43,9 @@ def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget:
         for folder in data
         for clip in Dataset(folder).clips("test")
     ]
-    content = json.dumps({"denoisers": [spec.name for spec in specs], "clips": clips})
+    content = {"denoisers": [spec.name for spec in specs], "clips": clips}
     template = resources.files("eval.benchmark").joinpath("page.html").read_text()
     path = runs / "compare.html"
     runs.mkdir(parents=True, exist_ok=True)
-    write_file(path, template.replace("/* DATA */ null", content).encode())
+    write_file(path, filled(template, content).encode())
     return path
