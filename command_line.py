@@ -339,7 +339,7 @@ def relight(
     out: Annotated[Path, arg(metavar="PAGE")] = Path("relight.html"),
     frame_range: Annotated[str | None, arg(name="frames", metavar="A-B")] = None,
 ) -> None:
-    """Write a page on which the denoised lights of a sequence are dimmed and coloured; one file that works offline.
+    """Write a page that dims and tints the denoised lights of a sequence: one file that works offline.
 
     Args:
         frames: files that `onespp denoise --aov LAYER...` has written.

@@ -23,7 +23,13 @@ class Previous(NamedTuple):
 
     luminances: Luminances
     error: Tensor  # of the displayed output, (1, 3, H, W)
-    noise: Tensor  # of the displayed reference, (1, 3, H, W)
+    reference_buffers: Tensor
+
+
+def half_difference(buffers: Tensor) -> Tensor:
+    """(A - B) / 2 of two images (2, 3, H, W)."""
+    a, b = buffers.split(1)
+    return (a - b) / 2
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,7 @@ class Comparison:
     @cached_property
     def displayed_noise(self) -> Tensor:
         """(A - B) / 2 of the displayed buffers, (1, 3, H, W): distributed as the error of the reference."""
-        a, b = self.displayed_buffers.split(1)
-        return (a - b) / 2
+        return half_difference(self.displayed_buffers)
 
     @cached_property
     def noise(self) -> Tensor:
@@ -103,6 +108,11 @@ class Comparison:
             return None
         return Luminances(*(now - before for now, before in zip(self.luminances, self.before.luminances, strict=True)))
 
+    @cached_property
+    def displayed_noise_before(self) -> Tensor | None:
+        """`displayed_noise` of the previous frame; None on the first one."""
+        return self.before and half_difference(display(self.before.reference_buffers.double(), self.exposure))
+
     def as_previous(self) -> Previous:
         """What the next frame's comparison needs of this one."""
-        return Previous(self.luminances, self.error, self.displayed_noise)
+        return Previous(self.luminances, self.error, self.reference_buffers)

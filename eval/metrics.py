@@ -167,13 +167,9 @@ def temporal_error_floor(c: Comparison) -> float | None:
     return float((a - b).abs().mean()) / 2
 
 
-def temporal_psnr(c: Comparison) -> float | None:
-    """tPSNR, the PSNR of the change of the displayed error (Bálint et al. 2023, Noisebase); None on the first frame."""
-    return None if c.before is None else psnr(float((c.error - c.before.error).square().mean()))
-
-
-def temporal_psnr_floor(c: Comparison) -> float | None:
-    return None if c.before is None else psnr(float((c.displayed_noise - c.before.noise).square().mean()))
+def temporal_psnr(error: Tensor, before: Tensor | None) -> float | None:
+    """tPSNR, the PSNR of the change of a displayed error (Bálint et al. 2023, Noisebase); None on the first frame."""
+    return None if before is None else psnr(float((error - before).square().mean()))
 
 
 def mean_block_change(c: Comparison, error_of: Callable[[Luminances], Tensor]) -> float | None:
@@ -271,8 +267,8 @@ METRICS = {
         "tPSNR dB",
         "{:.2f}",
         more_is_better=True,
-        of=temporal_psnr,
-        floor=temporal_psnr_floor,
+        of=lambda c: temporal_psnr(c.error, c.before and c.before.error),
+        floor=lambda c: temporal_psnr(c.displayed_noise, c.displayed_noise_before),
         edge=three_decibels_below,
     ),
     "disocclusion_l1": Metric(

@@ -74,12 +74,15 @@ def weights_of(name: DenoiserName, runs: Path) -> Path | None:
     return weights_file(name, runs, USUAL_BUDGET)
 
 
+def with_suffixes(base: str) -> list[str]:
+    """The names under which a denoiser is evaluated with wrappers."""
+    return [f"{base}+{suffix}" for suffix in prototype(base).evaluated_with]
+
+
 def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
     """All denoisers, then those with wrappers; networks with shipped weights and with those trained in `budget`."""
     plain = [DenoiserName(base) for base in DENOISERS]
-    wrapped = [
-        replace(name, wrappers=tuple(suffix.split("+"))) for name in plain for suffix in prototype(name).evaluated_with
-    ]
+    wrapped = [parse_name(each) for base in DENOISERS for each in with_suffixes(base)]
     for name in (*plain, *wrapped):
         yield name
         trained = replace(name, budget=budget)
@@ -102,7 +105,7 @@ def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu"
 def baselines() -> tuple[str, ...]:
     """The names of the denoisers with which those of total light are compared, and what is evaluated after them."""
     plain = [name for name in DENOISERS if "total" in prototype(name).baseline_for]
-    return tuple(each for name in plain for each in (name, *(f"{name}+{s}" for s in prototype(name).evaluated_with)))
+    return tuple(each for name in plain for each in (name, *with_suffixes(name)))
 
 
 def with_indirect_baselines(specs: Sequence[DenoiserSpec]) -> list[DenoiserSpec]:

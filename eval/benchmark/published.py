@@ -15,7 +15,7 @@ from datasets.frame import to_tensor
 from datasets.tonemap import DISPLAY_GAMMA, psnr
 from errors import BadInput
 from eval.clip_run import play
-from eval.metrics import flip, ssim
+from eval.metrics import flip, ssim, temporal_psnr
 from eval.selection import evaluated
 from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
@@ -89,9 +89,8 @@ def scores(clip: Clip, spec: DenoiserSpec, protocol: Protocol) -> list[list[floa
         reference = to_tensor(clip.reference(index).mean(axis=0))
         x, y = as_file(output, protocol), as_file(reference, protocol)
         error = x - y
-        change = None if before is None else psnr(float((error - before).square().mean()))
         similarity = ssim(image_luminance(x**DISPLAY_GAMMA), image_luminance(y**DISPLAY_GAMMA))  # of linear luminance
-        rows.append([psnr(float(error.square().mean())), similarity, flip(x, y), change])
+        rows.append([psnr(float(error.square().mean())), similarity, flip(x, y), temporal_psnr(error, before)])
         before = error
     return rows
 

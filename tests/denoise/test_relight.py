@@ -126,6 +126,26 @@ def test_more_frames_than_a_browser_holds_are_refused(folder, tmp_path, capsys, 
     main([*arguments, "--frames", "1"])
 
 
+def written(folder, name: str, image: np.ndarray) -> str:
+    """A file with `image` (H, W, 3) as both lights."""
+    channels = {f"{light}.{c}": image[..., i].astype(np.float32) for light in LIGHTS for i, c in enumerate("RGB")}
+    OpenEXR.File({}, channels).write(str(folder / name))
+    return str(folder / name)
+
+
+@pytest.mark.parametrize("image", [np.zeros((1, 1, 3)), np.full((1, 2, 3), 65504.0), np.full((2, 1, 3), np.nan)])
+def test_images_of_one_value(tmp_path, image):
+    content = relight.relit([written(tmp_path, "1.exr", image)], LIGHTS)
+    assert (content["height"], content["width"]) == image.shape[:2] and 0 < content["exposure"] <= 1
+
+
+def test_a_pixel_that_is_infinite_leaves_the_exposure_to_the_others(tmp_path):
+    image = np.full((64, 64, 3), 0.5)
+    plain = relight.relit([written(tmp_path, "1.exr", image)], LIGHTS)["exposure"]
+    image[3, 4] = np.inf
+    assert relight.relit([written(tmp_path, "2.exr", image)], LIGHTS)["exposure"] == pytest.approx(plain, rel=0.01)
+
+
 def test_what_is_no_light_is_refused(folder, tmp_path, capsys):
     out = tmp_path / "page.html"
     for names, message in (
@@ -134,8 +154,7 @@ def test_what_is_no_light_is_refused(folder, tmp_path, capsys):
         (["key", "key"], "name the lights' layers, each once"),
     ):
         assert message in fails(capsys, "relight", str(folder / "*.exr"), "--lights", *names, "--out", str(out))
-    channels = {f"{name}.{c}": np.zeros((4, 4), np.float32) for name in LIGHTS for c in "RGB"}
-    OpenEXR.File({}, channels).write(str(tmp_path / "lit.9.exr"))
-    arguments = [str(folder / "*.exr"), str(tmp_path / "lit.9.exr"), "--lights", *LIGHTS, "--out", str(out)]
+    small = written(tmp_path, "lit.9.exr", np.zeros((4, 4, 3)))
+    arguments = [str(folder / "*.exr"), small, "--lights", *LIGHTS, "--out", str(out)]
     assert "lit.9.exr has 4 x 4 pixels, the frames before 16 x 12" in fails(capsys, "relight", *arguments)
     assert not out.exists()
