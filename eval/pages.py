@@ -25,6 +25,7 @@ from provenance import ROOT, device_in_words
 
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+RUNTIME_PAGE = ROOT / "runtime" / "README.md"
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
 GLASS_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
 STEADY_FRAME = 15  # that of the benchmark: history no longer grows
@@ -127,6 +128,7 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
     "times": ("make", extract_times),
     "benchmark": ("onespp benchmark run --scenes DIR", extract_benchmark),
     "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),
+    "runtime": ("python -m runtime.measure", extract_keys("runtime/results.json", "device", "size", "rows")),
 }
 
 
@@ -355,6 +357,27 @@ def stress() -> str:
     return f"{text} The largest violation of a range by the others is {worst:.1g}.\n{table(lines) if lines else ''}"
 
 
+def form_table(rows: list[dict[str, Any]]) -> str:
+    """What each form of `one` takes, from rows of python -m runtime.measure."""
+    [baseline] = (row["ms"] for row in rows if row["form"] == "oidn")
+    lines = [
+        {
+            "form": row["form"],
+            "MB to install": f"{row['megabytes']:.3g}",
+            "s to build": "-" if row["build_seconds"] is None else f"{row['build_seconds']:.0f}",
+            "ms": f"{row['ms']:.0f}",
+            "times oidn": f"{row['ms'] / baseline:.2f}",
+            "peak MB": "-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}",
+        }
+        for row in rows
+    ]
+    return table(lines)
+
+
+def forms() -> str:
+    return form_table(measured("runtime")["rows"])
+
+
 def device(name: str) -> str:
     """What a source was measured on."""
     return str(measured(name)["device"])
@@ -375,7 +398,7 @@ GENERATORS: dict[str, Callable[..., str]] = {
     f.__name__: f
     for f in (
         *(quality, times, milliseconds, metrics, samples, front, glass, stress, device, size, minutes),
-        *(ages, steady, where, rendering),
+        *(ages, steady, where, rendering, forms),
     )
 }
 
@@ -401,7 +424,7 @@ def generated(page: str) -> str:
 def main(arguments: list[str]) -> None:
     for runs in arguments:
         collect(Path(runs))
-    for page in PAGES:
+    for page in (*PAGES, RUNTIME_PAGE):
         text = page.read_text()
         if (new := generated(text)) != text:
             write_file(page, new.encode())

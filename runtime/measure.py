@@ -1,0 +1,220 @@
+"""Size, time to build, milliseconds and memory of each form of `one`, beside OIDN, in one run.
+
+`python -m runtime.measure [WxH [RUNS]]` prints a table and writes RUNS/runtime/results.json; by default 1280x720 and
+runs. It needs a C compiler, onespp[export] and onespp[oidn]. WebAssembly is left out without Clang for it or Node.js.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import distribution
+from pathlib import Path
+from shutil import copyfile, copytree, ignore_patterns, which
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from datasets.frame import Frame
+from errors import BadInput
+from eval.bench.denoisers import FEWEST_FRAMES, TIMED_FRAMES, WARM_UP_FRAMES, parse_size, size_name
+from eval.bench.memory import alone, growth_mb
+from eval.bench.synthetic_frames import synthetic_frame
+from eval.pages import form_table
+from files import write_json
+from models.export.package import load_step
+from models.export.program import play, run_onnx, trace, write_onnx
+from models.registry import require_shipped, shipped_weights
+from models.spec import DenoiserSpec, fastest_precision
+from process import keep_freed_memory
+from provenance import ROOT, device_in_words
+from runtime.raw import PLANES, raw
+from timing import take_turns
+
+OIDN = ("oidn", "oidn-balanced", "oidn-fast")
+ISAS = {"avx512": "AVX-512", "avx2": "AVX2", "baseline": "baseline"}
+MESHES = 64  # at least those of synthetic frames
+SMALL = 128  # px, the side of frames that only load code
+MAX_SECONDS = 240.0
+
+Play = Callable[[Sequence[Frame]], Iterator[object]]  # denoises one frame for each result that it is asked for
+
+# Plays the raw frames of a file, each once a line arrives.
+NODE = """
+const [module, file, width, height, meshes, size] = process.argv.slice(1), fs = require("fs");
+const runtime = new WebAssembly.Instance(new WebAssembly.Module(fs.readFileSync(module))).exports;
+runtime._initialize();
+const address = runtime.create(+width, +height, +meshes), frames = fs.openSync(file);
+const frame = new Uint8Array(runtime.memory.buffer, address, +size);
+require("readline").createInterface({ input: process.stdin }).on("line", () => {
+  if (fs.readSync(frames, frame) !== frame.length || !runtime.denoise()) throw new Error("a frame is damaged");
+  console.log("done");
+});
+"""
+
+
+@dataclass(frozen=True)
+class Form:
+    """A way to include a denoiser in a program."""
+
+    name: str
+    megabytes: float  # beside Python and numpy
+    build_seconds: float | None
+    play: Play
+    in_process: bool = True  # so that its memory can be measured
+
+
+def play_library(spec: DenoiserSpec, frames: Sequence[Frame]) -> Iterator[object]:
+    denoiser, state = spec.build(), None
+    for frame in frames:
+        radiance, state = denoiser(frame, state)
+        yield radiance
+
+
+def play_wheel(package: Path, max_isa: str, frames: Sequence[Frame]) -> Iterator[object]:
+    sys.path.insert(0, str(package))
+    from onespp_runtime import Denoiser
+
+    height, width = frames[0].size
+    denoiser = Denoiser(width, height, max_meshes=MESHES, threads=torch.get_num_threads(), max_isa=max_isa)
+    for frame in frames:
+        images = {name: frame.channels[name][0].movedim(0, -1).numpy() for name in (*PLANES, "mesh_id")}
+        poses = {name: getattr(frame.now, name)[0].numpy() for name in ("K", "camera_to_world", "object_to_world")}
+        yield denoiser.denoise(images.pop("direct"), **images, **poses, samples=frame.samples.item())
+
+
+def play_onnx(path: Path, frames: Sequence[Frame]) -> Iterator[object]:
+    step = load_step("one", require_shipped("one"), torch.float32, "inside")
+    return play(step, frames, run_onnx(path))
+
+
+def play_wasm(module: Path, frames: Sequence[Frame]) -> Iterator[object]:
+    """The time of a frame includes reading it."""
+    height, width = frames[0].size
+    with tempfile.NamedTemporaryFile() as file:
+        contents = [raw(frame, reset=index == 0) for index, frame in enumerate(frames)]
+        Path(file.name).write_bytes(b"".join(contents))
+        meshes = frames[0].now.object_to_world.shape[1]
+        numbers = map(str, (width, height, meshes, len(contents[0])))
+        command = ["node", "-e", NODE, str(module), file.name, *numbers]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as node:
+            assert node.stdin and node.stdout
+            for _ in frames:
+                print(file=node.stdin, flush=True)
+                if not node.stdout.readline():
+                    raise BadInput("Node.js could not run the runtime as WebAssembly")
+                yield None
+
+
+def installed_mb(*packages: str) -> float:
+    files = (file.locate() for name in packages for file in distribution(name).files or ())
+    return sum(Path(str(file)).stat().st_size for file in files if Path(str(file)).is_file()) / 1e6
+
+
+def file_mb(path: Path) -> float:
+    return path.stat().st_size / 1e6
+
+
+def built(command: Sequence[str], folder: Path, product: str) -> tuple[Path, float]:
+    """The file that a command makes, and the seconds it takes. Raises BadInput where it fails."""
+    start = time.perf_counter()
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise BadInput(f"`{' '.join(command)}` failed: {(done.stderr or done.stdout).strip()[-300:]}")
+    [path] = folder.glob(product)
+    return path, time.perf_counter() - start
+
+
+def c_forms(folder: Path) -> Iterator[Form]:
+    """Those of the C runtime, compiled from copies. All run as the wheel, through ctypes."""
+    copytree(ROOT / "runtime", folder / "runtime", ignore=ignore_patterns("copies", "build", "_onespp.*", "*.o", "*.a"))
+    copyfile(ROOT / "LICENSE", folder / "LICENSE")
+    library, seconds = built(["make", "-B", "-C", "runtime", "libonespp.so"], folder, "runtime/libonespp.so")
+    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-index", "--no-build-isolation"]
+    wheel, wheel_seconds = built([*pip, "./runtime/python"], folder, "*.whl")
+    package = folder / "package"
+    built([sys.executable, "-m", "zipfile", "-e", str(wheel), str(package)], folder, "package")
+    for isa, name in ISAS.items():
+        yield Form(f"C, {name}", file_mb(library), seconds, partial(play_wheel, package, isa))
+    yield Form("Python wheel", file_mb(wheel), wheel_seconds, partial(play_wheel, package, "any"))
+    if which("node"):
+        try:
+            make = ["make", "-B", "-C", "runtime", "web/onespp.wasm"]
+            module, seconds = built(make, folder, "runtime/web/onespp.wasm")
+        except BadInput as missing:
+            print(missing, file=sys.stderr)
+        else:
+            play_module = partial(play_wasm, module)
+            yield Form("WebAssembly, one thread", file_mb(module), seconds, play_module, in_process=False)
+
+
+def onnx_form(folder: Path) -> Form:
+    """Raises BadInput without onespp[export]."""
+    start, path = time.perf_counter(), folder / "one.onnx"
+    step = load_step("one", require_shipped("one"), torch.float32, "inside")
+    write_onnx(trace(step, synthetic_frame(0, SMALL, SMALL)), step, path)
+    seconds = time.perf_counter() - start
+    return Form("ONNX", file_mb(path) + installed_mb("onnxruntime"), seconds, partial(play_onnx, path))
+
+
+def library_forms() -> Iterator[Form]:
+    megabytes = installed_mb("torch", "numba", "llvmlite")
+    for precision in dict.fromkeys((fastest_precision("one"), "float32")):
+        spec = DenoiserSpec.named("one", precision=precision, weights=shipped_weights("one"))
+        yield Form(f"PyTorch, {precision}", megabytes, None, partial(play_library, spec))
+
+
+def oidn_forms() -> Iterator[Form]:
+    for name in OIDN:
+        yield Form(name, installed_mb("pyoidn"), None, partial(play_library, DenoiserSpec.named(name)))
+
+
+@torch.inference_mode()
+def peak_mb(play: Play, height: int, width: int, threads: int) -> float | None:
+    """Growth of memory during two frames, from the denoiser's making on, in MB; call it in a fresh process."""
+    keep_freed_memory()
+    torch.set_num_threads(threads)
+    small, frames = ([synthetic_frame(i, *size) for i in range(2)] for size in ((SMALL, SMALL), (height, width)))
+    list(play(small))  # loads code
+    return growth_mb(lambda: list(play(frames)))
+
+
+@torch.inference_mode()
+def measure(forms: Sequence[Form], height: int, width: int) -> list[dict[str, Any]]:
+    """A row of each form; their frames take turns."""
+    frames = [synthetic_frame(index, height, width) for index in range(WARM_UP_FRAMES + TIMED_FRAMES)]
+    turns = {form.name: partial(next, form.play(frames)) for form in forms}
+    seconds = take_turns(turns, TIMED_FRAMES, WARM_UP_FRAMES, fewest=FEWEST_FRAMES, patience=MAX_SECONDS)
+    rows = []
+    for form in tqdm(forms, "memory", leave=False):
+        memory = alone(peak_mb, form.play, height, width, torch.get_num_threads()) if form.in_process else None
+        facts = {"form": form.name, "megabytes": form.megabytes, "build_seconds": form.build_seconds}
+        rows.append(facts | {"ms": 1e3 * float(torch.tensor(seconds[form.name]).median()), "peak_mb": memory})
+    return rows
+
+
+def main(size: str = "1280x720", runs: str = "runs") -> None:
+    """Raises BadInput for what is no size, and where something cannot be built."""
+    height, width = parse_size(size)
+    keep_freed_memory()
+    with tempfile.TemporaryDirectory() as folder:
+        forms = [*library_forms(), *c_forms(Path(folder)), onnx_form(Path(folder)), *oidn_forms()]
+        rows = measure(forms, height, width)
+    facts = {"device": device_in_words(threads=torch.get_num_threads()), "size": size_name((height, width))}
+    path = Path(runs) / "runtime" / "results.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"schema": 1, **facts, "rows": rows})
+    print(form_table(rows))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 3:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except BadInput as error:
+        sys.exit(f"error: {error}")
