@@ -8,12 +8,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import distribution
 from pathlib import Path
-from shutil import copyfile, copytree, ignore_patterns, which
+from shutil import which
 from typing import Any
 
 import torch
@@ -31,8 +32,9 @@ from models.export.program import play, run_onnx, trace, write_onnx
 from models.registry import require_shipped, shipped_weights
 from models.spec import DenoiserSpec, fastest_precision
 from process import keep_freed_memory
-from provenance import ROOT, device_in_words
+from provenance import device_in_words
 from runtime.raw import PLANES, raw
+from runtime.wheel import build_wheel
 from timing import take_turns
 
 OIDN = ("oidn", "oidn-balanced", "oidn-fast")
@@ -119,32 +121,29 @@ def file_mb(path: Path) -> float:
     return path.stat().st_size / 1e6
 
 
-def built(command: Sequence[str], folder: Path, product: str) -> tuple[Path, float]:
-    """The file that a command makes, and the seconds it takes. Raises BadInput where it fails."""
+def made(product: str, folder: Path) -> tuple[Path, float]:
+    """A target of the Makefile in FOLDER/runtime, and the seconds it takes. Raises BadInput where that fails."""
     start = time.perf_counter()
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(["make", "-B", product], cwd=folder / "runtime", capture_output=True, text=True)
     if done.returncode:
-        raise BadInput(f"`{' '.join(command)}` failed: {(done.stderr or done.stdout).strip()[-300:]}")
-    [path] = folder.glob(product)
-    return path, time.perf_counter() - start
+        raise BadInput(f"`make {product}` failed: {done.stderr.strip()[-300:]}")
+    return folder / "runtime" / product, time.perf_counter() - start
 
 
 def c_forms(folder: Path) -> Iterator[Form]:
     """Those of the C runtime, compiled from copies. All run as the wheel, through ctypes."""
-    copytree(ROOT / "runtime", folder / "runtime", ignore=ignore_patterns("copies", "build", "_onespp.*", "*.o", "*.a"))
-    copyfile(ROOT / "LICENSE", folder / "LICENSE")
-    library, seconds = built(["make", "-B", "-C", "runtime", "libonespp.so"], folder, "runtime/libonespp.so")
-    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-index", "--no-build-isolation"]
-    wheel, wheel_seconds = built([*pip, "./runtime/python"], folder, "*.whl")
+    start = time.perf_counter()
+    wheel = build_wheel(folder)
+    wheel_seconds = time.perf_counter() - start
     package = folder / "package"
-    built([sys.executable, "-m", "zipfile", "-e", str(wheel), str(package)], folder, "package")
+    zipfile.ZipFile(wheel).extractall(package)
+    library, seconds = made("libonespp.so", folder)
     for isa, name in ISAS.items():
         yield Form(f"C, {name}", file_mb(library), seconds, partial(play_wheel, package, isa))
     yield Form("Python wheel", file_mb(wheel), wheel_seconds, partial(play_wheel, package, "any"))
     if which("node"):
         try:
-            make = ["make", "-B", "-C", "runtime", "web/onespp.wasm"]
-            module, seconds = built(make, folder, "runtime/web/onespp.wasm")
+            module, seconds = made("web/onespp.wasm", folder)
         except BadInput as missing:
             print(missing, file=sys.stderr)
         else:

@@ -4,8 +4,6 @@
 """
 
 import platform
-import shutil
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -13,9 +11,9 @@ from tempfile import TemporaryDirectory
 
 from errors import BadInput
 from files import replacing
+from runtime.wheel import build_wheel
 
 HERE = Path(__file__).resolve().parent
-RUNTIME = HERE.parent
 SYSTEMS = {"Linux": "linux", "Darwin": "macos", "Windows": "windows"}
 MACHINES = {"x86_64": "x64", "AMD64": "x64", "aarch64": "arm64", "arm64": "arm64"}
 
@@ -28,20 +26,6 @@ def blender_platform() -> str:
     return f"{SYSTEMS[system]}-{MACHINES[machine]}"
 
 
-def build_wheel(folder: Path) -> Path:
-    """Compile copies, so that nothing is left in the source tree. Raises BadInput where that fails."""
-    built = shutil.ignore_patterns("copies", "build", "*.egg-info", "_onespp.*", "__pycache__", HERE.name)
-    shutil.copytree(RUNTIME, folder / "runtime", ignore=built)
-    shutil.copyfile(RUNTIME.parent / "LICENSE", folder / "LICENSE")
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps", "--no-index"]
-    try:
-        subprocess.run([*pip, "--no-build-isolation", "./runtime/python"], cwd=folder, check=True)
-    except subprocess.CalledProcessError:
-        raise BadInput("the runtime was not compiled, see above: it needs a C compiler, and setuptools") from None
-    [wheel] = folder.glob("*.whl")
-    return wheel
-
-
 def build(out: Path) -> None:
     """Write the extension; atomic. Raises BadInput where the folder is missing, or see `build_wheel`."""
     if not out.parent.is_dir():
@@ -50,7 +34,7 @@ def build(out: Path) -> None:
         wheel = build_wheel(Path(folder))
         added = f'platforms = ["{blender_platform()}"]\nwheels = ["./wheels/{wheel.name}"]\n'
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.write(RUNTIME.parent / "LICENSE", "LICENSE")
+            archive.write(HERE.parents[1] / "LICENSE", "LICENSE")
             archive.write(wheel, f"wheels/{wheel.name}")
             for source in sorted((HERE / "extension").iterdir()):
                 if source.suffix == ".py":

@@ -1,18 +1,23 @@
 """Turn the camera of any scene, at 1 spp: python turntable.py SCENE.xml FOLDER FRAMES DEGREES_A_FRAME WIDTH HEIGHT."""
 
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from onespp_mitsuba import GUIDES, Denoiser
 
-mi.set_variant("llvm_ad_rgb")
+if len(sys.argv) != 7:
+    sys.exit(__doc__)
 path, folder, frames, degrees, width, height = sys.argv[1:]
+Path(folder).mkdir(parents=True, exist_ok=True)
+mi.set_variant("llvm_ad_rgb")
 scene = mi.load_file(path)
 sensor = scene.sensors()[0]
 camera = mi.traverse(sensor)
 camera["film.size"] = [int(width), int(height)]
-pose, centre = camera["to_world"], scene.bbox().center()
+pose = mi.AffineTransform4f(camera["to_world"])  # a copy: the parameter itself changes with the camera
+centre = scene.bbox().center()
 up = np.eye(3)[np.abs(np.array(pose.matrix)[:3, 1]).argmax()].tolist()  # the world's axis that is most upright
 integrator = mi.load_dict({"type": "onespp_guides", "light": scene.integrator() or {"type": "path"}})
 denoiser = Denoiser([int(width), int(height)], albedo=True, normals=True, temporal=True)
