@@ -33,7 +33,8 @@ FURNITURE: tuple[Maker, ...] = (
 DECOR: tuple[Maker, ...] = (*VESSELS, *BODIES, make_small_plant, make_basket, make_photo)
 GLAZING: tuple[Maker, ...] = (make_showcase, make_pane)
 AGAINST_WALLS: tuple[Maker, ...] = (*UPHOLSTERED, *CASES, make_bench, make_screen)
-OWN_STOCK = Stock(FURNITURE, DECOR, AGAINST_WALLS)
+OWN_STOCK = Stock(FURNITURE, DECOR, AGAINST_WALLS, gloss=(-0.3, 0.5))
+FURNISHED_GLOSS = (0.2, 1.0)  # as in other people's scenes (docs/experiments.md)
 MODELS_TO_OWN = 2  # pieces of libraries for each of ours
 MIN_THINGS = 15
 
@@ -48,9 +49,9 @@ def stock_of(models: Path | None) -> Stock:
         return OWN_STOCK
     found = makers_of(open_libraries(models))
     floor, small, backed = (
-        (*own, *[maker] * MODELS_TO_OWN * len(own)) for own, maker in zip(OWN_STOCK, found, strict=True)
+        (*own, *[maker] * MODELS_TO_OWN * len(own)) for own, maker in zip(OWN_STOCK[:3], found, strict=True)
     )
-    return Stock(floor, small, backed)
+    return Stock(floor, small, backed, FURNISHED_GLOSS)
 
 
 def scatter(rng: Rng, small: Sequence[Maker], support: Array, most: int) -> Group:

@@ -146,7 +146,7 @@ def outside(layout: Layout, style: Style) -> Array | None:
 def room(rng: Rng, frames: int, stock: Stock = OWN_STOCK) -> Scene:
     """A random interior for a clip of `frames` frames, in metres: 15 to 60 things, 1 to 4 lamps or windows."""
     size = np.array([rng.uniform(3.2, 7.5), rng.uniform(2.3, 3.4), rng.uniform(3.2, 7.5)])
-    layout = Layout(rng, size, frames, max(0.0, float(rng.uniform(-0.3, 0.5))), stock)
+    layout = Layout(rng, size, frames, max(0.0, float(rng.uniform(*stock.gloss))), stock)
     style = STYLES[str(rng.choice(list(STYLES), p=[style.share for style in STYLES.values()]))]
     holes(layout, style)
     environment = outside(layout, style)

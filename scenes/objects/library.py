@@ -27,6 +27,7 @@ SMALL = 0.45  # m; smaller pieces stand on others
 LARGEST_PIECE = 2.8  # m
 TEXTURE_LIMIT = 512  # px
 LEAST_OPACITY = 0.5  # opacity below which parts are left out: sheets of glass show next to nothing of themselves
+VARNISHED = 0.6  # share of the materials that are neither metal nor glass
 METAL = re.compile("metal|chrome|steel|alumin|brass|inox", re.IGNORECASE)
 SMALLEST_AREA = 1e-10  # m², twice that of a triangle; smaller ones are left out
 ATTEMPTS = 20
@@ -126,17 +127,18 @@ def texture_of(material: Any) -> Bsdf:
 
 
 def material_of_obj(rng: Rng, name: str, material: Any) -> Bsdf:
-    """A material like that of an OBJ file; half of what is glossy there, since its exponents are rarely measured."""
+    """A material like that of an OBJ file, varnished where the file says so, and often elsewhere: few files say it."""
     base = texture_of(material)
     shininess = float(getattr(material, "glossiness", 0) or 0)
+    is_shiny = shininess > 1 and np.max(material.specular[:3]) > 40
     if METAL.search(name):
         alpha = log_uniform(rng, 0.05, 0.4)
         return {"type": "twosided", "bsdf": {"type": "roughconductor", "material": "Al", "alpha": alpha}}
-    if shininess > 1 and np.max(material.specular[:3]) > 40 and rng.random() < 0.5:
+    if rng.random() < VARNISHED:
         # The exponent of Blinn's model that has the same width as this alpha (Walter et al. 2007, section 5.3).
-        alpha = float(np.clip(np.sqrt(2 / (shininess + 2)), 0.05, 0.5))
-        glossy = {"type": "roughplastic", "diffuse_reflectance": base, "alpha": alpha}
-        return {"type": "twosided", "bsdf": glossy}
+        alpha = float(np.clip(np.sqrt(2 / (shininess + 2)), 0.05, 0.5)) if is_shiny else log_uniform(rng, 0.03, 0.4)
+        varnished = {"type": "roughplastic", "diffuse_reflectance": base, "alpha": alpha}
+        return {"type": "twosided", "bsdf": varnished}
     return {"type": "twosided", "bsdf": diffuse_bsdf(base)}
 
 

@@ -43,6 +43,7 @@ class Stock(NamedTuple):
     floor: Sequence[Maker]
     small: Sequence[Maker]  # for supports and the floor
     backed: Sequence[Maker]  # against walls
+    gloss: tuple[float, float]  # of rooms, see scenes.finish: drawn from this range; below 0 none
 
 
 def shifted(surfaces: SurfacesBySlot, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> SurfacesBySlot:

@@ -15,8 +15,8 @@ from errors import BadInput
 from render.clip import NO_OPTIONS
 from render.job.generate import begun
 from render.job.plan import plan
-from scenes.colours import srgb_to_linear
-from scenes.objects.library import make_piece, model_of, open_libraries, open_library
+from scenes.colours import Bsdf, srgb_to_linear
+from scenes.objects.library import VARNISHED, make_piece, model_of, open_libraries, open_library
 from scenes.registry import build_scene
 
 HEAD = "id=test\nname=Test\nlicense=CC0\n"
@@ -84,9 +84,15 @@ def test_a_piece_has_the_size_of_the_catalogue_and_stands_on_the_floor(libraries
     assert support[0, 1] == pytest.approx(0.7) and support[1, 1] == np.inf
 
 
+def colour_of(material: Bsdf) -> Bsdf:
+    """Varnished or not."""
+    inside = material["bsdf"]
+    return inside["reflectance"] if inside["type"] == "diffuse" else inside["diffuse_reflectance"]
+
+
 def test_colours_are_linear_and_pictures_upright(libraries: Path):
     thing = make_piece(np.random.default_rng(0), [open_libraries(libraries)[0].pieces[0]])
-    plain, picture = (thing.materials[slot]["bsdf"]["reflectance"] for slot in ("1-plain", "0-picture"))
+    plain, picture = (colour_of(thing.materials[slot]) for slot in ("1-plain", "0-picture"))
     assert plain["value"] == pytest.approx(srgb_to_linear(np.array([0.5, 0.25, 1.0])).clip(0.02, 0.9), abs=3e-3)
     # OBJ: v = 1 is the upper row, red; Mitsuba: v = 0 is the first row.
     surface = thing.parts["0-picture"]
@@ -138,6 +144,23 @@ def test_bad_libraries(tmp_path: Path):
         open_library(broken)
     with pytest.raises(BadInput, match="--models"):
         build_scene("furnished-room-1", 0, 2)
+
+
+def diffuse_share(room: str, libraries: Path) -> float:
+    """Of all shapes in eight rooms, those that are plainly diffuse."""
+    shapes = [shape for number in range(8) for shape in build_scene(f"{room}-{number}", 0, 1, libraries).shapes]
+    return sum((shape.bsdf.get("bsdf") or shape.bsdf)["type"] == "diffuse" for shape in shapes) / len(shapes)
+
+
+def test_varnish(libraries: Path):
+    """On VARNISHED of the materials, so that furnished rooms are glossier than others."""
+    pieces = open_libraries(libraries)[0].pieces[:1]
+    things = [make_piece(np.random.default_rng(seed), pieces) for seed in range(100)]
+    plain = [thing.materials["1-plain"]["bsdf"] for thing in things]
+    varnished = [bsdf for bsdf in plain if bsdf["type"] == "roughplastic"]
+    assert len(varnished) / len(plain) == pytest.approx(VARNISHED, abs=0.15)  # three deviations
+    assert all(0.03 <= bsdf["alpha"] <= 0.5 for bsdf in varnished)
+    assert diffuse_share("furnished-room", libraries) < 0.7 * diffuse_share("room", libraries)
 
 
 def test_furnished_rooms_hold_pieces_and_are_deterministic(libraries: Path):
