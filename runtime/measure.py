@@ -4,6 +4,7 @@
 runs. It needs a C compiler, onespp[export] and onespp[oidn]. WebAssembly is left out without Clang for it or Node.js.
 """
 
+import importlib
 import subprocess
 import sys
 import tempfile
@@ -12,7 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import distribution
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from shutil import which
 from typing import Any
@@ -28,7 +29,7 @@ from eval.bench.synthetic_frames import synthetic_frame
 from eval.pages import form_table
 from files import write_json
 from models.export.package import load_step
-from models.export.program import play, run_onnx, trace, write_onnx
+from models.export.program import check_installed, play, run_onnx, trace, write_onnx
 from models.registry import require_shipped, shipped_weights
 from models.spec import DenoiserSpec, fastest_precision
 from process import keep_freed_memory
@@ -77,12 +78,16 @@ def play_library(spec: DenoiserSpec, frames: Sequence[Frame]) -> Iterator[object
         yield radiance
 
 
-def play_wheel(package: Path, max_isa: str, frames: Sequence[Frame]) -> Iterator[object]:
-    sys.path.insert(0, str(package))
-    from onespp_runtime import Denoiser
+def denoiser_of(package: Path) -> Any:
+    """The class of the wheel unpacked in a folder."""
+    if str(package) not in sys.path:
+        sys.path.insert(0, str(package))
+    return importlib.import_module("onespp_runtime").Denoiser
 
+
+def play_wheel(package: Path, max_isa: str, frames: Sequence[Frame]) -> Iterator[object]:
     height, width = frames[0].size
-    denoiser = Denoiser(width, height, max_meshes=MESHES, threads=torch.get_num_threads(), max_isa=max_isa)
+    denoiser = denoiser_of(package)(width, height, max_meshes=MESHES, threads=torch.get_num_threads(), max_isa=max_isa)
     for frame in frames:
         images = {name: frame.channels[name][0].movedim(0, -1).numpy() for name in (*PLANES, "mesh_id")}
         poses = {name: getattr(frame.now, name)[0].numpy() for name in ("K", "camera_to_world", "object_to_world")}
@@ -113,7 +118,11 @@ def play_wasm(module: Path, frames: Sequence[Frame]) -> Iterator[object]:
 
 
 def installed_mb(*packages: str) -> float:
-    files = (file.locate() for name in packages for file in distribution(name).files or ())
+    """Raises BadInput where one is missing."""
+    try:
+        files = [file.locate() for name in packages for file in distribution(name).files or ()]
+    except PackageNotFoundError as missing:
+        raise BadInput(f"{missing.name} is missing: `pip install 'onespp[export,oidn]'`") from None
     return sum(Path(str(file)).stat().st_size for file in files if Path(str(file)).is_file()) / 1e6
 
 
@@ -138,8 +147,9 @@ def c_forms(folder: Path) -> Iterator[Form]:
     package = folder / "package"
     zipfile.ZipFile(wheel).extractall(package)
     library, seconds = made("libonespp.so", folder)
-    for isa, name in ISAS.items():
-        yield Form(f"C, {name}", file_mb(library), seconds, partial(play_wheel, package, isa))
+    available = [isa for isa in ISAS if denoiser_of(package)(1, 1, max_isa=isa).isa == isa]
+    for isa in available:
+        yield Form(f"C, {ISAS[isa]}", file_mb(library), seconds, partial(play_wheel, package, isa))
     yield Form("Python wheel", file_mb(wheel), wheel_seconds, partial(play_wheel, package, "any"))
     if which("node"):
         try:
@@ -153,6 +163,7 @@ def c_forms(folder: Path) -> Iterator[Form]:
 
 def onnx_form(folder: Path) -> Form:
     """Raises BadInput without onespp[export]."""
+    check_installed("onnx")
     start, path = time.perf_counter(), folder / "one.onnx"
     step = load_step("one", require_shipped("one"), torch.float32, "inside")
     write_onnx(trace(step, synthetic_frame(0, SMALL, SMALL)), step, path)
