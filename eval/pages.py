@@ -359,14 +359,13 @@ def stress() -> str:
 
 def form_table(rows: list[dict[str, Any]]) -> str:
     """What each form of `one` takes, from rows of python -m runtime.measure."""
-    [baseline] = (row["ms"] for row in rows if row["form"] == "oidn")
     lines = [
         {
             "form": row["form"],
             "MB to install": f"{row['megabytes']:.3g}",
             "s to build": "-" if row["build_seconds"] is None else f"{row['build_seconds']:.0f}",
             "ms": f"{row['ms']:.0f}",
-            "times oidn": f"{row['ms'] / baseline:.2f}",
+            "times oidn": f"{row['ms'] / row['oidn_ms']:.2f}",
             "peak MB": "-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}",
         }
         for row in rows

@@ -16,6 +16,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from shutil import which
+from statistics import median
 from typing import Any
 
 import torch
@@ -23,7 +24,7 @@ from tqdm import tqdm
 
 from datasets.frame import Frame
 from errors import BadInput
-from eval.bench.denoisers import FEWEST_FRAMES, TIMED_FRAMES, WARM_UP_FRAMES, parse_size, size_name
+from eval.bench.denoisers import FEWEST_FRAMES, WARM_UP_FRAMES, parse_size, size_name
 from eval.bench.memory import alone, growth_mb
 from eval.bench.synthetic_frames import synthetic_frame
 from eval.pages import form_table
@@ -42,7 +43,6 @@ OIDN = ("oidn", "oidn-balanced", "oidn-fast")
 ISAS = {"avx512": "AVX-512", "avx2": "AVX2", "baseline": "baseline"}
 MESHES = 64  # at least those of synthetic frames
 SMALL = 128  # px, the side of frames that only load code
-MAX_SECONDS = 240.0
 
 Play = Callable[[Sequence[Frame]], Iterator[object]]  # denoises one frame for each result that it is asked for
 
@@ -133,7 +133,10 @@ def file_mb(path: Path) -> float:
 def made(product: str, folder: Path) -> tuple[Path, float]:
     """A target of the Makefile in FOLDER/runtime, and the seconds it takes. Raises BadInput where that fails."""
     start = time.perf_counter()
-    done = subprocess.run(["make", "-B", product], cwd=folder / "runtime", capture_output=True, text=True)
+    try:
+        done = subprocess.run(["make", "-B", product], cwd=folder / "runtime", capture_output=True, text=True)
+    except FileNotFoundError:
+        raise BadInput("make is missing") from None
     if done.returncode:
         raise BadInput(f"`make {product}` failed: {done.stderr.strip()[-300:]}")
     return folder / "runtime" / product, time.perf_counter() - start
@@ -195,15 +198,18 @@ def peak_mb(play: Play, height: int, width: int, threads: int) -> float | None:
 
 @torch.inference_mode()
 def measure(forms: Sequence[Form], height: int, width: int) -> list[dict[str, Any]]:
-    """A row of each form; their frames take turns."""
-    frames = [synthetic_frame(index, height, width) for index in range(WARM_UP_FRAMES + TIMED_FRAMES)]
-    turns = {form.name: partial(next, form.play(frames)) for form in forms}
-    seconds = take_turns(turns, TIMED_FRAMES, WARM_UP_FRAMES, fewest=FEWEST_FRAMES, patience=MAX_SECONDS)
+    """A row of each form, which takes turns with OIDN, frame by frame."""
+    frames = [synthetic_frame(index, height, width) for index in range(WARM_UP_FRAMES + FEWEST_FRAMES)]
+    [baseline] = (form for form in forms if form.name == OIDN[0])
     rows = []
-    for form in tqdm(forms, "memory", leave=False):
+    for form in tqdm(forms, "forms"):
+        turns = {each.name: partial(next, each.play(frames)) for each in (form, baseline)}
+        seconds = take_turns(turns, FEWEST_FRAMES, WARM_UP_FRAMES)
+        del turns  # and with it what it denoises with
         memory = alone(peak_mb, form.play, height, width, torch.get_num_threads()) if form.in_process else None
         facts = {"form": form.name, "megabytes": form.megabytes, "build_seconds": form.build_seconds}
-        rows.append(facts | {"ms": 1e3 * float(torch.tensor(seconds[form.name]).median()), "peak_mb": memory})
+        times = {key: 1e3 * median(seconds[name]) for key, name in (("ms", form.name), ("oidn_ms", baseline.name))}
+        rows.append(facts | times | {"peak_mb": memory})
     return rows
 
 

@@ -316,5 +316,6 @@ def test_the_turntable_turns_evenly(environment, tmp_path):
     subprocess.run(command, cwd=tmp_path, check=True, env=environment, timeout=300)
     images = [np.array(mi.Bitmap(str(tmp_path / "out" / f"{frame:04}.exr"))) for frame in range(4)]
     assert images[0].shape == (24, 32, 3) and all(np.isfinite(image).all() for image in images)
+    assert np.abs(images[0] - images[1]).max() > 0.1
     from_first = [np.abs(image - images[0]).mean() for image in images]
     assert from_first[3] < 0.3 * min(from_first[1:3])
