@@ -26,7 +26,8 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
     augmentation = recipe.augmentation if training else Augmentation()
     frames = recipe.frames(training)
-    return TrainingSequences(clips, denoiser.reads, frames, recipe.crop, augmentation, seed, denoiser.signal)
+    given = clips, denoiser.reads, frames, recipe.crop, augmentation, seed, denoiser.signal, recipe.firsts
+    return TrainingSequences(*given)
 
 
 def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:

@@ -16,10 +16,16 @@ from models.history.running_scale import log_luminance_and_depth
 from train.augmentation import Augmentation, averaged
 
 
-def check_fits(clips: Sequence[Clip], length: int, crop: int | None) -> None:
-    """Raises BadInput where a clip is shorter than `length` frames or smaller than a crop."""
-    for clip in clips:
-        if clip.frames < length or min(clip.height, clip.width) < (crop or 1):
+def check_fits(clips: Sequence[Clip], length: int, crop: int | None, firsts: int = 0) -> None:
+    """Raises BadInput where a clip is shorter than `length` frames or smaller than a crop.
+
+    Where there are `firsts` beside the sequences, one clip of `length` frames is enough.
+    """
+    if firsts:
+        clips = sorted(clips, key=lambda clip: clip.frames, reverse=True)
+    for number, clip in enumerate(clips):
+        too_short = clip.frames < length and (number == 0 or not firsts)
+        if too_short or min(clip.height, clip.width) < (crop or 1):
             size = f" of {crop}x{crop}" if crop else ""
             raise BadInput(
                 f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small to train on "
@@ -59,13 +65,17 @@ class WholeFrames:
 
 
 class Batch:
-    """A Frame of all sequences for each time step. Fabric would convert a list, and cameras must stay float64."""
+    """A Frame of all sequences for each time step. Fabric would convert a list, and cameras must stay float64.
 
-    def __init__(self, frames: list[Frame]):
+    `firsts` are frames of other sequences, to be denoised without history.
+    """
+
+    def __init__(self, frames: list[Frame], firsts: Frame | None = None):
         self.frames = frames
+        self.firsts = firsts
 
     def to(self, device: torch.device | str) -> "Batch":
-        return Batch([frame.to(device) for frame in self.frames])
+        return Batch([frame.to(device) for frame in self.frames], self.firsts.to(device) if self.firsts else None)
 
 
 @dataclass(eq=False)
@@ -73,9 +83,9 @@ class TrainingSequences:
     """Sequences of `length` frames and `crop` x `crop` pixels (None: whole frames), with the channels in `reads`.
 
     References are always among the channels. Item i of epoch e depends on (seed, e, i) only. The sequences of an epoch
-    have together as many pixels as the clips. Frames name the scale of the frames that they are crops of in the noisy
-    light of `signal`, unless that is None. Raises BadInput where a clip is shorter than a sequence or smaller than a
-    crop.
+    have together as many pixels as the clips. Beside each, a batch has `firsts` frames without history, of any clip;
+    then clips may be shorter than a sequence. Frames name the scale of the frames that they are crops of in the noisy
+    light of `signal`, unless that is None. Raises BadInput as check_fits.
     """
 
     clips: Sequence[Clip]
@@ -85,16 +95,18 @@ class TrainingSequences:
     augmentation: Augmentation
     seed: int
     signal: Signal | None = None
+    firsts: int = 0
     epoch: int = 0  # that whose sequences come next
 
     def __post_init__(self) -> None:
-        check_fits(self.clips, self.length, self.crop)
+        check_fits(self.clips, self.length, self.crop, self.firsts)
         self.channels = tuple(dict.fromkeys([*self.reads, *REFERENCE_CHANNELS]))
         self.sampled = [name for name in self.channels if name in (*NOISY_CHANNELS, *HIT_CHANNELS)]
         self.whole_frames = WholeFrames(self.signal) if self.signal else None
-        pixels = np.array([clip.frames * clip.height * clip.width for clip in self.clips])
+        self.long = [clip for clip in self.clips if clip.frames >= self.length]
+        pixels = np.array([clip.frames * clip.height * clip.width for clip in self.long])
         self.probabilities = pixels / pixels.sum()
-        area = self.crop * self.crop if self.crop else pixels.sum() / sum(clip.frames for clip in self.clips)
+        area = self.crop * self.crop if self.crop else pixels.sum() / sum(clip.frames for clip in self.long)
         self.count = max(1, round(pixels.sum() / (self.length * area)))
 
     def __len__(self) -> int:
@@ -102,11 +114,19 @@ class TrainingSequences:
 
     def __getitem__(self, index: int) -> list[Frame]:
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        clip = self.clips[rng.choice(len(self.clips), p=self.probabilities)]
-        playback = self.augmentation.playback(clip.frames, self.length, rng)
+        clip = self.long[rng.choice(len(self.long), p=self.probabilities)]
+        return self.sequence(clip, self.length, rng)
+
+    def first_frames(self, index: int) -> list[Frame]:
+        """The `firsts` beside item `index`."""
+        rng = np.random.default_rng([self.seed, self.epoch, index, 1])
+        return [self.sequence(self.clips[rng.integers(len(self.clips))], 1, rng)[0] for _ in range(self.firsts)]
+
+    def sequence(self, clip: Clip, length: int, rng: np.random.Generator) -> list[Frame]:
+        playback = self.augmentation.playback(clip.frames, length, rng)
         window = random_window(clip, self.crop, rng)
-        stopped = len(set(playback)) < self.length
-        draw = self.augmentation.draw(clip.realisations, self.length, stopped, rng)
+        stopped = len(set(playback)) < length
+        draw = self.augmentation.draw(clip.realisations, length, stopped, rng)
         read = partial(read_frame, clip, window=window, in_layers=False)
         frames = []
         for time, position in enumerate(playback):
@@ -120,4 +140,6 @@ class TrainingSequences:
         return frames
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        return Batch([Frame.stack(step) for step in zip(*(self[number] for number in numbers), strict=True)])
+        frames = [Frame.stack(step) for step in zip(*(self[number] for number in numbers), strict=True)]
+        firsts = [frame for number in numbers for frame in self.first_frames(number)]
+        return Batch(frames, Frame.stack(firsts) if firsts else None)

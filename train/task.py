@@ -35,6 +35,7 @@ class Recipe:
     average: float = 0.0  # share of the steps over which weights are averaged to be judged and kept; 0: the last ones
     clip: float | None = None  # the largest norm of a step's gradients; longer ones are shortened to it
     trained: int | None = None  # frames of a sequence that are trained on; the rest is for validation
+    firsts: int = 0  # frames of any clip, denoised without history, beside each sequence
     crops: tuple[int, int] | None = None  # of each accumulated frame, for training and validation; None: sequences
     augmentation: Augmentation = field(default_factory=Augmentation)
 
@@ -75,8 +76,8 @@ class Task:
             )
         if self.micro_batch is not None and self.micro_batch < 1:
             raise BadInput(f"a micro-batch of {self.micro_batch} items is none: use 1 or more")
-        check_fits(self.data.clips("train"), self.recipe.frames(training=True), self.recipe.crop)
-        check_fits(self.data.clips("val"), self.recipe.frames(training=False), self.recipe.crop)
+        for split, training in (("train", True), ("val", False)):
+            check_fits(self.data.clips(split), self.recipe.frames(training), self.recipe.crop, self.recipe.firsts)
 
     def network(self, clips: list[Clip]) -> Denoiser:
         """The network that the training begins with, specialised to `clips` if it is to be.

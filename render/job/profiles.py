@@ -85,6 +85,17 @@ DATA_PROFILES = {
         closeups={"train": 128, "val": 4},
         quality=RELEASE_QUALITY,
     ),
+    # To continue trainings with rooms of other people's furniture: `--models DIR`.
+    "furnished": DataProfile(
+        size=(12, 128, 128),
+        rooms={"train": 80, "val": 4},
+        closeups={"train": 80, "val": 4},
+        quality={
+            "train": SamplingQuality(realisations=4, reference_spp=96),
+            "val": SamplingQuality(realisations=4, reference_spp=256),
+            "test": TEST_OF_SMALL_ROOMS,
+        },
+    ),
     # Scenes that no training uses, at a size at which people look, until the history is steady.
     "benchmark": DataProfile(
         size=(49, 360, 640),

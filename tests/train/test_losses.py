@@ -379,6 +379,27 @@ def test_the_displayed_loss_by_hand(batch_of, monkeypatch):
     assert value.item() == pytest.approx(spatial.item() + 0.5 * temporal.item(), rel=1e-4)
 
 
+def test_squared_errors_and_first_frames_add_to_the_displayed_loss(batch_of, monkeypatch):
+    batch = batch_of("one", 1, length=2, firsts=3)
+    assert batch.firsts is not None
+    denoiser = create("one")
+    predicted = predict_as(monkeypatch, denoiser, lambda frame, _: 0.5 * frame.reference_irradiance("total"))
+    loss = DisplayedLoss(temporal=0.0, scales=(1,))
+    plain, parts = NetworkLoss(denoiser, loss)(batch)
+    doubled = NetworkLoss(denoiser, replace(loss, first=2.0))(batch)[0]
+    assert parts["first"] > 0 and (doubled - plain).item() == pytest.approx(parts["first"].item(), rel=1e-4)
+    squared, more = NetworkLoss(denoiser, replace(loss, squared=7.0, first=0.0))(batch)
+    expected = []
+    for frame, (irradiance, scale) in zip(batch.frames, predicted, strict=False):
+        images = (irradiance, frame.reference_irradiance("total"))
+        output, truth = (tone(scale.exposure() * frame.divisor * image) for image in images)
+        error = output - truth
+        expected.append(7 * surface_mean(error.square(), frame.depth))
+    added = more["spatial"] - parts["spatial"]
+    assert added.item() == pytest.approx(torch.stack(expected).mean().item(), rel=1e-4)
+    assert squared.item() == pytest.approx(more["spatial"].item(), rel=1e-6)
+
+
 @pytest.mark.parametrize("name", ["rae", "wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "lbf", "ntd", "one"])
 def test_every_network_learns_one_batch(batch_of, name):
     """Some steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.

@@ -1,5 +1,6 @@
 """Training sequences: deterministic, and consistent under every augmentation."""
 
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -230,6 +231,21 @@ def test_too_short_or_small_clips_are_refused(clips):
         sequences(clips, length=9)
     with pytest.raises(BadInput, match="smaller budget"):
         sequences(clips, crop=65)
+
+
+def test_first_frames_come_from_all_clips_even_from_those_too_short_for_sequences(clips):
+    short = copy(clips[0])
+    short.frames = 1
+    given = IMAGE_CHANNELS, 5, 32, AUGMENTATIONS["none"], 0
+    data = TrainingSequences([short, clips[1]], *given, firsts=8)
+    firsts = data.batch([0, 1]).firsts
+    assert firsts is not None and firsts.direct.shape == (16, 3, 32, 32)
+    assert torch.equal(firsts.direct, Frame.stack([*data.first_frames(0), *data.first_frames(1)]).direct)
+    assert len({float(image.sum()) for image in firsts.direct}) == 16  # of other places and times
+    assert len(data) == len(TrainingSequences([clips[1]], *given))  # an epoch has the sequences of long clips
+    assert TrainingSequences([clips[1]], *given).batch([0]).firsts is None
+    with pytest.raises(BadInput, match="has 1 frames"):
+        TrainingSequences([short], *given, firsts=3)
 
 
 def test_demodulation_round_trip_and_unread_channels(clips):

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from datasets.frame import Frame
 from datasets.tonemap import DISPLAY_GAMMA
 from models.denoiser import Denoiser
 from train.crops import AnyBatch
 from train.losses.network_loss import Loss, Parts, exposed_outputs, surface_mean
+from train.sequences import Batch
 
 TONE_OFFSET = 1e-4  # of exposed radiance: it bounds the slope of the curve at black
 
@@ -49,6 +51,8 @@ class DisplayedLoss(Loss):
 
     temporal: float = 0.25  # weight of what changes, where there are sequences
     scales: tuple[int, ...] = (1, 4, 16)  # pixels, the first of them 1
+    squared: float = 0.0  # weight of the squared errors of pixels: their optimum is the mean
+    first: float = 1.0  # weight of frames without history, where there are any beside the sequences
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Output minus target (B, 3, H, W) as displayed, 0 off surfaces, and their share in blocks of each scale."""
@@ -59,20 +63,31 @@ class DisplayedLoss(Loss):
             errors.append((torch.where(share > 0, error, 0), share))
         return errors
 
+    def of_frame(
+        self, network: Denoiser, frame: Frame, output: Tensor, exposure: Tensor
+    ) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+        """The loss of one frame's output; its errors and the share of surfaces at each scale."""
+        target = exposure * frame.reference_buffers(network.signal).mean(dim=1)
+        errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
+        loss = sum_of_scales(errors, shares)
+        if self.squared:
+            loss = loss + self.squared * surface_mean(errors[0].square(), shares[0])
+        return loss, list(errors), list(shares)
+
     def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Sequence[Tensor] = ()  # the last frame's errors
         for frame, output, exposure in exposed_outputs(network, batch):
-            target = exposure * frame.reference_buffers(network.signal).mean(dim=1)
-            errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
-            spatial.append(sum_of_scales(errors, shares))
+            loss, errors, shares = self.of_frame(network, frame, output, exposure)
+            spatial.append(loss)
             if before:
                 temporal.append(sum_of_scales([now - then for now, then in zip(errors, before, strict=True)], shares))
             before = errors
         parts = {"spatial": torch.stack(spatial).mean()}
-        loss = parts["spatial"]
         if temporal:
-            parts["temporal"] = torch.stack(temporal).mean()
-            loss = loss + self.temporal * parts["temporal"]
-        return loss, parts
+            parts["temporal"] = self.temporal * torch.stack(temporal).mean()
+        if isinstance(batch, Batch) and batch.firsts is not None:
+            (given,) = exposed_outputs(network, Batch([batch.firsts]))
+            parts["first"] = self.first * self.of_frame(network, *given)[0]
+        return torch.stack([*parts.values()]).sum(), parts
