@@ -25,15 +25,15 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,release-256,benchmark,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, long clips, glass, "
-        "or N small rooms with references of S spp",
+        metavar="{tiny,quick,release,release-256,furnished,benchmark,glass,rooms-NxS}",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, for --models, "
+        "long clips, glass, or N small rooms with references of S spp",
     ),
 ]
 Budget = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,paper}",
+        metavar="{tiny,quick,release,paper,furnished}",
         help="how long networks are trained; the weights are in RUNS/train/NAME-BUDGET",
     ),
 ]

@@ -137,7 +137,7 @@ RECIPES: dict[tuple[str, str], Recipe] = {
 
 TRAINABLE = tuple(PAPERS_AND_BUDGETS)
 ONE_A_PAPER = ("rae", "wskp6", "ntd-mean")
-WORTH_TRAINING = {"quick": ("wskp6",), "furnished": ("one",)}  # in budgets in which the others still blur or are not
+WORTH_TRAINING = {"quick": ("wskp6",), "furnished": ("one",)}  # the others still blur, or have no recipe
 
 
 def trained_by_default(budget: str) -> tuple[str, ...]:

@@ -120,7 +120,7 @@ class TrainingSequences:
     def first_frames(self, index: int) -> list[Frame]:
         """The `firsts` beside item `index`."""
         rng = np.random.default_rng([self.seed, self.epoch, index, 1])
-        return [self.sequence(self.clips[rng.integers(len(self.clips))], 1, rng)[0] for _ in range(self.firsts)]
+        return [self.sequence(self.clips[int(rng.integers(len(self.clips)))], 1, rng)[0] for _ in range(self.firsts)]
 
     def sequence(self, clip: Clip, length: int, rng: np.random.Generator) -> list[Frame]:
         playback = self.augmentation.playback(clip.frames, length, rng)

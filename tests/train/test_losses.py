@@ -393,10 +393,9 @@ def test_squared_errors_and_first_frames_add_to_the_displayed_loss(batch_of, mon
     for frame, (irradiance, scale) in zip(batch.frames, predicted, strict=False):
         images = (irradiance, frame.reference_irradiance("total"))
         output, truth = (tone(scale.exposure() * frame.divisor * image) for image in images)
-        error = output - truth
-        expected.append(7 * surface_mean(error.square(), frame.depth))
+        expected.append(surface_mean((output - truth).square(), frame.depth))
     added = more["spatial"] - parts["spatial"]
-    assert added.item() == pytest.approx(torch.stack(expected).mean().item(), rel=1e-4)
+    assert added.item() == pytest.approx(7 * torch.stack(expected).mean().item(), rel=1e-4)
     assert squared.item() == pytest.approx(more["spatial"].item(), rel=1e-6)
 
 

@@ -45,9 +45,8 @@ def test_recipes_are_those_of_the_papers(name, expected):
 def test_budgets_scale_the_effort_and_anneal():
     for (name, budget), recipe in RECIPES.items():
         paper = RECIPES[name, "paper"]
-        displayed = budget in ("release", "furnished") or (
-            name == "lbf" and budget != "paper"
-        )  # its own loss makes it worse
+        # LBF's own loss makes it worse.
+        displayed = budget in ("release", "furnished") or (name == "lbf" and budget != "paper")
         may_differ = EFFORT | ENDS_WELL | (FOR_NOISY_REFERENCES if displayed else set())
         same = {field.name: getattr(recipe, field.name) for field in fields(recipe) if field.name in may_differ}
         assert replace(paper, **same) == recipe, (name, budget)
@@ -74,6 +73,5 @@ def test_every_network_has_recipes_for_all_budgets():
     networks = {name for name in DENOISERS if create(name).parameter_count()}
     assert set(TRAINABLE) == networks and set(ONE_A_PAPER) <= networks
     assert all(set(trained_by_default(budget)) <= networks for _, budget in RECIPES)
-    assert set(RECIPES) == {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")} | {
-        ("one", "furnished")
-    }
+    of_all = {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")}
+    assert set(RECIPES) == of_all | {("one", "furnished")}
