@@ -115,7 +115,7 @@ ONE_BUDGETS: Budgets = {
     # Continues the weights of `release`, with --from. Of twelve frames one has no history: more of these beside them.
     "furnished": {
         **{"epochs": 24, "rate": 7e-4, "batch": 6, "length": 12, "crop": 80, "firsts": 4},
-        "loss": DisplayedLoss(temporal=0.5, squared=25.0, first=2.0),
+        "loss": DisplayedLoss(temporal=0.5, squared=25.0, first=1.0),
     },
 }
 

@@ -20,7 +20,7 @@ from models.registry import create
 from tests.helpers.training import predict_as
 from train.crops import Crops
 from train.data import items
-from train.losses.displayed import DisplayedLoss, block_means, tone
+from train.losses.displayed import DisplayedLoss, block_means, clipped_tone, tone
 from train.losses.network_loss import NetworkLoss, surface_mean
 from train.losses.ntd import NTDLoss, masked_mean
 from train.losses.rae import RAELoss, edges, laplacian_of_gaussian
@@ -392,7 +392,7 @@ def test_squared_errors_and_first_frames_add_to_the_displayed_loss(batch_of, mon
     expected = []
     for frame, (irradiance, scale) in zip(batch.frames, predicted, strict=False):
         images = (irradiance, frame.reference_irradiance("total"))
-        output, truth = (tone(scale.exposure() * frame.divisor * image) for image in images)
+        output, truth = (clipped_tone(scale.exposure() * frame.divisor * image) for image in images)
         expected.append(surface_mean((output - truth).square(), frame.depth))
     added = more["spatial"] - parts["spatial"]
     assert added.item() == pytest.approx(7 * torch.stack(expected).mean().item(), rel=1e-4)

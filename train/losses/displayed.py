@@ -51,7 +51,7 @@ class DisplayedLoss(Loss):
 
     temporal: float = 0.25  # weight of what changes, where there are sequences
     scales: tuple[int, ...] = (1, 4, 16)  # pixels, the first of them 1
-    squared: float = 0.0  # weight of the squared errors of pixels: their optimum is the mean
+    squared: float = 0.0  # weight of the squared errors of pixels, whose optimum is the mean; white is as bright as any
     first: float = 1.0  # weight of frames without history, where there are any beside the sequences
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -71,7 +71,8 @@ class DisplayedLoss(Loss):
         errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
         loss = sum_of_scales(errors, shares)
         if self.squared:
-            loss = loss + self.squared * surface_mean(errors[0].square(), shares[0])
+            error = clipped_tone(output) - clipped_tone(target)
+            loss = loss + self.squared * surface_mean(error.square(), shares[0])
         return loss, list(errors), list(shares)
 
     def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
