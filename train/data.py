@@ -16,7 +16,7 @@ from train.task import Recipe
 
 Items = TrainingSequences | AccumulatedCrops
 
-PIXELS_IN_MEMORY = 2**20  # of all frames of the sequences of a micro-batch, by default
+PIXELS_IN_MEMORY = 2**20  # of all frames of a micro-batch, by default
 
 
 def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool, seed: int, cache: Path) -> Items:
@@ -26,14 +26,15 @@ def items(clips: list[Clip], recipe: Recipe, denoiser: Denoiser, training: bool,
         return AccumulatedCrops(clips, denoiser, recipe.crops[0 if training else 1], recipe.crop, seed, cache)
     augmentation = recipe.augmentation if training else Augmentation()
     frames = recipe.frames(training)
-    given = clips, denoiser.reads, frames, recipe.crop, augmentation, seed, denoiser.signal, recipe.firsts
-    return TrainingSequences(*given)
+    return TrainingSequences(
+        clips, denoiser.reads, frames, recipe.crop, augmentation, seed, denoiser.signal, recipe.firsts
+    )
 
 
 def largest_micro_batch(recipe: Recipe, clip: Clip) -> int:
     """How many items of a batch are in memory together by default."""
     area = recipe.crop**2 if recipe.crop else clip.height * clip.width
-    return max(1, min(recipe.batch, PIXELS_IN_MEMORY // (recipe.length * area)))
+    return max(1, min(recipe.batch, PIXELS_IN_MEMORY // ((recipe.length + recipe.firsts) * area)))
 
 
 def equal_parts(count: int, largest: int) -> list[range]:

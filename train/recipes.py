@@ -113,10 +113,8 @@ ONE_BUDGETS: Budgets = {
     "quick": {"epochs": 10},
     "release": {"epochs": 16, "rate": 1e-3, "length": 12, "crop": 80, "loss": DisplayedLoss(temporal=0.5)},
     # Continues the weights of `release`, with --from. Of twelve frames one has no history: more of these beside them.
-    "furnished": {
-        **{"epochs": 24, "rate": 7e-4, "batch": 6, "length": 12, "crop": 80, "firsts": 4},
-        "loss": DisplayedLoss(temporal=0.5, squared=25.0, first=1.0),
-    },
+    "furnished": {"epochs": 24, "rate": 7e-4, "batch": 6, "length": 12, "crop": 80, "firsts": 4}
+    | {"loss": DisplayedLoss(temporal=0.5, squared=25.0)},
 }
 
 PAPERS_AND_BUDGETS: dict[str, tuple[Recipe, Budgets]] = {
@@ -137,7 +135,7 @@ RECIPES: dict[tuple[str, str], Recipe] = {
 
 TRAINABLE = tuple(PAPERS_AND_BUDGETS)
 ONE_A_PAPER = ("rae", "wskp6", "ntd-mean")
-WORTH_TRAINING = {"quick": ("wskp6",), "furnished": ("one",)}  # the others still blur, or have no recipe
+WORTH_TRAINING = {"quick": ("wskp6",), "furnished": ("one",)}  # where the others still blur, or have no recipe
 
 
 def trained_by_default(budget: str) -> tuple[str, ...]:

@@ -21,11 +21,9 @@ def check_fits(clips: Sequence[Clip], length: int, crop: int | None, firsts: int
 
     Where there are `firsts` beside the sequences, one clip of `length` frames is enough.
     """
-    if firsts:
-        clips = sorted(clips, key=lambda clip: clip.frames, reverse=True)
-    for number, clip in enumerate(clips):
-        too_short = clip.frames < length and (number == 0 or not firsts)
-        if too_short or min(clip.height, clip.width) < (crop or 1):
+    least = 1 if firsts and any(clip.frames >= length for clip in clips) else length
+    for clip in clips:
+        if clip.frames < least or min(clip.height, clip.width) < (crop or 1):
             size = f" of {crop}x{crop}" if crop else ""
             raise BadInput(
                 f"{clip.path} has {clip.frames} frames of {clip.width}x{clip.height}: too few or too small to train on "
@@ -75,7 +73,8 @@ class Batch:
         self.firsts = firsts
 
     def to(self, device: torch.device | str) -> "Batch":
-        return Batch([frame.to(device) for frame in self.frames], self.firsts.to(device) if self.firsts else None)
+        firsts = None if self.firsts is None else self.firsts.to(device)
+        return Batch([frame.to(device) for frame in self.frames], firsts)
 
 
 @dataclass(eq=False)
@@ -123,6 +122,7 @@ class TrainingSequences:
         return [self.sequence(self.clips[int(rng.integers(len(self.clips)))], 1, rng)[0] for _ in range(self.firsts)]
 
     def sequence(self, clip: Clip, length: int, rng: np.random.Generator) -> list[Frame]:
+        """A random crop of `length` consecutive frames of a clip, augmented."""
         playback = self.augmentation.playback(clip.frames, length, rng)
         window = random_window(clip, self.crop, rng)
         stopped = len(set(playback)) < length

@@ -51,7 +51,7 @@ class DisplayedLoss(Loss):
 
     temporal: float = 0.25  # weight of what changes, where there are sequences
     scales: tuple[int, ...] = (1, 4, 16)  # pixels, the first of them 1
-    squared: float = 0.0  # weight of the squared errors of pixels, whose optimum is the mean; white is as bright as any
+    squared: float = 0.0  # weight of the squared errors of pixels, clipped at white: their optimum is the mean
     first: float = 1.0  # weight of frames without history, where there are any beside the sequences
 
     def errors(self, output: Tensor, target: Tensor, surface: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -63,9 +63,9 @@ class DisplayedLoss(Loss):
             errors.append((torch.where(share > 0, error, 0), share))
         return errors
 
-    def of_frame(
+    def frame_loss(
         self, network: Denoiser, frame: Frame, output: Tensor, exposure: Tensor
-    ) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+    ) -> tuple[Tensor, Sequence[Tensor], Sequence[Tensor]]:
         """The loss of one frame's output; its errors and the share of surfaces at each scale."""
         target = exposure * frame.reference_buffers(network.signal).mean(dim=1)
         errors, shares = zip(*self.errors(output, target, (frame.depth > 0).to(output)), strict=True)
@@ -73,22 +73,25 @@ class DisplayedLoss(Loss):
         if self.squared:
             error = clipped_tone(output) - clipped_tone(target)
             loss = loss + self.squared * surface_mean(error.square(), shares[0])
-        return loss, list(errors), list(shares)
+        return loss, errors, shares
 
     def compute(self, network: Denoiser, batch: AnyBatch, progress: float) -> tuple[Tensor, Parts]:
         spatial: list[Tensor] = []
         temporal: list[Tensor] = []
         before: Sequence[Tensor] = ()  # the last frame's errors
         for frame, output, exposure in exposed_outputs(network, batch):
-            loss, errors, shares = self.of_frame(network, frame, output, exposure)
-            spatial.append(loss)
+            of_frame, errors, shares = self.frame_loss(network, frame, output, exposure)
+            spatial.append(of_frame)
             if before:
                 temporal.append(sum_of_scales([now - then for now, then in zip(errors, before, strict=True)], shares))
             before = errors
         parts = {"spatial": torch.stack(spatial).mean()}
+        loss = parts["spatial"]
         if temporal:
-            parts["temporal"] = self.temporal * torch.stack(temporal).mean()
+            parts["temporal"] = torch.stack(temporal).mean()
+            loss = loss + self.temporal * parts["temporal"]
         if isinstance(batch, Batch) and batch.firsts is not None:
-            (given,) = exposed_outputs(network, Batch([batch.firsts]))
-            parts["first"] = self.first * self.of_frame(network, *given)[0]
-        return torch.stack([*parts.values()]).sum(), parts
+            (alone,) = exposed_outputs(network, Batch([batch.firsts]))
+            parts["first"], _, _ = self.frame_loss(network, *alone)
+            loss = loss + self.first * parts["first"]
+        return loss, parts
