@@ -355,16 +355,24 @@ def relight(
 def weights(
     name: Annotated[str | None, Positional, arg(metavar="NETWORK", help="show the card of this network")] = None,
     card: Annotated[Path | None, arg(metavar="RUNS")] = None,
+    average: Annotated[tuple[Path, ...], arg(metavar="FILE...", help="weights of NETWORK to average")] = (),
+    out: Annotated[Path | None, arg(metavar="FILE", help="where to write their mean")] = None,
 ) -> None:
-    """List the networks with shipped weights, or show the card of one.
+    """List the networks with shipped weights, show the card of one, or average the weights of trainings.
 
     Args:
         card: rewrite the measurements and facts of the card, or of all cards, from the weights and RUNS/eval.
     """
     from eval.shipped import card_file, measure_card, table
-    from models.registry import shipped_names
+    from models.registry import create, shipped_names
+    from models.weights import average_weights
 
-    if card:
+    if average:
+        if not (name and out):
+            raise BadInput("--average FILE... needs the NETWORK and --out FILE")
+        average_weights(create(name), name, average, out)
+        print(out)
+    elif card:
         for each in [name] if name else shipped_names():
             print(measure_card(each, card))
     else:

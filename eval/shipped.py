@@ -1,6 +1,7 @@
 """`onespp weights`: the networks whose weights are shipped, and a model card of each, generated from its files."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,18 +32,14 @@ def table() -> str:
     for name in shipped_names():
         path = require_shipped(name)
         recipe = read_metadata(path)["recipe"]
-        line = {
-            "network": name,
-            "parameters": recipe["parameters"],
-            "kB": round(path.stat().st_size / 1000),
-            "budget": recipe["budget"],
-            "trained on": f"{Path(recipe['data']['profile']).name}, {len(recipe['data']['scenes'])} scenes",
-            "step": recipe["step"],
-            "validation loss": f"{recipe['validation']:.4g}",
-            "SHA-256": file_digest(path)[:12],
-            "licence": WEIGHTS_LICENCE,
-        }
-        lines.append(line)
+        line = {"network": name, "parameters": recipe["parameters"], "kB": round(path.stat().st_size / 1000)}
+        if "trainings" in recipe:
+            line["trained on"] = f"{len(recipe['trainings'])} trainings' mean, see its card"
+        else:
+            line["trained on"] = f"{Path(recipe['data']['profile']).name}, {len(recipe['data']['scenes'])} scenes"
+            line |= {key: recipe[key] for key in ("budget", "step")}
+            line["validation loss"] = f"{recipe['validation']:.4g}"
+        lines.append(line | {"SHA-256": file_digest(path)[:12], "licence": WEIGHTS_LICENCE})
     return tabulate(lines, "keys", disable_numparse=True)
 
 
@@ -104,24 +101,16 @@ def facts(name: str) -> str:
     measured = read_json(measured_file(name))
     metadata = read_metadata(weights)
     recipe = metadata["recipe"]
-    data = recipe["data"]
-    fields = {key: recipe[key] for key in ("parameters", "budget", "seed", "step", "validation")}
-    fields |= {key: measured[key] for key in ("signal", "precision", "device", "versions")}
     return (
         FACTS.read_text()
         .strip()
         .format(
-            **fields,
-            name=name,
+            **{key: measured[key] for key in ("signal", "precision", "device", "versions")},
+            parameters=recipe["parameters"],
             bytes=weights.stat().st_size,
             digest=file_digest(weights),
             licence=WEIGHTS_LICENCE,
-            data=Path(data["profile"]).name,
-            data_seed=data["seed"],
-            generator=data["generator"],
-            scenes=len(data["scenes"]),
-            start=f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else "",
-            recipe=json.dumps({key: value for key, value in recipe.items() if key not in LISTED_APART}),
+            training=mean_of(recipe["trainings"]) if "trainings" in recipe else training(name, recipe),
             makers=" and ".join(
                 f"{version_list(maker['versions'])}, code {maker['code']}" for maker in metadata["made_by"]
             ),
@@ -133,6 +122,32 @@ def facts(name: str) -> str:
             legend=LEGEND,
         )
     )
+
+
+def training(name: str, recipe: dict[str, Any]) -> str:
+    """The lines of a card on the only training."""
+    command = f"onespp train {name} --budget {recipe['budget']} --seed {recipe['seed']}"
+    start = f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else ""
+    rest = {key: value for key, value in recipe.items() if key not in LISTED_APART}
+    return f"""\
+- Trained by `{command}` on {dataset(recipe["data"])}{start}.
+  Weights of step {recipe["step"]}, which had the lowest validation loss: {recipe["validation"]:.4g}.
+- Recipe: `{json.dumps(rest)}`."""
+
+
+def mean_of(trainings: Sequence[dict[str, Any]]) -> str:
+    """The lines of a card on the trainings whose weights were averaged."""
+    lines = [f"- The mean of the weights of {len(trainings)} trainings, by these recipes:"]
+    for each in trainings:
+        rest = {key: value for key, value in each.items() if key not in ("data", "parameters")}
+        lines.append(f"  - on {dataset(each['data'])}: `{json.dumps(rest)}`")
+    return "\n".join(lines)
+
+
+def dataset(data: dict[str, Any]) -> str:
+    """What was trained on."""
+    facts = f"seed {data['seed']}, generator\n  version {data['generator']}, {len(data['scenes'])} scenes"
+    return f"the data set `{Path(data['profile']).name}` ({facts})"
 
 
 def version_list(versions: dict[str, str]) -> str:

@@ -7,10 +7,12 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from errors import BadInput
 from files import write_file
 from models.denoiser import Denoiser
+from provenance import file_digest
 
 
 def save_weights(
@@ -32,6 +34,27 @@ def read_metadata(path: Path) -> dict[str, Any]:
     if "profile" in read.get("recipe", {}):  # the budget's key in the files that are shipped
         read["recipe"]["budget"] = read["recipe"].pop("profile")
     return read
+
+
+def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: Path) -> None:
+    """Write the mean of the weights of several trainings that had the same start.
+
+    After Wortsman et al. 2022, "Model soups": it is at least as good as most of them, at the cost of one. The recipe
+    lists the trainings'. Raises BadInput as `load_weights` does, and for specialised weights.
+    """
+    sums: dict[str, Tensor] = {}
+    recipes, made_by = [], []
+    for file in files:
+        load_weights(denoiser, name, file)
+        metadata = read_metadata(file)
+        if "constants" in metadata:
+            raise BadInput(f"{file} is specialised to one scene: average weights that take all inputs")
+        sums = {key: tensor.double() + sums.get(key, 0) for key, tensor in denoiser.state_dict().items()}
+        recipes.append(metadata["recipe"] | {"sha256": file_digest(file)})
+        made_by += [maker for maker in metadata["made_by"] if maker not in made_by]
+    denoiser.load_state_dict({key: total / len(files) for key, total in sums.items()})
+    recipe = {"parameters": sum(total.numel() for total in sums.values()), "trainings": recipes}
+    save_weights(denoiser, name, recipe, path, made_by)
 
 
 def load_weights(denoiser: Denoiser, name: str, path: Path) -> None:

@@ -4,7 +4,9 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from command_line import main
 from errors import BadInput
@@ -13,8 +15,9 @@ from eval.results import read_results
 from eval.shipped import BEGIN, END, card_file, facts, measure_card, table
 from files import read_json, write_json
 from models.registry import create, shipped_names
-from models.weights import save_weights
+from models.weights import average_weights, save_weights
 from provenance import file_digest
+from tests.helpers.training import tensors
 from tests.test_cli import fails
 
 RECIPE = {
@@ -101,6 +104,39 @@ def test_only_the_generated_part_of_a_card_changes(wskp3, tiny, tmp_path, capsys
 def test_cards_are_generated_from_weights_and_measurements(name):
     card = card_file(name).read_text()
     assert card.partition(BEGIN)[2].partition(END)[0].strip() == facts(name), "run `onespp weights --card RUNS`"
+
+
+def test_the_mean_of_trainings_names_their_recipes(wskp3, tiny, tmp_path, capsys):
+    """Its card has no training of its own; the table says so."""
+    files = [tmp_path / "a.safetensors", tmp_path / "b.safetensors", tmp_path / "c.safetensors"]
+    for seed, file in enumerate(files):
+        torch.manual_seed(seed)
+        save_weights(create("wskp3"), "wskp3", RECIPE | {"rate": seed}, file, MADE_BY[:1])
+    assert "needs the NETWORK and --out FILE" in fails(capsys, "weights", "--average", *map(str, files))
+    main(["weights", "wskp3", "--average", *map(str, files), "--out", str(wskp3)])
+    trained = [tensors(file) for file in files]
+    for key, value in tensors(wskp3).items():
+        mean = np.mean([each[key].numpy() for each in trained], axis=0)
+        np.testing.assert_allclose(value, mean, rtol=1e-5, atol=1e-7)
+    evaluate([tiny], tmp_path, "tiny", ["noisy", "wskp3"])
+    wskp3.with_suffix(".md").write_text(HAND)
+    text = measure_card("wskp3", tmp_path).read_text()
+    assert "mean of the weights of 3 trainings" in text and "Trained by" not in text
+    recipes = [line for line in text.splitlines() if line.startswith("  version") and "`{" in line]
+    for seed, (file, recipe) in enumerate(zip(files, recipes, strict=True)):
+        assert f'"rate": {seed}' in recipe and f'"sha256": "{file_digest(file)}"' in recipe
+    assert text.count("data set `my.toml`") == 3 and text.count("torch 1.2.3") == 1
+    assert "3 trainings' mean" in table()
+
+
+def test_specialised_weights_have_no_mean(tmp_path):
+    denoiser = create("wskp3")
+    denoiser.specialise({"albedo": [0.5, 0.5, 0.5]})
+    file = tmp_path / "a.safetensors"
+    save_weights(denoiser, "wskp3", RECIPE, file, MADE_BY)
+    with pytest.raises(BadInput, match=r"a.safetensors is specialised to one scene"):
+        average_weights(create("wskp3"), "wskp3", [file], tmp_path / "mean.safetensors")
+    assert not (tmp_path / "mean.safetensors").exists()
 
 
 def test_results_of_other_weights_are_refused(wskp3, tiny, tmp_path):
