@@ -115,23 +115,24 @@ def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs
         list(tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"))
 
 
-def strip(runs: Path, results: ClipResults) -> "Figure":
-    """The outputs of all denoisers for a frame at three quarters of the clip, and its reference, side by side."""
-    from eval.figures.show import Panel, draw_grid
+def sheet(runs: Path, results: ClipResults) -> "Figure":
+    """The outputs of all denoisers for a frame at three quarters of the clip, and its reference, in rows."""
+    from eval.figures.show import Panel, draw_grid, in_rows
 
     judged = results.reference.judged
     index = judged[len(judged) * 3 // 4]
-    columns = []
+    panels = []
     for result in (*results.results, results.reference):
         values = ((key, result.frames[index].get(key)) for key in ("rmse", "ssim"))
         errors = (f"{key.upper()} {value:.3f}" for key, value in values if value is not None)
         caption = f"{result.denoiser}\n{'' if result.floor else '  '.join(errors)}"
         picture = load_picture(folder_of(runs, result.scene, result.clip, result.denoiser, result.signal), index)
-        columns.append([Panel(picture / 255, caption)])
-    return draw_grid(columns, [f"frame {index}"])
+        panels.append(Panel(picture / 255, caption))
+    columns = in_rows(panels)
+    return draw_grid(columns, [f"frame {index}"] * len(columns[0]))
 
 
-def save_strips(runs: Path, clips: Iterable[ClipResults]) -> None:
+def save_sheets(runs: Path, clips: Iterable[ClipResults]) -> None:
     """Write a PNG per clip and signal, if the extra `report` is installed."""
     if not can_draw():
         print("no pictures: they need `pip install 'onespp[report]'`")
@@ -139,7 +140,7 @@ def save_strips(runs: Path, clips: Iterable[ClipResults]) -> None:
     from plotting import save_figure
 
     for clip in clips:
-        save_figure(runs / "eval" / f"{clip.file_name}.png", strip(runs, clip))
+        save_figure(runs / "eval" / f"{clip.file_name}.png", sheet(runs, clip))
 
 
 def evaluate(
@@ -173,6 +174,6 @@ def evaluate(
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
     content = write_results(runs, data, device_in_words(device), results, weights)
     judged = list(by_clip(results))
-    save_strips(runs, judged)
+    save_sheets(runs, judged)
     print(f"{results_table(judged)}\n\n{table_by_age(judged)}")
     return content

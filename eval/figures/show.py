@@ -1,5 +1,6 @@
 """`onespp show`: the outputs, states and errors of denoisers on a clip."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +30,7 @@ BRIGHTEST_DIFFERENCE = 0.25  # of displayed values; larger ones have the same co
 SMALLEST_IMAGE = 192
 LARGEST_IMAGE = 480
 COLOUR_BAR = 0.7  # inches beside an image
+MOST_IN_A_ROW = 6  # images of one frame
 
 
 class Panel(NamedTuple):
@@ -41,6 +43,15 @@ class Panel(NamedTuple):
 
 
 Column = list[Panel]
+
+
+def in_rows(panels: Sequence[Panel]) -> list[Column]:
+    """Columns that show panels row by row, MOST_IN_A_ROW at most in each; white fills the last row."""
+    rows = math.ceil(len(panels) / MOST_IN_A_ROW)
+    count = math.ceil(len(panels) / rows)
+    blank = Panel(np.ones_like(panels[0].image), "")
+    filled = [*panels, *[blank] * (rows * count - len(panels))]
+    return [filled[column::count] for column in range(count)]
 
 
 def draw_grid(columns: Sequence[Column], row_names: Sequence[str]) -> Figure:

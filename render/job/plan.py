@@ -10,6 +10,7 @@ import numpy as np
 
 from datasets.channels import CHANNELS, SAMPLE_BUFFERS, USUAL_CHANNELS
 from datasets.clip import SCHEMA, SPLITS, ClipKind
+from errors import BadInput
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options
 from render.job.profiles import DataProfile, furniture_of, profile_of, source_of
@@ -60,9 +61,12 @@ def plan(
     """The content of dataset.json.
 
     Clips for training and validation get the essential channels and those in `reads`; test clips get all for metrics,
-    but sample buffers only if `reads` names them. Raises BadInput for an unknown profile.
+    but sample buffers only if `reads` names them. Raises BadInput for an unknown profile, and for one without its
+    furniture.
     """
     described = profile_of(profile, models)
+    if described.for_models and not models:
+        raise BadInput(f"the profile {profile} needs furniture: --models DIR (docs/data.md says where to get it)")
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are sampled together
         reads = (*reads, *SAMPLE_BUFFERS.values())

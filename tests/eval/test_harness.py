@@ -11,7 +11,7 @@ import pytest
 from datasets.clip import Dataset
 from errors import BadInput
 from eval import clip_run, harness
-from eval.harness import evaluate, strip
+from eval.harness import evaluate, sheet
 from eval.metrics import METRICS
 from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
 from eval.tables import means_by_age
@@ -78,10 +78,10 @@ def test_results_are_the_means_of_frames(evaluated, tiny, signal, lights):
     assert float(printed[5]) == pytest.approx(np.mean(np.sqrt(floor)), abs=1e-4)
 
 
-def test_strips_show_every_denoiser_and_the_reference(evaluated):
+def test_sheets_show_every_denoiser_and_the_reference(evaluated):
     _, clips = read_results(evaluated)
     for clip in clips:
-        axes = strip(evaluated, clip).axes
+        axes = sheet(evaluated, clip).axes
         ending = "" if clip.signal == "total" else "-indirect"
         assert (evaluated / "eval" / f"{clip.scene}-000{ending}.png").exists()
         for result, panel in zip((*clip.results, clip.reference), axes, strict=True):

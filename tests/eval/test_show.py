@@ -13,7 +13,7 @@ from matplotlib import image as png
 from command_line import main
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from eval.figures.show import Panel, draw_grid, grids_of, show, view_clip
+from eval.figures.show import Panel, draw_grid, grids_of, in_rows, show, view_clip
 from models.denoiser import Denoiser, State
 from models.registry import create
 from plotting import save_figure
@@ -61,6 +61,18 @@ def test_panels_stand_where_they_belong(tmp_path):
         top[place] = y.min()
     assert all(left[column, frame] + 192 < left[column + 1, frame] for column in (0, 1) for frame in (0, 1))
     assert all(top[column, 0] + 0.75 * 192 < top[column, 1] for column in (0, 1, 2))
+
+
+@pytest.mark.parametrize(("count", "rows", "in_a_row"), [(1, 1, 1), (6, 1, 6), (7, 2, 4), (25, 5, 5), (26, 5, 6)])
+def test_panels_in_rows_keep_their_order(count, rows, in_a_row):
+    columns = in_rows([Panel(np.full((4, 6, 3), 0.5), str(place)) for place in range(count)])
+    assert len(columns) == in_a_row and {len(column) for column in columns} == {rows}
+    row_by_row = [columns[place % in_a_row][place // in_a_row] for place in range(rows * in_a_row)]
+    assert [panel.caption for panel in row_by_row[:count]] == [str(place) for place in range(count)]
+    assert all(panel.caption == "" and (panel.image == 1).all() for panel in row_by_row[count:])
+    assert [axis.get_title() for axis in draw_grid(columns, ["frame 0"] * rows).axes][:count] == [
+        str(place) for place in range(count)
+    ]
 
 
 def test_panels(tiny):

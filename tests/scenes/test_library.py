@@ -178,6 +178,9 @@ def test_training_rooms_are_furnished_and_test_rooms_are_not(libraries: Path):
     assert all(name.startswith("room-") for name in made["splits"]["test"])
     assert made["models"]["credits"] == ["furniture of test.sh3f (CC0), by Ada"]
     assert plan("rooms-2x4", 0)["models"] == {}
+    assert plan("furnished", 0, models=str(libraries))["splits"]["train"][0].startswith("furnished-room-")
+    with pytest.raises(BadInput, match="furnished needs furniture: --models DIR"):
+        plan("furnished", 0)
 
 
 def test_a_dataset_may_be_rendered_from_copies_of_the_libraries(libraries: Path, tmp_path: Path):
