@@ -130,7 +130,8 @@ def training(name: str, recipe: dict[str, Any]) -> str:
     start = f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else ""
     rest = {key: value for key, value in recipe.items() if key not in LISTED_APART}
     return f"""\
-- Trained by `{command}` on {dataset(recipe["data"])}{start}.
+- Trained by `{command}`
+  on {dataset(recipe["data"])}{start}.
   Weights of step {recipe["step"]}, which had the lowest validation loss: {recipe["validation"]:.4g}.
 - Recipe: `{json.dumps(rest)}`."""
 
@@ -146,7 +147,7 @@ def mean_of(trainings: Sequence[dict[str, Any]]) -> str:
 
 def dataset(data: dict[str, Any]) -> str:
     """What was trained on."""
-    facts = f"seed {data['seed']}, generator\n  version {data['generator']}, {len(data['scenes'])} scenes"
+    facts = f"seed {data['seed']}, generator version {data['generator']}, {len(data['scenes'])} scenes"
     return f"the data set `{Path(data['profile']).name}` ({facts})"
 
 

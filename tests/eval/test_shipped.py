@@ -122,7 +122,7 @@ def test_the_mean_of_trainings_names_their_recipes(wskp3, tiny, tmp_path, capsys
     wskp3.with_suffix(".md").write_text(HAND)
     text = measure_card("wskp3", tmp_path).read_text()
     assert "mean of the weights of 3 trainings" in text and "Trained by" not in text
-    recipes = [line for line in text.splitlines() if line.startswith("  version") and "`{" in line]
+    recipes = [line for line in text.splitlines() if line.startswith("  - on the data set")]
     for seed, (file, recipe) in enumerate(zip(files, recipes, strict=True)):
         assert f'"rate": {seed}' in recipe and f'"sha256": "{file_digest(file)}"' in recipe
     assert text.count("data set `my.toml`") == 3 and text.count("torch 1.2.3") == 1
