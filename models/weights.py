@@ -39,8 +39,8 @@ def read_metadata(path: Path) -> dict[str, Any]:
 def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: Path) -> None:
     """Write the mean of the weights of several trainings that had the same start.
 
-    After Wortsman et al. 2022, "Model soups": it is at least as good as most of them, at the cost of one. The recipe
-    lists the trainings'. Raises BadInput as `load_weights` does, and for specialised weights.
+    After Wortsman et al. 2022, "Model soups". The recipe lists those of the trainings. Raises BadInput as
+    `load_weights` does, and for specialised weights.
     """
     sums: dict[str, Tensor] = {}
     recipes, made_by = [], []
