@@ -35,8 +35,11 @@ def set_relative_deviation(line: Row, first: Row, second: Row, count: Row) -> No
     """√(E[y²] - E[y]²) / E[y], from sums of y, of y² and of pixels."""
     for x in range(line.size):
         mean = first[x] / count[x]
-        variance = max(second[x] / count[x] - mean * mean, f32(0))
-        line[x] = np.sqrt(variance) / max(mean, f32(MIN_MEAN))
+        line[x] = mean * mean
+    for x in range(line.size):
+        # Of pixels that are all alike this is exactly 0, as long as the square is rounded: it has a loop of its own.
+        variance = max(second[x] / count[x] - line[x], f32(0))
+        line[x] = np.sqrt(variance) / max(first[x] / count[x], f32(MIN_MEAN))
 
 
 @jit_with_memory

@@ -46,6 +46,13 @@ def test_the_minimum_of_a_single_pixel_is_its_value() -> None:
     assert mesh_min(torch.full((1, 1, 1, 1), 3.0), torch.zeros(1, 1, 1, 1)).item() == 3
 
 
+def test_pixels_alone_on_their_mesh_deviate_by_nothing() -> None:
+    """Not by the rounding of a square, whose root is 1000 times as large."""
+    image = torch.rand(1, 3, 8, 64, generator=torch.Generator().manual_seed(0))
+    *_, deviation = mesh_means(image, torch.arange(8.0 * 64).view(1, 1, 8, 64))
+    assert (deviation == 0).all()
+
+
 def test_light_without_limits_stays_finite() -> None:
     for level in (0.0, 1e-30, 65504.0, 1e35):
         for value in mesh_means(torch.full((1, 3, 4, 6), level), torch.ones(1, 1, 4, 6)):

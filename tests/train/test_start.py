@@ -14,7 +14,7 @@ from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
 from models.spec import load
-from provenance import ROOT, file_digest
+from provenance import file_digest
 from tests.helpers.frames import run
 from tests.helpers.training import SHORT, folder_of, fresh_weights, metadata, short_task, tensors
 from tests.test_cli import fails
@@ -167,12 +167,3 @@ def test_where_all_inputs_vary_none_is_left_out(capsys, tiny, tmp_path):
     assert "left out nothing: all of its inputs vary" in capsys.readouterr().out
     with pytest.raises(BadInput, match="without --specialise"):
         train_network(replace(short_task("one", tiny, tmp_path), specialised=True))
-
-
-def test_the_campaign_goes_on_from_weights_that_denoise(tiny):
-    clip = Dataset(tiny).clips("test")[0]
-    campaign = load("one", ROOT / "train" / "campaign" / "one.safetensors", torch.float32)
-    (output,) = run(campaign, [read_frame(clip, 0, campaign.reads)])
-    truth = torch.from_numpy(clip.reference(0).mean(axis=0)).movedim(-1, 0)
-    noisy = torch.from_numpy(clip.noisy(0)).movedim(-1, 0)
-    assert (output[0] - truth).square().mean() < 0.2 * (noisy - truth).square().mean()
