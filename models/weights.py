@@ -40,7 +40,7 @@ def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: 
     """Write the mean of the weights of several trainings that had the same start.
 
     After Wortsman et al. 2022, "Model soups". The recipe lists those of the trainings. Raises BadInput as
-    `load_weights` does, and for specialised weights.
+    `load_weights` does, for specialised weights, and for means.
     """
     sums: dict[str, Tensor] = {}
     recipes, made_by = [], []
@@ -50,6 +50,8 @@ def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: 
         if "constants" in metadata:
             raise BadInput(f"{file} is specialised to one scene: average weights that take all inputs")
         sums = {key: tensor.double() + sums.get(key, 0) for key, tensor in denoiser.state_dict().items()}
+        if "trainings" in metadata["recipe"]:
+            raise BadInput(f"{file} is a mean itself: name the weights of its trainings")
         recipes.append(metadata["recipe"] | {"sha256": file_digest(file)})
         made_by += [maker for maker in metadata["made_by"] if maker not in made_by]
     denoiser.load_state_dict({key: total / len(files) for key, total in sums.items()})

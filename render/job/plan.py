@@ -65,7 +65,7 @@ def plan(
     furniture.
     """
     described = profile_of(profile, models)
-    if described.for_models and not models:
+    if described.needs_models and not models:
         raise BadInput(f"the profile {profile} needs furniture: --models DIR (docs/data.md says where to get it)")
     splits = {split: clips_of(described, split, seed, needed_spp) for split in SPLITS}
     if not set(SAMPLE_BUFFERS.values()).isdisjoint(reads):  # direct and indirect light are sampled together

@@ -35,7 +35,7 @@ class DataProfile:
     special: dict[str, list[str]] = field(default_factory=dict)  # further clips, SCENE/CLIP
     judged: tuple[int, ...] = ()  # the frames of test clips that get a reference; empty for all
     own: Path | None = None  # the TOML of a user's own scene, the only one
-    for_models: bool = False  # whether there must be `models`
+    needs_models: bool = False  # whether it is refused without `models`
     models: Path | None = None  # the furniture libraries that training and validation rooms are furnished from
 
 
@@ -89,7 +89,7 @@ DATA_PROFILES = {
     # To continue trainings with rooms of other people's furniture: `--models DIR`.
     "furnished": DataProfile(
         size=(12, 128, 128),
-        for_models=True,
+        needs_models=True,
         rooms={"train": 80, "val": 4},
         closeups={"train": 80, "val": 4},
         quality={

@@ -114,6 +114,9 @@ def test_the_mean_of_trainings_names_their_recipes(wskp3, tiny, tmp_path, capsys
         save_weights(create("wskp3"), "wskp3", RECIPE | {"rate": seed}, file, MADE_BY[:1])
     assert "needs the NETWORK and --out FILE" in fails(capsys, "weights", "--average", *map(str, files))
     main(["weights", "wskp3", "--average", *map(str, files), "--out", str(wskp3)])
+    assert f"{wskp3} is a mean itself" in fails(
+        capsys, "weights", "wskp3", "--average", str(wskp3), str(files[0]), "--out", str(tmp_path / "mean.safetensors")
+    )
     trained = [tensors(file) for file in files]
     for key, value in tensors(wskp3).items():
         mean = np.mean([each[key].numpy() for each in trained], axis=0)

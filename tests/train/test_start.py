@@ -13,6 +13,7 @@ from command_line import main
 from datasets.clip import Dataset
 from datasets.frame import read_frame
 from errors import BadInput
+from models.registry import shipped_weights
 from models.spec import load
 from provenance import file_digest
 from tests.helpers.frames import run
@@ -167,3 +168,12 @@ def test_where_all_inputs_vary_none_is_left_out(capsys, tiny, tmp_path):
     assert "left out nothing: all of its inputs vary" in capsys.readouterr().out
     with pytest.raises(BadInput, match="without --specialise"):
         train_network(replace(short_task("one", tiny, tmp_path), specialised=True))
+
+
+def test_the_campaign_goes_on_from_weights_that_denoise(tiny):
+    clip = Dataset(tiny).clips("test")[0]
+    shipped = load("one", shipped_weights("one"), torch.float32)
+    (output,) = run(shipped, [read_frame(clip, 0, shipped.reads)])
+    truth = torch.from_numpy(clip.reference(0).mean(axis=0)).movedim(-1, 0)
+    noisy = torch.from_numpy(clip.noisy(0)).movedim(-1, 0)
+    assert (output[0] - truth).square().mean() < 0.2 * (noisy - truth).square().mean()
