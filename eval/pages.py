@@ -6,9 +6,10 @@ only rewrites the pages.
 """
 
 import json
+import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -29,7 +30,7 @@ RUNTIME_PAGE = ROOT / "runtime" / "README.md"
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
 GLASS_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
 STEADY_FRAME = 15  # that of the benchmark: history no longer grows
-SHOWN_METRICS = ("psnr", "ssim", "flip", "temporal_error")
+SHOWN_METRICS = ("ssim", "flip", "temporal_error", "psnr")
 
 
 # --- Extracts ---------------------------------------------------------------------------------------------------------
@@ -258,6 +259,13 @@ def front() -> str:
     return table(lines)
 
 
+def noise_off(clips: Iterable[dict[str, Any]], denoiser: str) -> str:
+    """Mean PSNR of a denoiser over clips, in dB, of its squared error less that of the references' noise."""
+    pairs = [(clip["results"][denoiser]["psnr"], clip["results"][NOISE_FLOOR]["psnr"]) for clip in clips]
+    own = [10 ** (-psnr / 10) - 10 ** (-floor / 10) for psnr, floor in pairs]
+    return f"{fmean(-10 * math.log10(error) for error in own):.2f}" if min(own) > 0 else ""
+
+
 def glass() -> str:
     """PSNR of denoisers on scenes of glass, the mean of their clips, with either kind of guides; and temporal error."""
     lines: dict[str, dict[str, dict[str, str]]] = {}  # by denoiser and guides
@@ -272,7 +280,8 @@ def glass() -> str:
             row = TableRow("mean", FLOOR if floor else denoiser, "total", {}, {})
             line = {"denoiser": cell(row), "made from": row.made_from, "guides": "" if floor else guides}
             line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
-            line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
+            line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "noise off": noise_off(clips, denoiser)}
+            line |= {"temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
             lines.setdefault(denoiser, {})[line["guides"]] = line
     return table([line for alike in lines.values() for line in alike.values()])
 
@@ -308,6 +317,7 @@ def steady(folder: str, *names: str) -> str:
         row = TableRow("mean", label, "total", means([*values.values()]), {})
         line = {"denoiser": cell(row), "made from": row.made_from}
         line |= {METRICS[metric].title: row.text(metric) for metric in SHOWN_METRICS}
+        line |= {"noise off": noise_off(clips, denoiser)}
         line |= {scene: value_cell("psnr", each["psnr"]) for scene, each in values.items()}
         if own_clips:
             own = fmean(clip["results"][denoiser]["psnr"] for clip in own_clips)
@@ -335,9 +345,7 @@ def rendering(folder: str) -> str:
     lines = [
         {
             "clip": row["scene"],
-            "references": str(row["judged"]),
             "spp": str(row["reference_spp"]),
-            "noise floor": f"{row['floor']:.1f} dB",
             "minutes": f"{row['seconds'] / 60:.1f}",
         }
         for row in benchmark(folder)["rendered"]

@@ -37,10 +37,11 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: Path) -> None:
-    """Write the mean of the weights of several trainings that had the same start.
+    """Write the mean of the weights of several trainings that had the same start, which may be among them.
 
     After Wortsman et al. 2022, "Model soups". The recipe lists those of the trainings. Raises BadInput as
-    `load_weights` does, for specialised weights, and for means.
+    `load_weights` does, for specialised weights, for means, and where the starts differ: no path of low loss connects
+    such weights.
     """
     sums: dict[str, Tensor] = {}
     recipes, made_by = [], []
@@ -54,6 +55,9 @@ def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: 
             raise BadInput(f"{file} is a mean itself: name the weights of its trainings")
         recipes.append(metadata["recipe"] | {"sha256": file_digest(file)})
         made_by += [maker for maker in metadata["made_by"] if maker not in made_by]
+    if not set.intersection(*({recipe["sha256"], recipe.get("from")} for recipe in recipes)) - {None}:
+        names = ", ".join(map(str, files))
+        raise BadInput(f"{names} did not begin with the same weights: average trainings that had one --from")
     denoiser.load_state_dict({key: total / len(files) for key, total in sums.items()})
     recipe = {"parameters": sum(total.numel() for total in sums.values()), "trainings": recipes}
     save_weights(denoiser, name, recipe, path, made_by)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +112,8 @@ def test_the_mean_of_trainings_names_their_recipes(wskp3, tiny, tmp_path, capsys
     files = [tmp_path / "a.safetensors", tmp_path / "b.safetensors", tmp_path / "c.safetensors"]
     for seed, file in enumerate(files):
         torch.manual_seed(seed)
-        save_weights(create("wskp3"), "wskp3", RECIPE | {"rate": seed}, file, MADE_BY[:1])
+        start = {"from": file_digest(files[0])} if seed else {}
+        save_weights(create("wskp3"), "wskp3", RECIPE | {"rate": seed} | start, file, MADE_BY[:1])
     assert "needs the NETWORK and --out FILE" in fails(capsys, "weights", "--average", *map(str, files))
     main(["weights", "wskp3", "--average", *map(str, files), "--out", str(wskp3)])
     assert f"{wskp3} is a mean itself" in fails(
@@ -130,6 +132,18 @@ def test_the_mean_of_trainings_names_their_recipes(wskp3, tiny, tmp_path, capsys
         assert f'"rate": {seed}' in recipe and f'"sha256": "{file_digest(file)}"' in recipe
     assert text.count("data set `my.toml`") == 3 and text.count("torch 1.2.3") == 1
     assert "3 trainings' mean" in table()
+
+
+@pytest.mark.parametrize(("starts", "is_averaged"), [(("x", "x"), True), (("x", "y"), False), ((None, None), False)])
+def test_trainings_with_other_starts_have_no_mean(tmp_path, starts, is_averaged):
+    files = [tmp_path / "a.safetensors", tmp_path / "b.safetensors"]
+    for file, start in zip(files, starts, strict=True):
+        recipe = RECIPE | ({"from": start} if start else {})
+        save_weights(create("wskp3"), "wskp3", recipe | {"file": file.name}, file, MADE_BY)
+    refused = pytest.raises(BadInput, match="did not begin with the same weights")
+    with nullcontext() if is_averaged else refused:
+        average_weights(create("wskp3"), "wskp3", files, tmp_path / "mean.safetensors")
+    assert (tmp_path / "mean.safetensors").exists() == is_averaged
 
 
 def test_specialised_weights_have_no_mean(tmp_path):

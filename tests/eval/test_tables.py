@@ -1,11 +1,12 @@
 """Tables that rank denoisers say what each is made from, on the console and in the documentation."""
 
+import math
 import re
 
 import pytest
 
-from eval.pages import GENERATORS, measured
-from eval.results import read_results
+from eval.pages import GENERATORS, measured, noise_off
+from eval.results import NOISE_FLOOR, read_results
 from eval.tables import results_table, table_by_age
 from eval.tradeoff.trades import Trade, front_table, samples_table
 from models.registry import DENOISERS, prototype
@@ -38,6 +39,16 @@ def check(table: str) -> None:
 @pytest.mark.parametrize(("name", "arguments"), DOCUMENTED.items(), ids=DOCUMENTED)
 def test_the_documentation_s_tables(name, arguments):
     check(GENERATORS[name](*arguments))
+
+
+def test_noise_of_references_is_taken_off():
+    """Errors of 1/1000 and 1/100 in references with noise of 1/4000 and 1/1000: 30 and 20 dB."""
+    clips = [
+        {"results": {"one": {"psnr": -10 * math.log10(own + noise)}, NOISE_FLOOR: {"psnr": -10 * math.log10(noise)}}}
+        for own, noise in ((1e-3, 2.5e-4), (1e-2, 1e-3))
+    ]
+    assert noise_off(clips, "one") == "25.00"
+    assert noise_off(clips, NOISE_FLOOR) == ""
 
 
 def test_the_console_s_tables(evaluated):
