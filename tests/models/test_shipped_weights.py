@@ -1,13 +1,16 @@
 """The weights that are shipped: small together, each with a card, and each of a network that denoises with them."""
 
 import tomllib
+from copy import deepcopy
 from fnmatch import fnmatch
 
+import numpy as np
 import pytest
 import torch
 
 from errors import BadInput
 from models import registry
+from models.networks.rae import RAE, RecurrentBlock
 from models.registry import SHIPPED_FOLDER, require_shipped, shipped_names, shipped_weights
 from models.spec import load
 from models.weights import read_metadata
@@ -45,6 +48,36 @@ def test_they_denoise(path):
     for output, frame in zip(run(denoiser, frames), frames, strict=True):
         assert torch.isfinite(output).all() and (output >= 0).all()
         assert output.mean() == pytest.approx(float(frame.radiance(denoiser.signal).mean()), rel=0.5)
+
+
+@torch.no_grad()
+def growth(block: RecurrentBlock, height: int, width: int, frames: int = 30) -> float:
+    """By what factor hidden features grow a frame in the end, by power iteration.
+
+    Without biases and input: what large features do, since all that is left is proportional to them.
+    """
+    block = deepcopy(block)
+    for layer in (block.input, block.merge, block.output):
+        layer.bias.zero_()
+    torch.manual_seed(0)
+    hidden = torch.randn(1, block.output.out_channels, height, width)
+    norms = []
+    for _ in range(frames):
+        hidden = block(torch.zeros_like(hidden), hidden / hidden.norm())
+        norms.append(float(hidden.norm()))
+    return float(np.exp(np.log(norms[-10:]).mean()))
+
+
+@pytest.mark.parametrize("size", [(2, 2), (12, 20), (40, 40)])
+def test_what_rae_carries_fades_at_every_resolution(size):
+    """At 640 x 360 the coarsest features are 20 x 12 pixels; of a training crop of 64 x 64, 2 x 2."""
+    rae = load("rae", shipped_weights("rae"), torch.float32)
+    assert isinstance(rae, RAE)
+    for block in rae.network.recurrent:
+        factor = growth(block, *size)
+        assert factor < 0.95
+        block.merge.weight.data *= 3
+        assert growth(block, *size) == pytest.approx(3 * factor, rel=0.1)
 
 
 @pytest.mark.slow
