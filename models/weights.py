@@ -40,8 +40,7 @@ def average_weights(denoiser: Denoiser, name: str, files: Sequence[Path], path: 
     """Write the mean of the weights of several trainings that had the same start, which may be among them.
 
     After Wortsman et al. 2022, "Model soups". The recipe lists those of the trainings. Raises BadInput as
-    `load_weights` does, for specialised weights, for means, and where the starts differ: no path of low loss connects
-    such weights.
+    `load_weights` does, for specialised weights, for means, and where the starts differ.
     """
     sums: dict[str, Tensor] = {}
     recipes, made_by = [], []
