@@ -186,10 +186,18 @@ static const int LAYER_SIZES[LAYERS][2] = { /* outputs, inputs */
 };
 /* clang-format on */
 
+/* A convolution of 3 x 3 gets two rows from four products of sums of rows, see convolve. */
+enum { PRODUCTS = 4, COLUMNS = 3, TAPS = 9 };
+
+static int is_convolution(int layer)
+{
+    return layer == CONVOLVE_B || layer == CONVOLVE_C1 || layer == CONVOLVE_C2 || layer == JOIN_B || layer == JOIN_A;
+}
+
 typedef struct {
     int inputs, outputs;  /* the latter a multiple of AT_ONCE: the last ones may be 0 */
     const float *bias;    /* (outputs) */
-    const float *weights; /* (outputs / AT_ONCE, inputs, AT_ONCE) */
+    const float *weights; /* (outputs / AT_ONCE, inputs, AT_ONCE); of a convolution, of each product */
 } Layer;
 
 /* Lines of a row that are kept for the whole image. */
@@ -256,6 +264,12 @@ typedef struct {
     float sums_9x9[SUMS][SPAN];
 } Neighbourhood;
 
+/* What a convolution works with: pixel x of a chunk is at x + 1 of the sums of rows. */
+typedef struct {
+    float sums[PRODUCTS][WIDTH_C][HALF_CHUNK + PAD];
+    float products[PRODUCTS][WIDTH_C][HALF_CHUNK];
+} Convolution;
+
 /* What each task works with. */
 typedef union {
     struct {
@@ -267,8 +281,10 @@ typedef union {
         float entered[WIDTH_A][HALF_CHUNK];
     } enter;
     float patches[PATCH * WIDTH_B][HALF_CHUNK];
+    Convolution convolution;
     struct {
-        float joined[WIDTH_A][HALF_CHUNK];
+        Convolution convolution;
+        float joined[2][WIDTH_A][HALF_CHUNK];
         float patches[PATCH * OUTPUTS][HALF_CHUNK];
         float head[OUTPUTS + AT_ONCE][CHUNK];
         float noisy[RGB][CHUNK];
@@ -357,6 +373,13 @@ static void lay_out_strip(onespp *d, Arena *arena)
     d->zeros = allocate(arena, (uint64_t)d->a.pitch, sizeof(float));
 }
 
+/* Numbers that a layer takes; a convolution has zeros beside its bias. */
+static uint64_t parameters_of(const Layer *layer, int name)
+{
+    int products = is_convolution(name) ? PRODUCTS : 1;
+    return (uint64_t)(layer->outputs * (layer->inputs * products + (products > 1 ? 2 : 1)));
+}
+
 static void lay_out_layers(onespp *d, Arena *arena)
 {
     uint64_t count = 0;
@@ -364,7 +387,9 @@ static void lay_out_layers(onespp *d, Arena *arena)
         Layer *layer = &d->layers[i];
         layer->outputs = rounded_up(LAYER_SIZES[i][0], AT_ONCE);
         layer->inputs = LAYER_SIZES[i][1];
-        count += (uint64_t)(layer->outputs * (layer->inputs + 1));
+        if (is_convolution(i))
+            layer->inputs = layer->inputs / TAPS * COLUMNS;
+        count += parameters_of(layer, i);
     }
     d->parameters = allocate(arena, count, sizeof(float));
 }
@@ -391,19 +416,44 @@ static void lay_out(onespp *d, Arena *arena)
     lay_out_strip(d, arena);
 }
 
-/* Reads a layer from the array of all weights: biases, then a matrix (inputs, outputs). Returns what follows it. */
-static const uint16_t *unpack(Layer *layer, int outputs, float *to, const uint16_t *from)
+/* Where the weight of an input for an output is. */
+static ptrdiff_t weight_index(const Layer *layer, int input, int output)
 {
-    float *weights = to + layer->outputs;
-    memset(to, 0, sizeof(float) * (size_t)(layer->outputs * (layer->inputs + 1)));
+    return ((ptrdiff_t)(output / AT_ONCE) * layer->inputs + input) * AT_ONCE + output % AT_ONCE;
+}
+
+/* The weights of a convolution's products, from those of three rows, `row` numbers apart: see convolve. */
+static void unpack_column(const Layer *layer, float *weights, int input, int outputs, const uint16_t *from)
+{
+    ptrdiff_t size = (ptrdiff_t)layer->outputs * layer->inputs, row = COLUMNS * outputs;
+    for (int o = 0; o < outputs; o++, from++) {
+        float *to = weights + weight_index(layer, input, o);
+        float above = float_of_half(from[0]), here = float_of_half(from[row]), below = float_of_half(from[2 * row]);
+        to[0] = above;
+        to[size] = (above + here + below) / 2;
+        to[2 * size] = (above - here + below) / 2;
+        to[3 * size] = below;
+    }
+}
+
+/* Reads a layer from the array of all weights: biases, then a matrix (inputs, outputs), where those of a convolution
+ * are in the order of channels, rows, columns. Returns what follows it. */
+static const uint16_t *unpack(Layer *layer, int name, float *to, const uint16_t *from)
+{
+    int outputs = LAYER_SIZES[name][0], inputs = LAYER_SIZES[name][1];
+    float *weights = to + (is_convolution(name) ? 2 : 1) * layer->outputs;
+    memset(to, 0, sizeof(float) * (size_t)parameters_of(layer, name));
     for (int o = 0; o < outputs; o++)
         to[o] = float_of_half(*from++);
     for (int i = 0; i < layer->inputs; i++)
-        for (int o = 0; o < outputs; o++)
-            weights[(o / AT_ONCE * layer->inputs + i) * AT_ONCE + o % AT_ONCE] = float_of_half(*from++);
+        if (is_convolution(name))
+            unpack_column(layer, weights, i, outputs, from + (i / COLUMNS * TAPS + i % COLUMNS) * outputs);
+        else
+            for (int o = 0; o < outputs; o++)
+                weights[weight_index(layer, i, o)] = float_of_half(from[i * outputs + o]);
     layer->bias = to;
     layer->weights = weights;
-    return from;
+    return from + (ptrdiff_t)inputs * outputs;
 }
 
 /* --- Frames ------------------------------------------------------------------------------------------------------- */
@@ -985,31 +1035,77 @@ static void clear_margins(const Window *w, int y, int width)
     }
 }
 
-/* The 3 x 3 taps of a row of an image of `height` rows, in the order of channels, rows, columns. */
-static void find_taps(const float **taps, const Window *from, int y, int height, const float *zeros)
-{
-    for (int c = 0; c < from->channels; c++)
-        for (int row = y - 1; row <= y + 1; row++) {
-            const float *line = row >= 0 && row < height ? line_of(from, row, c) : zeros + PAD;
-            for (int dx = -1; dx <= 1; dx++)
-                *taps++ = line + dx;
-        }
-}
-
 /* The size of the image of a window's resolution. */
 static int scaled(int size, int channels) { return size / (channels == WIDTH_A ? 2 : channels == WIDTH_B ? 4 : 8); }
 
-/* ReLU of a convolution of 3 x 3. */
+/* Of each channel, pixels x - 1 to x + n of the sums of rows y - 1 to y + 2 that a convolution's products need. */
+static void sum_rows(
+    const Job *job, Convolution *scratch, const Window *from, float *const rows[2], int y, int x, int n)
+{
+    int height = scaled(job->padded_height, from->channels);
+    for (int c = 0; c < from->channels; c++) {
+        const float *lines[4];
+        for (int i = 0; i < 4; i++) {
+            int is_needed = (i > 0 || rows[0]) && (i < 3 || rows[1]), row = y - 1 + i;
+            lines[i] = (is_needed && row >= 0 && row < height ? line_of(from, row, c) : job->d->zeros + PAD) + x - 1;
+        }
+        for (int i = 0; i < n + 2; i++) {
+            scratch->sums[0][c][i] = lines[0][i] - lines[2][i];
+            scratch->sums[1][c][i] = lines[1][i] + lines[2][i];
+            scratch->sums[2][c][i] = lines[2][i] - lines[1][i];
+            scratch->sums[3][c][i] = lines[1][i] - lines[3][i];
+        }
+    }
+}
+
+static void rectify_sum(
+    float *restrict line, const float *restrict a, float sign, const float *restrict b, const float *restrict c, int n)
+{
+    for (int i = 0; i < n; i++)
+        line[i] = maxf(a[i] + sign * (b[i] + c[i]), 0);
+}
+
+/* ReLU of a convolution of 3 x 3: pixels x to x + n - 1 of rows y and y + 1, n at most HALF_CHUNK. Their lines, `pitch`
+ * apart, begin at `rows`; one row may be NULL. Winograd's F(2, 3) along columns (Lavin and Gray 2016, section 4.1)
+ * multiplies sums of four rows by sums of three weights, which are four products for two rows instead of six. */
+static void convolve(
+    const Job *job, Convolution *scratch, LayerName name, const Window *from, float *const rows[2], int y, int x,
+    int n, ptrdiff_t pitch)
+{
+    Layer layer = job->d->layers[name];
+    const float *bias = layer.bias, *taps[COLUMNS * WIDTH_C];
+    sum_rows(job, scratch, from, rows, y, x, rounded_up(n, LANES));
+    for (int product = 0; product < PRODUCTS; product++) {
+        for (int i = 0; i < layer.inputs; i++)
+            taps[i] = scratch->sums[product][i / COLUMNS] + i % COLUMNS;
+        layer.bias = product == 1 ? bias : bias + layer.outputs; /* that in both rows; to others zeros are added */
+        if ((product > 0 || rows[0]) && (product < 3 || rows[1]))
+            multiply(&layer, taps, 0, n, scratch->products[product][0], HALF_CHUNK, PLAIN);
+        layer.weights += (ptrdiff_t)layer.outputs * layer.inputs;
+    }
+    for (int o = 0; o < layer.outputs; o++) {
+        float(*products)[WIDTH_C][HALF_CHUNK] = scratch->products;
+        if (rows[0])
+            rectify_sum(rows[0] + o * pitch, products[1][o], 1, products[0][o], products[2][o], n);
+        if (rows[1])
+            rectify_sum(rows[1] + o * pitch, products[1][o], -1, products[2][o], products[3][o], n);
+    }
+}
+
 static void convolve_rows(Job *job, Scratch *scratch, int first, int last)
 {
-    (void)scratch;
-    const float *taps[9 * WIDTH_C];
-    int width = scaled(job->padded_width, job->to->channels), height = scaled(job->padded_height, job->to->channels);
-    for (int y = first; y < last; y++) {
-        find_taps(taps, job->from, y, height, job->d->zeros);
-        multiply(&job->d->layers[job->layer], taps, 0, width, line_of(job->to, y, 0), job->to->pitch, RECTIFIED);
-        clear_margins(job->to, y, width);
-    }
+    const Window *to = job->to;
+    int width = scaled(job->padded_width, to->channels);
+    for (int y = first / 2 * 2; y < last; y += 2)
+        for (int x = 0; x < width; x += HALF_CHUNK) {
+            float *upper = y >= first ? line_of(to, y, 0) + x : NULL;
+            float *lower = y + 1 < last ? line_of(to, y + 1, 0) + x : NULL;
+            float *rows[2] = {upper, lower};
+            int n = mini(HALF_CHUNK, width - x);
+            convolve(job, &scratch->convolution, job->layer, job->from, rows, y, x, n, to->pitch);
+        }
+    for (int y = first; y < last; y++)
+        clear_margins(to, y, width);
 }
 
 /* Even and odd pixels of 2 n pixels. In patches of 2 x 2 pixels, lines are in the order of rows, columns, channels. */
@@ -1336,31 +1432,40 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
     decode_latent(job, head, y, x0, n);
 }
 
+/* Two rows of a chunk, n pixels from x0 on, from a row y at 1/2 of the resolution, whose channels are `joined`. */
+static void leave_chunk(const Job *job, Scratch *scratch, float (*joined)[HALF_CHUNK], int y, int x0, int n)
+{
+    const onespp *d = job->d;
+    const float *lines[WIDTH_A], *hidden[DETAIL];
+    float(*patches)[HALF_CHUNK] = scratch->leave.patches;
+    for (int c = 0; c < WIDTH_A; c++)
+        lines[c] = joined[c];
+    multiply(&d->layers[LEAVE], lines, 0, n / 2 + n % 2, patches[0], HALF_CHUNK, PLAIN);
+    for (int row = 2 * y; row < mini(2 * y + 2, job->frame.height); row++) {
+        int even = row % 2 * 2 * OUTPUTS;
+        for (int c = 0; c < OUTPUTS; c++)
+            join(scratch->leave.head[c], patches[even + c], patches[even + OUTPUTS + c], HALF_CHUNK);
+        for (int c = 0; c < DETAIL; c++)
+            hidden[c] = line_of(&d->hidden, row, c) + x0;
+        multiply(&d->layers[DETAIL_2], hidden, 0, n, scratch->leave.head[0], CHUNK, ADDED);
+        decode(job, scratch, row, x0, n);
+    }
+}
+
 /* The rows are those of 1/2 of the resolution. */
 static void leave_rows(Job *job, Scratch *scratch, int first, int last)
 {
-    const onespp *d = job->d;
-    const float *taps[9 * WIDTH_A], *joined[WIDTH_A], *hidden[DETAIL];
-    float(*patches)[HALF_CHUNK] = scratch->leave.patches;
-    for (int c = 0; c < WIDTH_A; c++)
-        joined[c] = scratch->leave.joined[c];
-    for (int y = first; y < last; y++) {
-        find_taps(taps, &d->sum_a, y, job->padded_height / 2, d->zeros);
+    Convolution *convolution = &scratch->leave.convolution;
+    for (int y = first / 2 * 2; y < last; y += 2)
         for (int x = 0; x < job->padded_width / 2; x += HALF_CHUNK) {
-            int x0 = 2 * x, n = mini(CHUNK, job->frame.width - x0);
-            multiply(&d->layers[JOIN_A], taps, x, n / 2 + n % 2, scratch->leave.joined[0], HALF_CHUNK, RECTIFIED);
-            multiply(&d->layers[LEAVE], joined, 0, n / 2 + n % 2, patches[0], HALF_CHUNK, PLAIN);
-            for (int row = 2 * y; row < mini(2 * y + 2, job->frame.height); row++) {
-                int even = row % 2 * 2 * OUTPUTS;
-                for (int c = 0; c < OUTPUTS; c++)
-                    join(scratch->leave.head[c], patches[even + c], patches[even + OUTPUTS + c], HALF_CHUNK);
-                for (int c = 0; c < DETAIL; c++)
-                    hidden[c] = line_of(&d->hidden, row, c) + x0;
-                multiply(&d->layers[DETAIL_2], hidden, 0, n, scratch->leave.head[0], CHUNK, ADDED);
-                decode(job, scratch, row, x0, n);
-            }
+            int n = mini(CHUNK, job->frame.width - 2 * x);
+            float(*joined)[WIDTH_A][HALF_CHUNK] = scratch->leave.joined;
+            float *rows[2] = {y >= first ? joined[0][0] : NULL, y + 1 < last ? joined[1][0] : NULL};
+            convolve(job, convolution, JOIN_A, &job->d->sum_a, rows, y, x, n / 2 + n % 2, HALF_CHUNK);
+            for (int i = 0; i < 2; i++)
+                if (rows[i])
+                    leave_chunk(job, scratch, joined[i], y + i, 2 * x, n);
         }
-    }
 }
 
 /* --- The network, strip by strip ---------------------------------------------------------------------------------- */
@@ -1656,8 +1761,8 @@ static onespp *create(const onespp_config *config, void *memory, const uint16_t 
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
     float *to = d->parameters;
     for (int i = 0; i < LAYERS; i++) {
-        weights = unpack(&d->layers[i], LAYER_SIZES[i][0], to, weights);
-        to += d->layers[i].outputs * (d->layers[i].inputs + 1);
+        weights = unpack(&d->layers[i], i, to, weights);
+        to += parameters_of(&d->layers[i], i);
     }
     return d;
 }
