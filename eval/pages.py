@@ -439,4 +439,6 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    if any(argument.startswith("-") for argument in sys.argv[1:]):
+        sys.exit(__doc__)
     main(sys.argv[1:])
