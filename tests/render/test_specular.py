@@ -81,7 +81,7 @@ def case_of(name):
     return pytest.param(*CASES[name], id=name, marks=[pytest.mark.slow] * (name in ("behind two", "behind a slab")))
 
 
-@pytest.mark.parametrize(("shapes", "share"), map(case_of, CASES))
+@pytest.mark.parametrize(("shapes", "share"), [case_of(case) for case in CASES])
 def test_a_lamp_is_as_free_of_noise_as_one_seen_directly(shapes, share):
     """In a black room nothing remains to be sampled, but for reflections back and forth that are too weak to follow."""
     scene = scene_of(*shapes)
