@@ -189,9 +189,9 @@ static const int LAYER_SIZES[LAYERS][2] = { /* outputs, inputs */
 /* A convolution of 3 x 3 gets two rows from four products of sums of rows, see convolve. */
 enum { PRODUCTS = 4, COLUMNS = 3, TAPS = 9 };
 
-static int is_convolution(int layer)
+static int is_convolution(int name)
 {
-    return layer == CONVOLVE_B || layer == CONVOLVE_C1 || layer == CONVOLVE_C2 || layer == JOIN_B || layer == JOIN_A;
+    return name == CONVOLVE_B || name == CONVOLVE_C1 || name == CONVOLVE_C2 || name == JOIN_B || name == JOIN_A;
 }
 
 typedef struct {
@@ -373,11 +373,10 @@ static void lay_out_strip(onespp *d, Arena *arena)
     d->zeros = allocate(arena, (uint64_t)d->a.pitch, sizeof(float));
 }
 
-/* Numbers that a layer takes; a convolution has zeros beside its bias. */
+/* How many floats a layer's bias and weights are. */
 static uint64_t parameters_of(const Layer *layer, int name)
 {
-    int products = is_convolution(name) ? PRODUCTS : 1;
-    return (uint64_t)(layer->outputs * (layer->inputs * products + (products > 1 ? 2 : 1)));
+    return (uint64_t)(layer->outputs * (layer->inputs * (is_convolution(name) ? PRODUCTS : 1) + 1));
 }
 
 static void lay_out_layers(onespp *d, Arena *arena)
@@ -441,7 +440,7 @@ static void unpack_column(const Layer *layer, float *weights, int input, int out
 static const uint16_t *unpack(Layer *layer, int name, float *to, const uint16_t *from)
 {
     int outputs = LAYER_SIZES[name][0], inputs = LAYER_SIZES[name][1];
-    float *weights = to + (is_convolution(name) ? 2 : 1) * layer->outputs;
+    float *weights = to + layer->outputs;
     memset(to, 0, sizeof(float) * (size_t)parameters_of(layer, name));
     for (int o = 0; o < outputs; o++)
         to[o] = float_of_half(*from++);
@@ -1038,6 +1037,9 @@ static void clear_margins(const Window *w, int y, int width)
 /* The size of the image of a window's resolution. */
 static int scaled(int size, int channels) { return size / (channels == WIDTH_A ? 2 : channels == WIDTH_B ? 4 : 8); }
 
+/* Whether a convolution of these rows, of which one may be NULL, needs row y - 1 + i and product i. */
+static int is_needed(float *const rows[2], int i) { return (i > 0 || rows[0]) && (i < PRODUCTS - 1 || rows[1]); }
+
 /* Of each channel, pixels x - 1 to x + n of the sums of rows y - 1 to y + 2 that a convolution's products need. */
 static void sum_rows(
     const Job *job, Convolution *scratch, const Window *from, float *const rows[2], int y, int x, int n)
@@ -1046,8 +1048,8 @@ static void sum_rows(
     for (int c = 0; c < from->channels; c++) {
         const float *lines[4];
         for (int i = 0; i < 4; i++) {
-            int is_needed = (i > 0 || rows[0]) && (i < 3 || rows[1]), row = y - 1 + i;
-            lines[i] = (is_needed && row >= 0 && row < height ? line_of(from, row, c) : job->d->zeros + PAD) + x - 1;
+            int row = y - 1 + i, is_read = is_needed(rows, i) && row >= 0 && row < height;
+            lines[i] = (is_read ? line_of(from, row, c) : job->d->zeros + PAD) + x - 1;
         }
         for (int i = 0; i < n + 2; i++) {
             scratch->sums[0][c][i] = lines[0][i] - lines[2][i];
@@ -1072,14 +1074,15 @@ static void convolve(
     const Job *job, Convolution *scratch, LayerName name, const Window *from, float *const rows[2], int y, int x,
     int n, ptrdiff_t pitch)
 {
+    static const float no_bias[WIDTH_C] = {0};
     Layer layer = job->d->layers[name];
     const float *bias = layer.bias, *taps[COLUMNS * WIDTH_C];
     sum_rows(job, scratch, from, rows, y, x, rounded_up(n, LANES));
     for (int product = 0; product < PRODUCTS; product++) {
         for (int i = 0; i < layer.inputs; i++)
             taps[i] = scratch->sums[product][i / COLUMNS] + i % COLUMNS;
-        layer.bias = product == 1 ? bias : bias + layer.outputs; /* that in both rows; to others zeros are added */
-        if ((product > 0 || rows[0]) && (product < 3 || rows[1]))
+        layer.bias = product == 1 ? bias : no_bias; /* this product is in both rows */
+        if (is_needed(rows, product))
             multiply(&layer, taps, 0, n, scratch->products[product][0], HALF_CHUNK, PLAIN);
         layer.weights += (ptrdiff_t)layer.outputs * layer.inputs;
     }
