@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets.channels import CHANNELS, MIRRORED, OPTIONAL_STEPS, SAMPLE_BUFFERS, SECOND, SECOND_LAYER
@@ -17,6 +18,7 @@ from render.first_bounce import hit_channels
 from render.gbuffer import Arrays, light_of_second_layer, render_gbuffer
 from render.glass_motion import chains_at, traced_motion
 from render.gradient import GradientSamples
+from render.kept import kept, kept_references
 from render.motion import dual_motion_vectors, tracked_motion
 from render.path import PathTracer, SampleRange
 from render.stage import Stage
@@ -118,8 +120,11 @@ def noise_free_frames(
 class SampledChannels:
     """Renders the channels of a clip that need random samples; its methods take the frames in order."""
 
-    def __init__(self, stage: Stage, sampling: Sampling, seed: int, in_buffers: bool, in_layers: bool):
+    def __init__(
+        self, stage: Stage, sampling: Sampling, seed: int, in_buffers: bool, in_layers: bool, references: Path | None
+    ):
         self.stage = stage
+        self.references = references
         self.in_layers = in_layers
         self.sampling = sampling
         self.seed = seed
@@ -171,8 +176,12 @@ class SampledChannels:
     def reference(self, frame: FrameInProgress) -> Arrays:
         spp = self.sampling.reference_spp // 2
         seeds = [stream_seed(self.seed, frame.index, REFERENCE_STREAM, buffer) for buffer in range(2)]
-        direct, indirect = zip(*(self.tracer.radiance(self.ray, seed, spp) for seed in seeds), strict=True)
-        return {"direct_reference": np.stack(direct), "indirect_reference": np.stack(indirect)}
+
+        def light() -> NDArray[np.float32]:  # (direct and indirect, buffers, H, W, 3)
+            return np.stack([self.tracer.radiance(self.ray, seed, spp) for seed in seeds], axis=1)
+
+        direct, indirect = kept(self.references / f"{frame.index}.npy", light) if self.references else light()
+        return {"direct_reference": direct, "indirect_reference": indirect}
 
 
 def render_clip(
@@ -183,12 +192,15 @@ def render_clip(
     sampling: Sampling,
     seed: int,
     channels: Collection[str] | None = None,
+    references: Path | None = None,
 ) -> Iterator[tuple[Arrays, Seconds]]:
     """Yield for each frame its channels, named and shaped as on disk (without the frame axis), and seconds by step.
 
     `channels` are those to render, with what mirrors and glass show in a scene with these, in two layers if they name
     any of SECOND_LAYER; by default all but sample buffers. Sample buffers need an even number of noisy samples a pixel,
     and change which samples are drawn.
+
+    References that an earlier call with these arguments left in the folder `references` are not rendered again.
 
     Deterministic in its arguments for one Mitsuba variant and processor.
     """
@@ -199,7 +211,7 @@ def render_clip(
     layers = [MIRRORED] * stage.looks_through + [SECOND] * in_layers
     wanted |= {forms[name] for forms in layers for name in wanted & forms.keys()}
     skipped = set(OPTIONAL_STEPS) - {CHANNELS[name].step for name in wanted}
-    sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers)
+    sampled = SampledChannels(stage, sampling, seed, SAMPLE_BUFFERS["direct"] in wanted, in_layers, references)
     steps = (sampled.noisy, sampled.hit_distance, sampled.shadow_motion, sampled.gradient, sampled.reference)
     steps_by_name = {step.__name__: step for step in steps}  # optional ones are called so in the channel table
     wants_dual = "dual_motion" not in skipped
@@ -224,12 +236,13 @@ def write_clip(
 ) -> None:
     """Render channels of a scene into a clip of `size` (frames, height, width), completely or not at all.
 
-    `seconds_before` rendering, by step, are recorded with those of rendering.
+    `seconds_before` rendering, by step, are recorded with those of rendering. After an interruption the references that
+    were finished are kept, and their time is not counted.
     """
     split, scene_name, clip_name = folder.parts[-3:]
-    frames = render_clip(scene, *size, sampling, seed, channels)
     derived = {name: "camera" for name in channels if CHANNELS[name].is_camera_motion and not scene.moves()}
-    with ClipWriter(folder) as writer:
+    with kept_references(folder) as references, ClipWriter(folder) as writer:
+        frames = render_clip(scene, *size, sampling, seed, channels, references)
         writer.timing = dict(seconds_before or {})
         for arrays, seconds in tqdm(frames, f"{split}/{scene_name}/{clip_name}", size[0], leave=False, unit="frame"):
             writer.add(arrays, seconds)

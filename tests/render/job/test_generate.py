@@ -20,6 +20,7 @@ from datasets.info import summarise
 from errors import BadInput
 from files import locked
 from render.job.generate import generate, share_of
+from render.path import PathTracer
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 from tests.helpers.training import full_disk
 
@@ -42,6 +43,28 @@ def test_rerun_renders_only_what_is_missing_and_ends_with_equal_bytes(tiny, tiny
     assert digest(tiny_copy) == digest(tiny)
     assert (tiny_copy / "test" / "cornell_box" / "000" / "direct.npy").stat().st_mtime_ns == untouched
     assert generate_tiny(tiny_copy) == 0
+
+
+def test_an_interrupted_clip_keeps_the_references_that_are_finished(tiny, tiny_copy, monkeypatch):
+    [clip] = remove_clips(tiny_copy, "test/cornell_box/000")
+    radiance = PathTracer.radiance
+    buffers = []
+
+    def interrupted(self, ray, seed, spp, *others):
+        buffers.extend([spp] if spp == 64 else [])
+        if len(buffers) == 6:
+            raise KeyboardInterrupt
+        return radiance(self, ray, seed, spp, *others)
+
+    monkeypatch.setattr(PathTracer, "radiance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        generate_tiny(tiny_copy)
+    assert sorted(path.name for path in (clip.parent / ".000.references").iterdir()) == ["0.npy", "1.npy"]
+    (clip.parent / ".000.references" / "1.npy").write_bytes(b"damaged")
+    buffers.extend([0] * 10)
+    generate_tiny(tiny_copy)
+    assert len(buffers) - 16 == 2 * (8 - 1)
+    assert digest(tiny_copy) == digest(tiny)
 
 
 def all_are_whole(root: Path) -> bool:
