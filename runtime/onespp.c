@@ -203,6 +203,7 @@ typedef struct {
 /* Lines of a row that are kept for the whole image. */
 enum {
     FEATURE_LINES = 0,
+    NOISY_LINES = FEATURE_LINES, /* irradiance of the frame, until `leave` */
     LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, red, green, blue of its output */
     ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
     OUTPUT_LINES, /* of the previous frame, reprojected */
@@ -274,7 +275,7 @@ typedef struct {
 typedef union {
     struct {
         Neighbourhood around;
-        float history[HISTORY][CHUNK];
+        float history[TEXEL][CHUNK]; /* the last lines are not used */
         float parts[MAX_PART_HISTORY][CHUNK];
         float lines[2][INPUTS][CHUNK];
         float patches[PATCH * INPUTS][HALF_CHUNK];
@@ -587,36 +588,41 @@ static float *part_line(const onespp *d, int y, int part, int line)
 
 /* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
 
-/* Mean luminance of the surfaces of a block, -1 without any. */
-static double block_luminance(const onespp_frame *frame, int row, int column)
+/* Keeps the noisy irradiance of n pixels of a row; adds luminance to the sums of the blocks that they lie in, and counts
+ * surfaces. */
+static void measure_row(const Job *job, int y, int x0, int n, float *restrict sums, int *restrict surfaces)
 {
-    int x = column * BLOCK, n = mini(BLOCK, frame->width - x), surfaces = 0;
-    float sum = 0;
-    for (int y = row * BLOCK; y < mini((row + 1) * BLOCK, frame->height); y++) {
-        float light[RGB][BLOCK], divisor[BLOCK], depth[BLOCK];
-        for (int c = 0; c < RGB; c++) {
-            load_irradiance(light[c], frame, c, y, x, n);
-            load_divisor(divisor, frame, c, y, x, n);
-            for (int i = 0; i < n; i++)
-                light[c][i] *= divisor[i];
-        }
-        load(depth, &frame->depth, 0, y, x, n);
-        for (int i = 0; i < n; i++) {
-            sum += luminance(light[0][i], light[1][i], light[2][i]);
-            surfaces += depth[i] > 0;
-        }
+    float light[RGB][CHUNK], divisor[CHUNK], depth[CHUNK];
+    for (int c = 0; c < RGB; c++) {
+        float *restrict noisy = row_line(job->d, y, NOISY_LINES + c) + x0;
+        load_irradiance(noisy, &job->frame, c, y, x0, n);
+        load_divisor(divisor, &job->frame, c, y, x0, n);
+        for (int i = 0; i < n; i++)
+            light[c][i] = noisy[i] * divisor[i];
     }
-    return surfaces ? (double)sum / surfaces : -1;
+    load(depth, &job->frame.depth, 0, y, x0, n);
+    for (int i = 0; i < n; i++) {
+        sums[i / BLOCK] += luminance(light[0][i], light[1][i], light[2][i]);
+        surfaces[i / BLOCK] += depth[i] > 0;
+    }
 }
 
-/* The rows are those of blocks. */
+/* Mean luminance of the surfaces of blocks, -1 without any. The rows are those of blocks. */
 static void measure_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
-    int columns = (job->frame.width + BLOCK - 1) / BLOCK;
+    const onespp_frame *frame = &job->frame;
+    int columns = (frame->width + BLOCK - 1) / BLOCK;
     for (int row = first; row < last; row++)
-        for (int column = 0; column < columns; column++)
-            job->d->blocks[(ptrdiff_t)row * columns + column] = block_luminance(&job->frame, row, column);
+        for (int x0 = 0; x0 < frame->width; x0 += CHUNK) {
+            float sums[CHUNK / BLOCK] = {0};
+            int surfaces[CHUNK / BLOCK] = {0}, n = mini(CHUNK, frame->width - x0);
+            for (int y = row * BLOCK; y < mini((row + 1) * BLOCK, frame->height); y++)
+                measure_row(job, y, x0, n, sums, surfaces);
+            double *means = job->d->blocks + (ptrdiff_t)row * columns + x0 / BLOCK;
+            for (int i = 0; i * BLOCK < n; i++)
+                means[i] = surfaces[i] ? (double)sums[i] / surfaces[i] : -1;
+        }
 }
 
 static void update(RunningMean *mean, double value)
@@ -761,6 +767,52 @@ static void set_up_geometry(Job *job)
     }
 }
 
+/* --- Interleaving ------------------------------------------------------------------------------------------------- */
+
+/* Even and odd pixels of 2 n pixels. */
+static void split(float *restrict even, float *restrict odd, const float *restrict line, int n)
+{
+    for (int i = 0; i < n; i++) {
+        even[i] = line[2 * i];
+        odd[i] = line[2 * i + 1];
+    }
+}
+
+static void join(float *restrict line, const float *restrict even, const float *restrict odd, int n)
+{
+    for (int i = 0; i < n; i++) {
+        line[2 * i] = even[i];
+        line[2 * i + 1] = odd[i];
+    }
+}
+
+/* Texels of n pixels from the lines of their channels, a transposition that compilers vectorise: each round joins a line
+ * of the first half of them with one of the second half. */
+static void join_texels(float *restrict texels, const float *const lines[TEXEL], int n)
+{
+    float two[TEXEL / 2][2 * CHUNK], four[TEXEL / 4][4 * CHUNK];
+    for (int c = 0; c < 8; c++)
+        join(two[c], lines[c], lines[c + 8], n);
+    for (int c = 0; c < 4; c++)
+        join(four[c], two[c], two[c + 4], 2 * n);
+    for (int c = 0; c < 2; c++)
+        join(two[4 * c], four[c], four[c + 2], 4 * n);
+    join(texels, two[0], two[4], 8 * n);
+}
+
+/* The rounds of join_texels, undone. */
+static void split_texels(float (*restrict lines)[CHUNK], const float *restrict texels, int n)
+{
+    float two[TEXEL / 2][2 * CHUNK], four[TEXEL / 4][4 * CHUNK];
+    split(two[0], two[4], texels, 8 * n);
+    for (int c = 0; c < 2; c++)
+        split(four[c], four[c + 2], two[4 * c], 4 * n);
+    for (int c = 0; c < 4; c++)
+        split(two[c], two[c + 4], four[c], 2 * n);
+    for (int c = 0; c < 8; c++)
+        split(lines[c], lines[c + 8], two[c], n);
+}
+
 /* --- Reprojection: what the previous frame holds of a pixel's surface --------------------------------------------- */
 
 typedef struct {
@@ -784,7 +836,7 @@ static Surface surface_before(const Job *job, int x, int y, float depth, const f
 }
 
 /* Whether pixel (x, y) of the previous frame shows the surface. */
-static int is_consistent(const Job *job, const Surface *surface, int x, int y)
+static inline int is_consistent(const Job *job, const Surface *surface, int x, int y)
 {
     const onespp *d = job->d;
     ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x;
@@ -803,7 +855,8 @@ static int is_consistent(const Job *job, const Surface *surface, int x, int y)
     return fabsf(off_plane) <= PLANE_TOLERANCE * depth && cosine >= NORMAL_TOLERANCE;
 }
 
-static void add_texel(float *restrict sum, float weight, const Job *job, int x, int y)
+static inline void add_texel(
+    float *restrict sum, float *restrict of_part, float weight, const Job *job, int x, int y)
 {
     ptrdiff_t pixel = (ptrdiff_t)y * job->d->pitch + x;
     int of_parts = PART_HISTORY * job->frame.parts;
@@ -812,29 +865,31 @@ static void add_texel(float *restrict sum, float weight, const Job *job, int x, 
     for (int c = 0; c < TEXEL; c++)
         sum[c] += weight * texel[c];
     for (int c = 0; c < of_parts; c++)
-        sum[TEXEL + c] += weight * parts[c];
+        of_part[c] += weight * parts[c];
 }
 
 /* The mean of the consistent ones among 3 x 3 pixels. */
-static void fetch_box(const Job *job, const Surface *surface, int x, int y, float *texel)
+static void fetch_box(const Job *job, const Surface *surface, int x, int y, float *texel, float *of_part)
 {
     int count = 0;
     for (int tap = 0; tap < 9; tap++) {
         int column = x + tap % 3 - 1, row = y + tap / 3 - 1;
         if (is_consistent(job, surface, column, row)) {
-            add_texel(texel, 1, job, column, row);
+            add_texel(texel, of_part, 1, job, column, row);
             count++;
         }
     }
-    for (int c = 0; c < TEXEL + PART_HISTORY * job->frame.parts; c++)
+    for (int c = 0; c < TEXEL; c++)
         texel[c] /= (float)maxi(count, 1);
+    for (int c = 0; c < PART_HISTORY * job->frame.parts; c++)
+        of_part[c] /= (float)maxi(count, 1);
 }
 
 /* The history of a surface at position (x, y) of the previous frame, from the corners of pixels, added to a texel of 0
  * and those of parts: nothing where there is none.
  *
  * The weights of taps that fail are spread evenly over the others (SVGF, section 4.1). */
-static void fetch(const Job *job, const Surface *surface, float x, float y, float *texel)
+static void fetch(const Job *job, const Surface *surface, float x, float y, float *texel, float *of_part)
 {
     int left = (int)floorf(x), top = (int)floorf(y);
     float fx = x - (float)left, fy = y - (float)top;
@@ -847,19 +902,19 @@ static void fetch(const Job *job, const Surface *surface, float x, float y, floa
         failed += good[tap] ? 0 : weights[tap];
     }
     if (count == 0) {
-        fetch_box(job, surface, left + (fx >= 0.5f), top + (fy >= 0.5f), texel);
+        fetch_box(job, surface, left + (fx >= 0.5f), top + (fy >= 0.5f), texel, of_part);
         return;
     }
     for (int tap = 0; tap < 4; tap++)
         if (good[tap])
-            add_texel(texel, weights[tap] + failed / (float)count, job, left + tap % 2, top + tap / 2);
+            add_texel(texel, of_part, weights[tap] + failed / (float)count, job, left + tap % 2, top + tap / 2);
 }
 
 /* The history of n pixels of a row, from x0 on; 0 where there is none. */
 static void reproject(
     const Job *job, int y, int x0, int n, float (*restrict history)[CHUNK], float (*restrict parts)[CHUNK])
 {
-    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK], texel[TEXEL + MAX_PART_HISTORY];
+    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK], texels[CHUNK][TEXEL], of_part[MAX_PART_HISTORY];
     int32_t mesh[CHUNK];
     int of_parts = PART_HISTORY * job->frame.parts;
     if (!job->has_history) {
@@ -873,21 +928,21 @@ static void reproject(
         load_normal(normal[c], &job->frame, c, y, x0, n);
     load(depth, &job->frame.depth, 0, y, x0, n);
     load_mesh(mesh, &job->frame, y, x0, n);
+    memset(texels, 0, sizeof texels);
     for (int i = 0; i < n; i++) {
-        memset(texel, 0, sizeof(float) * (size_t)(TEXEL + of_parts));
+        memset(of_part, 0, sizeof(float) * (size_t)of_parts);
         if (depth[i] > 0) {
             /* Far outside the image an index would overflow; any place outside is as good. */
             float x = maxf(minf((float)(x0 + i) + motion[0][i], (float)job->d->width + 1), -2);
             float y_then = maxf(minf((float)y + motion[1][i], (float)job->d->height + 1), -2);
             float n_here[3] = {normal[0][i], normal[1][i], normal[2][i]};
             Surface surface = surface_before(job, x0 + i, y, depth[i], n_here, mesh[i]);
-            fetch(job, &surface, x, y_then, texel);
+            fetch(job, &surface, x, y_then, texels[i], of_part);
         }
-        for (int c = 0; c < HISTORY; c++)
-            history[c][i] = texel[c];
         for (int c = 0; c < of_parts; c++)
-            parts[c][i] = texel[TEXEL + c];
+            parts[c][i] = of_part[c];
     }
+    split_texels(history, texels[0], n);
 }
 
 /* --- Statistics over neighbours of the same mesh ------------------------------------------------------------------ */
@@ -909,7 +964,7 @@ static void read_row(const Job *job, Neighbourhood *around, int y, int x0)
         return;
     load_mesh(mesh + left, frame, y, first, n);
     for (int c = 0; c < RGB; c++)
-        load_irradiance(pixels[c] + left, frame, c, y, first, n);
+        memcpy(pixels[c] + left, row_line(job->d, y, NOISY_LINES + c) + first, sizeof(float) * (size_t)n);
     for (int i = 0; i < SPAN; i++) {
         float bright = minf(luminance(pixels[0][i], pixels[1][i], pixels[2][i]), MAX_LUMINANCE);
         pixels[3][i] = bright;
@@ -969,10 +1024,20 @@ static inline void add_scaled(float *restrict line, float factor, const float *r
         line[i] += factor * from[i];
 }
 
-static inline void rectify(float *restrict line)
+/* What sums begin with: the bias, or the outputs so far unless they are NULL. */
+static inline void begin(float *restrict sums, float bias, const float *restrict outputs)
+{
+    if (outputs)
+        copy(sums, outputs);
+    else
+        fill(sums, bias);
+}
+
+/* The outputs are the sums, or `least` where those are smaller. */
+static inline void end(float *restrict outputs, const float *restrict sums, float least)
 {
     for (int i = 0; i < LANES; i++)
-        line[i] = maxf(line[i], 0);
+        outputs[i] = maxf(sums[i], least);
 }
 
 typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
@@ -984,12 +1049,12 @@ static void multiply_block(
     ptrdiff_t x, float *restrict out, ptrdiff_t pitch, Finish finish)
 {
     float s0[LANES], s1[LANES], s2[LANES], s3[LANES];
-    float *sums[4] = {s0, s1, s2, s3};
-    for (int o = 0; o < AT_ONCE; o++) {
-        if (finish == ADDED)
-            copy(sums[o], out + o * pitch);
-        else
-            fill(sums[o], bias[o]);
+    float *out1 = out + pitch, *out2 = out1 + pitch, *out3 = out2 + pitch;
+    begin(s0, bias[0], finish == ADDED ? out : NULL);
+    begin(s1, bias[1], finish == ADDED ? out1 : NULL);
+    if (AT_ONCE > 2) {
+        begin(s2, bias[2], finish == ADDED ? out2 : NULL);
+        begin(s3, bias[3], finish == ADDED ? out3 : NULL);
     }
     for (int i = 0; i < count; i++, weights += AT_ONCE) {
         const float *line = inputs[i] + x;
@@ -1000,10 +1065,12 @@ static void multiply_block(
             add_scaled(s3, weights[3], line);
         }
     }
-    for (int o = 0; o < AT_ONCE; o++) {
-        if (finish == RECTIFIED)
-            rectify(sums[o]);
-        copy(out + o * pitch, sums[o]);
+    float least = finish == RECTIFIED ? 0 : -FLT_MAX;
+    end(out, s0, least);
+    end(out1, s1, least);
+    if (AT_ONCE > 2) {
+        end(out2, s2, least);
+        end(out3, s3, least);
     }
 }
 
@@ -1111,24 +1178,8 @@ static void convolve_rows(Job *job, Scratch *scratch, int first, int last)
         clear_margins(to, y, width);
 }
 
-/* Even and odd pixels of 2 n pixels. In patches of 2 x 2 pixels, lines are in the order of rows, columns, channels. */
-static void split(float *restrict even, float *restrict odd, const float *restrict line, int n)
-{
-    for (int i = 0; i < n; i++) {
-        even[i] = line[2 * i];
-        odd[i] = line[2 * i + 1];
-    }
-}
-
-static void join(float *restrict line, const float *restrict even, const float *restrict odd, int n)
-{
-    for (int i = 0; i < n; i++) {
-        line[2 * i] = even[i];
-        line[2 * i + 1] = odd[i];
-    }
-}
-
-/* ReLU of a convolution of 2 x 2 pixels, which become one. */
+/* ReLU of a convolution of 2 x 2 pixels, which become one. Lines of such patches are in the order of rows, columns,
+ * channels. */
 static void halve_rows(Job *job, Scratch *scratch, int first, int last)
 {
     const Window *from = job->from, *to = job->to;
@@ -1426,7 +1477,7 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
     float(*head)[CHUNK] = scratch->leave.head;
     load(scratch->leave.depth, &job->frame.depth, 0, y, x0, n);
     for (int c = 0; c < RGB; c++)
-        load_irradiance(scratch->leave.noisy[c], &job->frame, c, y, x0, n);
+        memcpy(scratch->leave.noisy[c], row_line(job->d, y, NOISY_LINES + c) + x0, sizeof(float) * (size_t)n);
     for (int c = 0; c < FEATURES; c++)
         memcpy(row_line(job->d, y, FEATURE_LINES + c) + x0, head[c], sizeof(float) * (size_t)n);
     for (int level = 0; level < LEVELS; level++)
@@ -1677,16 +1728,15 @@ static void remember(const Job *job, int y, int x0, int n)
 {
     const onespp *d = job->d;
     ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x0;
-    float *texels = d->texels + pixel * TEXEL, normal[CHUNK];
-    const float *lines = row_line(d, y, OUTPUT_LINES) + x0;
+    float normal[3][CHUNK];
+    const float *lines[TEXEL];
     for (int c = 0; c < HISTORY; c++)
-        for (int i = 0; i < n; i++)
-            texels[i * TEXEL + c] = lines[c * d->pitch + i];
+        lines[c] = row_line(d, y, OUTPUT_LINES + c) + x0;
     for (int c = 0; c < 3; c++) {
-        load_normal(normal, &job->frame, c, y, x0, n);
-        for (int i = 0; i < n; i++)
-            texels[i * TEXEL + NORMAL + c] = normal[i];
+        load_normal(normal[c], &job->frame, c, y, x0, n);
+        lines[NORMAL + c] = normal[c];
     }
+    join_texels(d->texels + pixel * TEXEL, lines, n);
     int of_parts = PART_HISTORY * job->frame.parts;
     for (int c = 0; c < of_parts; c++) {
         const float *line = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
