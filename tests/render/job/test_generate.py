@@ -48,23 +48,25 @@ def test_rerun_renders_only_what_is_missing_and_ends_with_equal_bytes(tiny, tiny
 def test_an_interrupted_clip_keeps_the_references_that_are_finished(tiny, tiny_copy, monkeypatch):
     [clip] = remove_clips(tiny_copy, "test/cornell_box/000")
     radiance = PathTracer.radiance
-    buffers = []
+    rendered, limit = [], [5]  # buffers of references
 
-    def interrupted(self, ray, seed, spp, *others):
-        buffers.extend([spp] if spp == 64 else [])
-        if len(buffers) == 6:
+    def limited(self, ray, seed, spp, *others):
+        if spp == 64 and len(rendered) == limit[0]:
             raise KeyboardInterrupt
+        rendered.extend([seed] if spp == 64 else [])
         return radiance(self, ray, seed, spp, *others)
 
-    monkeypatch.setattr(PathTracer, "radiance", interrupted)
+    monkeypatch.setattr(PathTracer, "radiance", limited)
     with pytest.raises(KeyboardInterrupt):
         generate_tiny(tiny_copy)
-    assert sorted(path.name for path in (clip.parent / ".000.references").iterdir()) == ["0.npy", "1.npy"]
-    (clip.parent / ".000.references" / "1.npy").write_bytes(b"damaged")
-    buffers.extend([0] * 10)
+    references = clip.with_name(".000.references")
+    assert sorted(path.name for path in references.iterdir()) == ["0.npy", "1.npy"]
+    (references / "1.npy").write_bytes(b"damaged")
+    limit[0] = 100
     generate_tiny(tiny_copy)
-    assert len(buffers) - 16 == 2 * (8 - 1)
+    assert len(rendered) == 5 + 2 * 7  # all but frame 0
     assert digest(tiny_copy) == digest(tiny)
+    assert not references.exists()
 
 
 def all_are_whole(root: Path) -> bool:
