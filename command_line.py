@@ -25,7 +25,7 @@ Runs = Annotated[Path, arg(metavar="DIR", help="folder of trainings and results"
 Profile = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,release-256,furnished,benchmark,glass,rooms-NxS}",
+        metavar="{tiny,quick,release,release-256,furnished,furnished-192,benchmark,glass,rooms-NxS}",
         help="which clips, and how well sampled: seconds, minutes, the release (days), larger, for --models, "
         "long clips, glass, or N small rooms with references of S spp",
     ),

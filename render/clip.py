@@ -46,6 +46,7 @@ class Sampling(NamedTuple):
     reference_spp: int
     options: Options = NO_OPTIONS
     judged: tuple[int, ...] = ()  # the frames that get a reference; empty for all
+    rarity: float = 1.0  # in noisy frames lights are sampled so many times more rarely
 
 
 @contextmanager
@@ -136,6 +137,7 @@ class SampledChannels:
 
     def noisy(self, frame: FrameInProgress) -> Arrays:
         self.ray: mi.Ray3f = self.stage.rays(frame.view)
+        self.stage.lights.sample_rarely(self.sampling.rarity)
         streams = (NOISY_STREAM, SECOND_BUFFER_STREAM) if self.in_buffers else (NOISY_STREAM,)
         spp = self.sampling.noisy_spp // len(streams)
         # A realisation keeps its Halton shift, and its cycle continues from frame to frame.
@@ -174,6 +176,7 @@ class SampledChannels:
         return {"gradient": gradient}
 
     def reference(self, frame: FrameInProgress) -> Arrays:
+        self.stage.lights.sample_rarely(1)
         spp = self.sampling.reference_spp // 2
         seeds = [stream_seed(self.seed, frame.index, REFERENCE_STREAM, buffer) for buffer in range(2)]
 

@@ -53,7 +53,7 @@ def hits_of_sample(tracer: PathTracer, view: View, seed: int, index: int) -> NDA
     hit = scene.ray_intersect(onward, mi.RayFlags.Minimal, coherent=False, active=continues)
     lit = faces & dr.any(radiance != 0)
     blocker = scene.ray_intersect(si.spawn_ray_to(light.p), mi.RayFlags.Minimal, coherent=False, active=lit)
-    solid_angle = dr.select(light.delta, 0, 1 / (light.pdf * mi.Float(stage.lights.count)))
+    solid_angle = dr.select(light.delta, 0, 1 / (light.pdf * stage.lights.odds))
     values: list[Any] = [
         dr.select(continues & hit.is_valid(), dr.norm(hit.p - si.p), 0),
         dr.select(lit & blocker.is_valid(), dr.norm(blocker.p - si.p), 0),

@@ -12,7 +12,7 @@ class Lights:
     number of emitters into every kernel.
     """
 
-    DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32}
+    DRJIT_STRUCT: ClassVar = {"emitters": mi.EmitterPtr, "count": mi.UInt32, "odds": mi.Float}
 
     def __init__(self, scene: mi.Scene | None = None):
         if scene is None:  # Dr.Jit creates empty instances
@@ -22,18 +22,27 @@ class Lights:
         self.emitters = mi.EmitterPtr([*emitters, scene.environment(), None])
         self.count = mi.UInt32(len(emitters))
         dr.make_opaque(self.emitters, self.count)
+        self.sample_rarely(1)
+
+    def sample_rarely(self, rarity: float) -> None:
+        """Sample lights `rarity` (>= 1) times more rarely, each once in `odds` samples.
+
+        The mean stays, and noise becomes that of scenes in which light is hard to find.
+        """
+        self.odds = mi.Float(self.count) * rarity
+        dr.make_opaque(self.odds)
 
     def sample_direction(
         self, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
         """A direction to a light, and radiance over the density of the choice, without a test of visibility."""
-        scaled = u.x * mi.Float(self.count)
-        index = dr.minimum(mi.UInt32(scaled), self.count - 1)
-        active = active & (self.count > 0)
+        scaled = u.x * self.odds
+        index = mi.UInt32(scaled)
+        active = active & (index < self.count)
         emitter = dr.gather(mi.EmitterPtr, self.emitters, index, active)
         light, weight = emitter.sample_direction(si, mi.Point2f(scaled - mi.Float(index), u.y), active)
-        light.pdf = light.pdf / mi.Float(self.count)
-        return light, weight * mi.Float(self.count)
+        light.pdf = light.pdf / self.odds
+        return light, weight * self.odds
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
         """The emitter at `si`, the sky where nothing is hit; none elsewhere."""

@@ -64,7 +64,7 @@ def bounce(
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     chain &= delta & is_in(stage.specular, bsdf, chain)
     competes = active & (emitter != None) & ~delta  # noqa: E711 - traced
-    emitter_pdf = emitter.pdf_direction(si, towards, competes) / mi.Float(lights.count)
+    emitter_pdf = emitter.pdf_direction(si, towards, competes) / lights.odds
     mis = mis_weight(sample.pdf, emitter_pdf)
     radiance += dr.select(active & ~chain, throughput * emitter.eval(following, active) * mis, 0)
     return radiance, following, throughput, active & following.is_valid(), chain, sample.sampled_type

@@ -78,6 +78,7 @@ ONE_RECIPE = Recipe(
 # Ours, for weights that are shipped: of references of 32 spp the papers' losses learn the median (docs/experiments.md).
 # A network without coarse levels cannot help what is wrong in large blocks.
 RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedLoss(), "crop": 64, "clip": 1.0}
+FURNISHED: dict[str, Any] = RELEASE | {"ramp": 0, "crop": 128}  # continues the weights of `release`, with --from
 RELEASE_CROPS = RELEASE | {"loss": DisplayedLoss(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
 
 # An epoch of sequences has as many pixels as the clips.
@@ -85,12 +86,14 @@ RAE_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "ramp": 1},
     "quick": SHORT | {"epochs": 50, "crop": 64, "ramp": 2},
     "release": RELEASE | {"epochs": 15, "ramp": 0},  # it predicts colours, and needs the paper's gains
+    "furnished": FURNISHED | {"epochs": 20, "warm_up": 1, "batch": 16},
 }
 # In a thousand steps WSKP gets further at a higher rate than the paper's (docs/training.md).
 WSKP_BUDGETS = {
     "tiny": SHORT | {"epochs": 4, "crop": 32, "crops": (8, 2), "batch": 8},
     "quick": SHORT | {"epochs": 5, "rate": 4e-3, "crop": 64, "crops": (4, 2), "batch": 16},
     "release": RELEASE_CROPS | {"epochs": 8},
+    "furnished": RELEASE_CROPS | {"epochs": 36, "warm_up": 2, "crop": 128, "batch": 64},
 }
 # In so few steps the authors' rate leaves the weights where they began.
 NBGD_BUDGETS = WSKP_BUDGETS | {"tiny": WSKP_BUDGETS["tiny"] | {"rate": 2e-3}}
@@ -107,6 +110,7 @@ NTD_BUDGETS = {
     | {"epochs": 10, "rate": 5e-4, "batch": 2, "length": 8, "trained": None}
     | {"augmentation": Augmentation(stop=True, rotate=True, exposure=True)},
 }
+NTD_BUDGETS["furnished"] = NTD_BUDGETS["release"] | FURNISHED | {"epochs": 9, "warm_up": 0.5, "batch": 8}
 
 ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},

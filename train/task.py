@@ -31,6 +31,7 @@ class Recipe:
     epochs: int
     betas: tuple[float, float] = (0.9, 0.999)  # of Adam; these are its authors' and PyTorch's
     ramp: int = 0  # epochs of a geometric ramp from rate / 10; then rate * sqrt(ramp / e). 0: a constant rate
+    warm_up: float = 0.0  # epochs in which the rate rises from 0: Adam's first steps would spoil the weights of a start
     anneal: bool = False  # after the ramp the rate falls to zero instead, along half a cosine
     average: float = 0.0  # share of the steps over which weights are averaged to be judged and kept; 0: the last ones
     clip: float | None = None  # the largest norm of a step's gradients; longer ones are shortened to it
@@ -44,6 +45,10 @@ class Recipe:
 
     def learning_rate(self, epoch: float) -> float:
         """Learning rate after `epoch` epochs, fractions included, before the last one's end."""
+        warmth = min(1.0, epoch / self.warm_up) if self.warm_up else 1.0
+        return warmth * self.full_rate(epoch)
+
+    def full_rate(self, epoch: float) -> float:
         if epoch < self.ramp:
             return self.rate * 10 ** (epoch / self.ramp - 1)
         if self.anneal:

@@ -14,7 +14,7 @@ from files import locked, read_json, write_json
 from provenance import RENDERING, versions
 from render.clip import NO_OPTIONS, Options, Sampling, timed, write_clip
 from render.job.pilots import choose_rooms, samples_needed
-from render.job.plan import plan, scene_of_clip
+from render.job.plan import plan, rarity_of_clip, scene_of_clip
 from render.job.profiles import DataProfile, profile_of
 
 
@@ -147,6 +147,8 @@ def render_to_folder(
             needed_spp = samples_needed(scene, profile.size, quality, seed, options)
     spp = min(needed_spp, max(quality.reference_spp, quality.most_spp))
     judged = profile.judged if split == "test" else ()
-    sampling = Sampling(quality.realisations, ClipKind.of(clip_name).noisy_spp, spp, options, judged)
+    noisy_spp = ClipKind.of(clip_name).noisy_spp
+    rarity = rarity_of_clip(seed, quality.rarest)
+    sampling = Sampling(quality.realisations, noisy_spp, spp, options, judged, rarity)
     layers = SECOND_LAYER if split == "test" else ()  # networks are trained on one layer of glass
     write_clip(folder, scene, profile.size, sampling, seed, (*channels, *layers), seconds)

@@ -89,6 +89,12 @@ def plan(
     }
 
 
+def rarity_of_clip(seed: int, rarest: float) -> float:
+    """How many times more rarely lights are sampled in noisy frames of a clip: 1 in half of them, up to `rarest`."""
+    chance, exponent = np.random.default_rng([seed, zlib.crc32(b"rarity")]).random(2)
+    return float(rarest**exponent) if chance < 0.5 else 1.0
+
+
 def scene_of_clip(folder: Path, profile: DataProfile, dataset_seed: int) -> tuple[Scene, int]:
     """The scene and the 64-bit seed, independent of other clips, of the clip whose path ends in SPLIT/SCENE/CLIP.
 

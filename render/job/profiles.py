@@ -21,6 +21,7 @@ class SamplingQuality(NamedTuple):
     floor: float | None = None  # PSNR in dB: references get more samples until their noise is down to this,
     most_spp: int = 4096  # but no more than these
     skips_noisy_rooms: bool = False  # that would need more; the next ones take their places
+    rarest: float = 1.0  # in noisy frames of half of the clips lights are sampled up to so many times more rarely
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,18 @@ DATA_PROFILES = {
         quality={
             "train": SamplingQuality(realisations=4, reference_spp=96),
             "val": SamplingQuality(realisations=4, reference_spp=256),
+            "test": TEST_OF_SMALL_ROOMS,
+        },
+    ),
+    # The same larger, and in half of the clips light is as hard to find as in many scenes by others.
+    "furnished-192": DataProfile(
+        size=(12, 192, 192),
+        needs_models=True,
+        rooms={"train": 104, "val": 4},
+        closeups={"train": 96, "val": 4},
+        quality={
+            "train": SamplingQuality(realisations=4, reference_spp=128, rarest=64.0),
+            "val": SamplingQuality(realisations=4, reference_spp=256, rarest=64.0),
             "test": TEST_OF_SMALL_ROOMS,
         },
     ),

@@ -46,6 +46,15 @@ def test_a_clip_walks_through_the_cycle():
     assert not np.array_equal(frames[0]["direct"][0], frames[0]["direct"][1])
 
 
+def test_rarely_sampled_lights_change_noisy_frames_alone():
+    scene = build_scene("cornell_box", 3, 2)
+    often, rarely = ([a for a, _ in render_clip(scene, 2, 16, 16, Sampling(1, 1, 8, rarity=r), 1)] for r in (1, 9))
+    for one, other in zip(often, rarely, strict=True):
+        changed = {name for name in one if not np.array_equal(one[name], other[name])}
+        assert {"direct", "indirect"} <= changed
+        assert not changed & {"direct_reference", "indirect_reference", "emission"}
+
+
 def test_regularisation_changes_nothing_where_nothing_is_glossy(stage, rays):
     plain = PathTracer(stage).radiance(rays, 1, 4)
     regular = PathTracer(stage, regularise=True).radiance(rays, 1, 4)

@@ -41,6 +41,18 @@ def test_one_spp_images_average_to_the_stock_integrator(stage):
     assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
 
 
+def test_rarely_sampled_lights_have_the_same_mean_and_more_noise(stage):
+    emission, *light = realisations(stage, 600)
+    stage.lights.sample_rarely(6)
+    try:
+        _, *rare = realisations(stage, 600)
+    finally:
+        stage.lights.sample_rarely(1)
+    assert_same_mean(emission + sum(rare), np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
+    for often, rarely in zip(light, rare, strict=True):
+        assert rarely.var(axis=0).mean() > 2 * often.var(axis=0).mean()
+
+
 @pytest.mark.slow
 def test_metal_plastic_and_sky_average_to_the_stock_integrator():
     """Long paths with Russian roulette over glossy materials, lit by a lamp and through the open front by the sky."""

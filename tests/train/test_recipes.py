@@ -12,7 +12,7 @@ from train.losses.rae import RAELoss
 from train.losses.wskp import NBGDLoss, SMAPELoss
 from train.recipes import ONE_A_PAPER, RECIPES, TRAINABLE, recipe_for, trained_by_default
 
-EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained", "firsts"}
+EFFORT = {"epochs", "crop", "ramp", "batch", "crops", "length", "trained", "firsts", "warm_up"}
 ENDS_WELL = {"anneal", "average", "rate"}
 FOR_NOISY_REFERENCES = {"loss", "clip", "augmentation"}
 
@@ -74,4 +74,12 @@ def test_every_network_has_recipes_for_all_budgets():
     assert set(TRAINABLE) == networks and set(ONE_A_PAPER) <= networks
     assert all(set(trained_by_default(budget)) <= networks for _, budget in RECIPES)
     of_all = {(name, budget) for name in networks for budget in ("tiny", "quick", "release", "paper")}
-    assert set(RECIPES) == of_all | {("one", "furnished")}
+    assert set(RECIPES) == of_all | {(name, "furnished") for name in networks - {"lbf"}}
+
+
+def test_warm_rates_rise_from_zero():
+    recipe = recipe_for("rae", "furnished")
+    cold = replace(recipe, warm_up=0)
+    assert recipe.warm_up == 1 and recipe.learning_rate(0) == 0
+    assert recipe.learning_rate(0.25) == pytest.approx(cold.learning_rate(0.25) / 4)
+    assert [recipe.learning_rate(e) for e in (1, 7.5, 20)] == [cold.learning_rate(e) for e in (1, 7.5, 20)]

@@ -16,7 +16,7 @@ from render.clip import NO_OPTIONS
 from render.job import pilots
 from render.job.generate import generate, render_to_folder
 from render.job.pilots import choose_rooms, noise_of_reference, samples_needed
-from render.job.plan import clips_of, plan, rooms_of
+from render.job.plan import clips_of, plan, rarity_of_clip, rooms_of
 from render.job.profiles import DataProfile, SamplingQuality, profile_of
 from render.stage import Stage
 from scenes.registry import build_scene
@@ -40,6 +40,14 @@ def test_release_has_rooms_enough_and_tests_on_others():
 def test_other_seeds_have_other_rooms():
     a, b = (set(clips_of(profile_of("release"), "train", seed)) for seed in (0, 1))
     assert not a & b
+
+
+def test_half_of_the_clips_sample_lights_up_to_so_many_times_more_rarely():
+    rarities = np.array([rarity_of_clip(seed, 64.0) for seed in range(400)])
+    rarer = rarities[rarities != 1]
+    assert 160 < len(rarer) < 240 and rarer.min() > 1 and rarer.max() < 64
+    assert np.log2(rarer).mean() == pytest.approx(3, abs=0.4)
+    assert {rarity_of_clip(seed, 1.0) for seed in range(20)} == {1.0}
 
 
 def test_clip_names_are_parsed():
