@@ -26,8 +26,8 @@ Profile = Annotated[
     str,
     arg(
         metavar="{tiny,quick,release,release-256,furnished,furnished-192,benchmark,glass,rooms-NxS}",
-        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, for --models, "
-        "long clips, glass, or N small rooms with references of S spp",
+        help="which clips, and how well sampled: seconds, minutes, the release (days), larger, for --models, larger "
+        "with rarer light, long clips, glass, or N small rooms with references of S spp",
     ),
 ]
 Budget = Annotated[

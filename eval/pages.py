@@ -130,6 +130,7 @@ EXTRACTS: dict[str, tuple[str, Callable[[Path], dict[str, Any]]]] = {  # the com
     "benchmark": ("onespp benchmark run --scenes DIR", extract_benchmark),
     "glass": ("onespp eval --data data/glass --runs RUNS/glass", extract_glass),
     "runtime": ("python -m runtime.measure", extract_keys("runtime/results.json", "device", "size", "rows")),
+    "runtime-avx2": ("python -m runtime.measure", extract_keys("runtime-avx2/results.json", "device", "size", "rows")),
 }
 
 
@@ -381,8 +382,8 @@ def form_table(rows: list[dict[str, Any]]) -> str:
     return table(lines)
 
 
-def forms() -> str:
-    return form_table(measured("runtime")["rows"])
+def forms(name: str = "runtime") -> str:
+    return form_table(measured(name)["rows"])
 
 
 def device(name: str) -> str:

@@ -553,8 +553,8 @@ static void load_irradiance(float *restrict line, const onespp_frame *frame, int
     load_divisor(divisor, frame, channel, y, x, n);
     load(depth, &frame->depth, 0, y, x, n);
     for (int i = 0; i < n; i++) {
-        float irradiance = clamped((line[i] + indirect[i]) / divisor[i], MAX_IRRADIANCE);
-        line[i] = depth[i] > 0 ? maxf(irradiance, 0) : 0;
+        float irradiance = minf(maxf((line[i] + indirect[i]) / divisor[i], 0), MAX_IRRADIANCE);
+        line[i] = depth[i] > 0 ? irradiance : 0;
     }
 }
 

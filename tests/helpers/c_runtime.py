@@ -22,7 +22,7 @@ from runtime.raw import PLANES
 
 FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
-OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-DONESPP_DISPATCH")
+OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DONESPP_DISPATCH")
 SOURCES = tuple(str(FOLDER / name) for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
 OBJECTS = tempfile.TemporaryDirectory()  # for as long as the process runs
 ABI = 3
