@@ -1,7 +1,8 @@
 """Size, time to build, milliseconds and memory of each form of `one`, beside OIDN, in one run.
 
-`python -m runtime.measure [WxH [RUNS]]` prints a table and writes RUNS/runtime/results.json, or without AVX-512
-RUNS/runtime-avx2/results.json; by default 1280x720 and runs. It needs a C compiler, onespp[export] and onespp[oidn]. WebAssembly is left out without Clang for it or Node.js.
+`python -m runtime.measure [WxH [RUNS]]` prints a table and writes RUNS/runtime/results.json, without AVX-512
+RUNS/runtime-avx2/results.json; by default 1280x720 and runs. It needs a C compiler, onespp[export] and onespp[oidn].
+WebAssembly is left out without Clang for it or Node.js.
 """
 
 import importlib
