@@ -49,7 +49,8 @@ def test_help_begins_with_the_pipeline(capsys):
 
 
 def test_help_names_every_profile_and_budget(capsys):
-    assert "{" + ",".join([*DATA_PROFILES, "rooms-NxS"]) + "}" in help_of(capsys, "dataset")
+    in_one_line = "".join(help_of(capsys, "dataset").replace("│", "").split())  # the names take more than one
+    assert "{" + ",".join([*DATA_PROFILES, "rooms-NxS"]) + "}" in in_one_line
     assert "{" + ",".join(dict.fromkeys(budget for _, budget in RECIPES)) + "}" in help_of(capsys, "train")
 
 
