@@ -33,7 +33,7 @@ Profile = Annotated[
 Budget = Annotated[
     str,
     arg(
-        metavar="{tiny,quick,release,paper,furnished}",
+        metavar="{tiny,quick,release,furnished,paper}",
         help="how long networks are trained; the weights are in RUNS/train/NAME-BUDGET",
     ),
 ]
