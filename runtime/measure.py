@@ -1,8 +1,7 @@
 """Size, time to build, milliseconds and memory of each form of `one`, beside OIDN, in one run.
 
-`python -m runtime.measure [WxH [RUNS]]` prints a table and writes RUNS/runtime/results.json, without AVX-512
-RUNS/runtime-avx2/results.json; by default 1280x720 and runs. It needs a C compiler, onespp[export] and onespp[oidn].
-WebAssembly is left out without Clang for it or Node.js.
+`python -m runtime.measure [WxH [RUNS]]` prints a table and writes RUNS/runtime/results.json; by default 1280x720 and
+runs. It needs a C compiler, onespp[export] and onespp[oidn]. WebAssembly is left out without Clang for it or Node.js.
 """
 
 import importlib
@@ -222,8 +221,7 @@ def main(size: str = "1280x720", runs: str = "runs") -> None:
         forms = [*library_forms(), *c_forms(Path(folder)), onnx_form(Path(folder)), *oidn_forms()]
         rows = measure(forms, height, width)
     facts = {"device": device_in_words(threads=torch.get_num_threads()), "size": size_name((height, width))}
-    has_avx512 = any(row["form"] == f"C, {ISAS['avx512']}" for row in rows)
-    path = Path(runs) / ("runtime" if has_avx512 else "runtime-avx2") / "results.json"
+    path = Path(runs) / "runtime" / "results.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"schema": 1, **facts, "rows": rows})
     print(form_table(rows))

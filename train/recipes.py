@@ -78,7 +78,6 @@ ONE_RECIPE = Recipe(
 # Ours, for weights that are shipped: of references of 32 spp the papers' losses learn the median (docs/experiments.md).
 # A network without coarse levels cannot help what is wrong in large blocks.
 RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedLoss(), "crop": 64, "clip": 1.0}
-FURNISHED: dict[str, Any] = RELEASE | {"ramp": 0, "crop": 128}  # continues the weights of `release`, with --from
 RELEASE_CROPS = RELEASE | {"loss": DisplayedLoss(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
 
 # An epoch of sequences has as many pixels as the clips.
@@ -86,7 +85,8 @@ RAE_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "ramp": 1},
     "quick": SHORT | {"epochs": 50, "crop": 64, "ramp": 2},
     "release": RELEASE | {"epochs": 15, "ramp": 0},  # it predicts colours, and needs the paper's gains
-    "furnished": FURNISHED | {"epochs": 20, "warm_up": 1, "batch": 16},
+    # Here and below, `furnished` continues the weights of `release`, with --from.
+    "furnished": RELEASE | {"epochs": 20, "ramp": 0, "warm_up": 1, "crop": 128, "batch": 16},
 }
 # In a thousand steps WSKP gets further at a higher rate than the paper's (docs/training.md).
 WSKP_BUDGETS = {
@@ -103,14 +103,17 @@ LBF_BUDGETS: Budgets = {
     "quick": SHORT | {"epochs": 1, "rate": 3e-3, "crop": 64, "loss": DisplayedLoss()},
     "release": RELEASE | {"epochs": 1, "rate": 3e-3},
 }
+NTD_RELEASE: dict[str, Any] = (
+    RELEASE
+    | {"epochs": 10, "rate": 5e-4, "batch": 2, "length": 8, "trained": None}
+    | {"augmentation": Augmentation(stop=True, rotate=True, exposure=True)}
+)
 NTD_BUDGETS = {
     "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
     "quick": SHORT | {"epochs": 40, "crop": 128},
-    "release": RELEASE
-    | {"epochs": 10, "rate": 5e-4, "batch": 2, "length": 8, "trained": None}
-    | {"augmentation": Augmentation(stop=True, rotate=True, exposure=True)},
+    "release": NTD_RELEASE,
+    "furnished": NTD_RELEASE | {"epochs": 9, "warm_up": 0.5, "crop": 128, "batch": 8},
 }
-NTD_BUDGETS["furnished"] = NTD_BUDGETS["release"] | FURNISHED | {"epochs": 9, "warm_up": 0.5, "batch": 8}
 
 ONE_BUDGETS: Budgets = {
     "tiny": {"epochs": 15, "crop": 32, "length": 4},

@@ -31,7 +31,9 @@ class Recipe:
     epochs: int
     betas: tuple[float, float] = (0.9, 0.999)  # of Adam; these are its authors' and PyTorch's
     ramp: int = 0  # epochs of a geometric ramp from rate / 10; then rate * sqrt(ramp / e). 0: a constant rate
-    warm_up: float = 0.0  # epochs in which the rate rises from 0: Adam's first steps would spoil the weights of a start
+    warm_up: float = (
+        0.0  # epochs in which the rate rises from 0, lest Adam's first steps spoil the weights to start from
+    )
     anneal: bool = False  # after the ramp the rate falls to zero instead, along half a cosine
     average: float = 0.0  # share of the steps over which weights are averaged to be judged and kept; 0: the last ones
     clip: float | None = None  # the largest norm of a step's gradients; longer ones are shortened to it
@@ -49,6 +51,7 @@ class Recipe:
         return warmth * self.full_rate(epoch)
 
     def full_rate(self, epoch: float) -> float:
+        """The learning rate but for the warm-up."""
         if epoch < self.ramp:
             return self.rate * 10 ** (epoch / self.ramp - 1)
         if self.anneal:

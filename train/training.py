@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -25,12 +25,14 @@ from train.data import equal_parts, items, largest_micro_batch, load_ahead, micr
 from train.log import LogRow
 from train.losses.network_loss import NetworkLoss
 from train.precision import fabric_here
-from train.task import Task
+from train.task import Recipe, Task
 
 BEST_FILE = "best.safetensors"
 CHECKPOINT_FILE = "checkpoint.pt"
 VALIDATIONS = 10  # in a training
 MAX_SKIPPED_IN_A_ROW = 20
+
+RECIPE_DEFAULTS = {field.name: field.default for field in fields(Recipe) if field.default is not MISSING}
 
 Checkpoint = dict[str, Any]  # all that an interrupted training needs to resume
 
@@ -147,7 +149,8 @@ class Training:
         return kept
 
     def resume(self, saved: Checkpoint) -> None:
-        if saved.get("facts") != self.facts:
+        # What recipes have got since the checkpoint was written was as it is by default.
+        if RECIPE_DEFAULTS | saved.get("facts", {}) != self.facts:
             raise BadInput(
                 f"{self.task.folder} has a training with another recipe, seed, data set or start: delete it or use "
                 "another --runs"

@@ -51,6 +51,19 @@ RELEASE_QUALITY = {
     "test": SamplingQuality(realisations=1, reference_spp=256, floor=40, most_spp=16384),
 }
 
+# To continue trainings with rooms of other people's furniture: `--models DIR`.
+FURNISHED = DataProfile(
+    size=(12, 128, 128),
+    needs_models=True,
+    rooms={"train": 80, "val": 4},
+    closeups={"train": 80, "val": 4},
+    quality={
+        "train": SamplingQuality(realisations=4, reference_spp=96),
+        "val": SamplingQuality(realisations=4, reference_spp=256),
+        "test": TEST_OF_SMALL_ROOMS,
+    },
+)
+
 DATA_PROFILES = {
     "tiny": DataProfile(
         size=(8, 64, 64),
@@ -87,28 +100,17 @@ DATA_PROFILES = {
         closeups={"train": 128, "val": 4},
         quality=RELEASE_QUALITY,
     ),
-    # To continue trainings with rooms of other people's furniture: `--models DIR`.
-    "furnished": DataProfile(
-        size=(12, 128, 128),
-        needs_models=True,
-        rooms={"train": 80, "val": 4},
-        closeups={"train": 80, "val": 4},
-        quality={
-            "train": SamplingQuality(realisations=4, reference_spp=96),
-            "val": SamplingQuality(realisations=4, reference_spp=256),
-            "test": TEST_OF_SMALL_ROOMS,
-        },
-    ),
-    # The same larger, and in half of the clips light is as hard to find as in many scenes by others.
-    "furnished-192": DataProfile(
+    "furnished": FURNISHED,
+    # Larger, and in half of the clips light is as hard to find as in many scenes by others.
+    "furnished-192": replace(
+        FURNISHED,
         size=(12, 192, 192),
-        needs_models=True,
         rooms={"train": 104, "val": 4},
         closeups={"train": 96, "val": 4},
-        quality={
+        quality=FURNISHED.quality
+        | {
             "train": SamplingQuality(realisations=4, reference_spp=128, rarest=64.0),
             "val": SamplingQuality(realisations=4, reference_spp=256, rarest=64.0),
-            "test": TEST_OF_SMALL_ROOMS,
         },
     ),
     # Scenes that no training uses, at a size at which people look, until the history is steady.
