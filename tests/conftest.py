@@ -1,5 +1,6 @@
 """What tests share: compiled kernels, a tiny dataset, and loaded scenes."""
 
+import gc
 import os
 import shutil
 from pathlib import Path
@@ -17,11 +18,17 @@ from render.stage import Stage
 from scenes.registry import build_scene
 from tests.helpers.datasets import generate_tiny
 from tests.helpers.rendering import POSED_FRAME
+from tests.helpers.shared import made_once
 
 # For tests without a number of examples of their own; `make test-all` takes the thorough profile.
 hypothesis.settings.register_profile("quick", max_examples=10, deadline=None)  # busy machines are slow
 hypothesis.settings.register_profile("thorough", max_examples=100, deadline=None)
 hypothesis.settings.load_profile("quick")
+
+
+def pytest_collection_finish() -> None:
+    """Collections of garbage need not look at what is loaded now: each new scene begins with one."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -41,11 +48,16 @@ def kernels() -> None:
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the test run, which all of its processes use."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def tiny(shared: Path) -> Path:
     """The dataset of profile `tiny`. Read only: tests that damage it copy it first."""
-    root = tmp_path_factory.mktemp("data") / "tiny"
-    generate_tiny(root)
-    return root
+    return made_once(shared / "tiny", generate_tiny)
 
 
 @pytest.fixture

@@ -1,12 +1,10 @@
 """The C runtime, built by the C compiler and called through ctypes with Frames."""
 
 import ctypes
-import os
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import numpy as np
@@ -23,8 +21,8 @@ from runtime.raw import PLANES
 FOLDER = ROOT / "runtime"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror")
 OPTIMISED = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DONESPP_DISPATCH")
-SOURCES = tuple(str(FOLDER / name) for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
-OBJECTS = tempfile.TemporaryDirectory()  # for as long as the process runs
+SOURCES = tuple(FOLDER / name for name in ("onespp.c", "onespp_avx2.c", "onespp_avx512.c"))
+CC = which("cc") or which("gcc") or which("clang") or ""
 ABI = 3
 ISAS = {"any": 0, "baseline": 1, "avx2": 2, "avx512": 3}
 
@@ -85,18 +83,9 @@ class Library(ctypes.CDLL):
     max_isa = ISAS["any"]
 
 
-@cache
-def compiled(cc: str, flags: Sequence[str], source: str) -> str:
-    """The object file of a source, for any library or program of this process."""
-    target = Path(OBJECTS.name) / f"{len(os.listdir(OBJECTS.name))}.o"
-    subprocess.run([cc, *STRICT, *flags, "-fPIC", "-c", source, "-o", str(target)], check=True)
-    return str(target)
-
-
-def build(target: Path, cc: str, flags: Sequence[str] = OPTIMISED, sources: Sequence[str] = SOURCES) -> Library:
-    """The runtime as a shared library."""
-    objects = [compiled(cc, tuple(flags), source) for source in sources]
-    subprocess.run([cc, *flags, "-shared", *objects, "-o", str(target), "-lm"], check=True)
+def build(target: Path, files: Sequence[Path], flags: Sequence[str] = OPTIMISED) -> Library:
+    """The runtime as a shared library, of sources or object files."""
+    subprocess.run([CC, *STRICT, *flags, "-fPIC", "-shared", *files, "-o", target, "-lm"], check=True)
     library = Library(str(target))
     library.onespp_size.restype = ctypes.c_size_t
     library.onespp_message.restype = ctypes.c_char_p

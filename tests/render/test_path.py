@@ -34,21 +34,32 @@ def everything(stage: Stage, frame: int) -> dict[str, np.ndarray]:
     return render_gbuffer(stage, view) | light
 
 
-def test_one_spp_images_average_to_the_stock_integrator(stage):
-    emission, direct, indirect = realisations(stage, 600)
+@pytest.fixture(scope="module")
+def sampled(stage: Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return realisations(stage, 600)
+
+
+@pytest.fixture(scope="module")
+def stock(stage: Stage) -> np.ndarray:
+    """Radiance (N, H, W, 3) of all light."""
+    return np.stack([stock_radiance(stage, 3, 16, seed) for seed in range(30)])
+
+
+def test_one_spp_images_average_to_the_stock_integrator(stage, sampled, stock):
+    emission, direct, indirect = sampled
     np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
     assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(30)]))
-    assert_same_mean(emission + direct + indirect, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
+    assert_same_mean(emission + direct + indirect, stock)
 
 
-def test_rarely_sampled_lights_have_the_same_mean_and_more_noise(stage):
-    emission, *light = realisations(stage, 600)
+def test_rarely_sampled_lights_have_the_same_mean_and_more_noise(stage, sampled, stock):
+    emission, *light = sampled
     stage.lights.sample_rarely(6)
     try:
         _, *rare = realisations(stage, 600)
     finally:
         stage.lights.sample_rarely(1)
-    assert_same_mean(emission + sum(rare), np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
+    assert_same_mean(emission + sum(rare), stock)
     for often, rarely in zip(light, rare, strict=True):
         assert rarely.var(axis=0).mean() > 2 * often.var(axis=0).mean()
 

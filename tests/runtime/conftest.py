@@ -2,22 +2,39 @@
 
 import zipfile
 from pathlib import Path
-from shutil import which
 
 import pytest
 
 from runtime.wheel import build_wheel
-
-CC = which("cc") or which("gcc") or which("clang")
+from tests.helpers.c_runtime import CC, SOURCES, Library, build
+from tests.helpers.shared import made_once
 
 
 @pytest.fixture(scope="session")
-def wheel(tmp_path_factory) -> Path:
-    if CC is None:
+def wheel(shared) -> Path:
+    if not CC:
         pytest.skip("there is no C compiler")
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        build_wheel(folder)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CC", CC)
-        return build_wheel(tmp_path_factory.mktemp("wheel"))
+        [wheel] = made_once(shared / "wheel", make).glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="session")
+def objects(wheel) -> dict[str, Path]:
+    """The object files that the wheel is made of, by the names of their sources."""
+    found = {path.stem: path for path in wheel.parent.rglob("*.o")}
+    return {source.name: found[source.stem] for source in SOURCES}
+
+
+@pytest.fixture(scope="session")
+def library(objects, tmp_path_factory) -> Library:
+    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", [*objects.values()])
 
 
 @pytest.fixture(scope="session")

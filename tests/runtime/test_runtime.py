@@ -23,6 +23,7 @@ from runtime.raw import write_raw
 from runtime.weights import HEADER, header
 from tests.helpers.c_runtime import (
     ABI,
+    CC,
     FOLDER,
     ISAS,
     OPTIMISED,
@@ -36,42 +37,33 @@ from tests.helpers.c_runtime import (
     Task,
     address,
     build,
-    compiled,
     rounded_one,
 )
 from tests.helpers.frames import MESHES, chain, flat_frame
 
-CC = which("cc") or which("gcc") or which("clang")
 TOLERANCE = 1e-4  # of the brightest pixel
 SIZE = (40, 56)
 ISA_TOLERANCE = 1e-5
 STRIPS = "-DONESPP_STRIP_PIXELS=1"  # of 64 rows
 
-pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+pytestmark = pytest.mark.skipif(not CC, reason="there is no C compiler")
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory) -> Library:
-    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", CC)
-
-
-@pytest.fixture(scope="module")
-def built_in_strips(tmp_path_factory) -> Library:
-    return build(tmp_path_factory.mktemp("strips") / "libonespp.so", CC, (*OPTIMISED, STRIPS))
+def in_strips(tmp_path_factory) -> Library:
+    return build(tmp_path_factory.mktemp("strips") / "libonespp.so", SOURCES, (*OPTIMISED, STRIPS))
 
 
 @pytest.fixture(params=["baseline", "avx2", "avx512 in strips"])
-def library(request, built, built_in_strips) -> Library:
-    """Of each instruction set that this machine has."""
+def limited(request, library) -> Library:
+    """The runtime with each instruction set that this machine has."""
     isa, _, strips = request.param.partition(" ")
-    library = built_in_strips if strips else built
-    return limited(library, isa)
-
-
-def limited(library: Library, isa: str) -> Library:
     library.max_isa = ISAS[isa]
     if CRuntime(library, 8, 8).isa != library.max_isa:
         pytest.skip(f"there is no {isa} here")
+    if strips:
+        library = request.getfixturevalue("in_strips")
+        library.max_isa = ISAS[isa]
     return library
 
 
@@ -112,7 +104,7 @@ def test_the_array_of_weights_is_that_of_the_shipped_ones():
 
 
 @pytest.mark.parametrize("name", ["gcc", "clang"])
-@pytest.mark.parametrize("file", [*SOURCES, "example.c", "fuzz.c"])
+@pytest.mark.parametrize("file", [*(source.name for source in SOURCES), "example.c", "fuzz.c"])
 def test_compiles_without_warnings(name, file, tmp_path):
     if which(name) is None:
         pytest.skip(f"{name} is not installed")
@@ -121,30 +113,31 @@ def test_compiles_without_warnings(name, file, tmp_path):
         subprocess.run(command, check=True)
 
 
-@pytest.mark.parametrize("file", SOURCES)
-def test_it_neither_allocates_nor_has_global_state(file, tmp_path):
-    """As its symbols show: nothing of stdlib.h, and no variables."""
+@pytest.mark.parametrize("file", [source.name for source in SOURCES])
+def test_it_neither_allocates_nor_has_global_state(file, objects):
+    """As its symbols show: nothing of stdlib.h, and all that is not code is constant, relocated addresses too."""
     if which("nm") is None:
         pytest.skip("nm is not installed")
-    target = tmp_path / "it.o"
-    subprocess.run([CC, *OPTIMISED, "-fno-pie", "-c", file, "-o", str(target)], check=True)
-    lines = subprocess.run(["nm", str(target)], check=True, capture_output=True, text=True).stdout.splitlines()
-    symbols = [line.split()[-2:] for line in lines]
-    assert {kind for kind, _ in symbols} <= set("TtRrU")
+    command = ["nm", "--format=sysv", objects[file]]
+    table = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    symbols = [[cell.strip() for cell in line.split("|")] for line in table.splitlines() if line.count("|") == 6]
+    sections = {row[6] for row in symbols} - {"Section", "*UND*"}
+    assert all(section.startswith((".text", ".rodata", ".data.rel.ro")) for section in sections)
     functions = {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
-    assert {name for kind, name in symbols if kind == "T"} == (functions if file.endswith("onespp.c") else set())
-    needed = {name for kind, name in symbols if kind == "U"}
-    engines = {"onespp_avx2", "onespp_avx512", "__cpu_model"}  # the last one is the compiler's
+    assert {name for name, _, kind, *_ in symbols if kind == "T"} == (functions if file == "onespp.c" else set())
+    needed = {name for name, _, kind, *_ in symbols if kind == "U"}
+    engines = {"onespp_avx2", "onespp_avx512"}
+    of_the_compiler = {"__cpu_model", "_GLOBAL_OFFSET_TABLE_"}
     arithmetic = {"expf", "log", "logf", "fmax", "sqrtf", "floorf"}
-    assert needed <= {"memcpy", "memmove", "memset", "__stack_chk_fail"} | arithmetic | engines
+    assert needed <= {"memcpy", "memmove", "memset", "__stack_chk_fail"} | arithmetic | engines | of_the_compiler
 
 
-def test_instruction_sets_differ_by_rounding(built, one, frames):
+def test_instruction_sets_differ_by_rounding(library, one, frames):
     """The fastest one is the last."""
     outputs = []
     for isa in ("baseline", "avx2", "avx512", "any"):
-        built.max_isa = ISAS[isa]
-        runtime = CRuntime(built, SIZE[1], SIZE[0])
+        library.max_isa = ISAS[isa]
+        runtime = CRuntime(library, SIZE[1], SIZE[0])
         assert runtime.isa <= ISAS[isa] or isa == "any"
         outputs.append(torch.cat([runtime(frame, index == 0) for index, frame in enumerate(frames)]))
     brightest = outputs[0].amax().item()
@@ -154,20 +147,20 @@ def test_instruction_sets_differ_by_rounding(built, one, frames):
 
 
 def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
-    library = build(tmp_path / "libonespp.so", CC, ["-O3"], SOURCES[:1])
+    library = build(tmp_path / "libonespp.so", SOURCES[:1], ["-O1"])
     assert CRuntime(library, 8, 8).isa == ISAS["baseline"]
     compare(library, one, frames)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (13, 7), (40, 56), (3, 190), (41, 70), (197, 24)])
-def test_it_computes_what_the_denoiser_does(library, one, size):
+def test_it_computes_what_the_denoiser_does(limited, one, size):
     """With a moving camera, moving meshes, disocclusions and sky."""
-    compare(library, one, synthetic(4, size))
+    compare(limited, one, synthetic(4, size))
 
 
-def test_resets_and_changes_of_size(library, one):
+def test_resets_and_changes_of_size(limited, one):
     sequence = [*synthetic(3), *synthetic(2, first=9), *synthetic(2, (24, 64), first=9), *synthetic(2, first=11)]
-    compare(library, one, sequence, resets=(0, 3))
+    compare(limited, one, sequence, resets=(0, 3))
 
 
 def in_parts(frame: Frame, count: int) -> Frame:
@@ -179,41 +172,41 @@ def in_parts(frame: Frame, count: int) -> Frame:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (13, 7), (41, 70), (197, 24)])
-def test_parts_of_the_light(library, one, size):
+def test_parts_of_the_light(limited, one, size):
     frames = [in_parts(frame, count) for frame, count in zip(synthetic(5, size), (2, 2, 3, 3, 1), strict=True)]
-    compare(library, one, frames)
-    runtime = CRuntime(library, size[1], size[0], parts=3)
+    compare(limited, one, frames)
+    runtime = CRuntime(limited, size[1], size[0], parts=3)
     for frame in frames:
         whole = runtime(frame, reset=False) - frame.emission
         summed = runtime.parts.unflatten(1, (-1, 3)).sum(dim=1)
         torch.testing.assert_close(summed, whole, rtol=1e-5, atol=1e-5 * float(whole.abs().amax()))
 
 
-def test_the_whole_is_the_same_with_and_without_parts(library, frames):
-    runtimes = [CRuntime(library, SIZE[1], SIZE[0], parts=count) for count in (0, 2)]
+def test_the_whole_is_the_same_with_and_without_parts(limited, frames):
+    runtimes = [CRuntime(limited, SIZE[1], SIZE[0], parts=count) for count in (0, 2)]
     for frame in frames:
         assert torch.equal(runtimes[0](frame, False), runtimes[1](in_parts(frame, 2), False))
 
 
-def test_parts_of_light_of_any_size_are_finite(library, one, frames):
+def test_parts_of_light_of_any_size_are_finite(limited, one, frames):
     extreme = []
     for index, frame in enumerate(frames):
         parts = in_parts(disturbed(frame, ["direct"], (1e34, -1e30, 0.0), index), 2).parts
         parts[..., ::3, ::5] = torch.tensor([1e35, -1e35, float("nan"), float("inf")])[index]
         extreme.append(replace(frame, parts=parts))
-    compare(library, one, extreme)
+    compare(limited, one, extreme)
 
 
-def test_frames_count_by_their_samples(library, one, frames):
+def test_frames_count_by_their_samples(limited, one, frames):
     counts = (1.0, 16.0, 0.25, 4096.0)
-    compare(library, one, [replace(f, spp=torch.full((1, 1, 1, 1), n)) for f, n in zip(frames, counts, strict=True)])
+    compare(limited, one, [replace(f, spp=torch.full((1, 1, 1, 1), n)) for f, n in zip(frames, counts, strict=True)])
 
 
-def test_frames_without_any_surface_or_light(library, one, frames):
+def test_frames_without_any_surface_or_light(limited, one, frames):
     light = ("direct", "indirect")
     empty = {name: torch.zeros_like(frames[1].channel(name)) for name in ("depth", "mesh_id", "normal", *light)}
     dark = {name: empty[name] for name in light}
-    compare(library, one, [frames[0], frames[1].with_channels(empty), frames[2].with_channels(dark), frames[3]])
+    compare(limited, one, [frames[0], frames[1].with_channels(empty), frames[2].with_channels(dark), frames[3]])
 
 
 def disturbed(frame: Frame, names: Sequence[str], values: Sequence[float], seed: int) -> Frame:
@@ -229,45 +222,45 @@ def disturbed(frame: Frame, names: Sequence[str], values: Sequence[float], seed:
 
 
 @pytest.mark.parametrize("name", ["direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion"])
-def test_numbers_that_are_none_count_as_0(library, one, frames, name):
+def test_numbers_that_are_none_count_as_0(limited, one, frames, name):
     values = (torch.nan, torch.inf, -torch.inf)
-    compare(library, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
+    compare(limited, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
 
 
-def test_motion_may_lead_anywhere(library, one, frames):
+def test_motion_may_lead_anywhere(limited, one, frames):
     values = (1e30, -1e30, 1e5, -70.25, 0.0)
-    compare(library, one, [disturbed(frame, ["motion"], values, index) for index, frame in enumerate(frames)])
+    compare(limited, one, [disturbed(frame, ["motion"], values, index) for index, frame in enumerate(frames)])
 
 
-def test_light_may_be_of_any_size(library, one, frames):
+def test_light_may_be_of_any_size(limited, one, frames):
     for scale in (1e-12, 1e12):
         bright = [f.with_channels({name: scale * f.channel(name) for name in ("direct", "indirect")}) for f in frames]
-        compare(library, one, bright)
+        compare(limited, one, bright)
 
 
 @pytest.mark.parametrize("name", BOUNDED)
-def test_surfaces_count_as_at_most_100(library, one, frames, name):
+def test_surfaces_count_as_at_most_100(limited, one, frames, name):
     values = (1e35, -1e35, 3e38, 101.0)
-    compare(library, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
+    compare(limited, one, [disturbed(frame, [name], values, index) for index, frame in enumerate(frames)])
 
 
-def test_meshes_without_a_pose_stand_still(library, one):
+def test_meshes_without_a_pose_stand_still(limited, one):
     """As do those whose number is negative."""
     generator = torch.Generator().manual_seed(1)
     ids = torch.randint(1, 3 * MESHES, (1, 1, *SIZE), generator=generator).float()
     light = [torch.rand(1, 3, *SIZE, generator=generator) for _ in range(4)]
     sequence = chain([flat_frame(*SIZE, (0.5, 0.25), mesh_id=ids, irradiance=each) for each in light])
-    compare(library, one, sequence)
-    runtime = CRuntime(library, SIZE[1], SIZE[0])
+    compare(limited, one, sequence)
+    runtime = CRuntime(limited, SIZE[1], SIZE[0])
     for index, frame in enumerate(sequence):
         output = runtime(disturbed(frame, ["mesh_id"], (-1.0, -(2.0**31), 2.0**31 - 128), index), index == 0)
         assert output.isfinite().all()
 
 
-def test_optional_images(library, one, frames):
+def test_optional_images(limited, one, frames):
     """Their values by default, and one mesh for all surfaces."""
     ones, zeros = torch.ones_like(frames[0].depth), torch.zeros_like(frames[0].direct)
-    runtime, state = CRuntime(library, SIZE[1], SIZE[0]), None
+    runtime, state = CRuntime(limited, SIZE[1], SIZE[0]), None
     for index, frame in enumerate(frames):
         ids = (frame.depth > 0).float()
         plain = {"indirect": zeros, "emission": zeros, "roughness": ones, "mesh_id": ids}
@@ -277,13 +270,13 @@ def test_optional_images(library, one, frames):
         torch.testing.assert_close(actual, expected, rtol=0, atol=TOLERANCE * expected.amax().item())
 
 
-def test_images_may_be_interleaved(library, frames):
-    planar, interleaved = (CRuntime(library, SIZE[1], SIZE[0]) for _ in range(2))
+def test_images_may_be_interleaved(limited, frames):
+    planar, interleaved = (CRuntime(limited, SIZE[1], SIZE[0]) for _ in range(2))
     for index, frame in enumerate(frames):
         assert torch.equal(planar(frame, index == 0), interleaved(frame, index == 0, interleaved=True))
 
 
-def test_threads_change_nothing(library):
+def test_threads_change_nothing(limited):
     """Bit for bit, with more tasks than threads, and than rows."""
     sequence = synthetic(3, (70, 33))
 
@@ -293,7 +286,7 @@ def test_threads_change_nothing(library):
             def parallel_for(_: int, count: int, task: Task, argument: int) -> None:
                 list(pool.map(lambda index: task(argument, index), reversed(range(count))))
 
-            runtime = CRuntime(library, 33, 70, tasks=tasks, parallel_for=parallel_for)
+            runtime = CRuntime(limited, 33, 70, tasks=tasks, parallel_for=parallel_for)
             return torch.cat([runtime(frame, index == 0) for index, frame in enumerate(sequence)])
 
     alone = run(1, 1)
@@ -301,8 +294,8 @@ def test_threads_change_nothing(library):
         assert torch.equal(run(tasks, threads), alone)
 
 
-def test_errors_leave_everything_as_it_was(library, frames):
-    runtime, other = (CRuntime(library, SIZE[1], SIZE[0]) for _ in range(2))
+def test_errors_leave_everything_as_it_was(limited, frames):
+    runtime, other = (CRuntime(limited, SIZE[1], SIZE[0]) for _ in range(2))
     for index, frame in enumerate(frames):
         output = np.full((3, *SIZE), 7, np.float32)
         for changes in (
@@ -315,19 +308,19 @@ def test_errors_leave_everything_as_it_was(library, frames):
         ):
             given = CFrame(**({"width": 8, "height": 8, "samples": 1.0} | changes))
             error = runtime.call(given, Image(address(output), 0, 0, 0))
-            assert library.onespp_message(error).startswith(b"a size, a number")
+            assert limited.onespp_message(error).startswith(b"a size, a number")
         assert (output == 7).all()
         assert torch.equal(runtime(frame, index == 0), other(frame, index == 0))
 
 
-def test_bad_configurations(library):
-    fine = {"abi": ABI, "max_width": 8, "max_height": 8, "max_meshes": 0, "tasks": 1, "max_isa": library.max_isa}
-    memory = np.zeros(library.onespp_size(ctypes.byref(Config(**fine))), np.uint8)
+def test_bad_configurations(limited):
+    fine = {"abi": ABI, "max_width": 8, "max_height": 8, "max_meshes": 0, "tasks": 1, "max_isa": limited.max_isa}
+    memory = np.zeros(limited.onespp_size(ctypes.byref(Config(**fine))), np.uint8)
     denoiser = ctypes.c_void_p()
 
     def create(size: int, **changes: int) -> int:
         arguments = ctypes.byref(Config(**(fine | changes))), address(memory), ctypes.c_size_t(size)
-        return library.onespp_create(*arguments, ctypes.byref(denoiser))
+        return limited.onespp_create(*arguments, ctypes.byref(denoiser))
 
     assert create(memory.size) == 0
     assert create(memory.size, abi=ABI + 1) == 1
@@ -336,10 +329,10 @@ def test_bad_configurations(library):
     assert create(memory.size - 1) == 3
 
 
-def test_frames_of_4k_take_at_most_2_2_gb(library):
+def test_frames_of_4k_take_at_most_2_2_gb(limited):
     """So that a process with all inputs takes at most 3 GB."""
     config = Config(ABI, 3840, 2160, 64, 4)
-    assert 0 < library.onespp_size(ctypes.byref(config)) <= 2.2e9
+    assert 0 < limited.onespp_size(ctypes.byref(config)) <= 2.2e9
 
 
 def check_example(command: list[str], one: One, frames: list[Frame], folder: Path) -> None:
@@ -355,9 +348,8 @@ def check_example(command: list[str], one: One, frames: list[Frame], folder: Pat
         torch.testing.assert_close(output, expected, rtol=0, atol=TOLERANCE * expected.amax().item())
 
 
-def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path):
-    objects = [compiled(CC, OPTIMISED, source) for source in SOURCES]
-    command = [CC, *STRICT, *OPTIMISED, "-pthread", str(FOLDER / "example.c"), *objects]
+def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path, objects):
+    command = [CC, *STRICT, *OPTIMISED, "-pthread", str(FOLDER / "example.c"), *objects.values()]
     subprocess.run([*command, "-o", str(tmp_path / "example"), "-lm"], check=True)
     check_example([str(tmp_path / "example")], one, frames, tmp_path)
 
@@ -386,16 +378,16 @@ CLIPS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clip", CLIPS)
-def test_fifty_frames(library, one, clip):
-    worst = compare(library, one, CLIPS[clip](), resets=(0, 33) if clip == "cuts and sizes" else (0,))
+def test_fifty_frames(limited, one, clip):
+    worst = compare(limited, one, CLIPS[clip](), resets=(0, 33) if clip == "cuts and sizes" else (0,))
     print(f"{clip}: {worst:.1e}")
 
 
 @pytest.mark.slow
-def test_rendered_clips(library, one, tiny):
+def test_rendered_clips(limited, one, tiny):
     for clip in Dataset(tiny).clips("test"):
         sequence = [read_frame(clip, index, one.reads, in_layers=False) for index in range(clip.frames)]
-        compare(library, one, sequence)
+        compare(limited, one, sequence)
 
 
 @pytest.mark.slow

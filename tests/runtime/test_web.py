@@ -18,10 +18,10 @@ from datasets.frame import read_frame
 from datasets.tonemap import display, psnr
 from models.registry import prototype
 from provenance import ROOT
+from runtime.web.__main__ import main
 from tests.helpers.browser import chromium, needs_browser, no_errors, set_media
-from tests.helpers.c_runtime import CRuntime, build
+from tests.helpers.c_runtime import CRuntime
 
-CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 TOLERANCE = 1e-4  # of the brightest pixel
 WIDTH, HEIGHT = 1366, 768
 
@@ -64,10 +64,7 @@ def live(browser, page):
 
 
 @pytest.fixture(scope="module")
-def native(clip, tmp_path_factory) -> CRuntime:
-    if CC is None:
-        pytest.skip("there is no C compiler")
-    library = build(tmp_path_factory.mktemp("native") / "libonespp.so", CC)
+def native(clip, library) -> CRuntime:
     return CRuntime(library, clip.width, clip.height)
 
 
@@ -198,12 +195,13 @@ def test_a_page_of_fewer_frames(page, clip, tmp_path):
 
 
 def test_bad_input(clip, tmp_path, monkeypatch):
-    run = write_page(clip.path, tmp_path / "page.html", clip.frames + 1)
-    assert run.returncode == 1 and run.stderr == f"error: {clip.path} has 8 frames, not 9\n"
-    run = write_page(tmp_path, tmp_path / "page.html")
-    assert run.returncode == 1 and "clip.json is missing" in run.stderr
-    run = write_page(clip.path, tmp_path / "page.html", "many")
-    assert run.returncode == 1 and "CLIP PAGE [FRAMES]" in run.stderr
+    for source, frames, message in (
+        (clip.path, [str(clip.frames + 1)], f"^error: {clip.path} has 8 frames, not 9$"),
+        (tmp_path, [], "clip.json is missing"),
+        (clip.path, ["many"], r"CLIP PAGE \[FRAMES\]"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            main([str(source), str(tmp_path / "page.html"), *frames])
     assert not list(tmp_path.iterdir())
     shutil.copytree(ROOT / "runtime", tmp_path / "runtime", ignore=shutil.ignore_patterns("*.wasm"))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))

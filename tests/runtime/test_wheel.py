@@ -17,14 +17,13 @@ import torch
 from datasets.frame import Frame
 from eval.bench.synthetic_frames import synthetic_frame
 from runtime.raw import PLANES
-from tests.helpers.c_runtime import FOLDER, ISAS, STRICT, CRuntime, build
+from tests.helpers.c_runtime import CC, FOLDER, ISAS, STRICT, CRuntime
 from tests.helpers.c_runtime import SOURCES as C_SOURCES
 
-CC = which("cc") or which("gcc") or which("clang")
 MOST_BYTES = 3_000_000
 SIZE = (50, 72)
 IMAGES = {"direct": "color", **{name: name for name in (*PLANES[1:], "mesh_id")}}
-pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+pytestmark = pytest.mark.skipif(not CC, reason="there is no C compiler")
 
 
 # Plays frames with as many threads as an argument says, all of which lie as planes: no image is contiguous.
@@ -68,11 +67,6 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 def module(unpacked, monkeypatch):
     monkeypatch.syspath_prepend(unpacked)
     return importlib.import_module("onespp_runtime")
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("runtime") / "libonespp.so", CC)
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from datasets.clip import Clip, Dataset
+from tests.helpers.shared import made_once
 from tests.helpers.training import folder_of, short_task
 from train.loop import train_network
-from train.precision import BFLOAT16
 
 
 @pytest.fixture(scope="session")
@@ -17,11 +17,9 @@ def clips(tiny: Path) -> list[Clip]:
 
 
 @pytest.fixture(scope="session")
-def trained_runs(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a short training of rae in bfloat16 is kept. Read only."""
-    runs = tmp_path_factory.mktemp("trained")
-    train_network(short_task("rae", tiny, runs, precision=BFLOAT16))
-    return runs
+def trained_runs(tiny: Path, shared: Path) -> Path:
+    """Where a short training of rae is kept. Read only."""
+    return made_once(shared / "trained", lambda runs: train_network(short_task("rae", tiny, runs)))
 
 
 @pytest.fixture
