@@ -28,12 +28,22 @@
 #include "onespp_weights.h"
 #endif
 
+/* A layer sums LANES pixels of AT_ONCE outputs in registers, see multiply_block. CHUNK pixels of a row are worked on
+ * together: what they need stays in the first caches. */
 #if defined(__AVX512F__) || defined(ONESPP_AVX512)
-enum { LANES = 64, AT_ONCE = 4 }; /* pixels and outputs that a layer sums in registers, see multiply_block */
+enum { LANES = 64, AT_ONCE = 4, CHUNK = 256 };
+#elif defined(__AVX2__) || defined(ONESPP_AVX2)
+enum { LANES = 24, AT_ONCE = 4, CHUNK = 240 };
 #elif defined(__wasm_simd128__)
-enum { LANES = 8, AT_ONCE = 4 };
+enum { LANES = 8, AT_ONCE = 4, CHUNK = 256 };
 #else
-enum { LANES = 32, AT_ONCE = 2 };
+enum { LANES = 24, AT_ONCE = 2, CHUNK = 240 };
+#endif
+
+#if defined(__GNUC__)
+#define NOINLINE __attribute__((noinline)) /* where it is inlined, GCC runs out of registers */
+#else
+#define NOINLINE
 #endif
 
 enum {
@@ -51,13 +61,14 @@ enum {
 };
 
 enum {
-    CHUNK = 256, /* pixels of a row that are worked on together: what they need stays in the first caches */
     HALF_CHUNK = CHUNK / 2,
     MIN_STRIP_ROWS = 64,
     BLOCK = 16,       /* pixels, the side of the squares whose mean luminance is measured */
     MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
-    PAD = 16, /* floats before a line: alignment, and zeros to the left of the image */
+    PAD = 16,   /* floats before a line: alignment, and zeros to the left of the image */
+    LINE = 272, /* floats from line to line of a chunk: an odd multiple of 16, see pitch_of */
+    HALF_LINE = 144,
     ALIGNMENT = 64,
     BACKGROUND = 0 /* mesh id of pixels that show no surface */
 };
@@ -267,29 +278,29 @@ typedef struct {
 
 /* What a convolution works with: pixel x of a chunk is at x + 1 of the sums of rows. */
 typedef struct {
-    float sums[PRODUCTS][WIDTH_C][HALF_CHUNK + PAD];
-    float products[PRODUCTS][WIDTH_C][HALF_CHUNK];
+    float sums[PRODUCTS][WIDTH_C][HALF_LINE];
+    float products[PRODUCTS][WIDTH_C][HALF_LINE];
 } Convolution;
 
 /* What each task works with. */
 typedef union {
     struct {
         Neighbourhood around;
-        float history[TEXEL][CHUNK]; /* the last lines are not used */
-        float parts[MAX_PART_HISTORY][CHUNK];
-        float lines[2][INPUTS][CHUNK];
-        float patches[PATCH * INPUTS][HALF_CHUNK];
-        float entered[WIDTH_A][HALF_CHUNK];
+        float history[TEXEL][LINE]; /* the last lines are not used */
+        float parts[MAX_PART_HISTORY][LINE];
+        float lines[2][INPUTS][LINE];
+        float patches[PATCH * INPUTS][HALF_LINE];
+        float entered[WIDTH_A][HALF_LINE];
     } enter;
-    float patches[PATCH * WIDTH_B][HALF_CHUNK];
+    float patches[PATCH * WIDTH_B][HALF_LINE];
     Convolution convolution;
     struct {
         Convolution convolution;
-        float joined[2][WIDTH_A][HALF_CHUNK];
-        float patches[PATCH * OUTPUTS][HALF_CHUNK];
-        float head[OUTPUTS + AT_ONCE][CHUNK];
-        float noisy[RGB][CHUNK];
-        float depth[CHUNK];
+        float joined[2][WIDTH_A][HALF_LINE];
+        float patches[PATCH * OUTPUTS][HALF_LINE];
+        float head[OUTPUTS + AT_ONCE][LINE];
+        float noisy[RGB][LINE];
+        float depth[LINE];
     } leave;
 } Scratch;
 
@@ -561,7 +572,7 @@ static void load_irradiance(float *restrict line, const onespp_frame *frame, int
 /* Noisy irradiance of one colour of a part of the light, cut by as much as that of the whole. */
 static void load_part(float *restrict line, const onespp_frame *frame, int part, int channel, int y, int x, int n)
 {
-    float direct[CHUNK], indirect[CHUNK], divisor[CHUNK], depth[CHUNK];
+    float direct[LINE], indirect[LINE], divisor[LINE], depth[LINE];
     load(line, &frame->part[part].noisy, channel, y, x, n);
     load(direct, &frame->direct, channel, y, x, n);
     load(indirect, &frame->indirect, channel, y, x, n);
@@ -592,7 +603,7 @@ static float *part_line(const onespp *d, int y, int part, int line)
  * surfaces. */
 static void measure_row(const Job *job, int y, int x0, int n, float *restrict sums, int *restrict surfaces)
 {
-    float light[RGB][CHUNK], divisor[CHUNK], depth[CHUNK];
+    float light[RGB][LINE], divisor[LINE], depth[LINE];
     for (int c = 0; c < RGB; c++) {
         float *restrict noisy = row_line(job->d, y, NOISY_LINES + c) + x0;
         load_irradiance(noisy, &job->frame, c, y, x0, n);
@@ -801,7 +812,7 @@ static void join_texels(float *restrict texels, const float *const lines[TEXEL],
 }
 
 /* The rounds of join_texels, undone. */
-static void split_texels(float (*restrict lines)[CHUNK], const float *restrict texels, int n)
+static void split_texels(float (*restrict lines)[LINE], const float *restrict texels, int n)
 {
     float two[TEXEL / 2][2 * CHUNK], four[TEXEL / 4][4 * CHUNK];
     split(two[0], two[4], texels, 8 * n);
@@ -912,10 +923,10 @@ static void fetch(const Job *job, const Surface *surface, float x, float y, floa
 
 /* The history of n pixels of a row, from x0 on; 0 where there is none. */
 static void reproject(
-    const Job *job, int y, int x0, int n, float (*restrict history)[CHUNK], float (*restrict parts)[CHUNK])
+    const Job *job, int y, int x0, int n, float (*restrict history)[LINE], float (*restrict parts)[LINE])
 {
-    float motion[2][CHUNK], depth[CHUNK], normal[3][CHUNK], texels[CHUNK][TEXEL], of_part[MAX_PART_HISTORY];
-    int32_t mesh[CHUNK];
+    float motion[2][LINE], depth[LINE], normal[3][LINE], texels[CHUNK][TEXEL], of_part[MAX_PART_HISTORY];
+    int32_t mesh[LINE];
     int of_parts = PART_HISTORY * job->frame.parts;
     if (!job->has_history) {
         memset(history, 0, sizeof *history * HISTORY);
@@ -1042,9 +1053,9 @@ static inline void end(float *restrict outputs, const float *restrict sums, floa
 
 typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
 
-/* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers, of which LANES and AT_ONCE
- * take half as many as there are; each input is read once for all outputs. */
-static void multiply_block(
+/* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers: LANES and AT_ONCE take 12 of 16,
+ * or 16 of 32. Each input is read once for all outputs. */
+NOINLINE static void multiply_block(
     const float *restrict weights, const float *restrict bias, const float *const *restrict inputs, int count,
     ptrdiff_t x, float *restrict out, ptrdiff_t pitch, Finish finish)
 {
@@ -1078,11 +1089,11 @@ static void multiply_block(
 static void multiply(
     const Layer *layer, const float *const *inputs, ptrdiff_t x, int n, float *out, ptrdiff_t pitch, Finish finish)
 {
-    for (int o = 0; o < layer->outputs; o += AT_ONCE) {
-        const float *weights = layer->weights + (ptrdiff_t)o * layer->inputs;
-        for (int i = 0; i < n; i += LANES)
+    for (int i = 0; i < n; i += LANES) /* whose inputs stay in the first cache */
+        for (int o = 0; o < layer->outputs; o += AT_ONCE) {
+            const float *weights = layer->weights + (ptrdiff_t)o * layer->inputs;
             multiply_block(weights, layer->bias + o, inputs, layer->inputs, x + i, out + o * pitch + i, pitch, finish);
-    }
+        }
 }
 
 /* Pixel 0 of a line of a window. */
@@ -1150,11 +1161,11 @@ static void convolve(
             taps[i] = scratch->sums[product][i / COLUMNS] + i % COLUMNS;
         layer.bias = product == 1 ? bias : no_bias; /* this product is in both rows */
         if (is_needed(rows, product))
-            multiply(&layer, taps, 0, n, scratch->products[product][0], HALF_CHUNK, PLAIN);
+            multiply(&layer, taps, 0, n, scratch->products[product][0], HALF_LINE, PLAIN);
         layer.weights += (ptrdiff_t)layer.outputs * layer.inputs;
     }
     for (int o = 0; o < layer.outputs; o++) {
-        float(*products)[WIDTH_C][HALF_CHUNK] = scratch->products;
+        float(*products)[WIDTH_C][HALF_LINE] = scratch->products;
         if (rows[0])
             rectify_sum(rows[0] + o * pitch, products[1][o], 1, products[0][o], products[2][o], n);
         if (rows[1])
@@ -1212,7 +1223,7 @@ static void double_rows(Job *job, Scratch *scratch, int first, int last)
             lines[c] = line_of(from, y, c);
         for (int x = 0; x < width; x += HALF_CHUNK) {
             int n = mini(HALF_CHUNK, width - x);
-            multiply(&job->d->layers[job->layer], lines, x, n, scratch->patches[0], HALF_CHUNK, PLAIN);
+            multiply(&job->d->layers[job->layer], lines, x, n, scratch->patches[0], HALF_LINE, PLAIN);
             for (int i = 0; i < 2 * channels; i++) {
                 int even = i / channels * 2 * channels + i % channels;
                 const float *restrict old = line_of(skip, 2 * y + i / channels, i % channels) + 2 * x;
@@ -1257,11 +1268,11 @@ static void expose(float *restrict line, const float *restrict light, float expo
 }
 
 /* The lines that are means of irradiance, and its deviation. */
-static void fill_statistics(const Job *job, const Neighbourhood *around, int y, int n, float (*restrict lines)[CHUNK])
+static void fill_statistics(const Job *job, const Neighbourhood *around, int y, int n, float (*restrict lines)[LINE])
 {
     int slot = slot_of(y);
     const float *count = around->sums_9x9[5] + HALO;
-    float mean[CHUNK], square[CHUNK];
+    float mean[LINE], square[LINE];
     for (int c = 0; c < RGB; c++) {
         expose(lines[NOISY_INPUT + c], around->pixels[slot][c] + HALO, job->exposure, n);
         for (int i = 0; i < n; i++)
@@ -1284,7 +1295,7 @@ static void fill_statistics(const Job *job, const Neighbourhood *around, int y, 
 }
 
 /* The lines of the reprojected history; without one, its images are those of this frame. */
-static void fill_history(const Job *job, float (*restrict history)[CHUNK], int n, float (*restrict lines)[CHUNK])
+static void fill_history(const Job *job, float (*restrict history)[LINE], int n, float (*restrict lines)[LINE])
 {
     float samples = job->frame.samples;
     const float *length = history[LENGTH];
@@ -1307,10 +1318,10 @@ static void fill_history(const Job *job, float (*restrict history)[CHUNK], int n
 }
 
 /* The lines of surfaces: albedo, normal in view space, depth and roughness. */
-static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict lines)[CHUNK])
+static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict lines)[LINE])
 {
     const onespp_frame *frame = &job->frame;
-    float normal[3][CHUNK];
+    float normal[3][LINE];
     for (int c = 0; c < 3; c++) {
         load(lines[ALBEDO_INPUT + c], &frame->albedo, c, y, x0, n);
         load_normal(normal[c], frame, c, y, x0, n);
@@ -1333,7 +1344,7 @@ static void fill_surface(const Job *job, int y, int x0, int n, float (*restrict 
 }
 
 /* The inputs of a chunk of a row, n pixels from x0 on, whose last one is repeated. */
-static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, float (*restrict lines)[CHUNK])
+static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, float (*restrict lines)[LINE])
 {
     sum_neighbours(job, &scratch->enter.around, y, x0);
     reproject(job, y, x0, n, scratch->enter.history, scratch->enter.parts);
@@ -1346,7 +1357,7 @@ static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, 
 }
 
 /* What `leave` needs of a chunk of a row: the history of images and its length, and the hidden per-pixel layer. */
-static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, float (*lines)[CHUNK])
+static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, float (*lines)[LINE])
 {
     const onespp *d = job->d;
     const float *inputs[INPUTS];
@@ -1368,14 +1379,14 @@ static void enter_chunk(const Job *job, Scratch *scratch, int y, int x, int n)
     const float *patches[PATCH * INPUTS], *entered[WIDTH_A];
     for (int i = 0; i < 2 * INPUTS; i++) {
         int even = i / INPUTS * 2 * INPUTS + i % INPUTS;
-        float(*to)[HALF_CHUNK] = scratch->enter.patches;
+        float(*to)[HALF_LINE] = scratch->enter.patches;
         split(to[even], to[even + INPUTS], scratch->enter.lines[i / INPUTS][i % INPUTS], HALF_CHUNK);
     }
     for (int i = 0; i < PATCH * INPUTS; i++)
         patches[i] = scratch->enter.patches[i];
     for (int c = 0; c < WIDTH_A; c++)
         entered[c] = scratch->enter.entered[c];
-    multiply(&d->layers[ENTER_1], patches, 0, n, scratch->enter.entered[0], HALF_CHUNK, RECTIFIED);
+    multiply(&d->layers[ENTER_1], patches, 0, n, scratch->enter.entered[0], HALF_LINE, RECTIFIED);
     multiply(&d->layers[ENTER_2], entered, 0, n, line_of(&d->a, y, 0) + x, d->a.pitch, RECTIFIED);
 }
 
@@ -1414,11 +1425,11 @@ enum {
 
 /* The parameters of a level of the filter. */
 static void decode_level(
-    const Job *job, float (*head)[CHUNK], const float *restrict depth, int level, int y, int x0, int n)
+    const Job *job, float (*head)[LINE], const float *restrict depth, int level, int y, int x0, int n)
 {
     float *restrict sharpness = row_line(job->d, y, LEVEL_LINES + 3 * level) + x0;
     float *restrict centre = sharpness + job->d->pitch, *restrict importance = centre + job->d->pitch;
-    float shrunk[CHUNK]; /* of softplus */
+    float shrunk[LINE]; /* of softplus */
     for (int i = 0; i < n; i++)
         shrunk[i] = exponential(maxf(-fabsf(head[SHARPNESS_HEAD + level][i]), -MAX_EXPONENT));
     for (int i = 0; i < n; i++) {
@@ -1432,7 +1443,7 @@ static void decode_level(
 static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
 {
     const onespp *d = job->d;
-    float samples = job->frame.samples, newest[CHUNK];
+    float samples = job->frame.samples, newest[LINE];
     const float *head = scratch->leave.head[ALPHA_HEAD], *output_head = scratch->leave.head[ALPHA_HEAD + 1];
     float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0, *restrict length = row_line(d, y, LENGTH_LINE) + x0;
     for (int i = 0; i < n; i++) {
@@ -1451,14 +1462,14 @@ static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
             accumulated[i] = newest[i] * noisy[i] + (1 - newest[i]) * accumulated[i];
     }
     for (int c = 0; c < RGB * job->frame.parts; c++) {
-        float noisy[CHUNK], *restrict accumulated = part_line(d, y, c / RGB, PART_ACCUMULATED + c % RGB) + x0;
+        float noisy[LINE], *restrict accumulated = part_line(d, y, c / RGB, PART_ACCUMULATED + c % RGB) + x0;
         load_part(noisy, &job->frame, c / RGB, c % RGB, y, x0, n);
         for (int i = 0; i < n; i++)
             accumulated[i] = newest[i] * noisy[i] + (1 - newest[i]) * accumulated[i];
     }
 }
 
-static void decode_latent(const Job *job, float (*head)[CHUNK], int y, int x0, int n)
+static void decode_latent(const Job *job, float (*head)[LINE], int y, int x0, int n)
 {
     for (int c = 0; c < LATENT; c++) {
         float *restrict latent = row_line(job->d, y, LATENT_LINES + c) + x0;
@@ -1474,7 +1485,7 @@ static void decode_latent(const Job *job, float (*head)[CHUNK], int y, int x0, i
 /* Decodes a chunk of a row. */
 static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
 {
-    float(*head)[CHUNK] = scratch->leave.head;
+    float(*head)[LINE] = scratch->leave.head;
     load(scratch->leave.depth, &job->frame.depth, 0, y, x0, n);
     for (int c = 0; c < RGB; c++)
         memcpy(scratch->leave.noisy[c], row_line(job->d, y, NOISY_LINES + c) + x0, sizeof(float) * (size_t)n);
@@ -1487,21 +1498,21 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
 }
 
 /* Two rows of a chunk, n pixels from x0 on, from a row y at 1/2 of the resolution, whose channels are `joined`. */
-static void leave_chunk(const Job *job, Scratch *scratch, float (*joined)[HALF_CHUNK], int y, int x0, int n)
+static void leave_chunk(const Job *job, Scratch *scratch, float (*joined)[HALF_LINE], int y, int x0, int n)
 {
     const onespp *d = job->d;
     const float *lines[WIDTH_A], *hidden[DETAIL];
-    float(*patches)[HALF_CHUNK] = scratch->leave.patches;
+    float(*patches)[HALF_LINE] = scratch->leave.patches;
     for (int c = 0; c < WIDTH_A; c++)
         lines[c] = joined[c];
-    multiply(&d->layers[LEAVE], lines, 0, n / 2 + n % 2, patches[0], HALF_CHUNK, PLAIN);
+    multiply(&d->layers[LEAVE], lines, 0, n / 2 + n % 2, patches[0], HALF_LINE, PLAIN);
     for (int row = 2 * y; row < mini(2 * y + 2, job->frame.height); row++) {
         int even = row % 2 * 2 * OUTPUTS;
         for (int c = 0; c < OUTPUTS; c++)
             join(scratch->leave.head[c], patches[even + c], patches[even + OUTPUTS + c], HALF_CHUNK);
         for (int c = 0; c < DETAIL; c++)
             hidden[c] = line_of(&d->hidden, row, c) + x0;
-        multiply(&d->layers[DETAIL_2], hidden, 0, n, scratch->leave.head[0], CHUNK, ADDED);
+        multiply(&d->layers[DETAIL_2], hidden, 0, n, scratch->leave.head[0], LINE, ADDED);
         decode(job, scratch, row, x0, n);
     }
 }
@@ -1513,9 +1524,9 @@ static void leave_rows(Job *job, Scratch *scratch, int first, int last)
     for (int y = first / 2 * 2; y < last; y += 2)
         for (int x = 0; x < job->padded_width / 2; x += HALF_CHUNK) {
             int n = mini(CHUNK, job->frame.width - 2 * x);
-            float(*joined)[WIDTH_A][HALF_CHUNK] = scratch->leave.joined;
+            float(*joined)[WIDTH_A][HALF_LINE] = scratch->leave.joined;
             float *rows[2] = {y >= first ? joined[0][0] : NULL, y + 1 < last ? joined[1][0] : NULL};
-            convolve(job, convolution, JOIN_A, &job->d->sum_a, rows, y, x, n / 2 + n % 2, HALF_CHUNK);
+            convolve(job, convolution, JOIN_A, &job->d->sum_a, rows, y, x, n / 2 + n % 2, HALF_LINE);
             for (int i = 0; i < 2; i++)
                 if (rows[i])
                     leave_chunk(job, scratch, joined[i], y + i, 2 * x, n);
@@ -1609,7 +1620,7 @@ static void measure_distances(
 
 /* Adds weighted colours, whose lines are `pitch` apart, and their weights to n sums from `at` on. */
 static void add_weighted(
-    float (*restrict sums)[CHUNK], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch,
+    float (*restrict sums)[LINE], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch,
     int n)
 {
     for (int i = 0; i < n; i++) {
@@ -1629,7 +1640,7 @@ static const float *part_image(const onespp *d, int level, int part, int y)
 
 /* Adds weighted colours of parts of the light at pixels from x on, whose sums follow those of the whole. */
 static void add_parts(
-    const Job *job, float (*restrict sums)[CHUNK], int at, const float *restrict weight, int y, int x, int n)
+    const Job *job, float (*restrict sums)[LINE], int at, const float *restrict weight, int y, int x, int n)
 {
     for (int c = 0; c < RGB * job->frame.parts; c++) {
         const float *restrict line = part_image(job->d, job->level, c / RGB, y) + c % RGB * job->d->pitch + x;
@@ -1640,14 +1651,14 @@ static void add_parts(
 }
 
 /* Adds the tap (dx, dy) of a chunk of a row, where it is in the image. */
-static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n, int dx, int dy)
+static void add_tap(const Job *job, float (*restrict sums)[LINE], int y, int x0, int n, int dx, int dy)
 {
     const onespp *d = job->d;
     int first = maxi(x0, -dx), last = mini(x0 + n, job->frame.width - dx);
     int level_line = LEVEL_LINES + 3 * job->level;
     if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
         return;
-    float distance[CHUNK], weight[CHUNK];
+    float distance[LINE], weight[LINE];
     const float *restrict sharpness = row_line(d, y, level_line) + first;
     const float *restrict importance = row_line(d, y + dy, level_line + 2) + first + dx;
     int count = last - first;
@@ -1665,12 +1676,12 @@ static void add_tap(const Job *job, float (*restrict sums)[CHUNK], int y, int x0
 /* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
  * the pixel times the squared distance of their features), and by exp(centre) for the pixel itself; 0 off surfaces.
  * Isik et al. 2021, Eq. 4, with two weights more. */
-static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, int x0, int n)
+static void filter_chunk(const Job *job, float (*restrict sums)[LINE], int y, int x0, int n)
 {
     const onespp *d = job->d;
     int step = TAP_SPACINGS[job->level];
     const float *centre = row_line(d, y, LEVEL_LINES + 3 * job->level + 1) + x0, *importance = centre + d->pitch;
-    float weight[CHUNK];
+    float weight[LINE];
     int channels = 4 + RGB * job->frame.parts;
     memset(sums, 0, sizeof *sums * (size_t)channels);
     for (int i = 0; i < n; i++)
@@ -1694,7 +1705,7 @@ static void filter_chunk(const Job *job, float (*restrict sums)[CHUNK], int y, i
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
-    float sums[4 + RGB * ONESPP_MAX_PARTS][CHUNK];
+    float sums[4 + RGB * ONESPP_MAX_PARTS][LINE];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
@@ -1714,7 +1725,7 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 /* One colour of the denoised radiance. */
 static void write_radiance(const Job *job, int channel, const float *restrict irradiance, int y, int x0, int n)
 {
-    float divisor[CHUNK], emission[CHUNK];
+    float divisor[LINE], emission[LINE];
     load_divisor(divisor, &job->frame, channel, y, x0, n);
     load(emission, &job->frame.emission, channel, y, x0, n);
     ptrdiff_t step = job->radiance.column;
@@ -1728,7 +1739,7 @@ static void remember(const Job *job, int y, int x0, int n)
 {
     const onespp *d = job->d;
     ptrdiff_t pixel = (ptrdiff_t)y * d->pitch + x0;
-    float normal[3][CHUNK];
+    float normal[3][LINE];
     const float *lines[TEXEL];
     for (int c = 0; c < HISTORY; c++)
         lines[c] = row_line(d, y, OUTPUT_LINES + c) + x0;
@@ -1750,7 +1761,7 @@ static void remember(const Job *job, int y, int x0, int n)
 /* A colour of a part of the light, blended and written: where no surface is, it stays as it is. */
 static void finish_part(const Job *job, int part, int channel, const float *restrict filtered, int y, int x0, int n)
 {
-    float divisor[CHUNK], noisy[CHUNK];
+    float divisor[LINE], noisy[LINE];
     const float *restrict alpha = row_line(job->d, y, ALPHA_LINE) + x0;
     const float *restrict importance = row_line(job->d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
     float *restrict output = part_line(job->d, y, part, PART_OUTPUT + channel) + x0;
@@ -1770,7 +1781,7 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
     const onespp *d = job->d;
-    float sums[4 + RGB * ONESPP_MAX_PARTS][CHUNK];
+    float sums[4 + RGB * ONESPP_MAX_PARTS][LINE];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
