@@ -84,7 +84,7 @@ def synthetic(count: int, size: tuple[int, int] = SIZE, first: int = 0) -> list[
 @torch.no_grad()
 def compare(library: Library, one: One, frames: Iterable[Frame], resets: Sequence[int] = (0,)) -> float:
     """The largest difference of the sequence, relative to the brightest pixel of its frame."""
-    runtime = CRuntime(library, 200, 200, parts=3)
+    runtime = CRuntime(library, 600, 200, parts=3)
     state: State | None = None
     worst = 0.0
     for index, frame in enumerate(frames):
@@ -152,7 +152,7 @@ def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
     compare(library, one, frames)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (13, 7), (40, 56), (3, 190), (41, 70), (197, 24)])
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (13, 7), (40, 56), (3, 190), (41, 70), (197, 24), (9, 590)])
 def test_it_computes_what_the_denoiser_does(limited, one, size):
     """With a moving camera, moving meshes, disocclusions and sky."""
     compare(limited, one, synthetic(4, size))
@@ -171,7 +171,7 @@ def in_parts(frame: Frame, count: int) -> Frame:
     return replace(frame, parts=torch.cat([*(shares * light)], dim=1))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (13, 7), (41, 70), (197, 24)])
+@pytest.mark.parametrize("size", [(1, 1), (13, 7), (41, 70), (197, 24), (5, 333)])
 def test_parts_of_the_light(limited, one, size):
     frames = [in_parts(frame, count) for frame, count in zip(synthetic(5, size), (2, 2, 3, 3, 1), strict=True)]
     compare(limited, one, frames)
