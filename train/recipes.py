@@ -109,7 +109,7 @@ NTD_RELEASE: dict[str, Any] = (
     | {"augmentation": Augmentation(stop=True, rotate=True, exposure=True)}
 )
 NTD_BUDGETS = {
-    "tiny": SHORT | {"epochs": 15, "crop": 32, "length": 8, "trained": 7},
+    "tiny": SHORT | {"epochs": 8, "crop": 32, "length": 8, "trained": 7},
     "quick": SHORT | {"epochs": 40, "crop": 128},
     "release": NTD_RELEASE,
     "furnished": NTD_RELEASE | {"epochs": 9, "warm_up": 0.5, "crop": 128, "batch": 8},
