@@ -60,6 +60,9 @@ enum {
     REACH_C = 3   /* rows of 1/8 */
 };
 
+/* Floats from line to line: an odd multiple of 16, so that lines do not fall on the same sets of a cache. */
+#define PITCH(width) ((((width) + 15) / 16 | 1) * 16)
+
 enum {
     HALF_CHUNK = CHUNK / 2,
     MIN_STRIP_ROWS = 64,
@@ -67,8 +70,8 @@ enum {
     MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
     PAD = 16,   /* floats before a line: alignment, and zeros to the left of the image */
-    LINE = 272, /* floats from line to line of a chunk: an odd multiple of 16, see pitch_of */
-    HALF_LINE = 144,
+    LINE = PITCH(CHUNK),
+    HALF_LINE = PITCH(HALF_CHUNK), /* has room for the pixels beside the chunk, too */
     ALIGNMENT = 64,
     BACKGROUND = 0 /* mesh id of pixels that show no surface */
 };
@@ -354,12 +357,9 @@ static void *allocate(Arena *arena, uint64_t count, size_t size)
     return memory;
 }
 
-/* Floats from line to line: an odd multiple of 16, so that lines do not fall on the same sets of a cache. */
-static ptrdiff_t pitch_of(int width) { return ((width + 15) / 16 | 1) * 16; }
-
 static Window window(Arena *arena, int channels, int width, int rows)
 {
-    Window w = {NULL, pitch_of(PAD + rounded_up(width, LANES) + 1), channels, 0};
+    Window w = {NULL, PITCH(PAD + rounded_up(width, LANES) + 1), channels, 0};
     w.data = allocate(arena, (uint64_t)rows * (uint64_t)channels * (uint64_t)w.pitch, sizeof(float));
     return w;
 }
@@ -410,7 +410,7 @@ static void lay_out(onespp *d, Arena *arena)
 {
     uint64_t height = (uint64_t)d->config.max_height;
     uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
-    d->pitch = pitch_of(d->config.max_width);
+    d->pitch = PITCH(d->config.max_width);
     uint64_t pixels = height * (uint64_t)d->pitch;
     d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
     d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));

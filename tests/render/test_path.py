@@ -41,12 +41,14 @@ def sampled(stage: Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def stock(stage: Stage) -> np.ndarray:
-    """Radiance (N, H, W, 3) of all light."""
+    """All light by the stock integrator, radiance (N, H, W, 3)."""
+    stage.pose(POSED_FRAME)
     return np.stack([stock_radiance(stage, 3, 16, seed) for seed in range(30)])
 
 
 def test_one_spp_images_average_to_the_stock_integrator(stage, sampled, stock):
     emission, direct, indirect = sampled
+    stage.pose(POSED_FRAME)
     np.testing.assert_allclose(emission, stock_radiance(stage, 1, 1, 0), atol=1e-6)
     assert_same_mean(emission + direct, np.stack([stock_radiance(stage, 2, 16, s) for s in range(30)]))
     assert_same_mean(emission + direct + indirect, stock)

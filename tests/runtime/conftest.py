@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from runtime.wheel import build_wheel
-from tests.helpers.c_runtime import CC, SOURCES, Library, build
+from tests.helpers.c_runtime import CC, SOURCES, STRICT, Library, build
 from tests.helpers.shared import made_once
 
 
@@ -14,14 +14,10 @@ from tests.helpers.shared import made_once
 def wheel(shared) -> Path:
     if not CC:
         pytest.skip("there is no C compiler")
-
-    def make(folder: Path) -> None:
-        folder.mkdir()
-        build_wheel(folder)
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CC", CC)
-        [wheel] = made_once(shared / "wheel", make).glob("*.whl")
+        patch.setenv("CFLAGS", " ".join(STRICT))
+        [wheel] = made_once(shared / "wheel", build_wheel).glob("*.whl")
     return wheel
 
 

@@ -55,15 +55,15 @@ def in_strips(tmp_path_factory) -> Library:
 
 
 @pytest.fixture(params=["baseline", "avx2", "avx512 in strips"])
-def limited(request, library) -> Library:
+def limited(request, library, monkeypatch) -> Library:
     """The runtime with each instruction set that this machine has."""
     isa, _, strips = request.param.partition(" ")
-    library.max_isa = ISAS[isa]
+    monkeypatch.setattr(library, "max_isa", ISAS[isa])
     if CRuntime(library, 8, 8).isa != library.max_isa:
         pytest.skip(f"there is no {isa} here")
     if strips:
         library = request.getfixturevalue("in_strips")
-        library.max_isa = ISAS[isa]
+        monkeypatch.setattr(library, "max_isa", ISAS[isa])
     return library
 
 
@@ -122,7 +122,7 @@ def test_it_neither_allocates_nor_has_global_state(file, objects):
     table = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     symbols = [[cell.strip() for cell in line.split("|")] for line in table.splitlines() if line.count("|") == 6]
     sections = {row[6] for row in symbols} - {"Section", "*UND*"}
-    assert all(section.startswith((".text", ".rodata", ".data.rel.ro")) for section in sections)
+    assert sections and all(section.startswith((".text", ".rodata", ".data.rel.ro")) for section in sections)
     functions = {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
     assert {name for name, _, kind, *_ in symbols if kind == "T"} == (functions if file == "onespp.c" else set())
     needed = {name for name, _, kind, *_ in symbols if kind == "U"}
@@ -132,11 +132,11 @@ def test_it_neither_allocates_nor_has_global_state(file, objects):
     assert needed <= {"memcpy", "memmove", "memset", "__stack_chk_fail"} | arithmetic | engines | of_the_compiler
 
 
-def test_instruction_sets_differ_by_rounding(library, one, frames):
+def test_instruction_sets_differ_by_rounding(library, one, frames, monkeypatch):
     """The fastest one is the last."""
     outputs = []
     for isa in ("baseline", "avx2", "avx512", "any"):
-        library.max_isa = ISAS[isa]
+        monkeypatch.setattr(library, "max_isa", ISAS[isa])
         runtime = CRuntime(library, SIZE[1], SIZE[0])
         assert runtime.isa <= ISAS[isa] or isa == "any"
         outputs.append(torch.cat([runtime(frame, index == 0) for index, frame in enumerate(frames)]))
@@ -147,7 +147,7 @@ def test_instruction_sets_differ_by_rounding(library, one, frames):
 
 
 def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
-    library = build(tmp_path / "libonespp.so", SOURCES[:1], ["-O1"])
+    library = build(tmp_path / "libonespp.so", SOURCES[:1], ["-O3"])
     assert CRuntime(library, 8, 8).isa == ISAS["baseline"]
     compare(library, one, frames)
 

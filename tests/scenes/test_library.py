@@ -147,8 +147,8 @@ def test_bad_libraries(tmp_path: Path):
 
 
 def diffuse_share(room: str, libraries: Path) -> float:
-    """Of all shapes in three rooms, those that are plainly diffuse."""
-    shapes = [shape for number in range(3) for shape in build_scene(f"{room}-{number}", 0, 1, libraries).shapes]
+    """Of all shapes in eight rooms, those that are plainly diffuse."""
+    shapes = [shape for number in range(8) for shape in build_scene(f"{room}-{number}", 0, 1, libraries).shapes]
     return sum((shape.bsdf.get("bsdf") or shape.bsdf)["type"] == "diffuse" for shape in shapes) / len(shapes)
 
 

@@ -26,7 +26,7 @@ from tests.helpers.training import as_command, folder_of, metadata, same_weights
 from timing import thread_count
 from train.log import METRICS_CSV, Log, read_metrics, smooth
 from train.loop import alone_in, train_network
-from train.precision import BFLOAT16
+from train.precision import BFLOAT16, FLOAT32
 from train.task import WEIGHTS_FILE
 from train.training import CHECKPOINT_FILE, Training
 
@@ -84,6 +84,15 @@ def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, t
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(BadInput, match=r"checkpoint.pt is damaged"):
         train_network(task)
+
+
+def test_a_training_in_bfloat16_keeps_its_weights_in_float32(tiny, tmp_path):
+    recipe = {"epochs": 1, "crops": (1, 1)}
+    weights = train_network(short_task("wskp3", tiny, tmp_path, precision=BFLOAT16, **recipe))
+    assert all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in tensors(weights).values())
+    assert train_network(short_task("wskp3", tiny, tmp_path, precision=None, **recipe)) == weights
+    with pytest.raises(BadInput, match="a training in bfloat16"):
+        train_network(short_task("wskp3", tiny, tmp_path, precision=FLOAT32, **recipe))
 
 
 @pytest.mark.slow

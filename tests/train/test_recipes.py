@@ -45,7 +45,7 @@ def test_recipes_are_those_of_the_papers(name, expected):
 def test_budgets_scale_the_effort_and_anneal():
     for (name, budget), recipe in RECIPES.items():
         paper = RECIPES[name, "paper"]
-        # LBF's own loss makes it worse, as do those of other networks of single frames in `quick`.
+        # LBF's own loss makes it worse. What `quick` trains on single frames has references of few samples.
         displayed = budget in ("release", "furnished") or (name == "lbf" and budget != "paper")
         displayed |= budget == "quick" and paper.length == 1
         may_differ = EFFORT | ENDS_WELL | (FOR_NOISY_REFERENCES if displayed else set())
