@@ -54,13 +54,19 @@ def view_of(projection: Array) -> View | None:
 Y_UP = np.array([0.0, 1.0, 0.0])
 
 
+def cross(a: Array, b: Array) -> Array:
+    """a x b (..., 3), bit for bit as `np.cross`, which takes ten times as long for single vectors."""
+    (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def look_at(eye: Array, target: Array, up: Array = Y_UP) -> Array:
     """camera_to_world (4, 4) of a camera at `eye` (3,) with `target` (3,) in its centre and `up` (3,) upwards."""
     forward = (target - eye) / np.linalg.norm(target - eye)
-    left = np.cross(up, forward)
+    left = cross(up, forward)
     left /= np.linalg.norm(left)
     matrix = np.eye(4)
-    matrix[:3] = np.stack([left, np.cross(forward, left), forward, eye], axis=1)
+    matrix[:3] = np.stack([left, cross(forward, left), forward, eye], axis=1)
     return matrix
 
 

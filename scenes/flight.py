@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from scenes.animation import Camera, Track
 from scenes.boxes import first_hit, overlaps
-from scenes.camera import Array, intrinsics, look_at
+from scenes.camera import Y_UP, Array, cross, intrinsics
 from scenes.draws import log_uniform
 from scenes.layout import Layout
+from scenes.meshes import unit
 
 EYE_CLEARANCE = 0.3  # m, between the camera and reserved boxes
 MAX_SPEED = 20 / 256  # of things in the image, in image widths per frame
@@ -39,12 +40,17 @@ def flight_path(layout: Layout) -> Track:
     raise RuntimeError("no free path for the camera")
 
 
-def image_points(points: Array, eye: Array, target: Array, x_fov: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Positions (N, 2) of `points` (N, 3) in widths of a square image, and whether they (N,) lie in it."""
-    in_camera = (points - eye) @ look_at(eye, target)[:3, :3]
-    ahead = in_camera[:, 2] > 0.2
-    pixels = (in_camera @ intrinsics(x_fov, 1, 1).T)[:, :2] / np.where(ahead, in_camera[:, 2], 1)[:, None]
-    return pixels, ahead & ((pixels > 0) & (pixels < 1)).all(axis=1)
+def image_points(points: Array, eye: Array, targets: Array, x_fov: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Positions (T, N, 2) of `points` (N, 3) in widths of a square image, and whether they (T, N) lie in it.
+
+    Of T cameras at `eye` (3,), which look at `targets` (T, 3).
+    """
+    forward = unit(targets - eye)
+    left = unit(cross(Y_UP, forward))
+    in_camera = (points - eye) @ np.stack([left, cross(forward, left), forward], axis=-1)
+    ahead = in_camera[..., 2] > 0.2
+    pixels = (in_camera @ intrinsics(x_fov, 1, 1).T)[..., :2] / np.where(ahead, in_camera[..., 2], 1)[..., None]
+    return pixels, ahead & ((pixels > 0) & (pixels < 1)).all(axis=-1)
 
 
 def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
@@ -61,27 +67,31 @@ def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
     x_fov = float(rng.uniform(50, 80))
     wanted_speed = log_uniform(rng, MAX_SPEED / 40, MAX_SPEED)
 
-    def score(target: Track) -> float:
-        counts = []  # of visible things
-        speed, steepness, nearest = 0.0, 0.0, np.inf
-        sight = 1.0  # m, free in front of the lens
-        for moment, unhidden in zip(moments, in_sight, strict=True):
-            here, there = eye.at(moment), target.at(moment)
-            distance = float(np.linalg.norm(there - here))
-            now, visible = image_points(things, here, there, x_fov)
-            then, _ = image_points(things, eye.at(moment + 1), target.at(moment + 1), x_fov)
-            counts.append((visible & unhidden).sum())
-            speed = max(speed, float(np.abs(now - then)[visible].max(initial=0)))
-            sight = min(sight, float(first_hit(here, there[None], obstacles)[0]) * distance)
-            steepness = max(steepness, abs(there[1] - here[1]) / distance)
-            nearest = min(nearest, distance)
-        faults = (speed > MAX_SPEED) + (nearest < 0.7) + (steepness > 0.7)
-        return min(*counts, 8) + 4 * min(sight, 0.7) - abs(np.log(max(speed, 1e-4) / wanted_speed)) - 50.0 * faults
-
-    def draw() -> Track:
+    def draw() -> Array:
         a, b = candidates[rng.integers(len(candidates), size=2)]
-        keys = np.stack([a, a + (b - a) * rng.uniform()]) + rng.normal(0, 0.15, (2, 3))
-        return Track(keys, eye.first, eye.last)
+        return np.stack([a, a + (b - a) * rng.uniform()]) + rng.normal(0, 0.15, (2, 3))
 
-    target = max((draw() for _ in range(TARGET_CANDIDATES)), key=score)
-    return Camera(eye, target, Track.constant(x_fov))
+    def scores(targets: Track) -> Array:
+        """Of each of the T candidates, which `targets` has side by side (T, 3)."""
+        count = np.full(TARGET_CANDIDATES, 8)  # of visible things
+        speed, steepness = np.zeros((2, TARGET_CANDIDATES))
+        nearest = np.full(TARGET_CANDIDATES, np.inf)
+        sight = np.ones(TARGET_CANDIDATES)  # m, free in front of the lens
+        for moment, unhidden in zip(moments, in_sight, strict=True):
+            here, there = eye.at(moment), targets.at(moment)
+            distance = np.linalg.norm(there - here, axis=1)
+            now, visible = image_points(things, here, there, x_fov)
+            then, _ = image_points(things, eye.at(moment + 1), targets.at(moment + 1), x_fov)
+            moved = np.where(visible[..., None], np.abs(now - then), 0).max(axis=(1, 2))
+            count = np.minimum(count, (visible & unhidden).sum(axis=1))
+            speed = np.maximum(speed, moved)
+            sight = np.minimum(sight, first_hit(here, there, obstacles) * distance)
+            steepness = np.maximum(steepness, np.abs(there - here)[:, 1] / distance)
+            nearest = np.minimum(nearest, distance)
+        faults = (speed > MAX_SPEED) * 1.0 + (nearest < 0.7) + (steepness > 0.7)
+        slowness = np.abs(np.log(np.maximum(speed, 1e-4) / wanted_speed))
+        return np.asarray(count + 4 * np.minimum(sight, 0.7) - slowness - 50 * faults)
+
+    drawn = np.stack([draw() for _ in range(TARGET_CANDIDATES)], axis=1)
+    best = scores(Track(drawn, eye.first, eye.last)).argmax()
+    return Camera(eye, Track(drawn[:, best], eye.first, eye.last), Track.constant(x_fov))

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scenes.animation import Track
-from scenes.camera import Y_UP, Array, axis_rotation
+from scenes.camera import Y_UP, Array, axis_rotation, cross
 from scenes.draws import Rng
 
 Faces = NDArray[np.int64]
@@ -63,7 +63,7 @@ def unit(vectors: Array) -> Array:
 def area_vectors(points: Array, faces: Faces) -> Array:
     """Normals (F, 3) of the triangles, as long as twice their areas."""
     a, b, c = (points[corner] for corner in faces.T)
-    return np.cross(b - a, c - a)
+    return cross(b - a, c - a)
 
 
 def arc_lengths(path: Array) -> Array:

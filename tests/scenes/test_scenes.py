@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from errors import BadInput
+from scenes.camera import cross
 from scenes.glass import GLASS_SCENES
 from scenes.registry import SCENES, build_scene
 from tests.helpers.scenes import FRAMES, SEEDS
@@ -56,3 +57,9 @@ def test_moving_box_moves_rigidly_and_its_light_changes():
 def test_unknown_scene_names_the_known():
     with pytest.raises(BadInput, match="cornell_box_moving"):
         build_scene("cornel", 0, 1)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5, 3), (2, 4, 3)])
+def test_cross_products_are_those_of_numpy_bit_for_bit(shape):
+    a, b = np.random.default_rng(0).normal(0, 10, (2, *shape))
+    assert np.array_equal(cross(a, b), np.cross(a, b))
