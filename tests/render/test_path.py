@@ -80,7 +80,11 @@ def test_metal_plastic_and_sky_average_to_the_stock_integrator():
 
 
 @pytest.mark.parametrize(
-    ("scene", "frames"), [("cornell_box_moving", (4, 20, 4, 12)), ("glass-vitrine-moving", (0, 2, 1, 3))]
+    ("scene", "frames"),
+    [
+        ("cornell_box_moving", (4, 20, 4, 12)),
+        pytest.param("glass-vitrine-moving", (0, 2, 1, 3), marks=pytest.mark.slow),
+    ],
 )
 def test_recordings_follow_the_scene(scene, frames):
     """Every pose has the bytes that it has without recordings, and had before, whichever poses came between."""

@@ -120,7 +120,7 @@ def test_what_cannot_move_or_change_is_refused():
         Stage(Scene((), CAMERA, stock=(StockShape("lamp", KINDS["disk"], WHITE, checks, gain=gain),)), 4, 4)
 
 
-@pytest.mark.parametrize("bsdf_side", [{}, {"type": "twosided"}])
+@pytest.mark.parametrize("bsdf_side", [{}, pytest.param({"type": "twosided"}, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["normalmap", "bumpmap"])
 @pytest.mark.parametrize("behind", [False, True])
 def test_normals_are_those_that_a_mirror_with_the_same_map_has(kind, bsdf_side, behind):

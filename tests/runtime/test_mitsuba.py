@@ -67,7 +67,7 @@ def channels(scene, sensor, integrator: dict, seed: int = 0, spp: int = 1) -> di
     return dict(zip(counts, np.split(image, ends[:-1], axis=2), strict=True))
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "room-3", "extremes-mirrors"])
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("room-3", marks=pytest.mark.slow), "extremes-mirrors"])
 def test_guides_are_those_of_our_renderer(package, name):
     """In first hits and behind mirrors and glass."""
     stage = Stage(build_scene(name, 0, 4), HEIGHT, WIDTH)
