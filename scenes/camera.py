@@ -55,7 +55,7 @@ Y_UP = np.array([0.0, 1.0, 0.0])
 
 
 def cross(a: Array, b: Array) -> Array:
-    """a x b (..., 3), bit for bit as `np.cross`, which takes ten times as long for single vectors."""
+    """a x b (..., 3), bit for bit as by `np.cross`, which is slow for single vectors."""
     (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 

@@ -88,7 +88,7 @@ def aim_camera(layout: Layout, eye: Track, obstacles: Array) -> Camera:
             sight = np.minimum(sight, first_hit(here, there, obstacles) * distance)
             steepness = np.maximum(steepness, np.abs(there - here)[:, 1] / distance)
             nearest = np.minimum(nearest, distance)
-        faults = (speed > MAX_SPEED) * 1.0 + (nearest < 0.7) + (steepness > 0.7)
+        faults = np.sum([speed > MAX_SPEED, nearest < 0.7, steepness > 0.7], axis=0)
         slowness = np.abs(np.log(np.maximum(speed, 1e-4) / wanted_speed))
         return np.asarray(count + 4 * np.minimum(sight, 0.7) - slowness - 50 * faults)
 

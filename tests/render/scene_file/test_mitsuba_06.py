@@ -218,13 +218,13 @@ def rendered(scene) -> np.ndarray:
 
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_honoured_or_listed(folder, name, monkeypatch):
-    monkeypatch.setattr(load, "note_on_depth", lambda *_: [])  # it renders
+    monkeypatch.setattr(load, "note_on_depth", lambda *_: [])  # it renders; test_load.py has tests of it
     content, words = CASES[name]
     notes = own(folder, content).notes
     assert any(words in note for note in notes) if words else notes == []
 
 
-@pytest.mark.slow  # to compile
+@pytest.mark.slow  # its kernels take half a minute to compile
 def test_all_materials_and_lights_are_rendered_together(folder):
     materials = [part for part, _ in [*BSDFS.values(), *TEXTURES.values()]]
     place = '<point name="center" x="{}" y="{}" z="0"/>'
