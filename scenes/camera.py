@@ -60,13 +60,18 @@ def cross(a: Array, b: Array) -> Array:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
+def unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def look_at(eye: Array, target: Array, up: Array = Y_UP) -> Array:
-    """camera_to_world (4, 4) of a camera at `eye` (3,) with `target` (3,) in its centre and `up` (3,) upwards."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    left = cross(up, forward)
-    left /= np.linalg.norm(left)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([left, cross(forward, left), forward, eye], axis=1)
+    """camera_to_world (..., 4, 4) of cameras at `eye` with `target` in their centres and `up` upwards, all (..., 3)."""
+    forward = unit(target - eye)
+    left = unit(cross(up, forward))
+    axes = np.broadcast_arrays(left, cross(forward, left), forward, eye)
+    matrix = np.zeros((*forward.shape[:-1], 4, 4))
+    matrix[..., :3, :] = np.stack(axes, axis=-1)
+    matrix[..., 3, 3] = 1
     return matrix
 
 

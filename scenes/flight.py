@@ -5,10 +5,9 @@ from numpy.typing import NDArray
 
 from scenes.animation import Camera, Track
 from scenes.boxes import first_hit, overlaps
-from scenes.camera import Y_UP, Array, cross, intrinsics
+from scenes.camera import Array, intrinsics, look_at
 from scenes.draws import log_uniform
 from scenes.layout import Layout
-from scenes.meshes import unit
 
 EYE_CLEARANCE = 0.3  # m, between the camera and reserved boxes
 MAX_SPEED = 20 / 256  # of things in the image, in image widths per frame
@@ -45,9 +44,7 @@ def image_points(points: Array, eye: Array, targets: Array, x_fov: float) -> tup
 
     Of T cameras at `eye` (3,), which look at `targets` (T, 3).
     """
-    forward = unit(targets - eye)
-    left = unit(cross(Y_UP, forward))
-    in_camera = (points - eye) @ np.stack([left, cross(forward, left), forward], axis=-1)
+    in_camera = (points - eye) @ look_at(eye, targets)[..., :3, :3]
     ahead = in_camera[..., 2] > 0.2
     pixels = (in_camera @ intrinsics(x_fov, 1, 1).T)[..., :2] / np.where(ahead, in_camera[..., 2], 1)[..., None]
     return pixels, ahead & ((pixels > 0) & (pixels < 1)).all(axis=-1)

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from scenes.animation import Track
-from scenes.camera import Y_UP, Array, axis_rotation, cross
+from scenes.camera import Y_UP, Array, axis_rotation, cross, unit
 from scenes.draws import Rng
 
 Faces = NDArray[np.int64]
@@ -54,10 +54,6 @@ def join(surfaces: Sequence[Surface]) -> Surface:
         np.concatenate([surface.faces + start for surface, start in zip(surfaces, starts, strict=False)]),
         any(surface.smooth for surface in surfaces),
     )
-
-
-def unit(vectors: Array) -> Array:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def area_vectors(points: Array, faces: Faces) -> Array:
@@ -252,7 +248,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
         side = unit(side - forward * (side @ forward))  # twists as little as possible
         right[k] = side
     angle = full_turn(segments)[:, None]
-    around = np.cos(angle) * right[:, None] + np.sin(angle) * np.cross(tangent, right)[:, None]
+    around = np.cos(angle) * right[:, None] + np.sin(angle) * cross(tangent, right)[:, None]
     # Caps: a ring with the cap's normal, and the centre.
     ends = [0, 0, *range(len(path)), -1, -1]
     radii = np.concatenate([[0, radii[0]], radii, [radii[-1], 0]])
@@ -265,7 +261,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 8) -> Surface:
 
 def leaf(path: Array, width: float, fold: float) -> Surface:
     """A thin pointed leaf along `path` (N, 3) in a vertical plane, its middle `fold` * `width` lower than its edges."""
-    across = unit(np.cross(path[-1] - path[0], Y_UP))
+    across = unit(cross(path[-1] - path[0], Y_UP))
     share = np.sin(np.pi * np.linspace(0.04, 0.98, len(path)) ** 0.8) * width / 2
     side = share[:, None] * across
     edge = path + Y_UP * (fold * share)[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 from scenes import lighting
 from scenes.animation import Scene, Shape, Track
 from scenes.boxes import bounding_box
-from scenes.camera import Array
+from scenes.camera import Array, cross
 from scenes.colours import diffuse_bsdf, rgb
 from scenes.draws import Rng, log_uniform, one_of, uniforms
 from scenes.finish import finish
@@ -185,9 +185,9 @@ def closeup(rng: Rng, frames: int, stock: Stock = OWN_STOCK) -> Scene:
     targets = []
     for frame in range(frames):
         ahead = camera.target.at(frame) - camera.eye.at(frame)
-        right = np.cross(ahead, camera.up.at(frame))
+        right = cross(ahead, camera.up.at(frame))
         right *= np.linalg.norm(ahead) / np.linalg.norm(right)
-        above = np.cross(right, ahead) / np.linalg.norm(ahead)
+        above = cross(right, ahead) / np.linalg.norm(ahead)
         targets.append(camera.target.at(frame) + half_width * (across * right + up * above))
     fov = 2 * np.degrees(np.arctan(half_width / zoom))
     target = Track(np.stack(targets), 0, frames - 1)

@@ -9,7 +9,7 @@ from render.backend import dr, mi
 from render.loading import corners, upload
 from render.stage import Stage
 from scenes.animation import Camera, Track
-from scenes.camera import Array, View, directions, intrinsics, look_at, pixel_centres
+from scenes.camera import Array, View, cross, directions, intrinsics, look_at, pixel_centres
 from scenes.draws import Rng, log_uniform
 
 MIN_STEP, MAX_STEP = 0.002, 0.02  # of the distance to the target, per frame
@@ -84,7 +84,7 @@ def upright(camera: Camera) -> Camera:
     eye, target, up = camera.eye.at(0), camera.target.at(0), camera.up.at(0)
     axis = np.zeros(3)
     axis[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
-    left = np.cross(up, target - eye)
+    left = cross(up, target - eye)
     rolled = abs(float(left @ axis)) > 1e-3 * np.linalg.norm(left)
     return camera if rolled else replace(camera, up=Track.constant(axis))
 
@@ -106,7 +106,7 @@ def start_at(space: Space, camera: Camera) -> Start:
 
 def random_direction(rng: Rng, up: Array, tilt: float) -> Array:
     """A random direction (3,) whose elevation above the horizon has a standard deviation of `tilt` radians."""
-    across = np.cross(up, rng.normal(size=3))
+    across = cross(up, rng.normal(size=3))
     across /= np.linalg.norm(across)
     angle = np.clip(rng.normal(0, tilt), -1, 1)
     return np.cos(angle) * across + np.sin(angle) * up / np.linalg.norm(up)

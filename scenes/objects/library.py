@@ -12,10 +12,10 @@ import numpy as np
 import trimesh
 
 from errors import BadInput, requires_extra
-from scenes.camera import Array
+from scenes.camera import Array, unit
 from scenes.colours import MAX_REFLECTANCE, MIN_REFLECTANCE, Bsdf, bitmap, diffuse_bsdf, rgb, srgb_to_linear
 from scenes.draws import Rng, log_uniform, one_of
-from scenes.meshes import Faces, Surface, area_vectors, box_mapped, flat_shaded, unit
+from scenes.meshes import Faces, Surface, area_vectors, box_mapped, flat_shaded
 from scenes.objects.thing import Maker, Thing, standing, top_support
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
