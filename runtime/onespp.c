@@ -41,7 +41,7 @@ enum { LANES = 24, AT_ONCE = 2, CHUNK = 240 };
 #endif
 
 #if defined(__GNUC__)
-#define NOINLINE __attribute__((noinline)) /* where it is inlined, GCC runs out of registers */
+#define NOINLINE __attribute__((noinline))
 #else
 #define NOINLINE
 #endif
@@ -513,8 +513,8 @@ static void run(Job *job, void (*work)(Job *, Scratch *, int, int), int first, i
             run_task(job, i);
 }
 
-/* n pixels of a row of an image, from x on. */
-static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
+/* n pixels of a row of an image, from x on. Not inlined, as its many copies would take longer to compile than the rest. */
+NOINLINE static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
 {
     ptrdiff_t step = image->column;
     const float *from = image->data + image->channel * channel + image->row * y + step * x;
@@ -1054,7 +1054,7 @@ static inline void end(float *restrict outputs, const float *restrict sums, floa
 typedef enum { PLAIN, RECTIFIED, ADDED } Finish; /* ADDED: to what the outputs hold, instead of the bias */
 
 /* LANES pixels of AT_ONCE outputs. Compilers keep these four arrays in vector registers: LANES and AT_ONCE take 12 of 16,
- * or 16 of 32. Each input is read once for all outputs. */
+ * or 16 of 32; GCC would run out of them where it inlines this. Each input is read once for all outputs. */
 NOINLINE static void multiply_block(
     const float *restrict weights, const float *restrict bias, const float *const *restrict inputs, int count,
     ptrdiff_t x, float *restrict out, ptrdiff_t pitch, Finish finish)
