@@ -13,7 +13,7 @@ from plotting import DPI
 
 def test_contact_sheet_shows_every_scene(tmp_path):
     """Two rows of two: each place shows its scene, and the last one, without a scene, is white."""
-    names = ["cornell_box", "extremes-sky", "room-7"]
+    names = ["cornell_box", "extremes-sky", "cornell_box_moving"]
     height = 24
     width = 32
     contact_sheet(tmp_path / "sheet.png", names, size=(height, width), spp=2)

@@ -97,6 +97,7 @@ def test_the_light_of_the_second_layer_is_that_of_a_mirror_times_reflectance(pan
     np.testing.assert_allclose(np.mean(seconds), np.mean(expected), rtol=0.25)
 
 
+@pytest.mark.slow
 def test_motion_through_a_ball_leads_to_the_same_light():
     """Emission, computed by other means, is the same at the end of the motion vectors; motion of the ball's is not.
 
