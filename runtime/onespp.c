@@ -6,7 +6,8 @@
  *   enter      reprojection, neighbourhood statistics, inputs of the network, its per-pixel and first layers
  *   layers     the U-Net at 1/2, 1/4 and 1/8 of the resolution
  *   leave      its last layers, decoded into the parameters of the filter and the new accumulation
- *   filter     six levels of an a-trous filter; the last one writes the output and what the next frame needs
+ *   filter     three levels of an a-trous filter, which spread outliers, and all six of it; the last one writes the
+ *              output and what the next frame needs
  *
  * `enter` to `leave` work on strips of rows, so that activations take little memory. Strips overlap: what 3 x 3 taps
  * below and above a strip need is computed twice, except for `enter`, whose results are kept from strip to strip.
@@ -51,6 +52,8 @@ enum {
     LATENT = 6,   /* channels carried from frame to frame */
     FEATURES = 8, /* that pixels are compared by */
     LEVELS = 6,   /* of the filter */
+    SPREADING = 3, /* of these, the first ones, spread outliers before all of them filter */
+    PASSES = SPREADING + LEVELS,
     DETAIL = 24,  /* hidden channels of the per-pixel layers */
     PATCH = 4,    /* pixels, 2 x 2 */
     WIDTH_A = 40, /* channels at 1/2 of the resolution */
@@ -90,6 +93,7 @@ enum {
 #define MIN_MEAN 1e-20f
 #define ALBEDO_FLOOR 0.01f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
+#define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
 #define MAX_LOGIT 10.f
 #define MIN_LOGIT -40.f
 #define NO_WEIGHT -1e4f /* importance of pixels that show no surface */
@@ -220,6 +224,7 @@ enum {
     NOISY_LINES = FEATURE_LINES, /* irradiance of the frame, until `leave` */
     LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, red, green, blue of its output */
     ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
+    OUTLIER_LINE, /* share of the accumulation that is spread; until `leave` the least luminance of an outlier */
     OUTPUT_LINES, /* of the previous frame, reprojected */
     ACCUMULATED_LINES = OUTPUT_LINES + RGB,
     LENGTH_LINE = ACCUMULATED_LINES + RGB, /* of the history in samples; until `leave` of the past one, 0 for none */
@@ -238,7 +243,7 @@ enum {
     TEXEL = 16
 };
 
-/* Lines of a row of a part of the light. Levels of the filter write to the last two images in turn. */
+/* Lines of a row of a part of the light. Passes of the filter write to the last two images in turn. */
 enum { PART_OUTPUT = 0, PART_ACCUMULATED = RGB, PART_FILTERED = 2 * RGB, PART_LINES = 4 * RGB, PART_HISTORY = 2 * RGB };
 
 enum { MAX_PART_HISTORY = PART_HISTORY * ONESPP_MAX_PARTS };
@@ -291,6 +296,7 @@ typedef union {
         Neighbourhood around;
         float history[TEXEL][LINE]; /* the last lines are not used */
         float parts[MAX_PART_HISTORY][LINE];
+        float most[LINE]; /* luminance of a pixel that is no outlier */
         float lines[2][INPUTS][LINE];
         float patches[PATCH * INPUTS][HALF_LINE];
         float entered[WIDTH_A][HALF_LINE];
@@ -486,7 +492,8 @@ struct Job {
     int first, last;
     LayerName layer;
     const Window *from, *skip, *to;
-    int level;
+    int pass;  /* of the filter */
+    int level; /* that the pass takes */
 };
 
 static void run_task(void *argument, int index)
@@ -1267,21 +1274,24 @@ static void expose(float *restrict line, const float *restrict light, float expo
         line[i] = logarithm(line[i]);
 }
 
-/* The lines that are means of irradiance, and its deviation. */
-static void fill_statistics(const Job *job, const Neighbourhood *around, int y, int n, float (*restrict lines)[LINE])
+/* The lines that are means of irradiance, and its deviation; and the luminance beyond which pixels are outliers. */
+static void fill_statistics(
+    const Job *job, const Neighbourhood *around, int y, int n, float (*restrict lines)[LINE], float *restrict most)
 {
     int slot = slot_of(y);
     const float *count = around->sums_9x9[5] + HALO;
-    float mean[LINE], square[LINE];
+    float mean[LINE], square[LINE], means[RGB][LINE];
     for (int c = 0; c < RGB; c++) {
         expose(lines[NOISY_INPUT + c], around->pixels[slot][c] + HALO, job->exposure, n);
         for (int i = 0; i < n; i++)
             mean[i] = around->sums[slot][c][HALO + i] / around->sums[slot][5][HALO + i];
         expose(lines[MEAN_3X3_INPUT + c], mean, job->exposure, n);
         for (int i = 0; i < n; i++)
-            mean[i] = around->sums_9x9[c][HALO + i] / count[i];
-        expose(lines[MEAN_9X9_INPUT + c], mean, job->exposure, n);
+            means[c][i] = around->sums_9x9[c][HALO + i] / count[i];
+        expose(lines[MEAN_9X9_INPUT + c], means[c], job->exposure, n);
     }
+    for (int i = 0; i < n; i++)
+        most[i] = OUTLIER * luminance(means[0][i], means[1][i], means[2][i]);
     for (int i = 0; i < n; i++) {
         mean[i] = around->sums_9x9[3][HALO + i] / count[i];
         square[i] = mean[i] * mean[i];
@@ -1348,7 +1358,7 @@ static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, 
 {
     sum_neighbours(job, &scratch->enter.around, y, x0);
     reproject(job, y, x0, n, scratch->enter.history, scratch->enter.parts);
-    fill_statistics(job, &scratch->enter.around, y, n, lines);
+    fill_statistics(job, &scratch->enter.around, y, n, lines, scratch->enter.most);
     fill_history(job, scratch->enter.history, n, lines);
     fill_surface(job, y, x0, n, lines);
     for (int c = 0; c < INPUTS; c++)
@@ -1356,13 +1366,15 @@ static void fill_inputs(const Job *job, Scratch *scratch, int y, int x0, int n, 
             lines[c][i] = lines[c][n - 1];
 }
 
-/* What `leave` needs of a chunk of a row: the history of images and its length, and the hidden per-pixel layer. */
+/* What `leave` needs of a chunk of a row: the history of images and its length, how bright an outlier is, and the hidden
+ * per-pixel layer. */
 static void keep_row(const Job *job, Scratch *scratch, int y, int x0, int n, float (*lines)[LINE])
 {
     const onespp *d = job->d;
     const float *inputs[INPUTS];
     for (int c = OUTPUT; c <= LENGTH; c++)
         memcpy(row_line(d, y, OUTPUT_LINES + c) + x0, scratch->enter.history[c], sizeof(float) * (size_t)n);
+    memcpy(row_line(d, y, OUTLIER_LINE) + x0, scratch->enter.most, sizeof(float) * (size_t)n);
     for (int c = 0; c < PART_HISTORY * job->frame.parts; c++) {
         float *to = part_line(d, y, c / PART_HISTORY, c % PART_HISTORY) + x0;
         memcpy(to, scratch->enter.parts[c], sizeof(float) * (size_t)n);
@@ -1469,6 +1481,17 @@ static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
     }
 }
 
+/* The share of the accumulation that is spread: what is brighter than outliers begin. */
+static void find_outliers(const onespp *d, int y, int x0, int n)
+{
+    float *restrict share = row_line(d, y, OUTLIER_LINE) + x0;
+    const float *red = row_line(d, y, ACCUMULATED_LINES) + x0, *green = red + d->pitch, *blue = green + d->pitch;
+    for (int i = 0; i < n; i++) {
+        float bright = luminance(red[i], green[i], blue[i]), most = share[i];
+        share[i] = bright > most ? (bright - most) / bright : 0;
+    }
+}
+
 static void decode_latent(const Job *job, float (*head)[LINE], int y, int x0, int n)
 {
     for (int c = 0; c < LATENT; c++) {
@@ -1494,6 +1517,7 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
     for (int level = 0; level < LEVELS; level++)
         decode_level(job, head, scratch->leave.depth, level, y, x0, n);
     accumulate(job, scratch, y, x0, n);
+    find_outliers(job->d, y, x0, n);
     decode_latent(job, head, y, x0, n);
 }
 
@@ -1592,16 +1616,19 @@ static void run_network(Job *job)
 
 /* --- The filter --------------------------------------------------------------------------------------------------- */
 
-/* Where the lines of a level's output are: first in the texels, which are no longer needed, then over the parameters
- * of the level before. */
-static float *filtered_lines(const onespp *d, int level, int y)
+/* Where the lines of a pass's output are: first in the texels, which are no longer needed, then over the parameters of
+ * the level before. Pass -1 is what the first one filters. */
+static float *filtered_lines(const onespp *d, int pass, int y)
 {
-    return level == 0 ? d->texels + (ptrdiff_t)y * d->pitch * TEXEL : row_line(d, y, LEVEL_LINES + 3 * (level - 1));
+    int level = pass - SPREADING;
+    return level <= 0 ? d->texels + ((ptrdiff_t)y * TEXEL + RGB * (pass + 1)) * d->pitch
+                      : row_line(d, y, LEVEL_LINES + 3 * (level - 1));
 }
 
-static const float *image_lines(const onespp *d, int level, int y)
+/* The same of a part of the light. */
+static float *filtered_part(const onespp *d, int pass, int part, int y)
 {
-    return level == 0 ? row_line(d, y, ACCUMULATED_LINES) : filtered_lines(d, level - 1, y);
+    return part_line(d, y, part, PART_FILTERED + RGB * ((pass + 1) % 2));
 }
 
 /* Squared distances of features of n pixels, lines `pitch` apart. */
@@ -1632,18 +1659,12 @@ static void add_weighted(
     }
 }
 
-/* The same image of a part of the light. */
-static const float *part_image(const onespp *d, int level, int part, int y)
-{
-    return part_line(d, y, part, level == 0 ? PART_ACCUMULATED : PART_FILTERED + RGB * ((level - 1) % 2));
-}
-
 /* Adds weighted colours of parts of the light at pixels from x on, whose sums follow those of the whole. */
 static void add_parts(
     const Job *job, float (*restrict sums)[LINE], int at, const float *restrict weight, int y, int x, int n)
 {
     for (int c = 0; c < RGB * job->frame.parts; c++) {
-        const float *restrict line = part_image(job->d, job->level, c / RGB, y) + c % RGB * job->d->pitch + x;
+        const float *restrict line = filtered_part(job->d, job->pass - 1, c / RGB, y) + c % RGB * job->d->pitch + x;
         float *restrict sum = sums[4 + c] + at;
         for (int i = 0; i < n; i++)
             sum[i] += weight[i] * line[i];
@@ -1668,7 +1689,7 @@ static void add_tap(const Job *job, float (*restrict sums)[LINE], int y, int x0,
         float exponent = clamped(importance[i] - sharpness[i] * distance[i], -MIN_LOGIT);
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
     }
-    const float *image = image_lines(d, job->level, y + dy) + first + dx;
+    const float *image = filtered_lines(d, job->pass - 1, y + dy) + first + dx;
     add_weighted(sums, first - x0, weight, image, d->pitch, count);
     add_parts(job, sums, first - x0, weight, y + dy, first + dx, count);
 }
@@ -1686,7 +1707,7 @@ static void filter_chunk(const Job *job, float (*restrict sums)[LINE], int y, in
     memset(sums, 0, sizeof *sums * (size_t)channels);
     for (int i = 0; i < n; i++)
         weight[i] = exponential(centre[i]);
-    add_weighted(sums, 0, weight, image_lines(d, job->level, y) + x0, d->pitch, n);
+    add_weighted(sums, 0, weight, filtered_lines(d, job->pass - 1, y) + x0, d->pitch, n);
     add_parts(job, sums, 0, weight, y, x0, n);
     for (int tap = 0; tap < 9; tap++)
         if (tap != 4)
@@ -1702,6 +1723,32 @@ static void filter_chunk(const Job *job, float (*restrict sums)[LINE], int y, in
             sums[c][i] *= weight[i];
 }
 
+/* A line of outliers, before the first pass; when they are spread, what else was accumulated is added. */
+static void split_line(const Job *job, float *restrict to, const float *restrict accumulated, int y)
+{
+    const float *restrict share = row_line(job->d, y, OUTLIER_LINE);
+    for (int i = 0; i < job->frame.width; i++) {
+        float outliers = share[i] * accumulated[i];
+        to[i] = job->pass < 0 ? outliers : to[i] + (accumulated[i] - outliers);
+    }
+}
+
+static void split_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    const onespp *d = job->d;
+    for (int y = first; y < last; y++) {
+        for (int c = 0; c < RGB; c++) {
+            float *to = filtered_lines(d, job->pass, y) + c * d->pitch;
+            split_line(job, to, row_line(d, y, ACCUMULATED_LINES + c), y);
+        }
+        for (int c = 0; c < RGB * job->frame.parts; c++) {
+            float *to = filtered_part(d, job->pass, c / RGB, y) + c % RGB * d->pitch;
+            split_line(job, to, part_line(d, y, c / RGB, PART_ACCUMULATED + c % RGB), y);
+        }
+    }
+}
+
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
@@ -1710,11 +1757,11 @@ static void filter_rows(Job *job, Scratch *scratch, int first, int last)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
             filter_chunk(job, sums, y, x0, n);
-            float *to = filtered_lines(job->d, job->level, y) + x0;
+            float *to = filtered_lines(job->d, job->pass, y) + x0;
             for (int c = 0; c < RGB; c++)
                 memcpy(to + c * job->d->pitch, sums[c], sizeof(float) * (size_t)n);
             for (int c = 0; c < RGB * job->frame.parts; c++) {
-                to = part_line(job->d, y, c / RGB, PART_FILTERED + RGB * (job->level % 2) + c % RGB) + x0;
+                to = filtered_part(job->d, job->pass, c / RGB, y) + c % RGB * job->d->pitch + x0;
                 memcpy(to, sums[4 + c], sizeof(float) * (size_t)n);
             }
         }
@@ -1802,6 +1849,21 @@ static void finish_rows(Job *job, Scratch *scratch, int first, int last)
         }
 }
 
+/* --- The filter, pass by pass ------------------------------------------------------------------------------------ */
+
+static void run_filter(Job *job)
+{
+    int height = job->frame.height;
+    job->pass = -1;
+    run(job, split_rows, 0, height);
+    for (job->pass = 0; job->pass < PASSES; job->pass++) {
+        job->level = job->pass < SPREADING ? job->pass : job->pass - SPREADING;
+        run(job, job->pass < PASSES - 1 ? filter_rows : finish_rows, 0, height);
+        if (job->pass == SPREADING - 1)
+            run(job, split_rows, 0, height);
+    }
+}
+
 /* --- The engine --------------------------------------------------------------------------------------------------- */
 
 static uint64_t measure_memory(const onespp_config *config)
@@ -1883,8 +1945,7 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     measure(&job);
     set_up_geometry(&job);
     run_network(&job);
-    for (job.level = 0; job.level < LEVELS; job.level++)
-        run(&job, job.level < LEVELS - 1 ? filter_rows : finish_rows, 0, frame->height);
+    run_filter(&job);
     d->width = frame->width;
     d->height = frame->height;
     d->meshes = frame->meshes;

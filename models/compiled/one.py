@@ -16,7 +16,16 @@ from models.compiled.affinity import four
 from models.compiled.arrays import RGB, Image, Index, Matrix, Row, Rows, Scalar, f32
 from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
-from models.compiled.lines import copy_line, scale_depth, scale_line, transpose, triple
+from models.compiled.lines import (
+    BLUE_WEIGHT,
+    GREEN_WEIGHT,
+    RED_WEIGHT,
+    copy_line,
+    scale_depth,
+    scale_line,
+    transpose,
+    triple,
+)
 from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
@@ -26,6 +35,8 @@ LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
 # px between taps of each filter level: the last ones smooth the first ones' pattern
 TAP_SPACINGS = (32, 16, 8, 4, 2, 1)
+SPREADING_LEVELS = 3  # of these, the first ones, spread outliers before all of them filter
+OUTLIER = 8.0  # times the mean over 9 x 9 pixels: what is brighter is spread
 MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
 MAX_LOGIT = 10.0  # of the weights of taps
 SIDE_MULTIPLE = 8  # of the sides of the network's images
@@ -301,6 +312,17 @@ def lerp(line: Row, past: Row, new: Row, alpha: Row) -> None:
         line[x] = alpha[x] * new[x] + (f32(1) - alpha[x]) * past[x]
 
 
+@jit_in_any_order
+def outlier_share(share: Row, colour: RGB, mean: RGB) -> None:
+    """The share of colours' luminance that is beyond OUTLIER times that of their mean."""
+    red, green, blue = colour
+    mean_red, mean_green, mean_blue = mean
+    for x in range(share.size):
+        bright = RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x]
+        most = f32(OUTLIER) * (RED_WEIGHT * mean_red[x] + GREEN_WEIGHT * mean_green[x] + BLUE_WEIGHT * mean_blue[x])
+        share[x] = (bright - most) / bright if bright > most else f32(0)
+
+
 class DecodedImages(NamedTuple):
     """models.networks.one.Decoded of one image."""
 
@@ -311,6 +333,7 @@ class DecodedImages(NamedTuple):
     latent: Image
     accumulated: Image
     length: Image
+    outliers: Image
 
 
 @jit_in_any_order
@@ -337,6 +360,8 @@ def decode_lines(
     for c in range(3):
         past, noisy = inputs.history[3 + c, y, x : x + n], inputs.noisy[c, y, x : x + n]
         lerp(decoded.accumulated[c, y, x : x + n], past, noisy, alpha)
+    colour, mean = triple(decoded.accumulated, y, x, x + n), triple(inputs.mean_9x9, y, x, x + n)
+    outlier_share(decoded.outliers[0, y, x : x + n], colour, mean)
 
 
 @jit_parallel
@@ -363,7 +388,7 @@ def decode_head(
 ) -> tuple[Tensor, ...]:
     batch, _, height, width = head.shape
     levels = filter_levels(head.shape[1])
-    counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1)
+    counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     for item in range(batch):
         decoded = DecodedImages(*(each[item].numpy() for each in out))

@@ -19,7 +19,9 @@ from models.compiled.one import (
     MAX_EXPOSED,
     MAX_LOGIT,
     MIN_LENGTH,
+    OUTLIER,
     SIDE_MULTIPLE,
+    SPREADING_LEVELS,
     TAP_SPACINGS,
     filter_levels,
     head_channels,
@@ -30,7 +32,7 @@ from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import ConvReLU
-from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, STRIP_PIXELS, pad_to_multiple
+from models.operators import MAX_IRRADIANCE, MIN_DIVISOR, STRIP_PIXELS, image_luminance, pad_to_multiple
 
 DETAIL = 24  # hidden channels of the per-pixel layers
 PATCH = 4  # pixels, 2 x 2
@@ -112,6 +114,7 @@ class Decoded(NamedTuple):
     latent: Tensor  # (B, LATENT, H, W)
     accumulated: Tensor  # (B, 3, H, W)
     length: Tensor  # (B, 1, H, W)
+    outliers: Tensor  # (B, 1, H, W), the share of the accumulation that is spread
 
 
 def decode(head: Tensor, inputs: PixelInputs, samples: Tensor) -> tuple[Tensor, ...]:
@@ -128,8 +131,11 @@ def decode(head: Tensor, inputs: PixelInputs, samples: Tensor) -> tuple[Tensor, 
     variance = newest.square() / samples + kept.square() / length
     logits = (each.clamp(-MAX_LOGIT, MAX_LOGIT) for each in (centre, importance))
     accumulated = torch.lerp(inputs.history[:, 3:6], inputs.noisy, newest)
+    bright, most = image_luminance(accumulated), OUTLIER * image_luminance(inputs.mean_9x9)
+    outliers = (bright - most).clamp(min=0) / bright.clamp(min=MIN_DIVISOR)
     # Every level of the filter reads the features: make them contiguous once.
-    return features.contiguous(), F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance
+    features = features.contiguous()
+    return features, F.softplus(sharpness), *logits, alpha, torch.tanh(latent), accumulated, 1 / variance, outliers
 
 
 @compiled.by(kernels.decode_head)
@@ -190,12 +196,20 @@ def carried(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    There may be images of parts of the light beside the accumulation, and beside the past output.
+    Outliers, which no kernel is wide enough for, are spread by the coarsest levels first. So light is kept, and as all
+    weights are chosen by the whole, parts add up to it: there may be images of parts of the light beside the
+    accumulation, and beside the past output.
     """
-    image = decoded.accumulated
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
-    for step, sharpness, centre, importance in zip(steps, *planes, strict=True):
-        image = level(image, decoded.features, sharpness, centre, importance, surface, step)
+    levels = [*zip(*planes, steps, strict=True)]
+
+    def filtered(image: Tensor, count: int) -> Tensor:
+        for sharpness, centre, importance, step in levels[:count]:
+            image = level(image, decoded.features, sharpness, centre, importance, surface, step)
+        return image
+
+    outliers = decoded.outliers * decoded.accumulated
+    image = filtered(decoded.accumulated - outliers + filtered(outliers, SPREADING_LEVELS), len(levels))
     output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
     return output, decoded.accumulated, decoded.length, decoded.latent
 
@@ -276,7 +290,6 @@ class One(Denoiser):
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
-    convex = True
     inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
@@ -326,7 +339,7 @@ class One(Denoiser):
             return self.decoded_rows(frame, scale, noisy, history, has_history), history
         # Large images in strips of rows: the network's activations would take most of the memory.
         rows = max(1, STRIP_PIXELS // 2 // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
-        channels = *head_channels(len(self.steps)).values(), 3, 1
+        channels = *head_channels(len(self.steps)).values(), 3, 1, 1
         whole = Decoded(*(noisy.new_empty(len(noisy), count, height, width) for count in channels))
         for top in range(0, height, rows):
             first = max(0, top - NETWORK_REACH)

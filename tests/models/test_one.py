@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from datasets.frame import BOUNDED, Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
@@ -120,14 +121,26 @@ def test_the_state_is_small(fresh):
     assert bytes_a_pixel * 1280 * 720 <= BYTES_AT_720P
 
 
+def square(side: int) -> Tensor:
+    """Ones in a square about the pixel (12, 20)."""
+    image = torch.zeros(1, 3, *SIZE)
+    image[..., 12 - side // 2 : 13 + side // 2, 20 - side // 2 : 21 + side // 2] = 1.0
+    return image
+
+
 def test_levels_of_the_filter_can_be_chosen():
     """Without a word from the network each level is an even mean of nine, and levels follow one another."""
-    image = torch.zeros(1, 3, *SIZE)
-    image[..., 12, 20] = 81.0
-    outputs = run(silent(steps=(3, 1)), frames([image]))
-    square = torch.zeros_like(image)
-    square[..., 8:17, 16:25] = 1.0
-    torch.testing.assert_close(outputs[0], square)
+    outputs = run(silent(steps=(3, 1)), frames([20 + 81 * square(1)]))  # 8.1 times the mean of 9 x 9 pixels without 20
+    torch.testing.assert_close(outputs[0], 20 + square(9))
+
+
+@pytest.mark.usefixtures("implementation")
+def test_outliers_are_filtered_twice():
+    """What is beyond eight times the mean of 9 x 9 pixels; levels as above. All light is kept."""
+    outputs = run(silent(steps=(3, 1)), frames([1 + 162 * square(1)]))
+    pyramid = F.conv2d(square(9)[:, :1], torch.ones(1, 1, 9, 9), padding=4)
+    torch.testing.assert_close(outputs[0], 1 + (23 * square(9) + 139 * pyramid / 81) / 81)
+    assert outputs[0].sum() == pytest.approx(3 * (24 * 40 + 162))
 
 
 @pytest.mark.usefixtures("implementation")
