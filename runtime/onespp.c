@@ -52,7 +52,7 @@ enum {
     LATENT = 6,   /* channels carried from frame to frame */
     FEATURES = 8, /* that pixels are compared by */
     LEVELS = 6,   /* of the filter */
-    SPREADING = 3, /* of these, the first ones, spread outliers before all of them filter */
+    SPREADING = 3, /* of these: the first ones, which spread outliers before all of them filter */
     PASSES = SPREADING + LEVELS,
     DETAIL = 24,  /* hidden channels of the per-pixel layers */
     PATCH = 4,    /* pixels, 2 x 2 */
@@ -224,7 +224,7 @@ enum {
     NOISY_LINES = FEATURE_LINES, /* irradiance of the frame, until `leave` */
     LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, red, green, blue of its output */
     ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
-    OUTLIER_LINE, /* share of the accumulation that is spread; until `leave` the least luminance of an outlier */
+    OUTLIER_LINE, /* share of the accumulation that is spread; until `leave` the luminance where outliers begin */
     OUTPUT_LINES, /* of the previous frame, reprojected */
     ACCUMULATED_LINES = OUTPUT_LINES + RGB,
     LENGTH_LINE = ACCUMULATED_LINES + RGB, /* of the history in samples; until `leave` of the past one, 0 for none */
@@ -1481,7 +1481,7 @@ static void accumulate(const Job *job, Scratch *scratch, int y, int x0, int n)
     }
 }
 
-/* The share of the accumulation that is spread: what is brighter than outliers begin. */
+/* The share of the accumulation that is spread: what is over the luminance where outliers begin. */
 static void find_outliers(const onespp *d, int y, int x0, int n)
 {
     float *restrict share = row_line(d, y, OUTLIER_LINE) + x0;

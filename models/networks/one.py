@@ -196,8 +196,9 @@ def carried(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    Outliers pass through the coarsest levels twice: that spreads them wider, and cuts nothing off. All weights are those
-    of the whole, so that parts of the light add up to it: their images may follow the accumulation and the past output.
+    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. All weights are
+    those of the whole, so that parts of the light add up to it: their images may follow the accumulation and the past
+    output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
     levels = [*zip(*planes, steps, strict=True)]
