@@ -492,8 +492,7 @@ struct Job {
     int first, last;
     LayerName layer;
     const Window *from, *skip, *to;
-    int pass;  /* of the filter */
-    int level; /* that the pass takes */
+    int pass; /* of the filter */
 };
 
 static void run_task(void *argument, int index)
@@ -520,7 +519,7 @@ static void run(Job *job, void (*work)(Job *, Scratch *, int, int), int first, i
             run_task(job, i);
 }
 
-/* n pixels of a row of an image, from x on. Not inlined, as its many copies would take longer to compile than the rest. */
+/* n pixels of a row of an image, from x on. Not inlined: its many copies would double the time that `make` takes. */
 NOINLINE static void load(float *restrict line, const onespp_image *image, int channel, int y, int x, int n)
 {
     ptrdiff_t step = image->column;
@@ -1616,8 +1615,11 @@ static void run_network(Job *job)
 
 /* --- The filter --------------------------------------------------------------------------------------------------- */
 
-/* Where the lines of a pass's output are: first in the texels, which are no longer needed, then over the parameters of
- * the level before. Pass -1 is what the first one filters. */
+/* The level that a pass takes. */
+static int level_of(int pass) { return pass < SPREADING ? pass : pass - SPREADING; }
+
+/* Where the lines of a pass's output are: first in the texels, which are no longer needed and have room for five images,
+ * then over the parameters of the level before. Pass -1 is what the first one filters. */
 static float *filtered_lines(const onespp *d, int pass, int y)
 {
     int level = pass - SPREADING;
@@ -1676,7 +1678,7 @@ static void add_tap(const Job *job, float (*restrict sums)[LINE], int y, int x0,
 {
     const onespp *d = job->d;
     int first = maxi(x0, -dx), last = mini(x0 + n, job->frame.width - dx);
-    int level_line = LEVEL_LINES + 3 * job->level;
+    int level_line = LEVEL_LINES + 3 * level_of(job->pass);
     if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
         return;
     float distance[LINE], weight[LINE];
@@ -1700,8 +1702,8 @@ static void add_tap(const Job *job, float (*restrict sums)[LINE], int y, int x0,
 static void filter_chunk(const Job *job, float (*restrict sums)[LINE], int y, int x0, int n)
 {
     const onespp *d = job->d;
-    int step = TAP_SPACINGS[job->level];
-    const float *centre = row_line(d, y, LEVEL_LINES + 3 * job->level + 1) + x0, *importance = centre + d->pitch;
+    int level = level_of(job->pass), step = TAP_SPACINGS[level];
+    const float *centre = row_line(d, y, LEVEL_LINES + 3 * level + 1) + x0, *importance = centre + d->pitch;
     float weight[LINE];
     int channels = 4 + RGB * job->frame.parts;
     memset(sums, 0, sizeof *sums * (size_t)channels);
@@ -1857,7 +1859,6 @@ static void run_filter(Job *job)
     job->pass = -1;
     run(job, split_rows, 0, height);
     for (job->pass = 0; job->pass < PASSES; job->pass++) {
-        job->level = job->pass < SPREADING ? job->pass : job->pass - SPREADING;
         run(job, job->pass < PASSES - 1 ? filter_rows : finish_rows, 0, height);
         if (job->pass == SPREADING - 1)
             run(job, split_rows, 0, height);

@@ -16,16 +16,7 @@ from models.compiled.affinity import four
 from models.compiled.arrays import RGB, Image, Index, Matrix, Row, Rows, Scalar, f32
 from models.compiled.exponential import MIN_EXPONENT, exp, log
 from models.compiled.jit import array, jit_in_any_order, jit_inlined_in_any_order, jit_parallel
-from models.compiled.lines import (
-    BLUE_WEIGHT,
-    GREEN_WEIGHT,
-    RED_WEIGHT,
-    copy_line,
-    scale_depth,
-    scale_line,
-    transpose,
-    triple,
-)
+from models.compiled.lines import copy_line, luminance, scale_depth, scale_line, transpose, triple
 from models.history.running_scale import RunningScale
 
 if TYPE_CHECKING:
@@ -318,8 +309,8 @@ def outlier_share(share: Row, colour: RGB, mean: RGB) -> None:
     red, green, blue = colour
     mean_red, mean_green, mean_blue = mean
     for x in range(share.size):
-        bright = RED_WEIGHT * red[x] + GREEN_WEIGHT * green[x] + BLUE_WEIGHT * blue[x]
-        most = f32(OUTLIER) * (RED_WEIGHT * mean_red[x] + GREEN_WEIGHT * mean_green[x] + BLUE_WEIGHT * mean_blue[x])
+        bright = luminance(red[x], green[x], blue[x])
+        most = f32(OUTLIER) * luminance(mean_red[x], mean_green[x], mean_blue[x])
         share[x] = (bright - most) / bright if bright > most else f32(0)
 
 
