@@ -29,16 +29,16 @@
 #include "onespp_weights.h"
 #endif
 
-/* A layer sums LANES pixels of AT_ONCE outputs in registers, see multiply_block. CHUNK pixels of a row are worked on
- * together: what they need stays in the first caches. */
+/* A layer sums LANES pixels of AT_ONCE outputs in registers, see multiply_block, and the filter FILTER_LANES pixels. CHUNK
+ * pixels of a row are worked on together: what they need stays in the first caches. */
 #if defined(__AVX512F__) || defined(ONESPP_AVX512)
-enum { LANES = 64, AT_ONCE = 4, CHUNK = 256 };
+enum { LANES = 64, AT_ONCE = 4, CHUNK = 256, FILTER_LANES = 32 };
 #elif defined(__AVX2__) || defined(ONESPP_AVX2)
-enum { LANES = 24, AT_ONCE = 4, CHUNK = 240 };
+enum { LANES = 24, AT_ONCE = 4, CHUNK = 240, FILTER_LANES = 16 };
 #elif defined(__wasm_simd128__)
-enum { LANES = 8, AT_ONCE = 4, CHUNK = 256 };
+enum { LANES = 8, AT_ONCE = 4, CHUNK = 256, FILTER_LANES = 8 };
 #else
-enum { LANES = 24, AT_ONCE = 2, CHUNK = 240 };
+enum { LANES = 24, AT_ONCE = 2, CHUNK = 240, FILTER_LANES = 8 };
 #endif
 
 #if defined(__GNUC__)
@@ -72,7 +72,8 @@ enum {
     BLOCK = 16,       /* pixels, the side of the squares whose mean luminance is measured */
     MEDIAN_GRID = 64, /* the median depth of large images is taken from about as many rows and columns */
     MAX_DEPTHS = (2 * MEDIAN_GRID - 1) * (2 * MEDIAN_GRID - 1),
-    PAD = 16,   /* floats before a line: alignment, and zeros to the left of the image */
+    PAD = 16,   /* floats before a line of activations: alignment, and zeros to the left of the image */
+    MARGIN = 32, /* floats before and after other lines: the largest distance of taps of the filter */
     LINE = PITCH(CHUNK),
     HALF_LINE = PITCH(HALF_CHUNK), /* has room for the pixels beside the chunk, too */
     ALIGNMENT = 64,
@@ -92,6 +93,7 @@ enum {
 #define MIDDLE_GREY 0.18f /* the exposed geometric mean of luminance */
 #define MIN_MEAN 1e-20f
 #define ALBEDO_FLOOR 0.01f
+#define MIN_MASS 1e-30f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
 #define MAX_LOGIT 10.f
@@ -222,7 +224,7 @@ typedef struct {
 enum {
     FEATURE_LINES = 0,
     NOISY_LINES = FEATURE_LINES, /* irradiance of the frame, until `leave` */
-    LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, red, green, blue of its output */
+    LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, the last image but one */
     ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
     OUTLIER_LINE, /* share of the accumulation that is spread; until `leave` the luminance where outliers begin */
     OUTPUT_LINES, /* of the previous frame, reprojected */
@@ -247,6 +249,9 @@ enum {
 enum { PART_OUTPUT = 0, PART_ACCUMULATED = RGB, PART_FILTERED = 2 * RGB, PART_LINES = 4 * RGB, PART_HISTORY = 2 * RGB };
 
 enum { MAX_PART_HISTORY = PART_HISTORY * ONESPP_MAX_PARTS };
+
+/* Channels that are filtered: the image's colours and the sum of its weights, then colours of parts of the light. */
+enum { MASS = RGB, FILTERED, MAX_FILTERED = FILTERED + RGB * ONESPP_MAX_PARTS };
 
 /* Some rows of an image at the network's resolutions, surrounded by zeros. */
 typedef struct {
@@ -343,7 +348,7 @@ struct onespp {
     Window a, b, b_too, c, c_too; /* activations at 1/2, 1/4 and 1/8 of the resolution, of a strip */
     Window sum_a;                 /* of `a` and what comes from 1/4 */
     Window hidden;                /* of the per-pixel layers */
-    float *zeros;                 /* a line */
+    float *zeros, *ones;          /* lines */
     Motion *motions;
     double *blocks; /* mean luminance of each, -1 without surfaces */
     float *depths;
@@ -389,6 +394,7 @@ static void lay_out_strip(onespp *d, Arena *arena)
     d->c_too = window(arena, WIDTH_C, width / 8, rows + 2 * REACH_C);
     d->sum_a = window(arena, WIDTH_A, width / 2, 4 * rows + 4);
     d->zeros = allocate(arena, (uint64_t)d->a.pitch, sizeof(float));
+    d->ones = allocate(arena, (uint64_t)d->pitch, sizeof(float));
 }
 
 /* How many floats a layer's bias and weights are. */
@@ -416,7 +422,7 @@ static void lay_out(onespp *d, Arena *arena)
 {
     uint64_t height = (uint64_t)d->config.max_height;
     uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
-    d->pitch = PITCH(d->config.max_width);
+    d->pitch = PITCH(MARGIN + d->config.max_width + MARGIN + FILTER_LANES);
     uint64_t pixels = height * (uint64_t)d->pitch;
     d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
     d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));
@@ -594,13 +600,13 @@ static void load_part(float *restrict line, const onespp_frame *frame, int part,
 /* Where a row's line begins. */
 static float *row_line(const onespp *d, int y, int line)
 {
-    return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch;
+    return d->rows + ((ptrdiff_t)y * ROW_LINES + line) * d->pitch + MARGIN;
 }
 
 /* The same of a part of the light. */
 static float *part_line(const onespp *d, int y, int part, int line)
 {
-    return d->part_rows + (((ptrdiff_t)y * d->config.max_parts + part) * PART_LINES + line) * d->pitch;
+    return d->part_rows + (((ptrdiff_t)y * d->config.max_parts + part) * PART_LINES + line) * d->pitch + MARGIN;
 }
 
 /* --- Scale: the exposure and the unit of length that the network sees --------------------------------------------- */
@@ -1504,6 +1510,19 @@ static void decode_latent(const Job *job, float (*head)[LINE], int y, int x0, in
     }
 }
 
+/* Pixels beside the image count as ones that show no surface. */
+static void exclude_margins(const Job *job, int y)
+{
+    for (int level = 0; level < LEVELS; level++) {
+        float *centre = row_line(job->d, y, LEVEL_LINES + 3 * level + 1), *importance = centre + job->d->pitch;
+        for (int i = 0; i < MARGIN; i++)
+            importance[i - MARGIN] = NO_WEIGHT;
+        for (int i = job->frame.width; i < job->frame.width + MARGIN + FILTER_LANES; i++)
+            importance[i] = NO_WEIGHT;
+        memset(centre + job->frame.width, 0, sizeof(float) * FILTER_LANES); /* the exponential of anything is undefined */
+    }
+}
+
 /* Decodes a chunk of a row. */
 static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
 {
@@ -1515,6 +1534,8 @@ static void decode(const Job *job, Scratch *scratch, int y, int x0, int n)
         memcpy(row_line(job->d, y, FEATURE_LINES + c) + x0, head[c], sizeof(float) * (size_t)n);
     for (int level = 0; level < LEVELS; level++)
         decode_level(job, head, scratch->leave.depth, level, y, x0, n);
+    if (x0 == 0)
+        exclude_margins(job, y);
     accumulate(job, scratch, y, x0, n);
     find_outliers(job->d, y, x0, n);
     decode_latent(job, head, y, x0, n);
@@ -1618,155 +1639,141 @@ static void run_network(Job *job)
 /* The level that a pass takes. */
 static int level_of(int pass) { return pass < SPREADING ? pass : pass - SPREADING; }
 
-/* Where the lines of a pass's output are: first in the texels, which are no longer needed and have room for five images,
- * then over the parameters of the level before. Pass -1 is what the first one filters. */
-static float *filtered_lines(const onespp *d, int pass, int y)
+/* A line of a pass's output: colours and mass, then colours of parts of the light. It is in the texels, which are no longer
+ * needed and have room for two images, in turn; as the last pass writes texels, what that filters is over the first
+ * parameters. Pass -1 is what pass 0 filters. */
+static float *filtered_line(const onespp *d, int pass, int y, int channel)
 {
-    int level = pass - SPREADING;
-    return level <= 0 ? d->texels + ((ptrdiff_t)y * TEXEL + RGB * (pass + 1)) * d->pitch
-                      : row_line(d, y, LEVEL_LINES + 3 * (level - 1));
+    int turn = (pass + 1) % 2, of_part = channel - FILTERED;
+    if (of_part >= 0)
+        return part_line(d, y, of_part / RGB, PART_FILTERED + RGB * turn + of_part % RGB);
+    if (pass == PASSES - 2)
+        return row_line(d, y, LEVEL_LINES + channel);
+    return d->texels + ((ptrdiff_t)y * TEXEL + FILTERED * turn + channel) * d->pitch + MARGIN;
 }
 
-/* The same of a part of the light. */
-static float *filtered_part(const onespp *d, int pass, int part, int y)
-{
-    return part_line(d, y, part, PART_FILTERED + RGB * ((pass + 1) % 2));
-}
+static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Squared distances of features of n pixels, lines `pitch` apart. */
-static void measure_distances(
-    float *restrict distance, const float *restrict here, const float *restrict there, ptrdiff_t pitch, int n)
+/* Weights of a tap of n pixels, and some more: exp(importance of the tap - sharpness of the pixel times the squared distance
+ * of their features, in lines `pitch` apart). */
+static void weigh_tap(
+    float *restrict weight, const float *restrict here, const float *restrict there, ptrdiff_t pitch,
+    const float *restrict sharpness, const float *restrict importance, int n)
 {
-    for (int f = 0; f < FEATURES; f += 4, here += 4 * pitch, there += 4 * pitch)
-        for (int i = 0; i < n; i++) {
-            float a = here[i] - there[i];
-            float b = here[pitch + i] - there[pitch + i];
-            float c = here[2 * pitch + i] - there[2 * pitch + i];
-            float e = here[3 * pitch + i] - there[3 * pitch + i];
-            distance[i] = (f ? distance[i] : 0) + (a * a + b * b + c * c + e * e);
+    for (int x = 0; x < n; x += FILTER_LANES) {
+        float distance[FILTER_LANES] = {0};
+        for (int f = 0; f < FEATURES; f++)
+            for (int i = 0; i < FILTER_LANES; i++) {
+                float difference = here[f * pitch + x + i] - there[f * pitch + x + i];
+                distance[i] += difference * difference;
+            }
+        for (int i = 0; i < FILTER_LANES; i++) {
+            float exponent = maxf(importance[x + i] - sharpness[x + i] * distance[i], MIN_LOGIT);
+            weight[x + i] = importance[x + i] > NO_WEIGHT ? exponential(exponent) : 0;
         }
-}
-
-/* Adds weighted colours, whose lines are `pitch` apart, and their weights to n sums from `at` on. */
-static void add_weighted(
-    float (*restrict sums)[LINE], int at, const float *restrict weight, const float *restrict image, ptrdiff_t pitch,
-    int n)
-{
-    for (int i = 0; i < n; i++) {
-        float w = weight[i];
-        sums[0][at + i] += w * image[i];
-        sums[1][at + i] += w * image[pitch + i];
-        sums[2][at + i] += w * image[2 * pitch + i];
-        sums[3][at + i] += w;
     }
 }
 
-/* Adds weighted colours of parts of the light at pixels from x on, whose sums follow those of the whole. */
-static void add_parts(
-    const Job *job, float (*restrict sums)[LINE], int at, const float *restrict weight, int y, int x, int n)
+/* Weights of 3 x 3 taps of n pixels: Isik et al. 2021, Eq. 4, with two weights more, of which `centre` is the pixel's own.
+ * `scale` becomes 1 / their sum, or 0 off surfaces. */
+static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *restrict scale, int y, int x0, int n)
 {
-    for (int c = 0; c < RGB * job->frame.parts; c++) {
-        const float *restrict line = filtered_part(job->d, job->pass - 1, c / RGB, y) + c % RGB * job->d->pitch + x;
-        float *restrict sum = sums[4 + c] + at;
+    const onespp *d = job->d;
+    int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
+    const float *features = row_line(d, y, FEATURE_LINES) + x0, *sharpness = row_line(d, y, line) + x0;
+    const float *centre = sharpness + d->pitch, *importance = centre + d->pitch;
+    memset(scale, 0, sizeof(float) * (size_t)n);
+    for (int tap = 0; tap < TAPS; tap++) {
+        int row = y + (tap / 3 - 1) * step, column = x0 + (tap % 3 - 1) * step;
+        if (row < 0 || row >= job->frame.height)
+            memset(weights[tap], 0, sizeof *weights);
+        else if (tap == TAPS / 2)
+            for (int i = 0; i < n; i++)
+                weights[tap][i] = exponential(centre[i]);
+        else
+            weigh_tap(
+                weights[tap], features, row_line(d, row, FEATURE_LINES) + column, d->pitch, sharpness,
+                row_line(d, row, line + 2) + column, n);
         for (int i = 0; i < n; i++)
-            sum[i] += weight[i] * line[i];
+            scale[i] += weights[tap][i];
     }
-}
-
-/* Adds the tap (dx, dy) of a chunk of a row, where it is in the image. */
-static void add_tap(const Job *job, float (*restrict sums)[LINE], int y, int x0, int n, int dx, int dy)
-{
-    const onespp *d = job->d;
-    int first = maxi(x0, -dx), last = mini(x0 + n, job->frame.width - dx);
-    int level_line = LEVEL_LINES + 3 * level_of(job->pass);
-    if (y + dy < 0 || y + dy >= job->frame.height || first >= last)
-        return;
-    float distance[LINE], weight[LINE];
-    const float *restrict sharpness = row_line(d, y, level_line) + first;
-    const float *restrict importance = row_line(d, y + dy, level_line + 2) + first + dx;
-    int count = last - first;
-    const float *here = row_line(d, y, FEATURE_LINES) + first, *there = row_line(d, y + dy, FEATURE_LINES) + first + dx;
-    measure_distances(distance, here, there, d->pitch, count);
-    for (int i = 0; i < count; i++) {
-        float exponent = clamped(importance[i] - sharpness[i] * distance[i], -MIN_LOGIT);
-        weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
-    }
-    const float *image = filtered_lines(d, job->pass - 1, y + dy) + first + dx;
-    add_weighted(sums, first - x0, weight, image, d->pitch, count);
-    add_parts(job, sums, first - x0, weight, y + dy, first + dx, count);
-}
-
-/* A level of the filter at n pixels of a row: means of 3 x 3 taps weighted by exp(importance of the tap - sharpness of
- * the pixel times the squared distance of their features), and by exp(centre) for the pixel itself; 0 off surfaces.
- * Isik et al. 2021, Eq. 4, with two weights more. */
-static void filter_chunk(const Job *job, float (*restrict sums)[LINE], int y, int x0, int n)
-{
-    const onespp *d = job->d;
-    int level = level_of(job->pass), step = TAP_SPACINGS[level];
-    const float *centre = row_line(d, y, LEVEL_LINES + 3 * level + 1) + x0, *importance = centre + d->pitch;
-    float weight[LINE];
-    int channels = 4 + RGB * job->frame.parts;
-    memset(sums, 0, sizeof *sums * (size_t)channels);
     for (int i = 0; i < n; i++)
-        weight[i] = exponential(centre[i]);
-    add_weighted(sums, 0, weight, filtered_lines(d, job->pass - 1, y) + x0, d->pitch, n);
-    add_parts(job, sums, 0, weight, y, x0, n);
-    for (int tap = 0; tap < 9; tap++)
-        if (tap != 4)
-            add_tap(job, sums, y, x0, n, (tap % 3 - 1) * step, (tap / 3 - 1) * step);
-    for (int i = 0; i < n; i++) {
-        float scale = importance[i] > NO_WEIGHT ? 1 / sums[3][i] : 0;
-        for (int c = 0; c < RGB; c++)
-            sums[c][i] *= scale;
-        weight[i] = scale;
-    }
-    for (int c = 4; c < channels; c++)
-        for (int i = 0; i < n; i++)
-            sums[c][i] *= weight[i];
+        scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
 }
 
-/* A line of outliers, before the first pass; when they are spread, what else was accumulated is added. */
-static void split_line(const Job *job, float *restrict to, const float *restrict accumulated, int y)
+/* Weighted sums of the taps, in three rows, of n pixels, times `scale`. */
+static void sum_weighted(
+    float *restrict to, float (*restrict weights)[LINE], const float *restrict scale, const float *const *restrict rows,
+    int step, int n)
 {
-    const float *restrict share = row_line(job->d, y, OUTLIER_LINE);
-    for (int i = 0; i < job->frame.width; i++) {
-        float outliers = share[i] * accumulated[i];
-        to[i] = job->pass < 0 ? outliers : to[i] + (accumulated[i] - outliers);
+    for (int x = 0; x < n; x += FILTER_LANES) {
+        float sum[FILTER_LANES] = {0};
+        for (int tap = 0; tap < TAPS; tap++) {
+            const float *restrict from = rows[tap / 3] + x + (tap % 3 - 1) * step;
+            for (int i = 0; i < FILTER_LANES; i++)
+                sum[i] += weights[tap][x + i] * from[i];
+        }
+        for (int i = 0; i < FILTER_LANES; i++)
+            to[x + i] = scale[x + i] * sum[i];
     }
 }
 
+/* A pass of the filter at n pixels of a row, and some more: `to` has a line for each channel. */
+static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
+{
+    int step = TAP_SPACINGS[level_of(job->pass)];
+    float weights[TAPS][LINE], scale[LINE];
+    n = rounded_up(n, FILTER_LANES);
+    weigh_taps(job, weights, scale, y, x0, n);
+    for (int c = 0; c < filtered_channels(job); c++) {
+        const float *rows[3];
+        for (int i = 0; i < 3; i++) { /* rows outside the image have no weight */
+            int row = maxi(0, mini(y + (i - 1) * step, job->frame.height - 1));
+            rows[i] = filtered_line(job->d, job->pass - 1, row, c) + x0;
+        }
+        sum_weighted(to[c], weights, scale, rows, step, n);
+    }
+}
+
+/* What a channel of the filter accumulates; the mass, what ones become by the same steps, is the sum of the weights of all
+ * else. */
+static const float *accumulated_line(const onespp *d, int y, int channel)
+{
+    if (channel == MASS)
+        return d->ones;
+    int of_part = channel - FILTERED;
+    return of_part < 0 ? row_line(d, y, ACCUMULATED_LINES + channel)
+                       : part_line(d, y, of_part / RGB, PART_ACCUMULATED + of_part % RGB);
+}
+
+/* Outliers alone, before the first pass; when they are spread, what else was accumulated is added. */
 static void split_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
-    const onespp *d = job->d;
-    for (int y = first; y < last; y++) {
-        for (int c = 0; c < RGB; c++) {
-            float *to = filtered_lines(d, job->pass, y) + c * d->pitch;
-            split_line(job, to, row_line(d, y, ACCUMULATED_LINES + c), y);
+    for (int y = first; y < last; y++)
+        for (int c = 0; c < filtered_channels(job); c++) {
+            const float *restrict share = row_line(job->d, y, OUTLIER_LINE);
+            const float *restrict accumulated = accumulated_line(job->d, y, c);
+            float *restrict to = filtered_line(job->d, job->pass, y, c);
+            for (int i = 0; i < job->frame.width; i++) {
+                float outliers = share[i] * accumulated[i];
+                to[i] = job->pass < 0 ? outliers : to[i] + (accumulated[i] - outliers);
+            }
         }
-        for (int c = 0; c < RGB * job->frame.parts; c++) {
-            float *to = filtered_part(d, job->pass, c / RGB, y) + c % RGB * d->pitch;
-            split_line(job, to, part_line(d, y, c / RGB, PART_ACCUMULATED + c % RGB), y);
-        }
-    }
 }
 
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
-    float sums[4 + RGB * ONESPP_MAX_PARTS][LINE];
-    for (int y = first; y < last; y++)
-        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
-            int n = mini(CHUNK, job->frame.width - x0);
-            filter_chunk(job, sums, y, x0, n);
-            float *to = filtered_lines(job->d, job->pass, y) + x0;
-            for (int c = 0; c < RGB; c++)
-                memcpy(to + c * job->d->pitch, sums[c], sizeof(float) * (size_t)n);
-            for (int c = 0; c < RGB * job->frame.parts; c++) {
-                to = filtered_part(job->d, job->pass, c / RGB, y) + c % RGB * job->d->pitch + x0;
-                memcpy(to, sums[4 + c], sizeof(float) * (size_t)n);
+    float *to[MAX_FILTERED];
+    int step = TAP_SPACINGS[level_of(job->pass)];
+    for (int start = first; start < mini(first + step, last); start++)
+        for (int y = start; y < last; y += step) /* two of the three rows that it needs are in the cache */
+            for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+                for (int c = 0; c < filtered_channels(job); c++)
+                    to[c] = filtered_line(job->d, job->pass, y, c) + x0;
+                filter_chunk(job, to, y, x0, mini(CHUNK, job->frame.width - x0));
             }
-        }
 }
 
 /* --- The end of a frame ------------------------------------------------------------------------------------------- */
@@ -1825,28 +1832,35 @@ static void finish_part(const Job *job, int part, int channel, const float *rest
     }
 }
 
-/* The last level: its output is blended into that of the previous frame. */
+/* The last level: its output, divided by the mass, is blended into that of the previous frame. */
 static void finish_rows(Job *job, Scratch *scratch, int first, int last)
 {
     (void)scratch;
     const onespp *d = job->d;
-    float sums[4 + RGB * ONESPP_MAX_PARTS][LINE];
+    float filtered[MAX_FILTERED][LINE], *to[MAX_FILTERED], scale[LINE];
+    for (int c = 0; c < MAX_FILTERED; c++)
+        to[c] = filtered[c];
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
             const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
             const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
-            filter_chunk(job, sums, y, x0, n);
+            filter_chunk(job, to, y, x0, n);
+            for (int i = 0; i < n; i++)
+                scale[i] = 1 / maxf(filtered[MASS][i], MIN_MASS);
+            for (int c = 0; c < filtered_channels(job); c++)
+                for (int i = 0; i < n; i++)
+                    filtered[c][i] *= scale[i];
             for (int c = 0; c < RGB; c++) {
                 float *restrict output = row_line(d, y, OUTPUT_LINES + c) + x0;
                 for (int i = 0; i < n; i++) {
-                    float blended = output[i] + alpha[i] * (sums[c][i] - output[i]);
+                    float blended = output[i] + alpha[i] * (filtered[c][i] - output[i]);
                     output[i] = importance[i] > NO_WEIGHT ? blended : 0;
                 }
                 write_radiance(job, c, output, y, x0, n);
             }
             for (int c = 0; c < RGB * job->frame.parts; c++)
-                finish_part(job, c / RGB, c % RGB, sums[4 + c], y, x0, n);
+                finish_part(job, c / RGB, c % RGB, filtered[FILTERED + c], y, x0, n);
             remember(job, y, x0, n);
         }
 }
@@ -1882,10 +1896,12 @@ static onespp *create(const onespp_config *config, void *memory, const uint16_t 
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
     onespp *d = allocate(&arena, 1, sizeof(onespp));
-    memset(d, 0, sizeof *d);
+    memset(arena.base, 0, (size_t)(measure_memory(config) - ALIGNMENT)); /* margins must be finite */
     d->config = *config;
     lay_out(d, &arena);
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
+    for (ptrdiff_t i = 0; i < d->pitch; i++)
+        d->ones[i] = 1;
     float *to = d->parameters;
     for (int i = 0; i < LAYERS; i++) {
         weights = unpack(&d->layers[i], i, to, weights);

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.compiled.arrays import RGB, Image, Index, Row, Rows, f32
+from models.compiled.arrays import Image, Index, Row, Rows, f32
 from models.compiled.exponential import exp
 from models.compiled.jit import array, jit_in_any_order, jit_inlined, jit_parallel, jit_with_memory, match_threads
-from models.compiled.lines import add_line, add_product, add_weighted, normalise, scale_line, triple_of_lines
+from models.compiled.lines import add_line, add_product, normalise, scale_line
 
 MIN_LOGIT = -40.0  # smallest logit of a tap's weight: smaller ones are clamped
 AFFINITY_BLOCK_PIXELS = 2048  # filtered together, in whole rows: what they need stays in the first caches
@@ -27,7 +27,7 @@ STRIDE = 4  # features that are compared in one pass
 class Level(NamedTuple):
     """What a level filters, row after row (see models.networks.one), or the gradients of that."""
 
-    image: Image  # (B, 3, N), or several images side by side, (B, 3 P, N)
+    image: Image  # (B, C, N)
     features: Image  # (B, F, N), F a multiple of STRIDE
     sharpness: Rows  # (B, N), as those below
     own: Rows
@@ -43,7 +43,7 @@ class TapLayout(NamedTuple):
     inside: Rows  # (3, N), whether taps to the left, above or below, and to the right are inside, for whole rows
 
 
-# The output of a level (B, 3, N), its sums of weights (B, N), and the gradient of the output (B, 3, N).
+# The output of a level (B, C, N), its sums of weights (B, N), and the gradient of the output (B, C, N).
 Filtered: TypeAlias = tuple[Image, Rows, Image]
 # (offset, low, high, column): pixels `low` to `high` - 1, which have their taps `offset` pixels further in the image's
 # rows: in column 0, to the left, 1, above, below or the pixels themselves, or 2, to the right.
@@ -120,23 +120,21 @@ def taps_of_block(layout: TapLayout, first: Index, last: Index) -> Iterator[Taps
 def filter_block(
     out: Rows, total: Row, level: Level, layout: TapLayout, item: Index, first: Index, last: Index
 ) -> None:
-    """Pixels `first` to `last` - 1 of out (3 P, N) and total (N)."""
+    """Pixels `first` to `last` - 1 of out (C, N) and total (N)."""
     weights = np.empty(last - first, np.float32)
     distances = np.empty(last - first, np.float32)
-    ignored = np.zeros(last - first, np.float32)  # sums of the same weights, for further colours
     out[:, first:last] = f32(0)
     total[first:last] = f32(0)
     for taps in taps_of_block(layout, first, last):
         offset, low, high, _ = taps
         weight = weights[: high - low]
         weigh_taps(weight, distances[: high - low], level, layout, item, taps, first)
-        for c in range(0, len(out), 3):
-            sums = total[low:high] if c == 0 else ignored[: high - low]
-            there = triple_of_lines(level.image[item, c : c + 3], low + offset, high + offset)
-            add_weighted(triple_of_lines(out[c : c + 3], low, high), sums, weight, there)
+        add_line(total[low:high], weight)
+        for c in range(len(out)):
+            add_product(out[c, low:high], weight, level.image[item, c, low + offset : high + offset])
     scale_line(total[first:last], layout.surface[item, first:last])
-    for c in range(0, len(out), 3):
-        normalise(triple_of_lines(out[c : c + 3], first, last), total[first:last])
+    for c in range(len(out)):
+        normalise(out[c, first:last], total[first:last])
 
 
 @jit_in_any_order
@@ -190,19 +188,17 @@ def filter_level(
 
 @jit_in_any_order
 def scale_gradient(scaled: Row, dot: Row, gradient: Row, out: Row, total: Row) -> None:
-    """scaled = g / Σ w, and dot += scaled · out, for one colour."""
+    """scaled = g / Σ w, and dot += scaled · out, for one channel."""
     for x in range(scaled.size):
         scaled[x] = gradient[x] / total[x] if total[x] > f32(0) else f32(0)
         dot[x] += scaled[x] * out[x]
 
 
 @jit_in_any_order
-def pull_weights(pull: Row, weight: Row, scaled: RGB, dot: Row, values: RGB) -> None:
-    """pull (n): the gradients of the weights, times the weights."""
-    red, green, blue = scaled
-    to_red, to_green, to_blue = values
+def pull_weights(pull: Row, weight: Row, dot: Row) -> None:
+    """pull (n), g / Σ w times the tap's values, becomes the gradients of the weights, times the weights."""
     for x in range(pull.size):
-        pull[x] = weight[x] * (red[x] * to_red[x] + green[x] * to_green[x] + blue[x] * to_blue[x] - dot[x])
+        pull[x] = weight[x] * (pull[x] - dot[x])
 
 
 @jit_in_any_order
@@ -232,20 +228,22 @@ def pull_block(
     out, total, gradient = filtered
     weights, distances, pulls = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     dots = np.zeros(n, np.float32)
-    scaled = np.empty((3, n), np.float32)
-    for c in range(3):
-        to_out, filtered_colour = gradient[item, c, first:last], out[item, c, first:last]
-        scale_gradient(scaled[c], dots, to_out, filtered_colour, total[item, first:last])
+    channels = level.image.shape[1]
+    scaled = np.empty((channels, n), np.float32)
+    for c in range(channels):
+        to_out, filtered_channel = gradient[item, c, first:last], out[item, c, first:last]
+        scale_gradient(scaled[c], dots, to_out, filtered_channel, total[item, first:last])
     for taps in taps_of_block(layout, first, last):
         offset, low, high, _ = taps
         here = slice(low - first, high - first)
         there = slice(low + offset, high + offset)
         weight, distance, pull = weights[: high - low], distances[: high - low], pulls[: high - low]
         weigh_taps(weight, distance, level, layout, item, taps, first)
-        values = triple_of_lines(level.image[item], low + offset, high + offset)
-        pull_weights(pull, weight, triple_of_lines(scaled, low - first, high - first), dots[here], values)
-        for c in range(3):
+        pull[:] = f32(0)
+        for c in range(channels):
+            add_product(pull, scaled[c, here], level.image[item, c, there])
             add_product(to.image[item, c, there], weight, scaled[c, here])
+        pull_weights(pull, weight, dots[here])
         if offset == 0:
             add_line(to.own[item, low:high], pull)
             continue

@@ -12,13 +12,11 @@ from models.compiled.arrays import Image, Index, Row, Rows, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
 from models.compiled.lines import (
+    add_line,
     add_product,
     add_square,
-    add_weighted,
     normalise,
     scale_line,
-    triple,
-    triple_of_lines,
     window_taps,
 )
 from models.operators import MIN_DIVISOR
@@ -91,10 +89,12 @@ def filter_image(out: Image, total: Image, planes: Planes) -> None:
         for dx, dy, left, right in window_taps(row, FILTER_RADIUS, 1, height, width):
             lines = scratch[:, : right - left]
             weigh_tap(lines[0], lines[1], lines[2:], planes, row, left, dx, dy)
-            there = triple(planes.image, row + dy, left + dx, right + dx)
-            add_weighted(triple(out, row, left, right), total[0, row, left:right], lines[0], there)
+            add_line(total[0, row, left:right], lines[0])
+            for c in range(3):
+                add_product(out[c, row, left:right], lines[0], planes.image[c, row + dy, left + dx : right + dx])
         scale_line(total[0, row], planes.surface[0, row])
-        normalise(triple(out, row, 0, width), total[0, row])
+        for c in range(3):
+            normalise(out[c, row], total[0, row])
 
 
 def planes_of(pixels: "Pixels", sharpness: Tensor, item: int) -> Planes:
@@ -134,8 +134,10 @@ def pull_image(pulled: Image, gradient: Image, out: Image, total: Image, planes:
             lines = scratch[:, : right - left]
             weight, exponent, pull, distances = lines[0], lines[1], lines[2], lines[3:]
             weigh_tap(weight, exponent, distances, planes, row, left, dx, dy)
-            there = triple(planes.image, row + dy, left + dx, right + dx)
-            pull_weights(pull, weight, triple_of_lines(scaled, left, right), dots[left:right], there)
+            pull[:] = f32(0)
+            for c in range(3):
+                add_product(pull, scaled[c, left:right], planes.image[c, row + dy, left + dx : right + dx])
+            pull_weights(pull, weight, dots[left:right])
             pull_exponent(pull, exponent)
             for s in range(1 + GROUP_COUNT):
                 add_product(pulled[s, row, left:right], pull, distances[s])

@@ -63,27 +63,10 @@ def add_square(distance: Row, here: Row, there: Row) -> None:
 
 
 @jit_in_any_order
-def add_weighted(sums: RGB, total: Row, weight: Row, values: RGB) -> None:
-    """Add weighted colours, and their weights, to running sums."""
-    red, green, blue = sums
-    from_red, from_green, from_blue = values
-    for x in range(total.size):
-        w = weight[x]
-        red[x] += w * from_red[x]
-        green[x] += w * from_green[x]
-        blue[x] += w * from_blue[x]
-        total[x] += w
-
-
-@jit_in_any_order
-def normalise(sums: RGB, total: Row) -> None:
+def normalise(sums: Row, total: Row) -> None:
     """Weighted sums become means, 0 where no pixel has any weight."""
-    red, green, blue = sums
     for x in range(total.size):
-        scale = f32(1) / total[x] if total[x] > 0 else f32(0)
-        red[x] *= scale
-        green[x] *= scale
-        blue[x] *= scale
+        sums[x] = sums[x] / total[x] if total[x] > 0 else f32(0)
 
 
 @jit_in_any_order

@@ -41,11 +41,11 @@ def affinity_level(
     values = torch.cat([image, surface], dim=1)
     difference = neighbour_taps(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
-    importances, neighbours = neighbour_taps(torch.cat([importance, values], dim=1), step).split([1, 4], dim=1)
+    taps = neighbour_taps(torch.cat([importance, values], dim=1), step)
+    importances, neighbours = taps[:, :1], taps[:, 1:]
     weight = torch.exp((importances - sharpness * distance).clamp(min=MIN_LOGIT))
     total = (weight * neighbours).sum(dim=0, keepdim=True) + torch.exp(centre) * values
-    weighted, weights = total.split([3, 1], dim=1)
-    return torch.where(surface > 0, weighted / weights.clamp(min=MIN_DIVISOR), 0)
+    return torch.where(surface > 0, total[:, :-1] / total[:, -1:].clamp(min=MIN_DIVISOR), 0)
 
 
 def pointwise(layer: nn.Module) -> nn.Module:

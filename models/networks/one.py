@@ -184,7 +184,7 @@ def affinity_level(
 
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
     et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
-    image (B, 3, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
+    image (B, C, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
     (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
     """
     level = AffinityLevel.apply if compiled.usable(image) else plain_level
@@ -196,9 +196,9 @@ def carried(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. All weights are
-    those of the whole, so that parts of the light add up to it: their images may follow the accumulation and the past
-    output.
+    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. So does a channel of
+    ones, the sum of all weights, by which the result is divided. Weights are those of the whole, so that parts of the
+    light add up to it: their images may follow the accumulation and the past output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
     levels = [*zip(*planes, steps, strict=True)]
@@ -208,8 +208,10 @@ def carried(
             image = level(image, decoded.features, sharpness, centre, importance, surface, step)
         return image
 
-    outliers = decoded.outliers * decoded.accumulated
-    image = filtered(decoded.accumulated - outliers + filtered(outliers, SPREADING_LEVELS), len(levels))
+    light = torch.cat([decoded.accumulated, surface], dim=1)
+    outliers = decoded.outliers * light
+    light = filtered(light - outliers + filtered(outliers, SPREADING_LEVELS), len(levels))
+    image = light[:, :-1] / light[:, -1:].clamp(min=MIN_DIVISOR)
     output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
     return output, decoded.accumulated, decoded.length, decoded.latent
 
@@ -290,6 +292,7 @@ class One(Denoiser):
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
     refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
     is_network = True
+    convex = True
     inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 

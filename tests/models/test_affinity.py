@@ -11,6 +11,7 @@ from models import compiled
 from models.networks.one import affinity_level
 from tests.helpers.windows import Pixel, window
 
+CHANNELS = 4
 FEATURES = 8
 
 
@@ -22,13 +23,13 @@ def random_inputs(seed: int, height: int, width: int, background: float = 0.2) -
         return torch.randn(2, channels, height, width, generator=generator)
 
     surface = (torch.rand(2, 1, height, width, generator=generator) >= background).float()
-    return [5 * normal(3).abs(), normal(FEATURES), 2 * normal(1).abs(), normal(1), normal(1), surface]
+    return [5 * normal(CHANNELS).abs(), normal(FEATURES), 2 * normal(1).abs(), normal(1), normal(1), surface]
 
 
 def by_definition(inputs: list[Tensor], item: int, p: Pixel, step: int) -> Tensor:
     """The filtered pixel, tap by tap in float64."""
     image, features, sharpness, own, importance, surface = (tensor[item].double() for tensor in inputs)
-    total = torch.zeros(3, dtype=torch.float64)
+    total = torch.zeros(CHANNELS, dtype=torch.float64)
     weights = torch.zeros((), dtype=torch.float64)
     for q in window(surface.shape[1:], p, 1, step):
         distance = (features[:, *p] - features[:, *q]).square().sum()
@@ -53,7 +54,7 @@ def test_a_level_is_its_formula(step: int) -> None:
 def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: int) -> None:
     inputs = random_inputs(1, height, width)
     differentiable = [tensor.requires_grad_() for tensor in inputs[:5]]
-    upstream = torch.randn(2, 3, height, width, generator=torch.Generator().manual_seed(2))
+    upstream = torch.randn(2, CHANNELS, height, width, generator=torch.Generator().manual_seed(2))
     filtered = affinity_level(*inputs, step)
     gradients = torch.autograd.grad(filtered, differentiable, upstream)
     with compiled.disabled():

@@ -16,10 +16,9 @@ from tests.helpers.frames import chain, flat_frame, play, prepared, run
 
 NAMES = [name for name in registry.DENOISERS if not registry.prototype(name).unavailable()]
 both_implementations = pytest.mark.usefixtures("implementation")
-# Regressions and combinations of resolutions or grids may have weights below 0, whose sum is 1 nevertheless; those of
-# `one` have other sums near outliers alone.
-EVEN = ("bmfr", "nfor", "wskp-mr", "mr-kp", "nbgd", "one")
-KEEP_EVEN_LIGHT = [name for name in NAMES if registry.prototype(name).convex or name in EVEN]
+# Regressions and combinations of resolutions or grids may have weights below 0, whose sum is 1 nevertheless.
+AFFINE = ("bmfr", "nfor", "wskp-mr", "mr-kp", "nbgd")
+KEEP_EVEN_LIGHT = [name for name in NAMES if registry.prototype(name).convex or name in AFFINE]
 MASKS = st.builds(
     lambda height, width, share, seed: (
         torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed)) < share
