@@ -29,16 +29,16 @@
 #include "onespp_weights.h"
 #endif
 
-/* A layer sums LANES pixels of AT_ONCE outputs in registers, see multiply_block, and the filter FILTER_LANES pixels. CHUNK
- * pixels of a row are worked on together: what they need stays in the first caches. */
+/* A layer sums LANES pixels of AT_ONCE outputs in registers, see multiply_block. CHUNK pixels of a row are worked on
+ * together: what they need stays in the first caches. */
 #if defined(__AVX512F__) || defined(ONESPP_AVX512)
-enum { LANES = 64, AT_ONCE = 4, CHUNK = 256, FILTER_LANES = 32 };
+enum { LANES = 64, AT_ONCE = 4, CHUNK = 256 };
 #elif defined(__AVX2__) || defined(ONESPP_AVX2)
-enum { LANES = 24, AT_ONCE = 4, CHUNK = 240, FILTER_LANES = 16 };
+enum { LANES = 24, AT_ONCE = 4, CHUNK = 240 };
 #elif defined(__wasm_simd128__)
-enum { LANES = 8, AT_ONCE = 4, CHUNK = 256, FILTER_LANES = 8 };
+enum { LANES = 8, AT_ONCE = 4, CHUNK = 256 };
 #else
-enum { LANES = 24, AT_ONCE = 2, CHUNK = 240, FILTER_LANES = 8 };
+enum { LANES = 24, AT_ONCE = 2, CHUNK = 240 };
 #endif
 
 #if defined(__GNUC__)
@@ -422,7 +422,7 @@ static void lay_out(onespp *d, Arena *arena)
 {
     uint64_t height = (uint64_t)d->config.max_height;
     uint64_t blocks = (uint64_t)(d->config.max_width + BLOCK - 1) / BLOCK * ((height + BLOCK - 1) / BLOCK);
-    d->pitch = PITCH(MARGIN + d->config.max_width + MARGIN + FILTER_LANES);
+    d->pitch = PITCH(MARGIN + d->config.max_width + MARGIN);
     uint64_t pixels = height * (uint64_t)d->pitch;
     d->texels = allocate(arena, pixels * TEXEL, sizeof(float));
     d->rows = allocate(arena, pixels * ROW_LINES, sizeof(float));
@@ -1514,12 +1514,9 @@ static void decode_latent(const Job *job, float (*head)[LINE], int y, int x0, in
 static void exclude_margins(const Job *job, int y)
 {
     for (int level = 0; level < LEVELS; level++) {
-        float *centre = row_line(job->d, y, LEVEL_LINES + 3 * level + 1), *importance = centre + job->d->pitch;
-        for (int i = 0; i < MARGIN; i++)
-            importance[i - MARGIN] = NO_WEIGHT;
-        for (int i = job->frame.width; i < job->frame.width + MARGIN + FILTER_LANES; i++)
-            importance[i] = NO_WEIGHT;
-        memset(centre + job->frame.width, 0, sizeof(float) * FILTER_LANES); /* the exponential of anything is undefined */
+        float *importance = row_line(job->d, y, LEVEL_LINES + 3 * level + 2);
+        for (int i = 1; i <= MARGIN; i++)
+            importance[-i] = importance[job->frame.width - 1 + i] = NO_WEIGHT;
     }
 }
 
@@ -1654,23 +1651,25 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Weights of a tap of n pixels, and some more: exp(importance of the tap - sharpness of the pixel times the squared distance
- * of their features, in lines `pitch` apart). */
+/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times the squared distance of their
+ * features, in lines `pitch` apart). They are added to `total`. */
 static void weigh_tap(
-    float *restrict weight, const float *restrict here, const float *restrict there, ptrdiff_t pitch,
-    const float *restrict sharpness, const float *restrict importance, int n)
+    float *restrict weight, float *restrict total, const float *restrict here, const float *restrict there,
+    ptrdiff_t pitch, const float *restrict sharpness, const float *restrict importance, int n)
 {
-    for (int x = 0; x < n; x += FILTER_LANES) {
-        float distance[FILTER_LANES] = {0};
-        for (int f = 0; f < FEATURES; f++)
-            for (int i = 0; i < FILTER_LANES; i++) {
-                float difference = here[f * pitch + x + i] - there[f * pitch + x + i];
-                distance[i] += difference * difference;
-            }
-        for (int i = 0; i < FILTER_LANES; i++) {
-            float exponent = maxf(importance[x + i] - sharpness[x + i] * distance[i], MIN_LOGIT);
-            weight[x + i] = importance[x + i] > NO_WEIGHT ? exponential(exponent) : 0;
+    float distance[LINE];
+    for (int i = 0; i < n; i++) {
+        float sum = 0;
+        for (int f = 0; f < FEATURES; f++) {
+            float difference = here[f * pitch + i] - there[f * pitch + i];
+            sum += difference * difference;
         }
+        distance[i] = sum;
+    }
+    for (int i = 0; i < n; i++) {
+        float exponent = maxf(importance[i] - sharpness[i] * distance[i], MIN_LOGIT);
+        weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
+        total[i] += weight[i];
     }
 }
 
@@ -1682,48 +1681,43 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
     int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
     const float *features = row_line(d, y, FEATURE_LINES) + x0, *sharpness = row_line(d, y, line) + x0;
     const float *centre = sharpness + d->pitch, *importance = centre + d->pitch;
-    memset(scale, 0, sizeof(float) * (size_t)n);
+    for (int i = 0; i < n; i++)
+        scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
     for (int tap = 0; tap < TAPS; tap++) {
         int row = y + (tap / 3 - 1) * step, column = x0 + (tap % 3 - 1) * step;
         if (row < 0 || row >= job->frame.height)
             memset(weights[tap], 0, sizeof *weights);
-        else if (tap == TAPS / 2)
-            for (int i = 0; i < n; i++)
-                weights[tap][i] = exponential(centre[i]);
-        else
+        else if (tap != TAPS / 2)
             weigh_tap(
-                weights[tap], features, row_line(d, row, FEATURE_LINES) + column, d->pitch, sharpness,
+                weights[tap], scale, features, row_line(d, row, FEATURE_LINES) + column, d->pitch, sharpness,
                 row_line(d, row, line + 2) + column, n);
-        for (int i = 0; i < n; i++)
-            scale[i] += weights[tap][i];
     }
     for (int i = 0; i < n; i++)
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
 }
 
-/* Weighted sums of the taps, in three rows, of n pixels, times `scale`. */
-static void sum_weighted(
-    float *restrict to, float (*restrict weights)[LINE], const float *restrict scale, const float *const *restrict rows,
-    int step, int n)
+static inline float sum_row(float (*restrict weights)[LINE], const float *restrict from, int step, int i)
 {
-    for (int x = 0; x < n; x += FILTER_LANES) {
-        float sum[FILTER_LANES] = {0};
-        for (int tap = 0; tap < TAPS; tap++) {
-            const float *restrict from = rows[tap / 3] + x + (tap % 3 - 1) * step;
-            for (int i = 0; i < FILTER_LANES; i++)
-                sum[i] += weights[tap][x + i] * from[i];
-        }
-        for (int i = 0; i < FILTER_LANES; i++)
-            to[x + i] = scale[x + i] * sum[i];
-    }
+    return weights[0][i] * from[i - step] + weights[1][i] * from[i] + weights[2][i] * from[i + step];
 }
 
-/* A pass of the filter at n pixels of a row, and some more: `to` has a line for each channel. */
+/* Weighted sums of the taps, in three rows, of n pixels, times `scale`. */
+static void sum_weighted(
+    float *restrict to, float (*restrict weights)[LINE], const float *restrict scale, const float *const *rows, int step,
+    int n)
+{
+    const float *restrict above = rows[0], *restrict here = rows[1], *restrict below = rows[2];
+    for (int i = 0; i < n; i++)
+        to[i] = sum_row(weights, above, step, i) + sum_row(weights + 3, here, step, i);
+    for (int i = 0; i < n; i++)
+        to[i] = scale[i] * (to[i] + sum_row(weights + 6, below, step, i));
+}
+
+/* A pass of the filter at n pixels of a row: `to` has a line for each channel. */
 static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
 {
     int step = TAP_SPACINGS[level_of(job->pass)];
     float weights[TAPS][LINE], scale[LINE];
-    n = rounded_up(n, FILTER_LANES);
     weigh_taps(job, weights, scale, y, x0, n);
     for (int c = 0; c < filtered_channels(job); c++) {
         const float *rows[3];
