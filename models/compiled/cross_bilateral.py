@@ -11,14 +11,7 @@ from models.compiled.affinity import pull_weights, scale_gradient
 from models.compiled.arrays import Image, Index, Row, Rows, f32
 from models.compiled.exponential import MIN_EXPONENT, exp
 from models.compiled.jit import array, jit_in_any_order, jit_parallel
-from models.compiled.lines import (
-    add_line,
-    add_product,
-    add_square,
-    normalise,
-    scale_line,
-    window_taps,
-)
+from models.compiled.lines import add_line, add_product, add_square, normalise, scale_line, window_taps
 from models.operators import MIN_DIVISOR
 
 if TYPE_CHECKING:

@@ -196,9 +196,9 @@ def carried(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. So does a channel of
-    ones, the sum of all weights, by which the result is divided. Weights are those of the whole, so that parts of the
-    light add up to it: their images may follow the accumulation and the past output.
+    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. A channel of ones
+    takes the same way: it becomes the sum of all weights, by which the result is divided. Weights are those of the
+    whole, so that parts of the light add up to it: their images may follow the accumulation and the past output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
     levels = [*zip(*planes, steps, strict=True)]
