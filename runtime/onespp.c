@@ -1729,8 +1729,7 @@ static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
     }
 }
 
-/* What a channel of the filter accumulates; the mass, what ones become by the same steps, is the sum of the weights of all
- * else. */
+/* What is filtered in a channel: the accumulation, or ones, which become the sum of the weights of all else. */
 static const float *accumulated_line(const onespp *d, int y, int channel)
 {
     if (channel == MASS)
