@@ -1510,14 +1510,19 @@ static void decode_latent(const Job *job, float (*head)[LINE], int y, int x0, in
     }
 }
 
-/* Pixels beside the image count as ones that show no surface. */
+static void fill_margins(const Job *job, float *line, float value)
+{
+    for (int i = 1; i <= MARGIN; i++)
+        line[-i] = line[job->frame.width - 1 + i] = value;
+}
+
+/* Pixels beside the image count as ones that show no surface. What they have no weight for must be finite all the same. */
 static void exclude_margins(const Job *job, int y)
 {
-    for (int level = 0; level < LEVELS; level++) {
-        float *importance = row_line(job->d, y, LEVEL_LINES + 3 * level + 2);
-        for (int i = 1; i <= MARGIN; i++)
-            importance[-i] = importance[job->frame.width - 1 + i] = NO_WEIGHT;
-    }
+    for (int c = 0; c < FEATURES; c++)
+        fill_margins(job, row_line(job->d, y, FEATURE_LINES + c), 0);
+    for (int c = 0; c < 3 * LEVELS; c++)
+        fill_margins(job, row_line(job->d, y, LEVEL_LINES + c), c % 3 == 2 ? NO_WEIGHT : 0);
 }
 
 /* Decodes a chunk of a row. */
@@ -1748,6 +1753,10 @@ static void split_rows(Job *job, Scratch *scratch, int first, int last)
             const float *restrict share = row_line(job->d, y, OUTLIER_LINE);
             const float *restrict accumulated = accumulated_line(job->d, y, c);
             float *restrict to = filtered_line(job->d, job->pass, y, c);
+            if (job->pass < 0) {
+                fill_margins(job, to, 0);
+                fill_margins(job, filtered_line(job->d, 0, y, c), 0);
+            }
             for (int i = 0; i < job->frame.width; i++) {
                 float outliers = share[i] * accumulated[i];
                 to[i] = job->pass < 0 ? outliers : to[i] + (accumulated[i] - outliers);
@@ -1889,7 +1898,6 @@ static onespp *create(const onespp_config *config, void *memory, const uint16_t 
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
     onespp *d = allocate(&arena, 1, sizeof(onespp));
-    memset(arena.base, 0, (size_t)(measure_memory(config) - ALIGNMENT)); /* margins must be finite */
     d->config = *config;
     lay_out(d, &arena);
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
