@@ -6,8 +6,8 @@
  *   enter      reprojection, neighbourhood statistics, inputs of the network, its per-pixel and first layers
  *   layers     the U-Net at 1/2, 1/4 and 1/8 of the resolution
  *   leave      its last layers, decoded into the parameters of the filter and the new accumulation
- *   filter     three levels of an a-trous filter, which spread outliers, and all six of it; the last one writes the
- *              output and what the next frame needs
+ *   filter     two levels of an a-trous filter, which spread outliers, all six of it, and three of these guided by
+ *              luminance; the last one writes the output and what the next frame needs
  *
  * `enter` to `leave` work on strips of rows, so that activations take little memory. Strips overlap: what 3 x 3 taps
  * below and above a strip need is computed twice, except for `enter`, whose results are kept from strip to strip.
@@ -52,8 +52,9 @@ enum {
     LATENT = 6,   /* channels carried from frame to frame */
     FEATURES = 8, /* that pixels are compared by */
     LEVELS = 6,   /* of the filter */
-    SPREADING = 3, /* of these: the first ones, which spread outliers before all of them filter */
-    PASSES = SPREADING + LEVELS,
+    SPREADING = 2, /* of these: the first ones, which spread outliers before all of them filter */
+    FIRST_GUIDED = SPREADING + LEVELS, /* pass: every other level filters once more, guided by luminance */
+    PASSES = FIRST_GUIDED + LEVELS / 2,
     DETAIL = 24,  /* hidden channels of the per-pixel layers */
     PATCH = 4,    /* pixels, 2 x 2 */
     WIDTH_A = 40, /* channels at 1/2 of the resolution */
@@ -96,6 +97,8 @@ enum {
 #define MIN_MASS 1e-30f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
+#define GUIDANCE_ROOT 5.477226f /* squared, the weight of differences of the guide beside those of features */
+#define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
 #define MAX_LOGIT 10.f
 #define MIN_LOGIT -40.f
 #define NO_WEIGHT -1e4f /* importance of pixels that show no surface */
@@ -227,6 +230,7 @@ enum {
     LEVEL_LINES = FEATURES, /* of each level: sharpness, centre, importance; later on, the last image but one */
     ALPHA_LINE = LEVEL_LINES + 3 * LEVELS,
     OUTLIER_LINE, /* share of the accumulation that is spread; until `leave` the luminance where outliers begin */
+    GUIDE_LINE = OUTLIER_LINE, /* once they are spread */
     OUTPUT_LINES, /* of the previous frame, reprojected */
     ACCUMULATED_LINES = OUTPUT_LINES + RGB,
     LENGTH_LINE = ACCUMULATED_LINES + RGB, /* of the history in samples; until `leave` of the past one, 0 for none */
@@ -1523,6 +1527,7 @@ static void exclude_margins(const Job *job, int y)
         fill_margins(job, row_line(job->d, y, FEATURE_LINES + c), 0);
     for (int c = 0; c < 3 * LEVELS; c++)
         fill_margins(job, row_line(job->d, y, LEVEL_LINES + c), c % 3 == 2 ? NO_WEIGHT : 0);
+    fill_margins(job, row_line(job->d, y, GUIDE_LINE), 0);
 }
 
 /* Decodes a chunk of a row. */
@@ -1639,7 +1644,12 @@ static void run_network(Job *job)
 /* --- The filter --------------------------------------------------------------------------------------------------- */
 
 /* The level that a pass takes. */
-static int level_of(int pass) { return pass < SPREADING ? pass : pass - SPREADING; }
+static int level_of(int pass)
+{
+    if (pass >= FIRST_GUIDED)
+        return 2 * (pass - FIRST_GUIDED) + 1;
+    return pass < SPREADING ? pass : pass - SPREADING;
+}
 
 /* A line of a pass's output: colours and mass, then colours of parts of the light. It is in the texels, which are no longer
  * needed and have room for two images, in turn; as the last pass writes texels, what that filters is over the first
@@ -1656,13 +1666,10 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times the squared distance of their
- * features, in lines `pitch` apart). They are added to `total`. */
-static void weigh_tap(
-    float *restrict weight, float *restrict total, const float *restrict here, const float *restrict there,
-    ptrdiff_t pitch, const float *restrict sharpness, const float *restrict importance, int n)
+/* Squared distances of the features of n pixels, in lines `pitch` apart. */
+static void measure_features(
+    float *restrict distance, const float *restrict here, const float *restrict there, ptrdiff_t pitch, int n)
 {
-    float distance[LINE];
     for (int i = 0; i < n; i++) {
         float sum = 0;
         for (int f = 0; f < FEATURES; f++) {
@@ -1671,6 +1678,20 @@ static void weigh_tap(
         }
         distance[i] = sum;
     }
+}
+
+static void add_squares(float *restrict distance, const float *restrict here, const float *restrict there, int n)
+{
+    for (int i = 0; i < n; i++)
+        distance[i] += (here[i] - there[i]) * (here[i] - there[i]);
+}
+
+/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance). They are added
+ * to `total`. */
+static void weigh_tap(
+    float *restrict weight, float *restrict total, const float *restrict distance, const float *restrict sharpness,
+    const float *restrict importance, int n)
+{
     for (int i = 0; i < n; i++) {
         float exponent = maxf(importance[i] - sharpness[i] * distance[i], MIN_LOGIT);
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
@@ -1684,18 +1705,21 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
 {
     const onespp *d = job->d;
     int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
-    const float *features = row_line(d, y, FEATURE_LINES) + x0, *sharpness = row_line(d, y, line) + x0;
-    const float *centre = sharpness + d->pitch, *importance = centre + d->pitch;
+    const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
+    const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
+    float distance[LINE];
     for (int i = 0; i < n; i++)
         scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
     for (int tap = 0; tap < TAPS; tap++) {
         int row = y + (tap / 3 - 1) * step, column = x0 + (tap % 3 - 1) * step;
         if (row < 0 || row >= job->frame.height)
             memset(weights[tap], 0, sizeof *weights);
-        else if (tap != TAPS / 2)
-            weigh_tap(
-                weights[tap], scale, features, row_line(d, row, FEATURE_LINES) + column, d->pitch, sharpness,
-                row_line(d, row, line + 2) + column, n);
+        else if (tap != TAPS / 2) {
+            measure_features(distance, features, row_line(d, row, FEATURE_LINES) + column, d->pitch, n);
+            if (job->pass >= FIRST_GUIDED)
+                add_squares(distance, guide, row_line(d, row, GUIDE_LINE) + column, n);
+            weigh_tap(weights[tap], scale, distance, sharpness, row_line(d, row, line + 2) + column, n);
+        }
     }
     for (int i = 0; i < n; i++)
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
@@ -1761,6 +1785,26 @@ static void split_rows(Job *job, Scratch *scratch, int first, int last)
                 float outliers = share[i] * accumulated[i];
                 to[i] = job->pass < 0 ? outliers : to[i] + (accumulated[i] - outliers);
             }
+        }
+}
+
+/* The guide of the next pass: the luminance that there is, exposed. */
+static void guide_rows(Job *job, Scratch *scratch, int first, int last)
+{
+    (void)scratch;
+    float bright[LINE];
+    for (int y = first; y < last; y++)
+        for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
+            int n = mini(CHUNK, job->frame.width - x0);
+            const float *lines[FILTERED];
+            float *restrict guide = row_line(job->d, y, GUIDE_LINE) + x0;
+            for (int c = 0; c < FILTERED; c++)
+                lines[c] = filtered_line(job->d, job->pass - 1, y, c) + x0;
+            for (int i = 0; i < n; i++)
+                bright[i] = luminance(lines[0][i], lines[1][i], lines[2][i]) / maxf(lines[MASS][i], MIN_MASS);
+            expose(guide, bright, job->exposure / DARKEST, n);
+            for (int i = 0; i < n; i++)
+                guide[i] *= GUIDANCE_ROOT;
         }
 }
 
@@ -1875,6 +1919,8 @@ static void run_filter(Job *job)
     job->pass = -1;
     run(job, split_rows, 0, height);
     for (job->pass = 0; job->pass < PASSES; job->pass++) {
+        if (job->pass >= FIRST_GUIDED)
+            run(job, guide_rows, 0, height);
         run(job, job->pass < PASSES - 1 ? filter_rows : finish_rows, 0, height);
         if (job->pass == SPREADING - 1)
             run(job, split_rows, 0, height);

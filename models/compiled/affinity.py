@@ -4,6 +4,8 @@ A level filters with 3 x 3 taps q, `step` pixels apart, of each pixel p that sho
 
     out_p = Σ_q w_pq image_q / Σ_q w_pq
     w_pq = surface_q exp(importance_q - sharpness_p |features_p - features_q|²),  w_pp = exp(own_p)
+
+A guide is one more feature: a plane of its own, since it changes from level to level.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,6 +34,7 @@ class Level(NamedTuple):
     sharpness: Rows  # (B, N), as those below
     own: Rows
     importance: Rows
+    guide: Image  # (B, 1, N), or (B, 0, N) for none
 
 
 class TapLayout(NamedTuple):
@@ -76,6 +79,12 @@ def measure(distance: Row, features: Rows, low: Index, high: Index, offset: Inde
 
 
 @jit_in_any_order
+def add_square(distance: Row, here: Row, there: Row) -> None:
+    for x in range(distance.size):
+        distance[x] += (here[x] - there[x]) * (here[x] - there[x])
+
+
+@jit_in_any_order
 def weigh(weight: Row, distance: Row, sharpness: Row, importance: Row, surface: Row) -> None:
     for x in range(weight.size):
         exponent = importance[x] - sharpness[x] * distance[x]
@@ -98,8 +107,10 @@ def weigh_taps(
     if offset == 0:
         weigh_own(weight, level.own[item, low:high], surface[low:high])
         return
-    measure(distance, level.features[item], low, high, offset)
     there = slice(low + offset, high + offset)
+    measure(distance, level.features[item], low, high, offset)
+    for g in range(level.guide.shape[1]):
+        add_square(distance, level.guide[item, g, low:high], level.guide[item, g, there])
     weigh(weight, distance, level.sharpness[item, low:high], level.importance[item, there], surface[there])
     scale_line(weight, layout.inside[column, low - first : high - first])
 
@@ -153,13 +164,14 @@ def filter_item(out: Image, total: Rows, level: Level, layout: TapLayout, item: 
 
 def flat(tensor: Tensor) -> Image:
     """(B, C, H, W) as an array (B, C, N)."""
-    return array(tensor).reshape(*tensor.shape[:2], -1)
+    batch, channels, height, width = tensor.shape
+    return array(tensor).reshape(batch, channels, height * width)
 
 
 def level_of(inputs: Sequence[Tensor]) -> Level:
-    image, features, *others = inputs
+    image, features, *others, guide = inputs
     sharpness, own, importance = (flat(tensor)[:, 0] for tensor in others)
-    return Level(flat(image), flat(features), sharpness, own, importance)
+    return Level(flat(image), flat(features), sharpness, own, importance, flat(guide))
 
 
 def layout_of(surface: Tensor, step: int) -> TapLayout:
@@ -169,13 +181,15 @@ def layout_of(surface: Tensor, step: int) -> TapLayout:
     return TapLayout(width, step, flat(surface)[:, 0], inside.astype(np.float32))
 
 
-def filter_level(
-    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
-) -> tuple[Tensor, Tensor]:
-    """See models.networks.one.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces."""
+def filter_level(inputs: Sequence[Tensor], surface: Tensor, step: int) -> tuple[Tensor, Tensor]:
+    """See models.networks.one.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces.
+
+    The inputs are image, features, sharpness, own, importance and a guide (B, 1, H, W), or (B, 0, H, W) for none.
+    """
+    image = inputs[0]
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
     total = torch.empty_like(surface, memory_format=torch.contiguous_format)
-    level, layout = level_of([image, features, sharpness, own, importance]), layout_of(surface, step)
+    level, layout = level_of(inputs), layout_of(surface, step)
     for item in range(len(image)):
         filter_item(flat(out), flat(total)[:, 0], level, layout, item)
     return out, total
@@ -253,6 +267,9 @@ def pull_block(
         for f in range(level.features.shape[1]):
             features, to_features = level.features[item, f], to.features[item, f]
             pull_feature(to_features[low:high], to_features[there], distance, features[low:high], features[there])
+        for g in range(level.guide.shape[1]):
+            guide, to_guide = level.guide[item, g], to.guide[item, g]
+            pull_feature(to_guide[low:high], to_guide[there], distance, guide[low:high], guide[there])
 
 
 @jit_parallel
@@ -268,7 +285,7 @@ def pull_items(to: Level, level: Level, layout: TapLayout, filtered: Filtered) -
 def pull_level(
     gradient: Tensor, inputs: Sequence[Tensor], surface: Tensor, out: Tensor, total: Tensor, step: int
 ) -> tuple[Tensor, ...]:
-    """The gradients of the `inputs`: image, features, sharpness, own and importance."""
+    """The gradients of the `inputs` of filter_level."""
     match_threads()
     pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs]
     filtered = flat(out), flat(total)[:, 0], flat(gradient)

@@ -26,7 +26,10 @@ LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
 # px between taps of each filter level: the last ones smooth the first ones' pattern
 TAP_SPACINGS = (32, 16, 8, 4, 2, 1)
-SPREADING_LEVELS = 3  # of these, the first ones, spread outliers before all of them filter
+SPREADING_LEVELS = 2  # of these, the first ones, spread outliers before all of them filter
+GUIDED_LEVELS = slice(1, None, 2)  # of these, those that filter once more, guided by luminance
+GUIDANCE = 30.0  # weight of squared differences of the logarithm of luminance, beside those of features
+DARKEST = 0.01  # exposed luminance: what is darker looks alike to guided levels
 OUTLIER = 8.0  # times the mean over 9 x 9 pixels: what is brighter is spread
 MAX_EXPOSED = 1e13  # exposed irradiance; what is brighter looks alike to the network
 MAX_LOGIT = 10.0  # of the weights of taps

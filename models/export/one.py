@@ -35,9 +35,17 @@ def mesh_sums(image: Tensor, mesh: Tensor, step: int) -> Tensor:
 
 
 def affinity_level(
-    image: Tensor, features: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, surface: Tensor, step: int
+    image: Tensor,
+    features: Tensor,
+    sharpness: Tensor,
+    centre: Tensor,
+    importance: Tensor,
+    surface: Tensor,
+    step: int,
+    guide: Tensor | None = None,
 ) -> Tensor:
     """See models.networks.one.affinity_level; `image` is 0 for background."""
+    features = features if guide is None else torch.cat([features, guide], dim=1)
     values = torch.cat([image, surface], dim=1)
     difference = neighbour_taps(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
@@ -128,7 +136,7 @@ class OneStep(Step):
         whole = (SIDE_MULTIPLE * ((side + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for side in size)
         head = resized(self.trunk(resized(channels, *whole)), *size) + self.trunk.detail(channels)
         decoded = Decoded(*decode(head, inputs, x["samples"]))
-        images = carried(decoded, history, surface, self.steps, affinity_level)
+        images = carried(decoded, history, surface, exposure, self.steps, affinity_level)
         return {
             "radiance": images[0] * divisor + x["emission"],
             "new_history": torch.cat(images, dim=1),

@@ -1,5 +1,6 @@
 """`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, cast
@@ -14,6 +15,9 @@ from models.compiled import affinity as affinity_kernels
 from models.compiled import one as kernels
 from models.compiled.affinity import MIN_LOGIT
 from models.compiled.one import (
+    DARKEST,
+    GUIDANCE,
+    GUIDED_LEVELS,
     INPUT_CHANNELS,
     LATENT,
     MAX_EXPOSED,
@@ -147,9 +151,17 @@ def decode_head(
 
 
 def plain_level(
-    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+    image: Tensor,
+    features: Tensor,
+    sharpness: Tensor,
+    own: Tensor,
+    importance: Tensor,
+    surface: Tensor,
+    step: int,
+    guide: Tensor | None = None,
 ) -> Tensor:
     """See affinity_level: the way that PyTorch takes."""
+    features = features if guide is None else torch.cat([features, guide], dim=1)
     count = features.shape[1]
     taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
@@ -164,9 +176,9 @@ class AffinityLevel(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
-        """The arguments are those of affinity_level."""
+        """The arguments are those of affinity_level, but the guide comes before the surface."""
         *given, surface, step = arguments
-        out, total = affinity_kernels.filter_level(*arguments)
+        out, total = affinity_kernels.filter_level(given, surface, step)
         ctx.step = step
         ctx.save_for_backward(*given, surface, out, total)
         return out
@@ -178,39 +190,68 @@ class AffinityLevel(torch.autograd.Function):
 
 
 def affinity_level(
-    image: Tensor, features: Tensor, sharpness: Tensor, own: Tensor, importance: Tensor, surface: Tensor, step: int
+    image: Tensor,
+    features: Tensor,
+    sharpness: Tensor,
+    own: Tensor,
+    importance: Tensor,
+    surface: Tensor,
+    step: int,
+    guide: Tensor | None = None,
 ) -> Tensor:
     """One level of an à-trous transform by learned features: a convex mean over 3 x 3 taps `step` pixels apart.
 
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
     et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
     image (B, C, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
-    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows.
+    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows. A guide (B, 1, H, W) is one feature
+    more.
     """
-    level = AffinityLevel.apply if compiled.usable(image) else plain_level
-    return cast(Tensor, level(image, features, sharpness, own, importance, surface, step))
+    maps = features, sharpness, own, importance
+    if not compiled.usable(image):
+        return plain_level(image, *maps, surface, step, guide)
+    return cast(Tensor, AffinityLevel.apply(image, *maps, features[:, :0] if guide is None else guide, surface, step))
+
+
+def luminance_guide(light: Tensor, exposure: Tensor) -> Tensor:
+    """The guide (B, 1, H, W) of the last levels: colours, parts of the light and the sum of weights are filtered."""
+    exposed = image_luminance(exposure * light[:, :3] / light[:, -1:].clamp(min=MIN_DIVISOR))
+    return math.sqrt(GUIDANCE) * torch.log1p((exposed / DARKEST).clamp(max=MAX_EXPOSED))
 
 
 def carried(
-    decoded: Decoded, past: Tensor, surface: Tensor, steps: Sequence[int], level: Callable[..., Tensor] = affinity_level
+    decoded: Decoded,
+    past: Tensor,
+    surface: Tensor,
+    exposure: Tensor,
+    steps: Sequence[int],
+    level: Callable[..., Tensor] = affinity_level,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
-    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. A channel of ones
-    takes the same way: it becomes the sum of all weights, by which the result is divided. Weights are those of the
+    Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. After all levels
+    some filter once more, guided by the luminance that there is by then. A channel of ones takes the same way: it
+    becomes the sum of all weights, by which the result is divided. Weights are those of the
     whole, so that parts of the light add up to it: their images may follow the accumulation and the past output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
     levels = [*zip(*planes, steps, strict=True)]
 
-    def filtered(image: Tensor, count: int) -> Tensor:
-        for sharpness, centre, importance, step in levels[:count]:
-            image = level(image, decoded.features, sharpness, centre, importance, surface, step)
-        return image
+    def filtered(
+        image: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, step: int, *guide: Tensor
+    ) -> Tensor:
+        return level(image, decoded.features, sharpness, centre, importance, surface, step, *guide)
 
     light = torch.cat([decoded.accumulated, surface], dim=1)
     outliers = decoded.outliers * light
-    light = filtered(light - outliers + filtered(outliers, SPREADING_LEVELS), len(levels))
+    light = light - outliers
+    for each in levels[:SPREADING_LEVELS]:
+        outliers = filtered(outliers, *each)
+    light = light + outliers
+    for each in levels:
+        light = filtered(light, *each)
+    for each in levels[GUIDED_LEVELS]:
+        light = filtered(light, *each, luminance_guide(light, exposure))
     image = light[:, :-1] / light[:, -1:].clamp(min=MIN_DIVISOR)
     output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
     return output, decoded.accumulated, decoded.length, decoded.latent
@@ -309,7 +350,7 @@ class One(Denoiser):
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)
-        output, accumulated, length, latent = carried(decoded, past, surface, self.steps)
+        output, accumulated, length, latent = carried(decoded, past, surface, scale.exposure() * frame.gain, self.steps)
         images = output[:, :3], accumulated[:, :3], length, latent
         parts = output[:, 3:], accumulated[:, 3:]
         return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts)

@@ -41,24 +41,31 @@ def by_definition(inputs: list[Tensor], item: int, p: Pixel, step: int) -> Tenso
 
 
 @pytest.mark.usefixtures("implementation")
-@pytest.mark.parametrize("step", [1, 3])
-def test_a_level_is_its_formula(step: int) -> None:
+@pytest.mark.parametrize(("step", "guided"), [(1, False), (3, False), (2, True)])
+def test_a_level_is_its_formula(step: int, guided: bool) -> None:
+    """Where a guide is one feature more."""
     inputs = random_inputs(0, 5, 7)
-    filtered = affinity_level(*inputs, step)
+    guide = torch.randn(2, 1, 5, 7, generator=torch.Generator().manual_seed(3)) if guided else None
+    filtered = affinity_level(*inputs, step, guide)
+    if guide is not None:
+        inputs[1] = torch.cat([inputs[1], guide], dim=1)
     for item, *p in np.ndindex(2, 5, 7):
         expected = by_definition(inputs, item, tuple(p), step)
         torch.testing.assert_close(filtered[item, :, *p].double(), expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize(("height", "width", "step"), [(1, 1, 1), (1, 9, 2), (13, 20, 1), (13, 20, 8), (6, 300, 4)])
-def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: int) -> None:
+def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: int, guided: bool) -> None:
     inputs = random_inputs(1, height, width)
-    differentiable = [tensor.requires_grad_() for tensor in inputs[:5]]
+    guide = inputs[1][:, :1] - inputs[0][:, :1]  # may depend on what is filtered
+    differentiable = [tensor.requires_grad_() for tensor in inputs[:5]] + [guide.requires_grad_()] * guided
+    arguments = [*inputs, step, guide] if guided else [*inputs, step]
     upstream = torch.randn(2, CHANNELS, height, width, generator=torch.Generator().manual_seed(2))
-    filtered = affinity_level(*inputs, step)
+    filtered = affinity_level(*arguments)
     gradients = torch.autograd.grad(filtered, differentiable, upstream)
     with compiled.disabled():
-        expected = affinity_level(*inputs, step)
+        expected = affinity_level(*arguments)
         expected_gradients = torch.autograd.grad(expected, differentiable, upstream)
     torch.testing.assert_close(filtered, expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(gradients, expected_gradients, rtol=1e-4, atol=1e-4)
