@@ -51,6 +51,7 @@ enum {
     RGB = 3,
     LATENT = 6,   /* channels carried from frame to frame */
     FEATURES = 8, /* that pixels are compared by */
+    TOGETHER = 4, /* features: so many lines are compared at a time */
     LEVELS = 6,   /* of the filter */
     SPREADING = 2, /* of these: the first ones, which spread outliers before all of them filter */
     FIRST_GUIDED = SPREADING + LEVELS, /* pass: every other level filters once more, guided by luminance */
@@ -1666,34 +1667,35 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Squared distances of the features of n pixels, in lines `pitch` apart. */
-static void measure_features(
-    float *restrict distance, const float *restrict here, const float *restrict there, ptrdiff_t pitch, int n)
+/* Adds the squared distances of `count` features of n pixels, in lines `pitch` apart, from three taps in a row. */
+static inline void add_squares(
+    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there, ptrdiff_t pitch,
+    int count, int step, int n)
 {
+    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
     for (int i = 0; i < n; i++) {
-        float sum = 0;
-        for (int f = 0; f < FEATURES; f++) {
-            float difference = here[f * pitch + i] - there[f * pitch + i];
-            sum += difference * difference;
+        float a = left[i], b = middle[i], c = right[i];
+        for (int f = 0; f < count; f++) {
+            const float *tap = there + f * pitch + i;
+            float value = here[f * pitch + i];
+            a += (value - tap[-step]) * (value - tap[-step]);
+            b += (value - tap[0]) * (value - tap[0]);
+            c += (value - tap[step]) * (value - tap[step]);
         }
-        distance[i] = sum;
+        left[i] = a;
+        middle[i] = b;
+        right[i] = c;
     }
 }
 
-static void add_squares(float *restrict distance, const float *restrict here, const float *restrict there, int n)
-{
-    for (int i = 0; i < n; i++)
-        distance[i] += (here[i] - there[i]) * (here[i] - there[i]);
-}
-
-/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance). They are added
- * to `total`. */
+/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance, which is what
+ * `weight` is at first). They are added to `total`. */
 static void weigh_tap(
-    float *restrict weight, float *restrict total, const float *restrict distance, const float *restrict sharpness,
-    const float *restrict importance, int n)
+    float *restrict weight, float *restrict total, const float *restrict sharpness, const float *restrict importance,
+    int n)
 {
     for (int i = 0; i < n; i++) {
-        float exponent = maxf(importance[i] - sharpness[i] * distance[i], MIN_LOGIT);
+        float exponent = maxf(importance[i] - sharpness[i] * weight[i], MIN_LOGIT);
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
         total[i] += weight[i];
     }
@@ -1707,22 +1709,26 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
     int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
     const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
-    float distance[LINE];
+    memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
     for (int i = 0; i < n; i++)
-        scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
-    for (int tap = 0; tap < TAPS; tap++) {
-        int row = y + (tap / 3 - 1) * step, column = x0 + (tap % 3 - 1) * step;
+        scale[i] = exponential(centre[i]);
+    for (int tap = 0; tap < TAPS; tap += 3) {
+        int row = y + (tap / 3 - 1) * step;
         if (row < 0 || row >= job->frame.height)
-            memset(weights[tap], 0, sizeof *weights);
-        else if (tap != TAPS / 2) {
-            measure_features(distance, features, row_line(d, row, FEATURE_LINES) + column, d->pitch, n);
-            if (job->pass >= FIRST_GUIDED)
-                add_squares(distance, guide, row_line(d, row, GUIDE_LINE) + column, n);
-            weigh_tap(weights[tap], scale, distance, sharpness, row_line(d, row, line + 2) + column, n);
-        }
+            continue;
+        const float *there = row_line(d, row, FEATURE_LINES) + x0;
+        for (int f = 0; f < FEATURES; f += TOGETHER)
+            add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, TOGETHER, step, n);
+        if (job->pass >= FIRST_GUIDED)
+            add_squares(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, d->pitch, 1, step, n);
+        for (int i = 0; i < 3; i++)
+            if (tap + i != TAPS / 2)
+                weigh_tap(weights[tap + i], scale, sharpness, row_line(d, row, line + 2) + x0 + (i - 1) * step, n);
     }
-    for (int i = 0; i < n; i++)
+    for (int i = 0; i < n; i++) {
+        weights[TAPS / 2][i] = exponential(centre[i]);
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
+    }
 }
 
 static inline float sum_row(float (*restrict weights)[LINE], const float *restrict from, int step, int i)
