@@ -58,7 +58,7 @@ def test_a_level_is_its_formula(step: int, guided: bool) -> None:
 @pytest.mark.parametrize(("height", "width", "step"), [(1, 1, 1), (1, 9, 2), (13, 20, 1), (13, 20, 8), (6, 300, 4)])
 def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: int, guided: bool) -> None:
     inputs = random_inputs(1, height, width)
-    guide = inputs[1][:, :1] - inputs[0][:, :1]  # may depend on what is filtered
+    guide = inputs[1][:, :1] - inputs[0][:, :1]
     differentiable = [tensor.requires_grad_() for tensor in inputs[:5]] + [guide.requires_grad_()] * guided
     arguments = [*inputs, step, guide] if guided else [*inputs, step]
     upstream = torch.randn(2, CHANNELS, height, width, generator=torch.Generator().manual_seed(2))
