@@ -98,7 +98,7 @@ enum {
 #define MIN_MASS 1e-30f
 #define MIN_LENGTH 1e-3f /* samples of a history, to divide by */
 #define OUTLIER 8.f /* times the mean over 9 x 9 pixels: what is brighter is spread */
-#define GUIDANCE_ROOT 5.477226f /* squared, the weight of differences of the guide beside those of features */
+#define GUIDANCE 30.f /* weight of squared differences of the guide beside those of features, for each sample */
 #define DARKEST 0.01f /* exposed luminance: what is darker looks alike to guided levels */
 #define MAX_LOGIT 10.f
 #define MIN_LOGIT -40.f
@@ -1667,15 +1667,15 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Adds the squared distances of `count` features of n pixels, in lines `pitch` apart, from three taps in a row. */
-static inline void add_squares(
+/* Adds the squared distances of TOGETHER features of n pixels, in lines `pitch` apart, from three taps in a row. */
+static void add_squares(
     float (*restrict distances)[LINE], const float *restrict here, const float *restrict there, ptrdiff_t pitch,
-    int count, int step, int n)
+    int step, int n)
 {
     float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
     for (int i = 0; i < n; i++) {
         float a = left[i], b = middle[i], c = right[i];
-        for (int f = 0; f < count; f++) {
+        for (int f = 0; f < TOGETHER; f++) {
             const float *tap = there + f * pitch + i;
             float value = here[f * pitch + i];
             a += (value - tap[-step]) * (value - tap[-step]);
@@ -1685,6 +1685,21 @@ static inline void add_squares(
         left[i] = a;
         middle[i] = b;
         right[i] = c;
+    }
+}
+
+/* The same of the guide: the more samples a pixel has, the less noise there is in it. */
+static void add_guide(
+    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there,
+    const float *restrict samples, int step, int n)
+{
+    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    for (int i = 0; i < n; i++) {
+        float strength = GUIDANCE * samples[i], value = here[i];
+        const float *tap = there + i;
+        left[i] += strength * (value - tap[-step]) * (value - tap[-step]);
+        middle[i] += strength * (value - tap[0]) * (value - tap[0]);
+        right[i] += strength * (value - tap[step]) * (value - tap[step]);
     }
 }
 
@@ -1709,6 +1724,7 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
     int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
     const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
+    const float *samples = row_line(d, y, LENGTH_LINE) + x0;
     memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
     for (int i = 0; i < n; i++)
         scale[i] = exponential(centre[i]);
@@ -1718,9 +1734,9 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
             continue;
         const float *there = row_line(d, row, FEATURE_LINES) + x0;
         for (int f = 0; f < FEATURES; f += TOGETHER)
-            add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, TOGETHER, step, n);
+            add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, step, n);
         if (job->pass >= FIRST_GUIDED)
-            add_squares(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, d->pitch, 1, step, n);
+            add_guide(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, samples, step, n);
         for (int i = 0; i < 3; i++)
             if (tap + i != TAPS / 2)
                 weigh_tap(weights[tap + i], scale, sharpness, row_line(d, row, line + 2) + x0 + (i - 1) * step, n);
@@ -1803,14 +1819,12 @@ static void guide_rows(Job *job, Scratch *scratch, int first, int last)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
             const float *lines[FILTERED];
-            float *restrict guide = row_line(job->d, y, GUIDE_LINE) + x0;
+            float *guide = row_line(job->d, y, GUIDE_LINE) + x0;
             for (int c = 0; c < FILTERED; c++)
                 lines[c] = filtered_line(job->d, job->pass - 1, y, c) + x0;
             for (int i = 0; i < n; i++)
                 bright[i] = luminance(lines[0][i], lines[1][i], lines[2][i]) / maxf(lines[MASS][i], MIN_MASS);
             expose(guide, bright, job->exposure / DARKEST, n);
-            for (int i = 0; i < n; i++)
-                guide[i] *= GUIDANCE_ROOT;
         }
 }
 

@@ -5,7 +5,7 @@ A level filters with 3 x 3 taps q, `step` pixels apart, of each pixel p that sho
     out_p = Σ_q w_pq image_q / Σ_q w_pq
     w_pq = surface_q exp(importance_q - sharpness_p |features_p - features_q|²),  w_pp = exp(own_p)
 
-A guide is one more feature: a plane of its own, since it changes from level to level.
+A guide g of the strength k adds k_p (g_p - g_q)² to the squared distance of features.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,7 +34,7 @@ class Level(NamedTuple):
     sharpness: Rows  # (B, N), as those below
     own: Rows
     importance: Rows
-    guide: Image  # (B, 1, N), or (B, 0, N) for none
+    guide: Image  # (B, 2, N), its values and their strength, or (B, 0, N) for none
 
 
 class TapLayout(NamedTuple):
@@ -79,9 +79,9 @@ def measure(distance: Row, features: Rows, low: Index, high: Index, offset: Inde
 
 
 @jit_in_any_order
-def add_square(distance: Row, here: Row, there: Row) -> None:
+def add_square(distance: Row, here: Row, there: Row, strength: Row) -> None:
     for x in range(distance.size):
-        distance[x] += (here[x] - there[x]) * (here[x] - there[x])
+        distance[x] += strength[x] * (here[x] - there[x]) * (here[x] - there[x])
 
 
 @jit_in_any_order
@@ -109,8 +109,9 @@ def weigh_taps(
         return
     there = slice(low + offset, high + offset)
     measure(distance, level.features[item], low, high, offset)
-    for g in range(level.guide.shape[1]):
-        add_square(distance, level.guide[item, g, low:high], level.guide[item, g, there])
+    guide = level.guide[item]
+    if len(guide):
+        add_square(distance, guide[0, low:high], guide[0, there], guide[1, low:high])
     weigh(weight, distance, level.sharpness[item, low:high], level.importance[item, there], surface[there])
     scale_line(weight, layout.inside[column, low - first : high - first])
 
@@ -184,7 +185,7 @@ def layout_of(surface: Tensor, step: int) -> TapLayout:
 def filter_level(inputs: Sequence[Tensor], surface: Tensor, step: int) -> tuple[Tensor, Tensor]:
     """See models.networks.one.affinity_level; the sums of weights as well, (B, 1, H, W), 0 off surfaces.
 
-    The inputs are image, features, sharpness, own, importance and a guide (B, 1, H, W), or (B, 0, H, W) for none.
+    The inputs are image, features, sharpness, own, importance and a guide (B, 2, H, W), or (B, 0, H, W) for none.
     """
     image = inputs[0]
     out = torch.empty_like(image, memory_format=torch.contiguous_format)
@@ -267,9 +268,10 @@ def pull_block(
         for f in range(level.features.shape[1]):
             features, to_features = level.features[item, f], to.features[item, f]
             pull_feature(to_features[low:high], to_features[there], distance, features[low:high], features[there])
-        for g in range(level.guide.shape[1]):
-            guide, to_guide = level.guide[item, g], to.guide[item, g]
-            pull_feature(to_guide[low:high], to_guide[there], distance, guide[low:high], guide[there])
+        guide, to_guide = level.guide[item], to.guide[item]
+        if len(guide):
+            scale_line(distance, guide[1, low:high])
+            pull_feature(to_guide[0, low:high], to_guide[0, there], distance, guide[0, low:high], guide[0, there])
 
 
 @jit_parallel
@@ -285,7 +287,7 @@ def pull_items(to: Level, level: Level, layout: TapLayout, filtered: Filtered) -
 def pull_level(
     gradient: Tensor, inputs: Sequence[Tensor], surface: Tensor, out: Tensor, total: Tensor, step: int
 ) -> tuple[Tensor, ...]:
-    """The gradients of the `inputs` of filter_level."""
+    """The gradients of the `inputs` of filter_level; those of the guide's strength are left 0."""
     match_threads()
     pulled = [torch.zeros_like(tensor, memory_format=torch.contiguous_format) for tensor in inputs]
     filtered = flat(out), flat(total)[:, 0], flat(gradient)

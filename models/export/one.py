@@ -45,10 +45,13 @@ def affinity_level(
     guide: Tensor | None = None,
 ) -> Tensor:
     """See models.networks.one.affinity_level; `image` is 0 for background."""
-    features = features if guide is None else torch.cat([features, guide], dim=1)
     values = torch.cat([image, surface], dim=1)
     difference = neighbour_taps(features, step) - features
     distance = (difference * difference).sum(dim=1, keepdim=True)
+    if guide is not None:
+        bright, strength = guide.split(1, dim=1)
+        change = neighbour_taps(bright, step) - bright
+        distance = distance + strength * change * change
     taps = neighbour_taps(torch.cat([importance, values], dim=1), step)
     importances, neighbours = taps[:, :1], taps[:, 1:]
     weight = torch.exp((importances - sharpness * distance).clamp(min=MIN_LOGIT))

@@ -1,6 +1,5 @@
 """`one`: our own recurrent denoiser: convex kernels on irradiance, and history by validated reprojection."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, cast
@@ -161,10 +160,12 @@ def plain_level(
     guide: Tensor | None = None,
 ) -> Tensor:
     """See affinity_level: the way that PyTorch takes."""
-    features = features if guide is None else torch.cat([features, guide], dim=1)
     count = features.shape[1]
     taps = taps_3x3(torch.cat([features, importance, surface, image], dim=1), step)
     distance = (taps[:, :count] - features[:, :, None]).square().sum(dim=1)
+    if guide is not None:
+        values, strength = guide.split(1, dim=1)
+        distance = distance + strength * (taps_3x3(values, step)[:, 0] - values).square()
     exponent = (taps[:, count] - sharpness * distance).clamp(min=MIN_LOGIT)
     weight = torch.exp(torch.cat([exponent[:, :4], own, exponent[:, 5:]], dim=1)) * taps[:, count + 1]
     total = (taps[:, count + 2 :] * weight[:, None]).sum(dim=2)
@@ -204,8 +205,8 @@ def affinity_level(
     The weight of tap q for pixel p is exp(importance_q - sharpness_p |f_p - f_q|²), that of p itself exp(own_p): Isik
     et al. 2021, Eq. 4, with two weights more. Only pixels that show a surface count; the others become 0.
     image (B, C, H, W); features (B, F, H, W), F a multiple of 4; sharpness >= 0, own, importance and surface (1 or 0)
-    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows. A guide (B, 1, H, W) is one feature
-    more.
+    (B, 1, H, W). own and importance lie in [-10, 10], so that no sum overflows. A guide (B, 2, H, W), values g
+    and their strength k, adds k_p (g_p - g_q)² to the squared distance; strength gets no gradients.
     """
     maps = features, sharpness, own, importance
     if not compiled.usable(image):
@@ -213,10 +214,13 @@ def affinity_level(
     return cast(Tensor, AffinityLevel.apply(image, *maps, features[:, :0] if guide is None else guide, surface, step))
 
 
-def luminance_guide(light: Tensor, exposure: Tensor) -> Tensor:
-    """The guide (B, 1, H, W) of the last levels: colours, parts of the light and the sum of weights are filtered."""
+def luminance_guide(light: Tensor, length: Tensor, exposure: Tensor) -> Tensor:
+    """The guide (B, 2, H, W) of the last levels, stronger the more samples there are, since these have less noise.
+
+    light (B, ·, H, W): colours, parts of the light and the sum of weights; length (B, 1, H, W) in samples.
+    """
     exposed = image_luminance(exposure * light[:, :3] / light[:, -1:].clamp(min=MIN_DIVISOR))
-    return math.sqrt(GUIDANCE) * torch.log1p((exposed / DARKEST).clamp(max=MAX_EXPOSED))
+    return torch.cat([torch.log1p((exposed / DARKEST).clamp(max=MAX_EXPOSED)), GUIDANCE * length.detach()], dim=1)
 
 
 def carried(
@@ -251,7 +255,7 @@ def carried(
     for each in levels:
         light = filtered(light, *each)
     for each in levels[GUIDED_LEVELS]:
-        light = filtered(light, *each, luminance_guide(light, exposure))
+        light = filtered(light, *each, luminance_guide(light, decoded.length, exposure))
     image = light[:, :-1] / light[:, -1:].clamp(min=MIN_DIVISOR)
     output = torch.lerp(past[:, : image.shape[1]], image, decoded.alpha[:, 1:]) * surface
     return output, decoded.accumulated, decoded.length, decoded.latent

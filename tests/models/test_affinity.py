@@ -26,13 +26,20 @@ def random_inputs(seed: int, height: int, width: int, background: float = 0.2) -
     return [5 * normal(CHANNELS).abs(), normal(FEATURES), 2 * normal(1).abs(), normal(1), normal(1), surface]
 
 
-def by_definition(inputs: list[Tensor], item: int, p: Pixel, step: int) -> Tensor:
+def random_guide(seed: int, height: int, width: int) -> Tensor:
+    """Values and their strength."""
+    return torch.randn(2, 2, height, width, generator=torch.Generator().manual_seed(seed + 3)).abs()
+
+
+def by_definition(inputs: list[Tensor], guide: Tensor | None, item: int, p: Pixel, step: int) -> Tensor:
     """The filtered pixel, tap by tap in float64."""
     image, features, sharpness, own, importance, surface = (tensor[item].double() for tensor in inputs)
     total = torch.zeros(CHANNELS, dtype=torch.float64)
     weights = torch.zeros((), dtype=torch.float64)
     for q in window(surface.shape[1:], p, 1, step):
         distance = (features[:, *p] - features[:, *q]).square().sum()
+        if guide is not None:
+            distance += guide[item, 1, *p] * (guide[item, 0, *p] - guide[item, 0, *q]).square()
         exponent = (importance[0, *q] - sharpness[0, *p] * distance).clamp(min=-40)
         weight = torch.exp(own[0, *p] if q == p else exponent) * surface[0, *q]
         total += weight * image[:, *q]
@@ -43,24 +50,22 @@ def by_definition(inputs: list[Tensor], item: int, p: Pixel, step: int) -> Tenso
 @pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize(("step", "guided"), [(1, False), (3, False), (2, True)])
 def test_a_level_is_its_formula(step: int, guided: bool) -> None:
-    """Where a guide is one feature more."""
     inputs = random_inputs(0, 5, 7)
-    guide = torch.randn(2, 1, 5, 7, generator=torch.Generator().manual_seed(3)) if guided else None
+    guide = random_guide(0, 5, 7) if guided else None
     filtered = affinity_level(*inputs, step, guide)
-    if guide is not None:
-        inputs[1] = torch.cat([inputs[1], guide], dim=1)
     for item, *p in np.ndindex(2, 5, 7):
-        expected = by_definition(inputs, item, tuple(p), step)
+        expected = by_definition(inputs, guide, item, tuple(p), step)
         torch.testing.assert_close(filtered[item, :, *p].double(), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize(("height", "width", "step"), [(1, 1, 1), (1, 9, 2), (13, 20, 1), (13, 20, 8), (6, 300, 4)])
 def test_kernels_have_the_gradients_of_pytorch(height: int, width: int, step: int, guided: bool) -> None:
+    """Also of a guide's values."""
     inputs = random_inputs(1, height, width)
-    guide = inputs[1][:, :1] - inputs[0][:, :1]
-    differentiable = [tensor.requires_grad_() for tensor in inputs[:5]] + [guide.requires_grad_()] * guided
-    arguments = [*inputs, step, guide] if guided else [*inputs, step]
+    values, strength = random_guide(1, height, width).split(1, dim=1)
+    differentiable = [tensor.requires_grad_() for tensor in inputs[:5]] + [values.requires_grad_()] * guided
+    arguments = [*inputs, step, torch.cat([values, strength], dim=1)] if guided else [*inputs, step]
     upstream = torch.randn(2, CHANNELS, height, width, generator=torch.Generator().manual_seed(2))
     filtered = affinity_level(*arguments)
     gradients = torch.autograd.grad(filtered, differentiable, upstream)
