@@ -1964,6 +1964,7 @@ static onespp *create(const onespp_config *config, void *memory, const uint16_t 
     unsigned char *base = memory;
     Arena arena = {base + (ALIGNMENT - (uintptr_t)base % ALIGNMENT) % ALIGNMENT, 0};
     onespp *d = allocate(&arena, 1, sizeof(onespp));
+    memset(d, 0, sizeof *d); /* there is no previous frame, whatever the memory held */
     d->config = *config;
     lay_out(d, &arena);
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
