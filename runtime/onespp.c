@@ -1726,8 +1726,8 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
     const float *samples = row_line(d, y, LENGTH_LINE) + x0;
     memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
-    for (int i = 0; i < n; i++)
-        scale[i] = exponential(centre[i]);
+    for (int i = 0; i < n; i++) /* the pixel's own, to which its distance, 0, is added */
+        scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
     for (int tap = 0; tap < TAPS; tap += 3) {
         int row = y + (tap / 3 - 1) * step;
         if (row < 0 || row >= job->frame.height)
@@ -1741,10 +1741,8 @@ static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *r
             if (tap + i != TAPS / 2)
                 weigh_tap(weights[tap + i], scale, sharpness, row_line(d, row, line + 2) + x0 + (i - 1) * step, n);
     }
-    for (int i = 0; i < n; i++) {
-        weights[TAPS / 2][i] = exponential(centre[i]);
+    for (int i = 0; i < n; i++)
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
-    }
 }
 
 static inline float sum_row(float (*restrict weights)[LINE], const float *restrict from, int step, int i)

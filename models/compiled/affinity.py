@@ -79,7 +79,7 @@ def measure(distance: Row, features: Rows, low: Index, high: Index, offset: Inde
 
 
 @jit_in_any_order
-def add_square(distance: Row, here: Row, there: Row, strength: Row) -> None:
+def add_guide(distance: Row, here: Row, there: Row, strength: Row) -> None:
     for x in range(distance.size):
         distance[x] += strength[x] * (here[x] - there[x]) * (here[x] - there[x])
 
@@ -111,7 +111,7 @@ def weigh_taps(
     measure(distance, level.features[item], low, high, offset)
     guide = level.guide[item]
     if len(guide):
-        add_square(distance, guide[0, low:high], guide[0, there], guide[1, low:high])
+        add_guide(distance, guide[0, low:high], guide[0, there], guide[1, low:high])
     weigh(weight, distance, level.sharpness[item, low:high], level.importance[item, there], surface[there])
     scale_line(weight, layout.inside[column, low - first : high - first])
 
