@@ -8,6 +8,7 @@ import ctypes
 import os
 import re
 import subprocess
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from errors import BadInput
 
 MIN_LLVM = 17
 TESTED_LLVM = 19
+SLOW_BRANCHES = (b"znver3",)  # processors that LLVM spares gathers though these are faster, by its names
 MIN_THREADS = 2  # with one, Mitsuba waits forever for the first EXR that it reads or writes
 
 
@@ -50,6 +52,22 @@ def choose_llvm() -> None:
     os.environ["DRJIT_LIBLLVM_PATH"] = min(usable)[1]
 
 
+def use_gathers(processors: Collection[bytes] = SLOW_BRANCHES) -> bool:
+    """Have kernels gather by instructions where LLVM takes a branch for each lane instead, although that is slower.
+
+    On Zen 3 they then compile in 0.7 of the time, and run in 0.8 of it, with the same results to the bit. Dr.Jit offers
+    it in C++ alone. Returns whether this is one of the `processors`.
+    """
+    core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
+    processor, features = core._Z19jit_llvm_target_cpuv, core._Z24jit_llvm_target_featuresv
+    processor.restype = features.restype = ctypes.c_char_p
+    if processor() not in processors:
+        return False
+    width = core._Z21jit_llvm_vector_widthv()
+    core._Z19jit_llvm_set_targetPKcS0_j(processor(), features() + b",+fast-gather", width)
+    return True
+
+
 def has_cuda() -> bool:
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
@@ -68,6 +86,9 @@ import mitsuba as mi  # noqa: E402
 
 mi.set_variant(VARIANT)
 mi.set_log_level(mi.LogLevel.Error)
+if VARIANT == "llvm_ad_rgb":
+    with suppress(OSError, AttributeError):  # no such library or function elsewhere than on Linux
+        use_gathers()
 dr.set_thread_count(max(MIN_THREADS, dr.thread_count()))
 
 __all__ = ["MIN_THREADS", "VARIANT", "dr", "mi"]

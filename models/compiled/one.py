@@ -26,7 +26,7 @@ LATENT = 6  # channels carried beside images, in [-1, 1]
 FEATURES = 8  # that pixels are compared by
 # px between taps of each filter level: the last ones smooth the first ones' pattern
 TAP_SPACINGS = (32, 16, 8, 4, 2, 1)
-SPREADING_LEVELS = 2  # of these, the first ones, spread outliers before all of them filter
+SPREADING_LEVELS = slice(2)  # of these, those that spread outliers before all of them filter
 GUIDED_LEVELS = slice(1, None, 2)  # of these, those that filter once more, guided by luminance
 GUIDANCE = 30.0  # weight of squared differences of log luminance beside those of features, for each sample
 DARKEST = 0.01  # exposed luminance: what is darker looks alike to guided levels
@@ -56,16 +56,16 @@ INPUT_CHANNELS = {
 }
 
 
-def head_channels(levels: int) -> dict[str, int]:
-    """The outputs of the network in order, and how many channels each has, for a filter of so many levels."""
-    per_level = {"sharpness": levels, "centre": levels, "importance": levels}
-    return {"features": FEATURES, **per_level, "alpha": 2, "latent": LATENT}
-
-
-def filter_levels(outputs: int) -> int:
-    """How many levels of the filter a network of so many outputs sets."""
-    return (outputs - sum(head_channels(0).values())) // 3
-
+# The outputs of the network in order, and how many channels each has.
+LEVELS = len(TAP_SPACINGS)
+HEAD_CHANNELS = {
+    "features": FEATURES,
+    "sharpness": LEVELS,
+    "centre": LEVELS,
+    "importance": LEVELS,
+    "alpha": 2,
+    "latent": LATENT,
+}
 
 # The first channel of each input, in the order of INPUT_CHANNELS: constants, as Numba needs them.
 FIRST_CHANNELS = itertools.accumulate([*INPUT_CHANNELS.values()][:-1], initial=0)
@@ -334,15 +334,14 @@ class DecodedImages(NamedTuple):
 def decode_lines(
     decoded: DecodedImages, lines: Rows, inputs: PixelArrays, samples: Scalar, y: Index, x: Index, n: int
 ) -> None:
-    """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of head_channels."""
-    levels = decoded.sharpness.shape[0]
-    k = FEATURES + 3 * levels
+    """Write n pixels of a row from x on, whose head outputs are lines (C, ·) in the order of HEAD_CHANNELS."""
+    k = FEATURES + 3 * LEVELS
     for c in range(FEATURES):
         copy_line(decoded.features[c, y, x : x + n], lines[c, :n])
-    for c in range(levels):
+    for c in range(LEVELS):
         softplus(decoded.sharpness[c, y, x : x + n], lines[FEATURES + c, :n])
-    for c in range(2 * levels):
-        clamp_logit(decoded.logits[c, y, x : x + n], lines[FEATURES + levels + c, :n])
+    for c in range(2 * LEVELS):
+        clamp_logit(decoded.logits[c, y, x : x + n], lines[FEATURES + LEVELS + c, :n])
     valid = inputs.has_history[0, y, x : x + n]
     length = inputs.history[6, y, x : x + n]
     alpha = decoded.alpha[0, y, x : x + n]
@@ -381,12 +380,11 @@ def decode_head(
     head: Tensor, hidden: Tensor, last: nn.Linear, inputs: "PixelInputs", samples: Tensor
 ) -> tuple[Tensor, ...]:
     batch, _, height, width = head.shape
-    levels = filter_levels(head.shape[1])
-    counts = (FEATURES, levels, 2 * levels, 2, LATENT, 3, 1, 1)
+    counts = (FEATURES, LEVELS, 2 * LEVELS, 2, LATENT, 3, 1, 1)
     out = [torch.empty(batch, channels, height, width) for channels in counts]
     for item in range(batch):
         decoded = DecodedImages(*(each[item].numpy() for each in out))
         pixels = PixelArrays(*(array(image[item]) for image in inputs))
         head_and_hidden = head[item].movedim(0, -1).numpy(), array(hidden[item])
         decode_images(decoded, *head_and_hidden, LinearLayer.of(last), pixels, np.float32(samples[item].item()))
-    return out[0], out[1], *out[2].split(levels, dim=1), *out[3:]
+    return out[0], out[1], *out[2].split(LEVELS, dim=1), *out[3:]

@@ -112,7 +112,6 @@ class OneStep(Step):
 
     def __init__(self, denoiser: One, warp: Warp):
         super().__init__(denoiser, warp)
-        self.steps = tuple(denoiser.steps)
         self.trunk = denoiser.network
         self.trunk.enter = nn.Sequential(on_pixels(self.trunk.enter[0]), *[*self.trunk.enter][1:])
         self.trunk.detail = nn.Sequential(*map(pointwise, self.trunk.detail))
@@ -139,7 +138,7 @@ class OneStep(Step):
         whole = (SIDE_MULTIPLE * ((side + SIDE_MULTIPLE - 1) // SIDE_MULTIPLE) for side in size)
         head = resized(self.trunk(resized(channels, *whole)), *size) + self.trunk.detail(channels)
         decoded = Decoded(*decode(head, inputs, x["samples"]))
-        images = carried(decoded, history, surface, exposure, self.steps, affinity_level)
+        images = carried(decoded, history, surface, exposure, affinity_level)
         return {
             "radiance": images[0] * divisor + x["emission"],
             "new_history": torch.cat(images, dim=1),

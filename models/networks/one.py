@@ -17,6 +17,7 @@ from models.compiled.one import (
     DARKEST,
     GUIDANCE,
     GUIDED_LEVELS,
+    HEAD_CHANNELS,
     INPUT_CHANNELS,
     LATENT,
     MAX_EXPOSED,
@@ -26,8 +27,6 @@ from models.compiled.one import (
     SIDE_MULTIPLE,
     SPREADING_LEVELS,
     TAP_SPACINGS,
-    filter_levels,
-    head_channels,
 )
 from models.denoiser import Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, taps_3x3
@@ -125,8 +124,7 @@ def decode(head: Tensor, inputs: PixelInputs, samples: Tensor) -> tuple[Tensor, 
 
     The prior of the accumulation is the plain mean of all samples: α = σ(a - ln(length / samples)).
     """
-    channels = head_channels(filter_levels(head.shape[1]))
-    features, sharpness, centre, importance, alphas, latent = head.split([*channels.values()], dim=1)
+    features, sharpness, centre, importance, alphas, latent = head.split([*HEAD_CHANNELS.values()], dim=1)
     length = inputs.history[:, 6:7].clamp(min=MIN_LENGTH)
     prior = torch.cat([torch.log(length / samples), torch.zeros_like(length)], dim=1)
     alpha = torch.where(inputs.has_history > 0, torch.sigmoid(alphas - prior), 1)
@@ -228,18 +226,17 @@ def carried(
     past: Tensor,
     surface: Tensor,
     exposure: Tensor,
-    steps: Sequence[int],
     level: Callable[..., Tensor] = affinity_level,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The channels HISTORY after a frame: the new accumulation, filtered level by level, is blended into the `past`.
 
     Outliers pass through the coarsest levels twice, which spreads them wider and cuts nothing off. After all levels
     some filter once more, guided by the luminance that there is by then. A channel of ones takes the same way: it
-    becomes the sum of all weights, by which the result is divided. Weights are those of the
-    whole, so that parts of the light add up to it: their images may follow the accumulation and the past output.
+    becomes the sum of all weights, by which the result is divided. Weights are those of the whole, so that parts of the
+    light add up to it: their images may follow the accumulation and the past output.
     """
     planes = (each.split(1, dim=1) for each in (decoded.sharpness, decoded.centre, decoded.importance))
-    levels = [*zip(*planes, steps, strict=True)]
+    levels = [*zip(*planes, TAP_SPACINGS, strict=True)]
 
     def filtered(
         image: Tensor, sharpness: Tensor, centre: Tensor, importance: Tensor, step: int, *guide: Tensor
@@ -249,7 +246,7 @@ def carried(
     light = torch.cat([decoded.accumulated, surface], dim=1)
     outliers = decoded.outliers * light
     light = light - outliers
-    for each in levels[:SPREADING_LEVELS]:
+    for each in levels[SPREADING_LEVELS]:
         outliers = filtered(outliers, *each)
     light = light + outliers
     for each in levels:
@@ -341,11 +338,9 @@ class One(Denoiser):
     inputs = INPUT_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (40, 56, 64)
 
-    def __init__(self, *, steps: Sequence[int] = TAP_SPACINGS, signal: Signal | None = None):
-        """`steps` are the pixels between the taps of each filter level."""
+    def __init__(self, *, signal: Signal | None = None):
         super().__init__(signal=signal)
-        self.steps = steps
-        self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(head_channels(len(steps)).values()), self.widths)
+        self.network = Trunk(sum(INPUT_CHANNELS.values()), sum(HEAD_CHANNELS.values()), self.widths)
 
     def predict(self, frame: Frame, state: State | None) -> tuple[Tensor, OneState]:
         """Denoised irradiance (B, 3, H, W), and the state for the next frame."""
@@ -354,7 +349,7 @@ class One(Denoiser):
             before = None  # the parts would not add up to the whole
         surface = (frame.depth > 0).to(frame.depth)
         decoded, past, scale = self.decoded(frame, before, surface)
-        output, accumulated, length, latent = carried(decoded, past, surface, scale.exposure() * frame.gain, self.steps)
+        output, accumulated, length, latent = carried(decoded, past, surface, scale.exposure() * frame.gain)
         images = output[:, :3], accumulated[:, :3], length, latent
         parts = output[:, 3:], accumulated[:, 3:]
         return images[0], OneState(frame.moment, *images, GBuffer.of(frame), scale, decoded.alpha.detach(), *parts)
@@ -387,7 +382,7 @@ class One(Denoiser):
             return self.decoded_rows(frame, scale, noisy, history, has_history), history
         # Large images in strips of rows: the network's activations would take most of the memory.
         rows = max(1, STRIP_PIXELS // 2 // width // SIDE_MULTIPLE) * SIDE_MULTIPLE
-        channels = *head_channels(len(self.steps)).values(), 3, 1, 1
+        channels = *HEAD_CHANNELS.values(), 3, 1, 1
         whole = Decoded(*(noisy.new_empty(len(noisy), count, height, width) for count in channels))
         for top in range(0, height, rows):
             first = max(0, top - NETWORK_REACH)

@@ -32,7 +32,7 @@ from eval.bench.synthetic_frames import synthetic_frame
 from eval.harness import compile_kernels
 from eval.selection import cannot_run
 from models import compiled
-from models.compiled.one import INPUT_CHANNELS, TAP_SPACINGS, head_channels
+from models.compiled.one import HEAD_CHANNELS, INPUT_CHANNELS
 from models.networks.one import One
 from models.registry import DENOISERS, create, parse_name
 from models.spec import DenoiserSpec, fastest_precision
@@ -232,7 +232,7 @@ def test_transposed_convolutions_count_their_inputs():
     """By hand for `one`: each layer's weights, at the resolution at which they are applied."""
     a, b, c = One.widths
     inputs = sum(INPUT_CHANNELS.values())
-    outputs = sum(head_channels(len(TAP_SPACINGS)).values())
+    outputs = sum(HEAD_CHANNELS.values())
     half = 4 * inputs * a + (1 + 9) * a * a + 4 * a * outputs
     quarter = 4 * a * b + 2 * 9 * b * b + 4 * b * a
     eighth = 4 * b * c + 2 * 9 * c * c + 4 * c * b

@@ -21,9 +21,9 @@ SIZE = (24, 40)
 BYTES_AT_720P = 150e6
 
 
-def silent(**changes: object) -> One:
+def silent() -> One:
     """A network that says nothing: all its outputs are 0."""
-    denoiser = One(**changes)
+    denoiser = One()
     for parameter in denoiser.parameters():
         parameter.data.zero_()
     denoiser.prepare()
@@ -128,36 +128,41 @@ def square(side: int) -> Tensor:
     return image
 
 
-def guided_level(grey: Tensor, mass: Tensor, exposure: Tensor) -> Tensor:
-    """3 x 3 taps, where the network says nothing: softplus(0) = ln 2 times 30 squared differences of log luminance."""
-    guide = torch.log1p(100 * exposure * grey / mass)
-    taps = F.unfold(torch.cat([guide, torch.ones_like(grey), grey, mass], dim=1), 3, padding=1).view(4, 9, *SIZE)
-    weights = 2.0 ** (-30 * (taps[0] - guide[0]).square()) * taps[1]
-    light, sums = (taps[2:] * weights).sum(dim=1)
-    return light / sums
+def level(image: Tensor, step: int, guide: Tensor | None = None, strength: float = 0.0) -> Tensor:
+    """Where the network says nothing, taps have even weights but for their guide, with a sharpness of softplus(0)."""
+    values = torch.zeros_like(image[:, :1]) if guide is None else guide
+    taps = F.unfold(torch.cat([values, torch.ones_like(values), image], dim=1), 3, step, step).view(-1, 9, *SIZE)
+    weights = 2.0 ** (-strength * (taps[0] - values[0]).square()) * taps[1]
+    return ((taps[2:] * weights).sum(dim=1) / weights.sum(dim=0))[None]
 
 
-def test_levels_of_the_filter_can_be_chosen():
-    """Without a word from the network each level is an even mean of nine, and levels follow one another.
-
-    Every other level filters once more.
-    """
-    outputs, state = play(silent(steps=(3, 1)), frames([11 + 81 * square(1)]))  # no pixel is an outlier
-    light = 11 + square(9)[:, :1]
-    expected = guided_level(light, torch.ones_like(light), state.scale.exposure())
-    torch.testing.assert_close(outputs[0], expected.expand(1, 3, -1, -1))
-    assert (expected - light).abs().max() < 0.53  # 5 / 9 without the guide
+def filtered(light: Tensor, exposure: Tensor) -> Tensor:
+    """Light (1, 2, H, W), grey and its weight, by all levels, and those that log luminance guides."""
+    for step in (32, 16, 8, 4, 2, 1):
+        light = level(light, step)
+    for step in (16, 4, 1):
+        light = level(light, step, torch.log1p(100 * exposure * light[:, :1] / light[:, 1:]), 30)
+    return light[:, :1] / light[:, 1:]
 
 
 @pytest.mark.usefixtures("implementation")
-def test_outliers_are_filtered_twice():
-    """What is beyond eight times the mean of 9 x 9 pixels, with its weight; levels as above."""
-    outputs, state = play(silent(steps=(3, 1)), frames([1 + 162 * square(1)]))
-    once = square(9)[:, :1]
-    twice = F.conv2d(once, torch.ones(1, 1, 9, 9), padding=4) / 81
-    share = 139 / 163
-    light, mass = 1 + (23 * once + 139 * twice) / 81, 1 + share * (twice - once) / 81
-    expected = guided_level(light, mass, state.scale.exposure())
+def test_levels_follow_one_another_and_luminance_guides_the_last():
+    image = 11 + 81 * square(5)  # no pixel is an outlier
+    outputs, state = play(silent(), frames([image]))
+    light = torch.cat([image[:, :1], torch.ones(1, 1, *SIZE)], dim=1)
+    expected = filtered(light, state.scale.exposure())
+    torch.testing.assert_close(outputs[0], expected.expand(1, 3, -1, -1))
+
+
+@pytest.mark.usefixtures("implementation")
+def test_outliers_are_spread():
+    """What is beyond eight times the mean of 9 x 9 pixels passes through two levels more, with its weight."""
+    outputs, state = play(silent(), frames([1 + 162 * square(1)]))
+    centre = square(1)[:, :1]
+    share = 139 / 163 * centre
+    light = torch.cat([1 + 162 * centre, torch.ones_like(centre)], dim=1)
+    outliers = level(level(share * light, 32), 16)
+    expected = filtered((1 - share) * light + outliers, state.scale.exposure())
     torch.testing.assert_close(outputs[0], expected.expand(1, 3, -1, -1))
 
 

@@ -15,6 +15,15 @@ from render.backend import mi
 print(mi.Bitmap(sys.argv[1]).size())
 """
 
+GATHER = """
+from render.backend import SLOW_BRANCHES, dr, mi, use_gathers
+assert use_gathers([b"athlon-xp"]) is False
+use_gathers(SLOW_BRANCHES)
+index = dr.arange(mi.UInt32, 1000) * 7 % 1000
+values = dr.gather(mi.Float, dr.arange(mi.Float, 1000), index, active=index % 3 != 0)
+print(sum(values))
+"""
+
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound to a core here")
 def test_one_core_is_enough_to_read_exr(tmp_path):
@@ -24,3 +33,10 @@ def test_one_core_is_enough_to_read_exr(tmp_path):
         file.write(str(path))
     command = [sys.executable, "-c", READ_ON_ONE_CORE, str(path)]
     assert subprocess.run(command, capture_output=True, text=True, timeout=60).stdout == "[128, 64]\n"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only there the functions have these names")
+def test_gathers_on_processors_that_llvm_spares_them():
+    """Dr.Jit's functions have the names under which they are called, and kernels gather what they should."""
+    found = subprocess.run([sys.executable, "-c", GATHER], capture_output=True, text=True, timeout=120)
+    assert float(found.stdout) == sum(index for index in range(1000) if index % 3), found.stderr
