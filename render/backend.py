@@ -16,7 +16,7 @@ from errors import BadInput
 
 MIN_LLVM = 17
 TESTED_LLVM = 19
-SLOW_BRANCHES = (b"znver3",)  # processors that LLVM spares gathers though these are faster, by its names
+SLOW_BRANCHES = (b"znver3",)  # processors, as LLVM names them, on which it avoids gathers although they are faster
 MIN_THREADS = 2  # with one, Mitsuba waits forever for the first EXR that it reads or writes
 
 
@@ -53,10 +53,10 @@ def choose_llvm() -> None:
 
 
 def use_gathers(processors: Collection[bytes] = SLOW_BRANCHES) -> bool:
-    """Have kernels gather by instructions where LLVM takes a branch for each lane instead, although that is slower.
+    """Have kernels use gather instructions on `processors` for which LLVM replaces them by slower branches per lane.
 
-    On Zen 3 they then compile in 0.7 of the time, and run in 0.8 of it, with the same results to the bit. Dr.Jit offers
-    it in C++ alone. Returns whether this is one of the `processors`.
+    Results stay the same to the bit (docs/experiments.md, Gathers). Dr.Jit offers this in C++ alone. Returns whether
+    this is one of the processors.
     """
     core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
     processor, features = core._Z19jit_llvm_target_cpuv, core._Z24jit_llvm_target_featuresv

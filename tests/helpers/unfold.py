@@ -9,10 +9,11 @@ from torch.nn import functional as F
 from models.compiled.fusion import WINDOWS
 
 
-def taps(image: Tensor, window: int) -> Tensor:
-    """The windows of an image (B, C, H, W), of so many pixels a side, as (B, C, k k, H, W); 0 outside."""
+def taps(image: Tensor, window: int, step: int = 1) -> Tensor:
+    """The windows of an image (B, C, H, W), k taps a side, `step` pixels apart, as (B, C, k k, H, W); 0 outside."""
     batch, channels, height, width = image.shape
-    return F.unfold(image, window, padding=window // 2).view(batch, channels, -1, height, width)
+    unfolded = F.unfold(image, window, dilation=step, padding=window // 2 * step)
+    return unfolded.view(batch, channels, -1, height, width)
 
 
 def unfold_kernels(image: Tensor, logits: Tensor, surface: Tensor | None = None) -> Tensor:

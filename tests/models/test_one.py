@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from datasets.frame import BOUNDED, Frame, read_frame
 from eval.bench.synthetic_frames import synthetic_frame
@@ -16,6 +15,7 @@ from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
 from models.networks.one import One
 from tests.helpers.frames import chain, flat_frame, play, prepared, run
+from tests.helpers.unfold import taps
 
 SIZE = (24, 40)
 BYTES_AT_720P = 150e6
@@ -131,9 +131,9 @@ def square(side: int) -> Tensor:
 def level(image: Tensor, step: int, guide: Tensor | None = None, strength: float = 0.0) -> Tensor:
     """Where the network says nothing, taps have even weights but for their guide, with a sharpness of softplus(0)."""
     values = torch.zeros_like(image[:, :1]) if guide is None else guide
-    taps = F.unfold(torch.cat([values, torch.ones_like(values), image], dim=1), 3, step, step).view(-1, 9, *SIZE)
-    weights = 2.0 ** (-strength * (taps[0] - values[0]).square()) * taps[1]
-    return ((taps[2:] * weights).sum(dim=1) / weights.sum(dim=0))[None]
+    there = taps(torch.cat([values, torch.ones_like(values), image], dim=1), 3, step)
+    weights = 2.0 ** (-strength * (there[:, :1] - values[:, :, None]).square()) * there[:, 1:2]
+    return (there[:, 2:] * weights).sum(dim=2) / weights.sum(dim=2)
 
 
 def filtered(light: Tensor, exposure: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def test_one_core_is_enough_to_read_exr(tmp_path):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only there the functions have these names")
-def test_gathers_on_processors_that_llvm_spares_them():
+def test_gathers_where_llvm_avoids_them():
     """Dr.Jit's functions have the names under which they are called, and kernels gather what they should."""
     found = subprocess.run([sys.executable, "-c", GATHER], capture_output=True, text=True, timeout=120)
     assert float(found.stdout) == sum(index for index in range(1000) if index % 3), found.stderr
