@@ -27,7 +27,7 @@ from provenance import ROOT, device_in_words
 
 MEASURED = ROOT / "docs" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-RUNTIME_PAGE = ROOT / "runtime" / "README.md"
+FURTHER_PAGES = (ROOT / "runtime" / "README.md", ROOT / "models" / "shipped" / "one.md")
 MARKED = re.compile(r"<!-- measured: (.+?) -->.*?<!-- end -->", re.DOTALL)
 GLASS_FRAME = 4  # the frame from which on clips of glass are compared: history has grown
 STEADY_FRAME = 15  # that of the benchmark: history no longer grows
@@ -442,7 +442,7 @@ def generated(page: str) -> str:
 def main(arguments: list[str]) -> None:
     for runs in arguments:
         collect(Path(runs))
-    for page in (*PAGES, RUNTIME_PAGE):
+    for page in (*PAGES, *FURTHER_PAGES):
         text = page.read_text()
         if (new := generated(text)) != text:
             write_file(page, new.encode())

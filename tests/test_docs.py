@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from command_line import GROUPS
-from eval.pages import MARKED, PAGES, RUNTIME_PAGE, generated
+from eval.pages import FURTHER_PAGES, MARKED, PAGES, generated
 from provenance import ROOT
 from tests.test_cli import commands
 
@@ -16,7 +16,7 @@ FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 MEASURED_PAGES = [page for page in PAGES if page.name in ("README.md", "results.md", "evaluation.md", "denoisers.md")]
 
 
-@pytest.mark.parametrize("page", [*PAGES, RUNTIME_PAGE], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", [*PAGES, *FURTHER_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_generated_parts_agree_with_their_sources(page):
     assert generated(page.read_text()) == page.read_text(), "run `python -m eval.pages`"
 
