@@ -57,8 +57,6 @@ enum {
     FIRST_GUIDED = SPREADING + LEVELS, /* pass: every other level filters once more, guided by luminance */
     PASSES = FIRST_GUIDED + LEVELS / 2,
     DETAIL = 24,  /* hidden channels of the per-pixel layers */
-    TAPS = 9,     /* 3 x 3, of a level of the filter and of convolutions, row by row */
-    MIDDLE = TAPS / 2, /* the pixel's own tap */
     PATCH = 4,    /* pixels, 2 x 2 */
     WIDTH_A = 40, /* channels at 1/2 of the resolution */
     WIDTH_B = 56, /* 1/4 */
@@ -213,7 +211,7 @@ static const int LAYER_SIZES[LAYERS][2] = { /* outputs, inputs */
 /* clang-format on */
 
 /* A convolution of 3 x 3 gets two rows from four products of sums of rows, see convolve. */
-enum { PRODUCTS = 4, COLUMNS = 3 };
+enum { PRODUCTS = 4, COLUMNS = 3, TAPS = 9 };
 
 static int is_convolution(int name)
 {
@@ -356,7 +354,6 @@ struct onespp {
     Window sum_a;                 /* of `a` and what comes from 1/4 */
     Window hidden;                /* of the per-pixel layers */
     float *zeros, *ones;          /* lines */
-    float *distances;             /* lines of each task, see distance_line */
     Motion *motions;
     double *blocks; /* mean luminance of each, -1 without surfaces */
     float *depths;
@@ -425,9 +422,6 @@ static void lay_out_layers(onespp *d, Arena *arena)
     d->parameters = allocate(arena, count, sizeof(float));
 }
 
-/* How many floats all tasks' distances are. */
-static uint64_t distances_of(const onespp *d) { return (uint64_t)(d->config.tasks * 2 * MIDDLE * d->pitch); }
-
 /* Where everything is in memory. */
 static void lay_out(onespp *d, Arena *arena)
 {
@@ -446,7 +440,6 @@ static void lay_out(onespp *d, Arena *arena)
     d->blocks = allocate(arena, blocks, sizeof(double));
     d->depths = allocate(arena, MAX_DEPTHS, sizeof(float));
     d->scratch = allocate(arena, (uint64_t)d->config.tasks, sizeof(Scratch));
-    d->distances = allocate(arena, distances_of(d), sizeof(float));
     lay_out_layers(d, arena);
     lay_out_strip(d, arena);
 }
@@ -1674,72 +1667,50 @@ static float *filtered_line(const onespp *d, int pass, int y, int channel)
 
 static int filtered_channels(const Job *job) { return FILTERED + RGB * job->frame.parts; }
 
-/* Of a row's pixels, the squared distances of their features from those of a tap behind MIDDLE. From the tap they are the
- * same, so the row below finds them here: every other row uses the same lines. */
-static float *distance_line(const Job *job, const Scratch *scratch, int y, int tap)
+/* Adds the squared distances of TOGETHER features of n pixels, in lines `pitch` apart, from three taps in a row. */
+static void add_squares(
+    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there, ptrdiff_t pitch,
+    int step, int n)
 {
-    const onespp *d = job->d;
-    int slot = y / TAP_SPACINGS[level_of(job->pass)] % 2 * MIDDLE + tap - MIDDLE - 1;
-    return d->distances + ((scratch - d->scratch) * 2 * MIDDLE + slot) * d->pitch + MARGIN;
-}
-
-/* Squared distances of n pixels' features from those of a tap, in lines `pitch` apart. */
-static void sum_squares(
-    float *restrict distances, const float *restrict here, const float *restrict there, ptrdiff_t pitch, int n)
-{
-    for (int i = 0; i < n; i++)
-        distances[i] = 0;
-    for (int f = 0; f < FEATURES; f += TOGETHER, here += TOGETHER * pitch, there += TOGETHER * pitch)
-        for (int i = 0; i < n; i++) {
-            float sum = distances[i];
-            for (int k = 0; k < TOGETHER; k++) {
-                float difference = here[k * pitch + i] - there[k * pitch + i];
-                sum += difference * difference;
-            }
-            distances[i] = sum;
+    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    for (int i = 0; i < n; i++) {
+        float a = left[i], b = middle[i], c = right[i];
+        for (int f = 0; f < TOGETHER; f++) {
+            const float *tap = there + f * pitch + i;
+            float value = here[f * pitch + i];
+            a += (value - tap[-step]) * (value - tap[-step]);
+            b += (value - tap[0]) * (value - tap[0]);
+            c += (value - tap[step]) * (value - tap[step]);
         }
-}
-
-/* Distances of n pixels of a row from the taps `first` to TAPS - 1. */
-static void measure_taps(const Job *job, const Scratch *scratch, int first, int y, int x0, int n)
-{
-    const onespp *d = job->d;
-    int step = TAP_SPACINGS[level_of(job->pass)];
-    const float *here = row_line(d, y, FEATURE_LINES) + x0;
-    for (int tap = first; tap < TAPS; tap++) {
-        int row = y + (tap / 3 - 1) * step, shift = (tap % 3 - 1) * step;
-        if (row >= job->frame.height)
-            continue;
-        const float *there = row_line(d, row, FEATURE_LINES) + x0 + shift;
-        sum_squares(distance_line(job, scratch, y, tap) + x0, here, there, d->pitch, n);
+        left[i] = a;
+        middle[i] = b;
+        right[i] = c;
     }
 }
 
-/* Distances of the row above from row y, before the first of the rows that follow each other. */
-static void measure_above(const Job *job, const Scratch *scratch, int y)
-{
-    int above = y - TAP_SPACINGS[level_of(job->pass)];
-    for (int x0 = 0; above >= 0 && x0 < job->frame.width; x0 += CHUNK)
-        measure_taps(job, scratch, MIDDLE + 2, above, x0, mini(CHUNK, job->frame.width - x0));
-}
-
-/* Distances, and those of the guide: the more samples a pixel has, the less noise there is in it. */
+/* The same of the guide: the more samples a pixel has, the less noise there is in it. */
 static void add_guide(
-    float *restrict sums, const float *restrict distances, const float *restrict here, const float *restrict there,
-    const float *restrict samples, int n)
+    float (*restrict distances)[LINE], const float *restrict here, const float *restrict there,
+    const float *restrict samples, int step, int n)
 {
-    for (int i = 0; i < n; i++)
-        sums[i] = distances[i] + GUIDANCE * samples[i] * (here[i] - there[i]) * (here[i] - there[i]);
+    float *restrict left = distances[0], *restrict middle = distances[1], *restrict right = distances[2];
+    for (int i = 0; i < n; i++) {
+        float strength = GUIDANCE * samples[i], value = here[i];
+        const float *tap = there + i;
+        left[i] += strength * (value - tap[-step]) * (value - tap[-step]);
+        middle[i] += strength * (value - tap[0]) * (value - tap[0]);
+        right[i] += strength * (value - tap[step]) * (value - tap[step]);
+    }
 }
 
-/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance). They are added
- * to `total`. */
+/* Weights of a tap of n pixels: exp(importance of the tap - sharpness of the pixel times their distance, which is what
+ * `weight` is at first). They are added to `total`. */
 static void weigh_tap(
-    float *restrict weight, float *restrict total, const float *restrict distances, const float *restrict sharpness,
-    const float *restrict importance, int n)
+    float *restrict weight, float *restrict total, const float *restrict sharpness, const float *restrict importance,
+    int n)
 {
     for (int i = 0; i < n; i++) {
-        float exponent = maxf(importance[i] - sharpness[i] * distances[i], MIN_LOGIT);
+        float exponent = maxf(importance[i] - sharpness[i] * weight[i], MIN_LOGIT);
         weight[i] = importance[i] > NO_WEIGHT ? exponential(exponent) : 0;
         total[i] += weight[i];
     }
@@ -1747,31 +1718,28 @@ static void weigh_tap(
 
 /* Weights of 3 x 3 taps of n pixels: Isik et al. 2021, Eq. 4, with two weights more, of which `centre` is the pixel's own.
  * `scale` becomes 1 / their sum, or 0 off surfaces. */
-static void weigh_taps(
-    const Job *job, const Scratch *scratch, float (*restrict weights)[LINE], float *restrict scale, int y, int x0, int n)
+static void weigh_taps(const Job *job, float (*restrict weights)[LINE], float *restrict scale, int y, int x0, int n)
 {
     const onespp *d = job->d;
     int level = level_of(job->pass), step = TAP_SPACINGS[level], line = LEVEL_LINES + 3 * level;
-    const float *guide = row_line(d, y, GUIDE_LINE) + x0, *samples = row_line(d, y, LENGTH_LINE) + x0;
+    const float *features = row_line(d, y, FEATURE_LINES) + x0, *guide = row_line(d, y, GUIDE_LINE) + x0;
     const float *sharpness = row_line(d, y, line) + x0, *centre = sharpness + d->pitch, *importance = centre + d->pitch;
-    float guided[LINE];
-    for (int i = 0; i < n; i++)
-        scale[i] = weights[MIDDLE][i] = exponential(centre[i]);
-    for (int tap = 0; tap < TAPS; tap++) {
-        int row = y + (tap / 3 - 1) * step, shift = (tap % 3 - 1) * step;
-        if (tap == MIDDLE)
+    const float *samples = row_line(d, y, LENGTH_LINE) + x0;
+    memset(weights, 0, sizeof *weights * TAPS); /* of rows outside the image, for good */
+    for (int i = 0; i < n; i++) /* the pixel's own, to which its distance, 0, is added */
+        scale[i] = weights[TAPS / 2][i] = exponential(centre[i]);
+    for (int tap = 0; tap < TAPS; tap += 3) {
+        int row = y + (tap / 3 - 1) * step;
+        if (row < 0 || row >= job->frame.height)
             continue;
-        if (row < 0 || row >= job->frame.height) {
-            memset(weights[tap], 0, sizeof *weights);
-            continue;
-        }
-        const float *distances = tap > MIDDLE ? distance_line(job, scratch, y, tap) + x0
-                                              : distance_line(job, scratch, row, TAPS - 1 - tap) + x0 + shift;
-        if (job->pass >= FIRST_GUIDED) {
-            add_guide(guided, distances, guide, row_line(d, row, GUIDE_LINE) + x0 + shift, samples, n);
-            distances = guided;
-        }
-        weigh_tap(weights[tap], scale, distances, sharpness, row_line(d, row, line + 2) + x0 + shift, n);
+        const float *there = row_line(d, row, FEATURE_LINES) + x0;
+        for (int f = 0; f < FEATURES; f += TOGETHER)
+            add_squares(weights + tap, features + f * d->pitch, there + f * d->pitch, d->pitch, step, n);
+        if (job->pass >= FIRST_GUIDED)
+            add_guide(weights + tap, guide, row_line(d, row, GUIDE_LINE) + x0, samples, step, n);
+        for (int i = 0; i < 3; i++)
+            if (tap + i != TAPS / 2)
+                weigh_tap(weights[tap + i], scale, sharpness, row_line(d, row, line + 2) + x0 + (i - 1) * step, n);
     }
     for (int i = 0; i < n; i++)
         scale[i] = importance[i] > NO_WEIGHT ? 1 / scale[i] : 0;
@@ -1795,12 +1763,11 @@ static void sum_weighted(
 }
 
 /* A pass of the filter at n pixels of a row: `to` has a line for each channel. */
-static void filter_chunk(const Job *job, const Scratch *scratch, float *const *to, int y, int x0, int n)
+static void filter_chunk(const Job *job, float *const *to, int y, int x0, int n)
 {
     int step = TAP_SPACINGS[level_of(job->pass)];
     float weights[TAPS][LINE], scale[LINE];
-    measure_taps(job, scratch, MIDDLE + 1, y, x0, n);
-    weigh_taps(job, scratch, weights, scale, y, x0, n);
+    weigh_taps(job, weights, scale, y, x0, n);
     for (int c = 0; c < filtered_channels(job); c++) {
         const float *rows[3];
         for (int i = 0; i < 3; i++) { /* rows outside the image have no weight */
@@ -1861,17 +1828,16 @@ static void guide_rows(Job *job, Scratch *scratch, int first, int last)
 
 static void filter_rows(Job *job, Scratch *scratch, int first, int last)
 {
+    (void)scratch;
     float *to[MAX_FILTERED];
     int step = TAP_SPACINGS[level_of(job->pass)];
-    for (int start = first; start < mini(first + step, last); start++) {
-        measure_above(job, scratch, start);
+    for (int start = first; start < mini(first + step, last); start++)
         for (int y = start; y < last; y += step) /* two of the three rows that it needs are in the cache */
             for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
                 for (int c = 0; c < filtered_channels(job); c++)
                     to[c] = filtered_line(job->d, job->pass, y, c) + x0;
-                filter_chunk(job, scratch, to, y, x0, mini(CHUNK, job->frame.width - x0));
+                filter_chunk(job, to, y, x0, mini(CHUNK, job->frame.width - x0));
             }
-    }
 }
 
 /* --- The end of a frame ------------------------------------------------------------------------------------------- */
@@ -1933,17 +1899,17 @@ static void finish_part(const Job *job, int part, int channel, const float *rest
 /* The last level: its output, divided by the mass, is blended into that of the previous frame. */
 static void finish_rows(Job *job, Scratch *scratch, int first, int last)
 {
+    (void)scratch;
     const onespp *d = job->d;
     float filtered[MAX_FILTERED][LINE], *to[MAX_FILTERED], scale[LINE];
     for (int c = 0; c < MAX_FILTERED; c++)
         to[c] = filtered[c];
-    measure_above(job, scratch, first);
     for (int y = first; y < last; y++)
         for (int x0 = 0; x0 < job->frame.width; x0 += CHUNK) {
             int n = mini(CHUNK, job->frame.width - x0);
             const float *restrict alpha = row_line(d, y, ALPHA_LINE) + x0;
             const float *restrict importance = row_line(d, y, LEVEL_LINES + 3 * LEVELS - 1) + x0;
-            filter_chunk(job, scratch, to, y, x0, n);
+            filter_chunk(job, to, y, x0, n);
             for (int i = 0; i < n; i++)
                 scale[i] = 1 / maxf(filtered[MASS][i], MIN_MASS);
             for (int c = 0; c < filtered_channels(job); c++)
@@ -2000,7 +1966,6 @@ static onespp *create(const onespp_config *config, void *memory, const uint16_t 
     d->config = *config;
     lay_out(d, &arena);
     memset(d->zeros, 0, sizeof(float) * (size_t)d->a.pitch);
-    memset(d->distances, 0, sizeof(float) * (size_t)distances_of(d)); /* margins are read, too */
     for (ptrdiff_t i = 0; i < d->pitch; i++)
         d->ones[i] = 1;
     float *to = d->parameters;
