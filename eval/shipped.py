@@ -37,7 +37,7 @@ def table() -> str:
             line["trained on"] = f"{len(recipe['trainings'])} trainings' mean, see its card"
         else:
             line["trained on"] = f"{Path(recipe['data']['profile']).name}, {len(recipe['data']['scenes'])} scenes"
-            line |= {key: recipe[key] for key in ("budget", "step")}
+            line |= {"budget": recipe.get("budget", "a script"), "step": recipe["step"]}
             line["validation loss"] = f"{recipe['validation']:.4g}"
         lines.append(line | {"SHA-256": file_digest(path)[:12], "licence": WEIGHTS_LICENCE})
     return tabulate(lines, "keys", disable_numparse=True)
@@ -125,12 +125,14 @@ def facts(name: str) -> str:
 
 
 def training(name: str, recipe: dict[str, Any]) -> str:
-    """The lines of a card on the only training."""
-    command = f"onespp train {name} --budget {recipe['budget']} --seed {recipe['seed']}"
+    """The lines of a card on the only training, which has no budget where a script took the place of `onespp train`."""
+    command = "a script that is not kept, train/campaign/README.md"
+    if "budget" in recipe:
+        command = f"`onespp train {name} --budget {recipe['budget']} --seed {recipe['seed']}`"
     start = f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else ""
     rest = {key: value for key, value in recipe.items() if key not in LISTED_APART}
     return f"""\
-- Trained by `{command}`
+- Trained by {command}
   on {dataset(recipe["data"])}{start}.
   Weights of step {recipe["step"]}, which had the lowest validation loss: {recipe["validation"]:.4g}.
 - Recipe: `{json.dumps(rest)}`."""

@@ -52,6 +52,16 @@ def test_the_table_has_a_line_for_each(wskp3, capsys):
     assert file_digest(wskp3)[:12] in lines[0] and "my.toml, 2 scenes" in lines[0] and "0.1235" in lines[0]
 
 
+def test_weights_that_a_script_trained_say_so(wskp3, tiny, tmp_path):
+    recipe = {key: value for key, value in RECIPE.items() if key != "profile"}
+    save_weights(create("wskp3"), "wskp3", recipe, wskp3, MADE_BY)
+    evaluate([tiny], tmp_path, "tiny", ["noisy", "wskp3"])
+    wskp3.with_suffix(".md").write_text(HAND)
+    text = measure_card("wskp3", tmp_path).read_text()
+    assert "- Trained by a script that is not kept" in text and "onespp train" not in text
+    assert "a script" in table()
+
+
 def test_no_card_without_shipped_weights(shipped, capsys):
     assert "no weights of 'rae' are shipped; those are none" in fails(capsys, "weights", "rae")
     assert table() == ""
