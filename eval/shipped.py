@@ -125,8 +125,8 @@ def facts(name: str) -> str:
 
 
 def training(name: str, recipe: dict[str, Any]) -> str:
-    """The lines of a card on the only training, which has no budget where a script took the place of `onespp train`."""
-    command = "a script that is not kept, train/campaign/README.md"
+    """The lines of a card on the only training, which has no budget where a script did it."""
+    command = "a script that is not kept ([campaign](../../train/campaign/README.md))"
     if "budget" in recipe:
         command = f"`onespp train {name} --budget {recipe['budget']} --seed {recipe['seed']}`"
     start = f", starting from weights of SHA-256 `{recipe['from']}`" if "from" in recipe else ""
