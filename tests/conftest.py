@@ -74,7 +74,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
     return folder
 
 
-@pytest.fixture(scope="session", params=["cornell_box", "cornell_box_moving"])
+@pytest.fixture(scope="session", params=[pytest.param("cornell_box", marks=pytest.mark.slow), "cornell_box_moving"])
 def stage(request: pytest.FixtureRequest) -> Stage:
     """A built-in scene at 64 x 64, which tests pose."""
     return Stage(build_scene(request.param, seed=3, frames=24), 64, 64)

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from eval.bench.synthetic_frames import synthetic_frame
 from provenance import ROOT
 from tests.helpers import foreign
@@ -34,6 +36,7 @@ def test_denoising_and_the_library(tmp_path):
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".exr", ".json"}
 
 
+@pytest.mark.slow
 def test_training_and_evaluation(tiny: Path, tmp_path: Path):
     words = ("wskp6", str(tiny), str(tmp_path), repr({"epochs": 1, "crops": (1, 1)}))
     judging = ["eval", "noisy", "--data", str(tiny), "--runs", str(tmp_path)]

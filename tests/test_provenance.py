@@ -40,7 +40,7 @@ def test_a_digest_changes_with_its_imports_only(project, changed, same):
     assert (code_digest("models.a") == before) == same
 
 
-@pytest.mark.parametrize("module", ["eval.clip_run", "models.filters.svgf"])
+@pytest.mark.parametrize("module", ["eval.clip_run", pytest.param("models.filters.svgf", marks=pytest.mark.slow)])
 def test_all_modules_that_python_loads_are_sources(module):
     code = f"import sys, {module}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout

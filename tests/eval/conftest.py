@@ -10,6 +10,7 @@ from PIL import Image
 
 from eval.harness import evaluate
 from eval.report.page import report
+from tests.helpers.shared import made_once
 from tests.helpers.training import folder_of, fresh_weights
 from train.task import WEIGHTS_FILE
 
@@ -37,14 +38,16 @@ def bench_of(runs: Path, times: dict[str, float], size: tuple[int, int], threads
 
 
 @pytest.fixture(scope="session")
-def evaluated(tiny, tmp_path_factory) -> Path:
+def evaluated(tiny, shared) -> Path:
     """Results on the tiny data set, what was printed of them, the bench's times, a figure, and the report of all."""
-    runs = tmp_path_factory.mktemp("evaluated")
-    untrained(runs, "ntd")
-    with (runs / "table.txt").open("w") as printed, contextlib.redirect_stdout(printed):
-        evaluate([tiny], runs, "tiny", list(TIMES))
-    bench_of(runs, TIMES | INDIRECT, (720, 1280))
-    (runs / "report" / "figures").mkdir(parents=True)
-    Image.new("RGB", (20, 10), "red").save(runs / "report" / "figures" / "trade-flip.png")
-    report(runs)
-    return runs
+
+    def make(runs: Path) -> None:
+        untrained(runs, "ntd")
+        with (runs / "table.txt").open("w") as printed, contextlib.redirect_stdout(printed):
+            evaluate([tiny], runs, "tiny", list(TIMES))
+        bench_of(runs, TIMES | INDIRECT, (720, 1280))
+        (runs / "report" / "figures").mkdir(parents=True)
+        Image.new("RGB", (20, 10), "red").save(runs / "report" / "figures" / "trade-flip.png")
+        report(runs)
+
+    return made_once(shared / "evaluated", make)

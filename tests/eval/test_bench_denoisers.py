@@ -66,6 +66,7 @@ def test_results_have_the_agreed_form(tmp_path):
         assert row["frames"] == 2
 
 
+@pytest.mark.slow
 def test_the_head_of_results_is_of_the_most_threads(tmp_path, capsys):
     sizes_and_threads = ["--size", "8x4", "16x8", "--threads", "2", "1"]
     main(["bench", "denoisers", "noisy", "ntd", *sizes_and_threads, "--runs", str(tmp_path)])

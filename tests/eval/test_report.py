@@ -70,6 +70,12 @@ def page(evaluated) -> Page:
     return Page(evaluated / "report" / "index.html")
 
 
+@pytest.fixture
+def no_live_page(monkeypatch):
+    """Reports have none, which takes a process of its own: for tests of something else."""
+    monkeypatch.setattr("eval.report.page.save_live_page", lambda *_: [])
+
+
 def pixels(uri: str) -> np.ndarray:
     head, body = uri.split(",")
     assert head == "data:image/webp;base64"
@@ -191,6 +197,7 @@ def test_quality_against_time(page):
     assert (indirect["noisy"]["ms"], indirect["accumulated"]["ms"]) == (0.4, 0.6)  # not those of total light
 
 
+@pytest.mark.usefixtures("no_live_page")
 def test_a_page_of_few_megabytes_shows_fewer_frames(evaluated, tmp_path):
     runs = shutil.copytree(evaluated, tmp_path / "runs")
     whole = (runs / "report" / "index.html").stat().st_size
@@ -213,6 +220,7 @@ def test_animations(evaluated):
             assert not np.array_equal(first, np.array(image.convert("RGB")))
 
 
+@pytest.mark.usefixtures("no_live_page")
 def test_without_results_or_with_damaged_ones(evaluated, tmp_path, capsys):
     with pytest.raises(BadInput, match="onespp eval"):
         report(tmp_path)
@@ -231,6 +239,7 @@ def test_without_results_or_with_damaged_ones(evaluated, tmp_path, capsys):
         report(runs)
 
 
+@pytest.mark.slow
 def test_the_live_page_is_linked_where_it_can_be_made(evaluated, tmp_path, monkeypatch, capsys):
     def links(runs: Path) -> bool:
         linked = ("a", "href", "live.html") in Page(runs / "report" / "index.html").attributes
@@ -255,6 +264,7 @@ def test_the_live_page_is_linked_where_it_can_be_made(evaluated, tmp_path, monke
     assert capsys.readouterr().out == "" and not links(runs)
 
 
+@pytest.mark.usefixtures("no_live_page")
 def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     runs = shutil.copytree(evaluated, tmp_path / "runs")
     shutil.rmtree(runs / "bench")

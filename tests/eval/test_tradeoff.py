@@ -208,6 +208,7 @@ def traded(tiny, tmp_path_factory):
     return read_json(runs / "report" / "trade.json"), text, [path.name for path in (runs / "report/figures").iterdir()]
 
 
+@pytest.mark.slow
 def test_trade_has_every_precision(traded):
     content, text, figures = traded
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
@@ -221,6 +222,7 @@ def test_trade_has_every_precision(traded):
     assert figures == ["trade-samples.png"]
 
 
+@pytest.mark.slow
 def test_more_samples_cost_more_and_gain_quality(traded):
     content, *_ = traded
     rows = {(row["denoiser"], row["spp"]): row for row in content["samples"]}
@@ -235,6 +237,7 @@ def test_more_samples_cost_more_and_gain_quality(traded):
     assert all(math.isfinite(row["metrics"]["psnr"]) for row in content["samples"])
 
 
+@pytest.mark.slow
 def test_the_plot_of_samples(traded):
     rows = [Trade(**row) for row in traded[0]["samples"]]
     left, right = draw_samples(rows, "title").axes

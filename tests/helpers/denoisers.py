@@ -4,10 +4,11 @@ from collections.abc import Iterable
 
 import pytest
 
-# They share the code of others: what holds for them all is shown for these by make test-all.
-VARIANTS = ("oidn-balanced", "oidn-fast", "oidn-irradiance", "wskp-mr", "kp", "mr-kp", "ntd-a", "ntd-b", "ntd-mean")
+# What holds for all denoisers is shown by make test-all for those that share the code of others, and for the slowest.
+RARELY = ("nfor", "oidn-balanced", "oidn-fast", "oidn-irradiance")
+RARELY += ("wskp-mr", "kp", "mr-kp", "ntd-a", "ntd-b", "ntd-mean")
 
 
 def each(names: Iterable[str], *long: str):
-    """The names; VARIANTS and those that take `long` are slow."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name in (*VARIANTS, *long))) for name in names]
+    """The names; those tested RARELY and those that take `long` are slow."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in (*RARELY, *long))) for name in names]

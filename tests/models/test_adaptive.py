@@ -35,7 +35,10 @@ def noisy_light(generator: torch.Generator, level: float = 1.0) -> torch.Tensor:
     return grey(level * 2 * tail * (torch.rand(size, generator=generator) < 0.5))
 
 
-@pytest.mark.parametrize(("firefly", "every"), [(0.0, 1), (1e3, 1), (1e4, 50)])
+@pytest.mark.parametrize(
+    ("firefly", "every"),
+    [(1e4, 50), *(pytest.param(firefly, 1, marks=pytest.mark.slow) for firefly in (0.0, 1e3))],
+)
 def test_noise_raises_few_false_alarms_and_loses_no_energy(monkeypatch, firefly, every):
     """A χ² of one degree of freedom exceeds 6 in 1.4 % of cases; fireflies must not add many.
 
@@ -81,6 +84,7 @@ def test_a_firefly_is_no_change():
     assert plain.irradiance.max() > 400 * after.irradiance.max() / 5
 
 
+@pytest.mark.slow
 def test_clamping_loses_no_energy_at_the_edges_of_surfaces():
     """In the mean of many frames, beside an edge and at the border."""
     generator = torch.Generator().manual_seed(0)

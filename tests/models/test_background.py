@@ -1,5 +1,7 @@
 """Background reflects nothing: it is black in the output, and no surface gathers from it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,6 @@ from tests.helpers.denoisers import each
 from tests.helpers.frames import chain, flat_frame, play, prepared, run
 
 NAMES = [name for name in registry.DENOISERS if not registry.prototype(name).unavailable()]
-both_implementations = pytest.mark.usefixtures("implementation")
 # Regressions and combinations of resolutions or grids may have weights below 0, whose sum is 1 nevertheless.
 AFFINE = ("bmfr", "nfor", "wskp-mr", "mr-kp", "nbgd")
 KEEP_EVEN_LIGHT = [name for name in NAMES if registry.prototype(name).convex or name in AFFINE]
@@ -51,6 +52,13 @@ def noisy_frames(surface: torch.Tensor, count: int = 3) -> list[Frame]:
     return chain(frames)
 
 
+def both_implementations(test: Callable[..., None]) -> Callable[..., None]:
+    """With kernels, which denoisers take, and in test-all in PyTorch as well."""
+    values = ["kernels", pytest.param("PyTorch", marks=pytest.mark.slow)]
+    parametrized = pytest.mark.parametrize("implementation", values, indirect=True)(test)
+    return pytest.mark.usefixtures("implementation")(parametrized)
+
+
 # --- All denoisers ----------------------------------------------------------------------------------------------------
 
 
@@ -70,7 +78,7 @@ def test_background_is_its_emission_alone(name):
 
 
 @both_implementations
-@pytest.mark.parametrize("name", KEEP_EVEN_LIGHT)
+@pytest.mark.parametrize("name", each(KEEP_EVEN_LIGHT))
 @settings(deadline=None)
 @given(surface=MASKS)
 def test_even_light_stays_even_beside_background(name, surface):

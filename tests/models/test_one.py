@@ -105,6 +105,7 @@ def test_kernels_are_pytorch_at_any_size(fresh, size):
         torch.testing.assert_close(getattr(state, name), getattr(expected, name), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_still_wall_stays_what_it_is(fresh):
     """300 frames of even light, with a static camera: no drift."""
     image = 0.5 * torch.ones(1, 3, *SIZE)

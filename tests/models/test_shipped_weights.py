@@ -68,7 +68,7 @@ def growth(block: RecurrentBlock, height: int, width: int, frames: int = 30) -> 
     return float(np.exp(np.log(norms[-10:]).mean()))
 
 
-@pytest.mark.parametrize("size", [(2, 2), (12, 20), (40, 40)])
+@pytest.mark.parametrize("size", [(2, 2), (12, 20), pytest.param((40, 40), marks=pytest.mark.slow)])
 def test_what_rae_carries_fades_at_every_resolution(size):
     """At 640 x 360 the coarsest features are 20 x 12 pixels; of a training crop of 64 x 64, 2 x 2."""
     rae = load("rae", shipped_weights("rae"), torch.float32)

@@ -154,7 +154,7 @@ def shown_psnr(images, others, exposure) -> float:
 
 
 @pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("name", each(NAMES))
+@pytest.mark.parametrize("name", each(NAMES, "rae", "ntd"))
 def test_half_precision_is_close_on_real_frames_or_refused_with_a_reason(tiny, name, precision):
     half = registry.create(name)
     if precision in half.refuses:

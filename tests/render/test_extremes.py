@@ -37,7 +37,7 @@ def test_extreme_scene_becomes_a_clip(name, tmp_path):
         assert clip.read("roughness", 0).min() == 0
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e4])
+@pytest.mark.parametrize("factor", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
 def test_units_do_not_matter(factor):
     """The same samples in other units: the same picture and motion, depth times the factor."""
     scene = build_scene("cornell_box_moving", 5, FRAMES)

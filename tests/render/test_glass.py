@@ -52,6 +52,7 @@ def assert_same_surfaces(frame: Arrays, forms: dict[str, str], other: Arrays, na
         np.testing.assert_allclose(shown[found], expected[found], rtol=1e-4, atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow
 def test_what_a_pane_transmits_is_the_room_without_it(pane):
     scene = with_picture(THIN)
     picture, *others = scene.shapes
@@ -61,6 +62,7 @@ def test_what_a_pane_transmits_is_the_room_without_it(pane):
     assert np.abs(pane[-1][MIRRORED["motion"]]).max() > 1
 
 
+@pytest.mark.slow
 def test_what_a_pane_reflects_is_what_a_mirror_shows(pane):
     for frame, other in zip(pane, rendered(with_picture(SILVER)), strict=True):
         assert_same_surfaces(frame, SECOND, other, MIRRORED)

@@ -41,7 +41,7 @@ def test_all_places_in_a_stratum_are_taken_alike():
     assert counts.min() > 60 and counts.max() < 140  # 100 each, standard deviation 9.4
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "room-5"])
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("room-5", marks=pytest.mark.slow)])
 def test_shading_an_unchanged_scene_anew_changes_no_bit(name):
     tracer = PathTracer(Stage(build_scene(name, 3, 24), SIZE, SIZE))
     samples = samples_of(tracer, 0, seed=7)

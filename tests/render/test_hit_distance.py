@@ -52,6 +52,7 @@ def test_paths_hit_a_ceiling_as_cosine_weighted_directions_do():
     assert kstest((height / hit) ** 2, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_the_sky_is_infinitely_far_away_and_wide():
     (frame,) = frames_of(WALL, sky=np.ones((4, 8, 3)), frames=1)
     hit, blocked, light, angle, _ = of_frame(frame)

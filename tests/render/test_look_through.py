@@ -154,6 +154,7 @@ def test_mirrors_in_mirrors_turn_what_they_show_in_their_order():
     assert {"itself", "a", "b"} <= set(shown) and {"ab", "ba"} & set(shown)
 
 
+@pytest.mark.slow
 def test_the_ball_of_the_docs_shows_its_room(tmp_path):
     """A curved mirror in a scene file: a picture of the room, farther away than the ball, no sky and no ball in it."""
     found = own(tmp_path, (ROOT / "docs" / "mirror-ball.xml").read_text())

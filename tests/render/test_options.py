@@ -17,10 +17,10 @@ from scenes.registry import build_scene
 from tests.helpers.rendering import POSED_FRAME, assert_same_mean, rgb, stock_radiance
 
 
-@pytest.mark.parametrize("cycles", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_every_point_of_the_halton_cycle_is_unbiased(stage, rays, cycles):
+@pytest.mark.slow
+def test_every_point_of_the_halton_cycle_is_unbiased(stage, rays):
     tracer = PathTracer(stage, halton=True)
-    images = np.stack([np.add(*tracer.radiance(rays, seed, 1, first=seed)) for seed in range(cycles * CYCLE)])
+    images = np.stack([np.add(*tracer.radiance(rays, seed, 1, first=seed)) for seed in range(50 * CYCLE)])
     emission = render_gbuffer(stage, stage.view(POSED_FRAME))["emission"]
     assert_same_mean(emission + images, np.stack([stock_radiance(stage, 3, 16, s) for s in range(30)]))
 
@@ -36,6 +36,7 @@ def test_a_halton_cycle_is_less_noisy_than_independent_frames(stage, rays):
     assert errors[0] < 0.8 * errors[1]
 
 
+@pytest.mark.slow
 def test_a_clip_walks_through_the_cycle():
     scene = frozen(build_scene("cornell_box", 3, 2))
     frames = [arrays for arrays, _ in render_clip(scene, CYCLE + 2, 16, 16, Sampling(2, 1, 8, Options(halton=True)), 1)]
@@ -61,6 +62,7 @@ def test_regularisation_changes_nothing_where_nothing_is_glossy(stage, rays):
     assert all(np.array_equal(a, b) for a, b in zip(plain, regular, strict=True))
 
 
+@pytest.mark.slow
 def test_regularisation_trades_bias_for_noise():
     """Direct light is untouched. Indirect light has less variance, and a bias of a few percent.
 

@@ -48,6 +48,7 @@ def test_single_samples_are_uniform_and_independent():
     assert np.abs(correlations).max() < 5 / np.sqrt(count)
 
 
+@pytest.mark.slow
 def test_integrates_better_than_random():
     """A smooth integrand: the error of 256 samples over many seeds is far below that of independent samples."""
     x, y = np.moveaxis([sampler_points(key * 7919, 256) for key in range(200)], -1, 0)

@@ -78,7 +78,7 @@ CASES = {
 
 
 def case_of(name):
-    return pytest.param(*CASES[name], id=name, marks=[pytest.mark.slow] * (name in ("behind two", "behind a slab")))
+    return pytest.param(*CASES[name], id=name, marks=[pytest.mark.slow] * (name != "in a mirror"))
 
 
 @pytest.mark.parametrize(("shapes", "share"), [case_of(case) for case in CASES])
@@ -97,6 +97,7 @@ def test_mirrors_tint_light():
     np.testing.assert_allclose(emission, np.broadcast_to(LAMP * [0.9, 0.6, 0.3], emission.shape), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regularise", [False, True])
 def test_paths_that_are_too_short_show_no_light(regularise):
     """As in Mitsuba: paths of three segments do not get through a slab and two surfaces more."""

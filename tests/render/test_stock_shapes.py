@@ -167,7 +167,7 @@ def test_holes_of_masks_are_seen_through():
     np.testing.assert_allclose(buffer["albedo"][2, 1], [0.1, 0.7, 0.1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e4])
+@pytest.mark.parametrize("factor", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
 def test_the_size_of_a_scene_changes_nothing_but_its_depth(factor):
     """Scenes measured in millimetres or in kilometres: points, spots and skies shine alike."""
 

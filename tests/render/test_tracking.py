@@ -46,6 +46,7 @@ def test_a_reflection_moves_as_what_stands_behind_the_mirror(eye_slides):
         assert len(of_thing) > 10 and np.abs(of_thing[:, 1]).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_the_sky_s_reflection_moves_with_the_view_alone():
     for frame in frames_of(MIRROR, eye_slides=0.2, sky=np.ones((2, 4, 3)))[1:]:
         assert np.abs(frame["reflection_motion"]).max() < 1e-3 and np.abs(frame["motion"][..., 0]).min() > 1

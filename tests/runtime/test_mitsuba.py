@@ -5,6 +5,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -67,7 +69,9 @@ def channels(scene, sensor, integrator: dict, seed: int = 0, spp: int = 1) -> di
     return dict(zip(counts, np.split(image, ends[:-1], axis=2), strict=True))
 
 
-@pytest.mark.parametrize("name", ["cornell_box", pytest.param("room-3", marks=pytest.mark.slow), "extremes-mirrors"])
+@pytest.mark.parametrize(
+    "name", ["extremes-mirrors", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cornell_box", "room-3"))]
+)
 def test_guides_are_those_of_our_renderer(package, name):
     """In first hits and behind mirrors and glass."""
     stage = Stage(build_scene(name, 0, 4), HEIGHT, WIDTH)
@@ -276,22 +280,28 @@ def environment(unpacked) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def by_variant(environment, tmp_path_factory) -> dict[str, dict[str, np.ndarray]]:
-    folder, arrays = tmp_path_factory.mktemp("variants"), {}
-    for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"):
+def by_variant(environment, tmp_path_factory) -> Callable[[str], dict[str, np.ndarray]]:
+    folder = tmp_path_factory.mktemp("variants")
+
+    @cache
+    def arrays_of(variant: str) -> dict[str, np.ndarray]:
         command = [sys.executable, "-c", VARIANT, variant, str(folder / f"{variant}.npz")]
         subprocess.run(command, check=True, env=environment, timeout=300)
-        arrays[variant] = dict(np.load(folder / f"{variant}.npz"))
-    return arrays
+        return dict(np.load(folder / f"{variant}.npz"))
+
+    return arrays_of
 
 
 SHAPE_CHANNEL = 14  # its numbers follow the order in which a variant loads shapes
 
 
-@pytest.mark.parametrize(("variant", "tolerance"), [("scalar_rgb", 1e-4), ("llvm_ad_spectral", 0.02)])
+@pytest.mark.parametrize(
+    ("variant", "tolerance"),
+    [("scalar_rgb", 1e-4), pytest.param("llvm_ad_spectral", 0.02, marks=pytest.mark.slow)],
+)
 def test_variants_agree(by_variant, variant, tolerance):
     """On guides but for rays along edges, and on the denoised images exactly; spectra round colours."""
-    ours, theirs = by_variant["llvm_ad_rgb"], by_variant[variant]
+    ours, theirs = by_variant("llvm_ad_rgb"), by_variant(variant)
     guides = [np.delete(each["image"], [0, 1, 2, SHAPE_CHANNEL], axis=2) for each in (ours, theirs)]
     differs = (np.abs(guides[0] - guides[1]) > tolerance * np.maximum(1, np.abs(guides[0]))).any(axis=2)
     assert differs.mean() < 0.05
@@ -306,6 +316,7 @@ def test_the_example_of_the_page(environment, tmp_path):
     assert len(list(tmp_path.glob("*.exr"))) == 8
 
 
+@pytest.mark.slow
 def test_the_turntable_turns_evenly(environment, tmp_path):
     """Around a cube: after 90 degrees, and only then, it looks as before."""
     xml = """<scene version="3.0.0"><sensor type="perspective">

@@ -146,6 +146,7 @@ def test_instruction_sets_differ_by_rounding(library, one, frames, monkeypatch):
     assert torch.equal(outputs[-1], outputs[-2])
 
 
+@pytest.mark.slow
 def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
     library = build(tmp_path / "libonespp.so", SOURCES[:1], ["-O3"])
     assert CRuntime(library, 8, 8).isa == ISAS["baseline"]

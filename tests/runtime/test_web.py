@@ -189,6 +189,7 @@ def test_it_fits_the_screen_and_loads_nothing(live):
     assert live.execute_script(unnamed) == 0
 
 
+@pytest.mark.slow
 def test_a_page_of_fewer_frames(page, clip, tmp_path):
     assert write_page(clip.path, tmp_path / "page.html", 2).returncode == 0
     assert [path.read_text().count('"raw"') for path in (page, tmp_path / "page.html")] == [clip.frames, 2]

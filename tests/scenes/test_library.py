@@ -152,6 +152,7 @@ def diffuse_share(room: str, libraries: Path) -> float:
     return sum((shape.bsdf.get("bsdf") or shape.bsdf)["type"] == "diffuse" for shape in shapes) / len(shapes)
 
 
+@pytest.mark.slow
 def test_varnish(libraries: Path):
     """On VARNISHED of the materials, so that furnished rooms are glossier than others."""
     pieces = open_libraries(libraries)[0].pieces[:1]

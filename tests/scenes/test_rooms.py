@@ -47,7 +47,9 @@ def lights(scene: Scene) -> list[Shape]:
     return [shape for shape in scene.shapes if shape.radiance is not None]
 
 
-@pytest.mark.parametrize("number", [*FEW, *(pytest.param(number, marks=pytest.mark.slow) for number in MANY)])
+@pytest.mark.parametrize(
+    "number", [*FEW[:3], *(pytest.param(number, marks=pytest.mark.slow) for number in (*FEW[3:], *MANY))]
+)
 def test_room(number):
     scene = build_room(number)
     assert 15 <= len(things(scene)) <= 60
@@ -109,7 +111,7 @@ def test_half_of_the_rooms_move():
     assert all(shares[name] <= 0.5 for name in ("lights change", "camera stops", "sky"))
 
 
-@pytest.mark.parametrize("number", [0, 3, 5])
+@pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.slow) for number in (3, 5))])
 def test_frames_are_neither_night_nor_glare(number):
     size = 48
     stage = Stage(build_room(number), size, size)
@@ -127,6 +129,7 @@ def test_frames_are_neither_night_nor_glare(number):
         assert (shown.min(axis=-1) >= 1).mean() < 0.3 and (shown.max(axis=-1) < 0.02).mean() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", FEW[:4])
 def test_nothing_moves_faster_than_twenty_pixels_of_256(number):
     """Motion of visible surfaces, with a margin for those nearer than the centres of things, which were aimed at."""

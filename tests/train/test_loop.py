@@ -86,6 +86,7 @@ def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, t
         train_network(task)
 
 
+@pytest.mark.slow
 def test_a_training_in_bfloat16_keeps_its_weights_in_float32(tiny, tmp_path):
     recipe = {"epochs": 1, "crops": (1, 1)}
     weights = train_network(short_task("wskp3", tiny, tmp_path, precision=BFLOAT16, **recipe))

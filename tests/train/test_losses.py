@@ -17,6 +17,7 @@ from models.networks.ntd import NTD
 from models.networks.rae import RAE, raised
 from models.networks.wskp import WSKP
 from models.registry import create
+from tests.helpers.denoisers import each
 from tests.helpers.training import predict_as
 from train.crops import Crops
 from train.data import items
@@ -399,7 +400,10 @@ def test_squared_errors_and_first_frames_add_to_the_displayed_loss(batch_of, mon
     assert squared.item() == pytest.approx(more["spatial"].item(), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["rae", "wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "lbf", "ntd", "one"])
+NETWORKS = ("rae", "wskp3", "wskp6", "wskp-mr", "kp", "mr-kp", "nbgd", "lbf", "ntd", "one")
+
+
+@pytest.mark.parametrize("name", each(NETWORKS, "rae", "ntd", "lbf"))
 def test_every_network_learns_one_batch(batch_of, name):
     """Some steps of Adam at 0.002 on a batch of one clip take a fifth off the loss, and half off RAE's.
 

@@ -81,7 +81,7 @@ def few_steps(task: Task) -> dict[str, Any]:
     return {"epochs": 1} if task.recipe.length > 1 else {"epochs": 1, "crops": (2, 1)}
 
 
-@pytest.mark.parametrize("name", ["wskp3", "rae"])
+@pytest.mark.parametrize("name", ["wskp3", pytest.param("rae", marks=pytest.mark.slow)])
 def test_a_training_that_makes_it_worse_keeps_its_start(tiny, tmp_path, name):
     task = short(name, tiny, tmp_path)
     task = replace(task, recipe=replace(task.recipe, rate=1e3, ramp=0))
@@ -111,6 +111,7 @@ def test_weights_that_cannot_be_begun_with_are_named(capsys, tiny, tmp_path, gen
     assert not list(tmp_path.glob("runs/train/*/[!.]*"))
 
 
+@pytest.mark.slow
 def test_it_may_begin_with_what_is_shipped(capsys, tiny, tmp_path, shipped):
     ours = fresh_weights("wskp3", shipped / "wskp3.safetensors", seed=5)
     there = ["--data", str(tiny), "--runs", str(tmp_path / "runs"), "--budget", "tiny", "--from", "weights"]
@@ -160,6 +161,7 @@ def test_a_network_is_specialised_from_scratch_too(tiny, tmp_path):
     assert weights == folder_of(tmp_path, "rae") / WEIGHTS_FILE
 
 
+@pytest.mark.slow
 def test_where_all_inputs_vary_none_is_left_out(capsys, tiny, tmp_path):
     general = Training(short_task("wskp6", tiny, tmp_path / "general"))
     special = Training(short("wskp6", tiny, tmp_path / "special", specialised=True))

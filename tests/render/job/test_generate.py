@@ -122,6 +122,7 @@ def test_full_disk_is_one_clear_line_and_leaves_whole_clips_only(tmp_path):
     assert [path for path in root.rglob("*") if path.is_file() and path.name != "dataset.json"] == []
 
 
+@pytest.mark.slow
 def test_a_clip_that_another_job_renders_is_left_to_it(tiny_copy, tiny):
     theirs, ours = remove_clips(tiny_copy, "val/cornell_box/000", "train/cornell_box/000")
     with locked(theirs.with_name(".000.lock")) as claim:

@@ -168,6 +168,7 @@ def bulb_in_a_room(max_depth: int) -> str:
     return xml(depth, walls, lamp, inner, light="", shape=ball.format(0.5, glass.format(1.5, 1)))
 
 
+@pytest.mark.slow
 def test_lamps_that_shine_through_glass_alone_need_more_bounces(tmp_path):
     assert own(tmp_path, bulb_in_a_room(6)).notes == []
     (note,) = own(tmp_path, bulb_in_a_room(3)).notes
