@@ -113,7 +113,7 @@ def train(
     from_: Annotated[str | None, arg(name="from", metavar="weights|FILE")] = None,
     specialise: Flag = False,
 ) -> None:
-    """Train networks, or resume: by default wskp6, and in budgets other than quick also rae and ntd-mean.
+    """Train networks, or resume: by default wskp6 for quick, one for furnished, else rae, wskp6 and ntd-mean.
 
     On several GPUs or machines: `torchrun --nproc-per-node N -m onespp train ...`. Every batch is shared by all
     processes, so the steps are the same.

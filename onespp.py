@@ -34,10 +34,14 @@ def load(
     is by default the fastest on the device. Raises errors.BadInput where the name is unknown, the file missing, damaged
     or of another network, for a network without weights, and where there is no such device.
     """
+    from errors import BadInput
     from models.registry import parse_name, shipped_weights
     from models.spec import load as load_denoiser
 
-    file = Path(weights) if weights else shipped_weights(parse_name(name).base)
+    parsed = parse_name(name)
+    if parsed.budget and not weights:
+        raise BadInput(f"'{name}' are weights in a folder of runs, such as runs/train: give their file as `weights`")
+    file = Path(weights) if weights else shipped_weights(parsed.base)
     return load_denoiser(name, file, precision, device=device)
 
 

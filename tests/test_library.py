@@ -36,6 +36,8 @@ def test_networks_have_their_shipped_weights(shipped, tmp_path):
     for name, weights, same in (("wskp3", None, True), ("wskp3+taa", None, True), ("wskp3", others, False)):
         found = list(onespp.load(name, weights, torch.float32).state_dict().values())
         assert all(map(torch.equal, found, given.values())) == same
+    with pytest.raises(BadInput, match="'wskp3@quick' are weights in a folder of runs"):
+        onespp.load("wskp3@quick")
 
 
 def arrays(index: int, size: tuple[int, int] = (24, 32)) -> dict:

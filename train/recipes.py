@@ -76,7 +76,7 @@ ONE_RECIPE = Recipe(
 )
 
 # Ours, where references have few samples: of single noisy pixels the papers' losses learn the median
-# (docs/experiments.md).
+# (docs/training.md).
 # A network without coarse levels cannot help what is wrong in large blocks.
 RELEASE: dict[str, Any] = SHORT | {"loss": DisplayedLoss(), "crop": 64, "clip": 1.0}
 RELEASE_CROPS = RELEASE | {"loss": DisplayedLoss(scales=(1, 4)), "crops": (4, 1), "batch": 16, "rate": 4e-3}
