@@ -206,7 +206,7 @@ def exr(
     out: Annotated[Path, Positional, arg(metavar="OUT", help="the folder to write")],
     layout: Literal["frames", "oidn"] = "frames",
 ) -> None:
-    """Write OpenEXR files, or resume: a multi-layer file per frame of a clip, or a dataset for OIDN's training toolkit.
+    """Write OpenEXR files: a multi-layer file per frame of a clip, or, resumable, a dataset for OIDN's trainer.
 
     Args:
         layout: "frames" takes a clip, such as data/quick/test/cornell_box/000; "oidn" takes a dataset and

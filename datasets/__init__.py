@@ -1,1 +1,1 @@
-"""From arrays to disk and back: the channel table, clips, the generation job and training sequences."""
+"""From arrays to disk and back: the channel table, clips, frames, OpenEXR, and files of other people."""

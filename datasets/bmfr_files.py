@@ -14,7 +14,7 @@ import OpenEXR
 from tqdm import tqdm
 
 from datasets.exr import silenced
-from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
+from datasets.imported import Image, ImportedFrame, by_name, view_of_clip_space, write_dataset
 from errors import BadInput
 from scenes.camera import Array
 
@@ -25,13 +25,14 @@ NUMBER = r"-?\d+\.?\d*(?:[eE][-+]?\d+)?f?"
 def import_bmfr(source: Path, out: Path) -> int:
     """Make a dataset of the scenes below `source`. Returns how many clips were written.
 
-    Raises BadInput, naming the file, where there is none, or one is missing or damaged.
+    Raises BadInput, naming the file, where there is none, one is missing or damaged, or two have the same name.
     """
     folders = sorted(path.parent for path in source.glob(f"**/{MATRICES}"))
     if not folders:
         raise BadInput(f"{source} has no scene: each is a folder with {MATRICES} and color0.exr")
-    names = {folder: folder.parent.name if folder.name == "inputs" else folder.name for folder in folders}
-    return write_dataset(out, "bmfr", {names[folder]: frames_of(folder) for folder in folders}, spp=1)
+    names = [folder.parent.name if folder.name == "inputs" else folder.name for folder in folders]
+    clips = {name: frames_of(folder) for name, folder in by_name(folders, names).items()}
+    return write_dataset(out, "bmfr", clips, spp=1)
 
 
 def frames_of(folder: Path) -> Iterator[ImportedFrame]:

@@ -9,6 +9,7 @@ from tabulate import tabulate
 from datasets.channels import CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset, is_clip
 from datasets.tonemap import psnr
+from errors import BadInput
 from files import write_file
 
 CARD_FILE = "card.json"
@@ -30,9 +31,11 @@ def write_card(dataset: Dataset) -> None:
 def card_of(dataset: Dataset) -> dict[str, Any]:
     """The card, for JSON. It follows from the data alone: the same data set has the same card anywhere.
 
-    Raises BadInput where a clip is missing or damaged.
+    Raises BadInput where a clip is missing or damaged, and for an imported dataset.
     """
     facts = dataset.facts
+    if not facts["generator"]:
+        raise BadInput(f"{dataset.path} was imported: only datasets that onespp rendered have a card")
     clips = {str(path.relative_to(dataset.path)): clip_facts(Clip(path)) for path in dataset.planned()}
     used = [split for split, names in facts["splits"].items() if names]
     what = f"--scene {Path(facts['profile']).name}" if facts["source"] else f"--profile {facts['profile']}"

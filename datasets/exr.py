@@ -66,7 +66,7 @@ def write_file(path: Path, file: OpenEXR.File) -> None:
         raise BadInput(f"{path} cannot be written ({error}): make room or choose another folder") from None
 
 
-def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
+def write_exr(path: Path, clip: Clip, index: int) -> None:
     """Write one frame of a clip atomically.
 
     Layers are all channels that the clip has of this frame, in their stored precision, and the noisy beauty image as
@@ -75,9 +75,9 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
     """
     kinds = {name: CHANNELS[name].kind for name in clip.channels if CHANNELS[name].is_image}
     names = [name for name, kind in kinds.items() if kind != "reference" or index in clip.judged]
-    arrays = {name: clip.read(name, index, realisation=realisation) for name in names}
+    arrays = {name: clip.read(name, index) for name in names}
     planes = {key: plane for name, array in arrays.items() for key, plane in layers_of(name, array).items()}
-    beauty = clip.noisy(index, realisation)
+    beauty = clip.noisy(index)
     planes |= {c: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate("RGB")}
     view = clip.view(index)
     facts = {
@@ -85,7 +85,7 @@ def write_exr(path: Path, clip: Clip, index: int, realisation: int = 0) -> None:
         "scene": clip.scene,
         "clip": clip.name,
         "frame": index,
-        "realisation": realisation,
+        "realisation": 0,
         **{name: matrix.tolist() for name, matrix in view._asdict().items()},
     }
     attributes = {
@@ -108,9 +108,15 @@ def channels_in(planes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def export_clip(path: Path, out: Path) -> int:
-    """Write the frames of the clip at `path` to `out` as 0000.exr and so on. Returns how many there are."""
+    """Write the frames of the clip at `path` to `out` as 0000.exr and so on. Returns how many there are.
+
+    Raises BadInput where `out` has other files of this kind, and where it cannot be written.
+    """
     clip = Clip(path)
+    files = [out / f"{index:04d}.exr" for index in range(clip.frames)]
+    if others := sorted(set(out.glob("*.exr")) - set(files)):
+        raise BadInput(f"{others[0]} is no frame of {path}: choose an empty or new folder")
     out.mkdir(parents=True, exist_ok=True)
-    for index in tqdm(range(clip.frames), f"{clip.scene}/{clip.name}", unit="frame"):
-        write_exr(out / f"{index:04d}.exr", clip, index)
+    for index, file in enumerate(tqdm(files, f"{clip.scene}/{clip.name}", unit="frame")):
+        write_exr(file, clip, index)
     return clip.frames

@@ -1,6 +1,6 @@
 """Datasets made from files of other people: what they have in common."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,6 +66,14 @@ def channels_of(frame: ImportedFrame, previous: View) -> dict[str, NDArray[Any]]
     }
 
 
+def by_name(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
+    """Folders of clips by the names of their scenes. Raises BadInput where two have one name."""
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        both = " and ".join(str(folder) for folder, name in zip(folders, names, strict=True) if name == twice)
+        raise BadInput(f"{both} have the same name: rename one, or import them one by one")
+    return dict(zip(names, folders, strict=True))
+
+
 def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[ImportedFrame]], spp: int) -> int:
     """Write test clips by their scenes' names to a dataset, or resume. Returns how many were written.
 
@@ -75,12 +83,15 @@ def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[Imported
     facts = {
         "schema": SCHEMA,
         "profile": source,
+        "seed": 0,
+        "generator": 0,  # none of ours
+        "options": {},
         "scenes": list(clips),
         "splits": {"train": [], "val": [], "test": [f"{name}/000" for name in clips]},
     }
     root.mkdir(parents=True, exist_ok=True)
     plan = root / "dataset.json"
-    if any(root.glob("[!.]*")) and not (plan.exists() and read_json(plan) == facts):
+    if any(root.glob("[!.]*")) and not (plan.exists() and read_json(plan).items() <= facts.items()):
         raise BadInput(f"{root} contains something other than these clips: choose an empty or new folder")
     write_json(plan, facts)
     missing = {root / "test" / name / "000": frames for name, frames in clips.items()}

@@ -32,7 +32,7 @@ def summarise(root: Path) -> str:
         timings.append(clip.seconds)
         rows[-1] |= {
             "frames": clip.frames,
-            "size": f"{clip.height}x{clip.width}",
+            "size": f"{clip.width}x{clip.height}",
             "noisy": clip.realisations,
             "reference spp": clip.facts["reference_spp"],
             "floor dB": f"{psnr(clip.facts['floor_mse']):.1f}",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.imported import Image, ImportedFrame, view_of_clip_space, write_dataset
+from datasets.imported import Image, ImportedFrame, by_name, view_of_clip_space, write_dataset
 from errors import BadInput, requires_extra
 
 CROPPED_ROWS = 28  # rows
@@ -27,7 +27,8 @@ def import_noisebase(source: Path, out: Path, samples: int) -> int:
     folders = sorted({path.parent for path in source.glob("**/frame[0-9][0-9][0-9][0-9].zip")})
     if not folders:
         raise BadInput(f"{source} has no sequence: each is a folder with frame0000.zip and so on")
-    clips = {folder.name: frames_of(folder, samples) for folder in folders}
+    named = by_name(folders, [folder.name for folder in folders])
+    clips = {name: frames_of(folder, samples) for name, folder in named.items()}
     return write_dataset(out, f"noisebase at {samples} spp", clips, samples)
 
 

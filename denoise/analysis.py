@@ -12,7 +12,7 @@ from datasets.channels import CHANNELS
 from datasets.tonemap import luminance
 from denoise.foreign_frame import ForeignFrame, Image, read_foreign_frame
 from denoise.frames import InputConventions, are_encoded, camera_conventions
-from denoise.layers import QUANTITIES, normalised
+from denoise.layers import COLOUR, QUANTITIES, normalised
 from denoise.motion_convention import ConventionDetector, MotionConvention
 from denoise.sequence import FrameFiles
 from denoise.sources import Sources
@@ -101,7 +101,7 @@ def motion_convention(
 ) -> tuple[MotionConvention, str]:
     """The convention of motion vectors, as `given` or as detected on the first frames that move, and why.
 
-    Raises BadInput where `given` names components that the layer does not have.
+    Raises BadInput where `given` names components that the layer does not have, and where frames differ in size.
     """
     components = len(sources.quantities["motion"].layer.channels)
     if given:
@@ -115,6 +115,9 @@ def motion_convention(
             break
         frame, _ = read_foreign_frame(files, sources)
         now = guides(frame)
+        if before is not None and now.shape != before.shape:
+            size = f"{now.shape[1]}x{now.shape[0]}"
+            raise BadInput(f"{files.passes[COLOUR]} is {size}, unlike the frame before it: name one sequence")
         if index and before is not None:
             detector.add(now, before, frame.arrays["motion"])
         before = now

@@ -51,6 +51,7 @@ def foreign_frame(quantities: Quantities, source: str) -> ForeignFrame:
         expected = (*arrays[COLOUR].shape[:2], COMPONENTS.get(name, 3))
         if array.shape != expected:
             raise BadInput(f"{source}: '{name}' has the shape {array.shape}, not {expected}")
+    if view is not None and not isinstance(view, View):
+        raise BadInput(f"{source}: '{CAMERA}' is of type {type(view).__name__}: make it by onespp.camera")
     nonfinite = make_finite(arrays)
-    view = view if isinstance(view, View) else None
     return ForeignFrame(arrays, surface_of(arrays, None), nonfinite, source, view=view)

@@ -107,22 +107,24 @@ def is_own_space(
 ) -> bool:
     """Whether the `positions` that a camera was fitted to are in its own coordinates: the camera is at the origin.
 
-    Where the header has `worldToCamera`, it is if the fit is closer to the origin than to the camera's place in the
+    Where the header has a `worldToCamera`, it is if the fit is closer to the origin than to the camera's place in the
     world.
     """
     eye = view.camera_to_world[:3, 3]
-    if "worldToCamera" in header:
-        return bool(np.linalg.norm(eye) <= np.linalg.norm(eye - to_world(header)[:3, 3]))
+    pose = to_world(header)
+    if pose is not None:
+        return bool(np.linalg.norm(eye) <= np.linalg.norm(eye - pose[:3, 3]))
     return bool(np.linalg.norm(eye) < MAX_ORIGIN_DISTANCE * np.median(np.linalg.norm(positions[surface], axis=-1)))
 
 
-def to_world(header: Mapping[str, Any]) -> Array:
-    """The inverse (4, 4) of `worldToCamera`, which EXR has for row vectors."""
-    return np.linalg.inv(np.asarray(header["worldToCamera"], np.float64).T).astype(np.float64)
+def to_world(header: Mapping[str, Any]) -> Array | None:
+    """The inverse (4, 4) of `worldToCamera`, which EXR has for row vectors; None where there is none."""
+    matrix = np.asarray(header.get("worldToCamera", np.zeros((4, 4))), np.float64).T
+    regular = np.isfinite(matrix).all() and np.linalg.matrix_rank(matrix) == 4
+    return np.linalg.inv(matrix).astype(np.float64) if regular else None
 
 
 def in_the_world(view: View, header: Mapping[str, Any]) -> View | None:
     """A view fitted in the camera's own coordinates, moved to the world by `worldToCamera`; None without it."""
-    if "worldToCamera" not in header:
-        return None
-    return view._replace(camera_to_world=to_world(header) @ view.camera_to_world)
+    pose = to_world(header)
+    return None if pose is None else view._replace(camera_to_world=pose @ view.camera_to_world)

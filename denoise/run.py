@@ -24,7 +24,7 @@ from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers
 from denoise.motion_convention import MotionConvention
 from denoise.parts import Parts
-from denoise.sequence import FrameFiles, files_of, gaps, numbered, sequence_of, split_at_cuts
+from denoise.sequence import FrameFiles, files_of, gaps, like, numbered, sequence_of, split_at_cuts
 from denoise.sources import Sources, find_sources, has_two_buffers
 from denoise.supersampling import AlbedoMean
 from errors import BadInput, requires_extra
@@ -39,6 +39,7 @@ from models.wrappers.shrinkage import JamesStein
 from models.wrappers.wrapper import unwrapped
 from provenance import DENOISING, file_digest, versions
 
+SETTINGS_FILE = "denoise.json"
 DTYPES: dict[str | None, type | None] = {None: None, "half": np.float16, "float": np.float32}
 
 
@@ -100,7 +101,7 @@ def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
     """The reference of each frame, or none at all. Raises BadInput where one is missing."""
     if not job.ref:
         return []
-    files = numbered(files_of(job.ref))
+    files = like([frame.number for frame in frames], numbered(files_of(job.ref)))
     for frame in frames:
         if frame.number not in files:
             raise BadInput(f"'{' '.join(job.ref)}' has no reference of frame {frame.number}")
@@ -108,18 +109,20 @@ def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
 
 
 def check_names(out: Path, frames: Sequence[FrameFiles]) -> None:
-    """Raise BadInput where an output would overwrite an input, or another output."""
+    """Raise BadInput where an output would overwrite an input, another output, or a file of something else."""
     if any(path.parent.resolve() == out.resolve() for frame in frames for path in frame.passes.values()):
         raise BadInput(f"--out {out} contains the frames to denoise: choose another folder")
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
         raise BadInput("frames of different folders have the same name: denoise one folder at a time")
+    if not (out / SETTINGS_FILE).exists() and (taken := [name for name in names if (out / name).exists()]):
+        raise BadInput(f"--out {out} has a {taken[0]} that was not denoised here: choose another folder")
 
 
 def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
     """Make the folder and write the settings into it. Raises BadInput where it has frames with other settings."""
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "denoise.json"
+    path = out / SETTINGS_FILE
     if not path.exists():
         write_json(path, dict(settings))
         return
@@ -229,6 +232,8 @@ class SequenceDenoiser:
                     size = f"{image.width}x{image.height}"
                     raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
                 frame = frame.to(self.denoiser.device)
+                if self.estimator:
+                    frame = frame.without("second")  # as denoise_with_error does, so that history is the same
                 if self.parts:
                     frame = self.parts.added(frame, image)
                 if albedo:

@@ -2,7 +2,7 @@
 
 import glob
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -47,12 +47,18 @@ def numbered(paths: Sequence[Path]) -> dict[int, Path]:
     raise BadInput(f"the names of {paths[0]} to {paths[-1]} have no frame numbers that differ: name one sequence")
 
 
+def like(frames: Collection[int], files: dict[int, Path]) -> dict[int, Path]:
+    """Files by number; a single file belongs to a single frame, whatever number its name has."""
+    return dict(zip(frames, files.values(), strict=True)) if len(frames) == len(files) == 1 else files
+
+
 def sequence_of(patterns: Mapping[str, Sequence[str]], numbers: str | None = None) -> list[FrameFiles]:
     """The frames of the patterns of all passes, by number; of "colour" all that there are within `numbers` "A-B".
 
     Raises BadInput where a pass lacks a frame, or no frame is left.
     """
     passes = {name: numbered(files_of(each)) for name, each in patterns.items()}
+    passes = {name: like(passes[COLOUR], files) for name, files in passes.items()}
     first, last = frame_range(numbers)
     chosen = [number for number in passes[COLOUR] if first <= number <= last]
     if not chosen:

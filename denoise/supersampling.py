@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from datasets.channels import ALBEDO_FLOOR, CHANNELS
 from datasets.frame import Frame, times_each
+from models.operators import sampling_grid
 
 MOST_BEFORE = 4  # frames that the mean before counts as at most: each fetch blurs it a little
 
@@ -29,7 +30,8 @@ class AlbedoMean:
         surface = (frame.depth > 0).to(frame.albedo)
         mean, count = frame.albedo, surface
         if self.mean is not None and self.count is not None:
-            grid, inside = places(frame.motion)
+            grid = sampling_grid(frame.motion)
+            inside = (grid.abs() <= 1).all(dim=-1)[:, None]
             before = F.grid_sample(self.count, grid, "nearest", align_corners=False).clamp(max=MOST_BEFORE)
             count = surface * (1 + before * inside)
             fetched = F.grid_sample(self.mean, grid, "bicubic", "border", align_corners=False)
@@ -40,16 +42,6 @@ class AlbedoMean:
         light = {name: light * ratio for name, light in frame.channels.items() if CHANNELS[name].is_reflected}
         parts = None if frame.parts is None else times_each(frame.parts, ratio)
         return replace(frame.with_channels({"albedo": mean, **light}), parts=parts)
-
-
-def places(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Where motion (1, 2, H, W) leads, as grid_sample wants it, and whether that is in the image (1, 1, H, W)."""
-    height, width = motion.shape[-2:]
-    rows, columns = (torch.arange(side, device=motion.device) + 0.5 for side in (height, width))
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    size = motion.new_tensor([width, height]).view(1, 2, 1, 1)
-    place = 2 * (torch.stack([x, y])[None] + motion) / size - 1
-    return place.movedim(1, -1), (place.abs() <= 1).all(dim=1, keepdim=True)
 
 
 def range_of_neighbours(albedo: Tensor, surface: Tensor) -> tuple[Tensor, Tensor]:

@@ -103,7 +103,7 @@ def compile_kernels(spec: DenoiserSpec) -> None:
     denoiser = spec.build()
     state = None
     for index in range(2):
-        _, state = denoiser(synthetic_frame(index, *COMPILED_SIZE), state)
+        _, state = denoiser(synthetic_frame(index, *COMPILED_SIZE).to(spec.device), state)
 
 
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:

@@ -14,11 +14,13 @@ from files import replacing
 
 @contextmanager
 def kept_references(clip: Path) -> Iterator[Path]:
-    """A hidden folder beside the folder `clip`. Only a job that is killed or interrupted leaves it behind."""
+    """A hidden folder beside the folder `clip`. A job that is killed, interrupted, or out of disk leaves it behind."""
     folder = clip.with_name(f".{clip.name}.references")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield folder
+    except OSError:
+        raise
     except Exception:
         shutil.rmtree(folder)
         raise

@@ -20,11 +20,12 @@ Roughness = float | dict[str, Any]  # a number or a texture, as in a Mitsuba dic
 
 
 def at_least(roughness: Roughness, least: float) -> Roughness:
+    """Textures whose values are not at hand, such as those of files, become `least` everywhere."""
     if not isinstance(roughness, dict):
         return max(roughness, least)
     if "data" in roughness:
         return roughness | {"data": np.maximum(roughness["data"], least)}
-    return roughness | {"value": max(roughness["value"], least)}
+    return roughness | {"value": max(roughness["value"], least)} if "value" in roughness else least
 
 
 def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
@@ -35,7 +36,8 @@ def blurred(bsdf: dict[str, Any]) -> dict[str, Any]:
     nested = {key: blurred(value) if isinstance(value, dict) else value for key, value in bsdf.items()}
     kind = ROUGH.get(bsdf["type"], bsdf["type"])
     if kind in ROUGH.values():
-        return nested | {"type": kind, "alpha": at_least(bsdf.get("alpha", 0.0), MIN_BLURRED_ALPHA)}
+        given = {key: bsdf[key] for key in ("alpha", "alpha_u", "alpha_v") if key in bsdf} or {"alpha": 0.0}
+        return nested | {"type": kind} | {key: at_least(alpha, MIN_BLURRED_ALPHA) for key, alpha in given.items()}
     if kind == "principled":
         return nested | {"roughness": at_least(bsdf.get("roughness", 0.5), MIN_BLURRED_ALPHA**0.5)}
     return nested

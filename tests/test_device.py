@@ -12,7 +12,7 @@ from denoise.job import Job
 from denoise.run import denoise
 from errors import BadInput
 from eval.bench.synthetic_frames import synthetic_frame
-from eval.harness import evaluate_clip, named_denoisers
+from eval.harness import compile_kernels, evaluate_clip, named_denoisers
 from models.registry import DENOISERS
 from models.spec import DenoiserSpec
 from tests.helpers import foreign
@@ -59,6 +59,11 @@ def test_denoise_and_its_error_estimate_on_a_device(tmp_path):
         found = foreign.read(tmp_path / "other" / path.name)
         for name, plane in foreign.read(path).items():
             np.testing.assert_allclose(found[name], plane, rtol=1e-2, atol=1e-3)
+
+
+def test_kernels_are_compiled_for_denoisers_of_a_device():
+    with other_device() as device:
+        compile_kernels(DenoiserSpec.named("wskp3", device=device))
 
 
 def test_evaluation_on_a_device(tiny, tmp_path):

@@ -98,6 +98,7 @@ def test_bad_pixels_and_background_of_own_arrays():
         ({"colour": np.zeros((4, 4))}, "'colour' has the shape"),
         ({"depth": np.zeros((24, 32, 3))}, r"'depth' has the shape \(24, 32, 3\), not \(24, 32, 1\)"),
         ({"colours": np.zeros((24, 32, 3))}, "unknown quantity 'colours'"),
+        ({"camera": (np.eye(3), np.eye(4))}, "'camera' is of type tuple: make it by onespp.camera"),
     ],
 )
 def test_unusable_arrays_are_named(changes, message):

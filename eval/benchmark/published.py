@@ -19,6 +19,7 @@ from eval.metrics import flip, ssim, temporal_psnr
 from eval.selection import evaluated
 from models.operators import finite, image_luminance
 from models.spec import DenoiserSpec
+from models.wrappers.taa import transform_colours
 
 PUBLISHED_METRICS = ("PSNR", "SSIM", "FLIP", "tPSNR")
 # Stephen Hill's fit of the ACES tone curve (BakingLab): to its colour space, the curve's coefficients, and back.
@@ -27,9 +28,9 @@ ACES_OUTPUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0
 
 
 def aces_tone(radiance: Tensor) -> Tensor:
-    x = torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_INPUT).to(radiance), radiance)
+    x = transform_colours(radiance, ACES_INPUT)
     x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
-    return torch.einsum("ji,bihw->bjhw", torch.tensor(ACES_OUTPUT).to(x), x).clamp(0, 1) ** (1 / DISPLAY_GAMMA)
+    return transform_colours(x, ACES_OUTPUT).clamp(0, 1) ** (1 / DISPLAY_GAMMA)
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,9 @@ def published(names: Sequence[str], data: Path, runs: Path, budget: str) -> str:
     """A table of denoisers and published rows. Raises BadInput as `protocol_of` and `onespp eval`."""
     dataset = Dataset(data)
     protocol = protocol_of(dataset)
+    for clip in dataset.clips("test"):
+        if clip.frames <= protocol.warm_up:
+            raise BadInput(f"{clip.path} has {clip.frames} frames; of {protocol.warm_up} the first do not count")
     rows: list[list[Any]] = [[name, "published", *row] for name, row in protocol.rows.items()]
     for spec in evaluated(names, runs, budget):
         clips = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in dataset.clips("test")]

@@ -183,9 +183,10 @@ def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips
     evaluate(everything, runs, BUDGET, chosen)
     content, results = read_results(runs)
     tested = [clip for folder in everything for clip in Dataset(folder).clips("test")]
+    total = by_signal(results).get("total", [])  # networks of indirect light alone have none
     facts = {
         "size": size_name((clips.size[1], clips.size[0])),
-        "by_age": {metric: means_by_age(by_signal(results)["total"], metric) for metric in PRINTED},
+        "by_age": {metric: means_by_age(total, metric) for metric in PRINTED},
         "digests": {name: digests_of(file, dataset) for name, (file, dataset) in done.items()},
         "rendered": [rendered(clip) for clip in tested],
         "where": {clip.scene: located(clip, [name for name in LOCATED if name in chosen], runs) for clip in tested},

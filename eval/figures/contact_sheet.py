@@ -15,6 +15,7 @@ from render.scene_file.load import own_scene
 from render.stage import Stage
 from scenes.registry import build_scene
 
+FLIGHT_FRAMES = 24  # of each flight, of which the middle one is shown
 TITLE_INCHES = 0.2  # height of the line above each picture
 
 
@@ -37,7 +38,6 @@ def contact_sheet(
     path: Path,
     names: Sequence[str],
     seed: int = 0,
-    frames: int = 24,
     size: tuple[int, int] = (192, 256),
     spp: int = 64,
     models: Path | None = None,
@@ -52,7 +52,7 @@ def contact_sheet(
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, name in zip(axes.flat, tqdm(names, "scenes", unit="scene"), strict=False):
-        image = displayed_frame(name, seed, frames // 2, frames, height, width, spp, models)
+        image = displayed_frame(name, seed, FLIGHT_FRAMES // 2, FLIGHT_FRAMES, height, width, spp, models)
         axis.imshow(image, interpolation="nearest")
         axis.set_title(name, fontsize=8, pad=2)
     figure.subplots_adjust(

@@ -216,7 +216,8 @@ def save_live_page(runs: Path, data: Sequence[Path], clips: Sequence[ClipResults
     command = [sys.executable, "-m", "runtime.web", str(clip.resolve()), str(path.resolve())]
     finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if finished.returncode:
-        print(f"no {LIVE_PAGE}: {finished.stderr.strip().splitlines()[-1]}")
+        reason = finished.stderr.strip().splitlines() or [f"exit status {finished.returncode}"]
+        print(f"no {LIVE_PAGE}: {reason[-1]}")
         return []
     return [path]
 

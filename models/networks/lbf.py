@@ -29,7 +29,6 @@ What differs, since frames have 1 spp and noise-free features:
 """
 
 from collections.abc import Iterator
-from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
@@ -275,7 +274,6 @@ class LBF(KernelPredictor):
     )
     offline = True
     convex = True
-    inputs = MappingProxyType({"secondary features": SECONDARY})
     dispensable: ClassVar = {}
 
     def __init__(self, *, signal: Signal | None = None):

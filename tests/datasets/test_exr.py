@@ -52,6 +52,13 @@ def test_other_tools_find_the_usual_names(exported):
     assert json.loads(header["onespp"])["meshes"] == clip.facts["meshes"]
 
 
+def test_frames_of_another_clip_are_not_mixed_in(exported, tmp_path):
+    clip, _ = exported
+    (tmp_path / "0049.exr").touch()
+    with pytest.raises(BadInput, match=r"0049\.exr is no frame of"):
+        export_clip(clip.path, tmp_path)
+
+
 def test_damaged_files_are_named(exported, tmp_path):
     _, out = exported
     damaged = tmp_path / "damaged.exr"

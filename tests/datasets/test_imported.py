@@ -1,5 +1,7 @@
 """Files of other people become datasets: written here by their documented formats, with known cameras."""
 
+import shutil
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -8,8 +10,11 @@ from datasets.bmfr_files import import_bmfr
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from datasets.imported import write_dataset
+from datasets.info import summarise
 from datasets.noisebase_files import CROPPED_ROWS, import_noisebase
+from datasets.oidn_layout import export_dataset
 from errors import BadInput
+from eval.tradeoff.samples import scene_of
 from models.registry import create
 from scenes.camera import STILL, View, directions, intrinsics, look_at, motion_vectors, pixel_centres
 
@@ -112,6 +117,22 @@ def test_another_dataset_is_not_overwritten(bmfr, tmp_path):
     with pytest.raises(BadInput, match="something other than these clips"):
         write_dataset(tmp_path / "data", "noisebase at 2 spp", {}, 2)
     assert (tmp_path / "data" / "dataset.json").read_bytes() == before
+
+
+def test_what_needs_a_scene_says_so_and_the_rest_works(bmfr, tmp_path):
+    import_bmfr(bmfr, tmp_path / "data")
+    dataset = Dataset(tmp_path / "data")
+    assert "profile bmfr" in summarise(tmp_path / "data")
+    with pytest.raises(BadInput, match="was imported: only datasets that onespp rendered have a card"):
+        export_dataset(tmp_path / "data", tmp_path / "oidn")
+    with pytest.raises(BadInput, match="was rendered by another version"):
+        scene_of(dataset.clips("test")[0], dataset)
+
+
+def test_scenes_of_one_name_are_refused(bmfr, tmp_path):
+    shutil.copytree(bmfr / "sponza", bmfr / "again" / "sponza")
+    with pytest.raises(BadInput, match=r"again.* and .*sponza.* have the same name"):
+        import_bmfr(bmfr, tmp_path / "data")
 
 
 def test_a_scene_without_frames_or_with_a_singular_camera_is_refused(bmfr, tmp_path):

@@ -85,4 +85,6 @@ def test_positions_in_the_cameras_own_space(dtype):
         assert is_own_space(fitted, header, rounded, SURFACE) == is_own_space(fitted, {}, rounded, SURFACE) == is_own
         fitted_view = in_the_world(fitted, header) if is_own else fitted
         assert_same(fitted_view, view, 1e-3 if dtype == np.float32 else 1e-2)
-        assert in_the_world(fitted, {}) is None
+        for nothing in ({}, {"worldToCamera": np.zeros((4, 4))}):
+            assert in_the_world(fitted, nothing) is None
+            assert is_own_space(fitted, nothing, rounded, SURFACE) == is_own

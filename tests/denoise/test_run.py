@@ -332,6 +332,15 @@ def test_what_cannot_be_done_is_explained(spheres, tmp_path, capfd):
     with pytest.raises(BadInput, match="choose another folder"):
         denoised(tmp_path / "in", tmp_path / "in")
     assert not (tmp_path / "out").exists()
+    others = contents(foreign.write_sequence(tmp_path / "clean", spheres, foreign.blender)[0].parent)
+    with pytest.raises(BadInput, match=r"clean has a 0001\.exr that was not denoised here"):
+        denoised(tmp_path / "in", tmp_path / "clean", ref=(str(tmp_path / "clean" / "*.exr"),))
+    assert contents(tmp_path / "clean") == others
+    foreign.write(tmp_path / "sizes" / "1.exr", foreign.blender(spheres[0]))
+    larger = {layer: np.tile(image, (2, 2, 1)) for layer, image in foreign.blender(spheres[1]).items()}
+    foreign.write(tmp_path / "sizes" / "2.exr", larger)
+    with pytest.raises(BadInput, match=r"2\.exr is 112x80, unlike the frame before it"):
+        denoised(tmp_path / "sizes", tmp_path / "out")
     paths[2].write_bytes(paths[2].read_bytes()[:3000])
     capfd.readouterr()
     with pytest.raises(BadInput, match=r"0003\.exr is damaged"):

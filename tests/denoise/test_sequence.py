@@ -49,6 +49,12 @@ def test_passes_are_matched_by_number(folder):
     assert len(sequence_of({"colour": ["hdr/*"], "normal": ["nrm/*"]}, "1-1")) == 1
 
 
+def test_single_files_belong_together(folder):
+    folder("scene_1spp.exr", "albedo.exr")
+    (frame,) = sequence_of({"colour": ["scene_1spp.exr"], "albedo": ["albedo.exr"]})
+    assert frame.number == 1 and frame.passes["albedo"].name == "albedo.exr"
+
+
 def test_missing_files_and_frames_are_named(folder):
     folder("1.exr")
     with pytest.raises(BadInput, match=r"no file matches 'x\*'"):

@@ -113,6 +113,14 @@ def test_denoisers_are_checked_before_anything_is_rendered(benchmark, tmp_path, 
     assert "oidn+accumulated: skipped, pyoidn is not installed" in capsys.readouterr().out
 
 
+def test_a_network_of_indirect_light_alone_has_no_means_of_total_light(benchmark, tmp_path):
+    root, _ = benchmark
+    content = read_json(
+        run(root / "scenes", root / "data", tmp_path / "runs", ("ntd",), Format((24, 24), 6, 35.0), own=False)
+    )
+    assert {row["denoiser"] for row in content["rows"]} == {"ntd"} and not any(content["by_age"].values())
+
+
 def test_without_names_no_errors_are_located(benchmark):
     """Elsewhere no names stand for all denoisers."""
     root, _ = benchmark
@@ -168,6 +176,12 @@ def test_published_rules_are_those_of_the_scripts(tmp_path):
     assert float(row[2]) == pytest.approx(np.mean([each[5:-5, 5:-5].mean() for each in maps]), abs=2e-3)
     changes = [(pairs[i + 1][0] - pairs[i][0]) - (pairs[i + 1][1] - pairs[i][1]) for i in range(2)]
     assert float(row[4]) == pytest.approx(np.mean([-10 * math.log10((c**2).mean()) for c in changes]), abs=0.02)
+
+
+def test_clips_of_which_no_frame_counts_are_refused(tmp_path):
+    write_dataset(tmp_path / "data", "noisebase at 2 spp", {"bistro1": frames(2)}, 2)
+    with pytest.raises(BadInput, match="has 2 frames; of 16 the first do not count"):
+        published(["noisy"], tmp_path / "data", tmp_path, "quick")
 
 
 def test_other_data_has_no_published_results(benchmark):

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import shutil
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -271,6 +272,14 @@ def test_without_a_bench_there_is_no_plot(evaluated, tmp_path):
     report(runs, megabytes=1e-6)  # one frame a clip
     assert Page(runs / "report" / "index.html").data["trades"] == []
     assert 'id="trade"' not in (runs / "report" / "index.html").read_text()
+
+
+def test_a_live_page_that_fails_without_a_word_costs_nothing_else(evaluated, tmp_path, monkeypatch, capsys):
+    killed = subprocess.CompletedProcess([], -9, "", "")
+    monkeypatch.setattr("eval.report.page.subprocess.run", lambda *_, **__: killed)
+    runs = shutil.copytree(evaluated, tmp_path / "runs")
+    report(runs, megabytes=1e-6)
+    assert "no live.html: exit status -9" in capsys.readouterr().out
 
 
 def test_densest_crop():

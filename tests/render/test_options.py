@@ -95,6 +95,9 @@ def test_blurred_materials_are_rough_and_others_unchanged():
     ramp = np.linspace(0, 1, 16).reshape(4, 4, 1)
     rough = blurred({"type": "roughconductor", "alpha": {"type": "bitmap", "data": ramp}})
     np.testing.assert_array_equal(rough["alpha"]["data"], np.maximum(ramp, 0.3))
+    assert blurred({"type": "roughconductor", "alpha": {"type": "bitmap", "filename": "a.png"}})["alpha"] == 0.3
+    brushed = {"type": "roughconductor", "alpha_u": 0.05, "alpha_v": 0.5}
+    assert blurred(brushed) == {"type": "roughconductor", "alpha_u": 0.3, "alpha_v": 0.5}
 
 
 def test_materials_are_blurred_at_any_depth():

@@ -1,5 +1,6 @@
 """The rendering job: equal bytes however it is interrupted or shared, and clear errors."""
 
+import errno
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from datasets.info import summarise
 from errors import BadInput
 from files import locked
 from render.job.generate import generate, share_of
+from render.kept import kept_references
 from render.path import PathTracer
 from tests.helpers.datasets import clip_in_progress, dataset_command, digest, generate_tiny
 from tests.helpers.training import full_disk
@@ -67,6 +69,13 @@ def test_an_interrupted_clip_keeps_the_references_that_are_finished(tiny, tiny_c
     assert len(rendered) == 5 + 2 * 7  # all but frame 0
     assert digest(tiny_copy) == digest(tiny)
     assert not references.exists()
+
+
+def test_references_outlive_a_full_disk_but_no_failure(tmp_path):
+    for error, kept in ((OSError(errno.ENOSPC, "No space left on device"), True), (RuntimeError("a kernel"), False)):
+        with pytest.raises(type(error)), kept_references(tmp_path / "000") as folder:
+            raise error
+        assert folder.exists() == kept
 
 
 def all_are_whole(root: Path) -> bool:
