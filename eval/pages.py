@@ -331,8 +331,8 @@ def steady(folder: str, *names: str) -> str:
         line |= {"noise off": noise_off(clips, denoiser)}
         line |= {scene: value_cell("psnr", each["psnr"]) for scene, each in values.items()}
         if own_clips:
-            own = fmean(clip["results"][denoiser]["psnr"] for clip in own_clips)
-            line |= {f"{len(own_clips)} of ours": value_cell("psnr", own)}
+            own = [clip["results"][denoiser]["psnr"] for clip in own_clips if denoiser in clip["results"]]
+            line |= {f"{len(own_clips)} of ours": value_cell("psnr", fmean(own)) if own else ""}
         lines.append(line)
     return table(lines)
 

@@ -116,6 +116,7 @@ class Training:
             "seed": task.seed,
             "data": {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")},
             **asdict(self.recipe),
+            "loss": {"name": type(self.recipe.loss).__name__, **asdict(self.recipe.loss)},
             "parameters": denoiser.parameter_count(),
         }
         if task.start:
@@ -149,8 +150,10 @@ class Training:
         return kept
 
     def resume(self, saved: Checkpoint) -> None:
-        # What recipes have got since the checkpoint was written was as it is by default.
-        if RECIPE_DEFAULTS | saved.get("facts", {}) != self.facts:
+        # What recipes have got since the checkpoint was written was as it is by default; losses had no names.
+        facts = RECIPE_DEFAULTS | saved.get("facts", {})
+        facts["loss"] = {"name": self.facts["loss"]["name"]} | facts.get("loss", {})
+        if facts != self.facts:
             raise BadInput(
                 f"{self.task.folder} has a training with another recipe, seed, data set or start: delete it or use "
                 "another --runs"

@@ -60,11 +60,15 @@ def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, monkeypat
 
 def test_a_training_from_before_recipes_got_a_number_has_its_default(tiny, tmp_path, trained_copy):
     saved = torch.load(trained_copy / CHECKPOINT_FILE)
-    del saved["facts"]["warm_up"]
+    del saved["facts"]["warm_up"], saved["facts"]["loss"]["name"]
     torch.save(saved, trained_copy / CHECKPOINT_FILE)
     assert train_network(short_task("rae", tiny, tmp_path, precision=None)) == trained_copy / WEIGHTS_FILE
     with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
         train_network(short_task("rae", tiny, tmp_path, precision=None, warm_up=1.0))
+    saved["facts"]["loss"]["name"] = "AnotherLoss"  # of the same numbers
+    torch.save(saved, trained_copy / CHECKPOINT_FILE)
+    with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
+        train_network(short_task("rae", tiny, tmp_path, precision=None))
 
 
 def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, trained_copy):
