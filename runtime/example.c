@@ -65,21 +65,22 @@ static void parallel_for(void *user, int count, onespp_task task, void *argument
 
 /* --- Frames ------------------------------------------------------------------------------------------------------- */
 
-/* Whether there is another frame, which then replaces the one in memory. */
+/* 1 if there is another frame, which then replaces the one in memory, 0 at the end, -1 where the file is damaged. */
 static int read_frame(FILE *file, raw_header **raw)
 {
     raw_header header;
-    if (fread(&header, sizeof header, 1, file) != 1)
-        return 0;
+    size_t bytes = fread(&header, 1, sizeof header, file);
+    if (bytes != sizeof header)
+        return bytes || ferror(file) ? -1 : 0;
     if (header.width < 1 || header.width > ONESPP_MAX_SIDE || header.height < 1 || header.height > ONESPP_MAX_SIDE
         || header.meshes < 0 || header.meshes > MAX_MESHES)
-        return 0;
+        return -1;
     size_t size = raw_size(&header);
     *raw = realloc(*raw, size);
     if (!*raw)
-        return 0;
+        return -1;
     **raw = header;
-    return fread(*raw + 1, size - sizeof header, 1, file) == 1;
+    return fread(*raw + 1, size - sizeof header, 1, file) == 1 ? 1 : -1;
 }
 
 static double seconds(void)
@@ -103,8 +104,9 @@ int main(int count, char **arguments)
     raw_header *raw = NULL;
     if (!out || threads < 1 || threads > MAX_THREADS)
         return fail("usage: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]");
-    if (!read_frame(file, &raw))
-        return fail("there is no frame");
+    int found = read_frame(file, &raw);
+    if (found != 1)
+        return fail("there is no whole frame");
 
     static Pool pool = {PTHREAD_MUTEX_INITIALIZER, PTHREAD_COND_INITIALIZER, PTHREAD_COND_INITIALIZER, 0, 0, 0, 0, 0};
     pthread_t thread;
@@ -136,6 +138,9 @@ int main(int count, char **arguments)
         pixels = (size_t)frame.width * (size_t)frame.height;
         if (fwrite(radiance, sizeof(float), 3 * pixels, out) != 3 * pixels)
             return fail("the output could not be written");
-    } while (read_frame(file, &raw));
+        found = read_frame(file, &raw);
+    } while (found == 1);
+    if (found)
+        return fail("the sequence is damaged: the frames before are written");
     return fclose(out) ? fail("the output could not be written") : EXIT_SUCCESS;
 }

@@ -2040,13 +2040,16 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     return ONESPP_OK;
 }
 
+/* The engines are no part of the interface of a shared library. */
+#define HIDDEN __attribute__((visibility("hidden")))
+
 #if defined(ONESPP_AVX512)
 
-const Engine onespp_avx512 = {ONESPP_ISA_AVX512, measure_memory, create, denoise};
+HIDDEN const Engine onespp_avx512 = {ONESPP_ISA_AVX512, measure_memory, create, denoise};
 
 #elif defined(ONESPP_AVX2)
 
-const Engine onespp_avx2 = {ONESPP_ISA_AVX2, measure_memory, create, denoise};
+HIDDEN const Engine onespp_avx2 = {ONESPP_ISA_AVX2, measure_memory, create, denoise};
 
 #else
 
@@ -2057,7 +2060,7 @@ static const Engine baseline = {ONESPP_ISA_BASELINE, measure_memory, create, den
 /* Flags for AVX-512 leave no choice. GCC for Windows does not align the stack for AVX (its bug 54412). */
 #if defined(ONESPP_DISPATCH) && defined(__x86_64__) && defined(__GNUC__) && !defined(_WIN32) && !defined(__AVX512F__)
 
-extern const Engine onespp_avx2, onespp_avx512;
+extern HIDDEN const Engine onespp_avx2, onespp_avx512;
 
 /* The fastest engine for this processor and operating system. */
 static const Engine *engine_of(const onespp_config *config)

@@ -79,7 +79,8 @@ typedef struct {
     int reset;         /* 1 for the first frame and after a cut: forget everything before */
     float samples;     /* per pixel, in the light below; 1 where unknown */
 
-    onespp_image direct;    /* 3 channels: noisy radiance after one bounce, or the sum of both kinds of light */
+    onespp_image direct;    /* 3 channels: noisy radiance after one bounce, or the sum of both kinds of light. Of
+                             * surfaces: background shows its emission alone */
     onespp_image indirect;  /* 3, optional: noisy radiance after more bounces, added to `direct` */
     onespp_image emission;  /* 3, optional: light sources seen directly, free of noise; added to the output */
     onespp_image albedo;    /* 3: reflectance in [0, 1] that both kinds of light contain; 1 for background */

@@ -8,6 +8,8 @@ from pathlib import Path
 from errors import BadInput
 from provenance import ROOT
 
+BUILT = ["copies", "build", "*.egg-info", "_onespp.*", "__pycache__"]
+BUILT += ["*.o", "*.a", "*.so", "*.raw", "example", "fuzz", "libfuzzer"]  # see .gitignore
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps", "--no-index")
 
 
@@ -16,8 +18,7 @@ def build_wheel(folder: Path) -> Path:
 
     The copy of the C files is FOLDER/runtime.
     """
-    built = shutil.ignore_patterns("copies", "build", "*.egg-info", "_onespp.*", "*.o", "*.a", "__pycache__")
-    shutil.copytree(ROOT / "runtime", folder / "runtime", ignore=built)
+    shutil.copytree(ROOT / "runtime", folder / "runtime", ignore=shutil.ignore_patterns(*BUILT))
     shutil.copyfile(ROOT / "LICENSE", folder / "LICENSE")
     try:
         subprocess.run([*PIP, "--no-build-isolation", "./runtime/python"], cwd=folder, check=True)

@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 
 from provenance import ROOT
+from scenes.camera import axis_rotation
 
 EXTENSION = ROOT / "runtime" / "blender" / "extension"
 SIZE = (37, 50)
@@ -115,6 +116,25 @@ def test_passes_become_what_the_runtime_takes(extension, tmp_path):
     )
     np.testing.assert_allclose(np.linalg.norm(frame.normal[5:], axis=-1), 1, rtol=1e-5)
     np.testing.assert_array_equal(frame.motion[..., 1], -planes["ViewLayer.Vector.Y"])
+
+
+def test_albedo_that_is_no_number_is_black(extension, tmp_path):
+    planes = layers(np.random.default_rng(4))
+    planes["ViewLayer.Denoising Albedo.G"][7, 3] = np.nan
+    frame = extension("cycles_frame").read_cycles_frame(write(tmp_path / "it.exr", [planes]))
+    assert frame.albedo[7, 3, 1] == 0 and np.isfinite(frame.albedo).all()
+
+
+def test_the_pose_of_a_sheared_camera_is_rigid(extension):
+    camera = extension("camera")
+    turned = np.eye(4)
+    turned[:3, :3] = axis_rotation(1, 0.7) @ axis_rotation(0, 0.3)
+    expected = turned @ np.diag([-1, 1, -1, 1])
+    np.testing.assert_allclose(camera.pose(turned @ np.diag([2, 2, 2, 1])), expected, atol=1e-12)
+    found = camera.pose(np.diag([1, 1, 3, 1]) @ turned)[:3, :3]
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+    with pytest.raises(extension("exr").BadFrame, match="scaled by 0"):
+        camera.pose(np.zeros((4, 4)))
 
 
 @pytest.mark.parametrize(

@@ -221,6 +221,32 @@ def test_alpha_and_one_channel_are_kept_and_reset_forgets(package):
     assert np.array(denoiser(noisy[..., :1], flow=still)).shape == (HEIGHT, WIDTH, 1)
 
 
+def test_background_stays_as_it_is(package):
+    """As the noisy image has it: by the normals alone, as OptiX is called, and by depth."""
+    noisy = np.random.default_rng(0).exponential(1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    normals = np.zeros_like(noisy)
+    normals[8:, :, 2] = -1
+    still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    by_depth = {"depth": 2 * np.abs(normals[..., 2]), "sensor": sensor_at(before_the_box())}
+    for guides in ({}, by_depth):
+        found = np.array(package.Denoiser((WIDTH, HEIGHT), normals=True)(noisy, normals=normals, flow=still, **guides))
+        np.testing.assert_allclose(found[:8], noisy[:8], rtol=1e-6)
+        assert found[8:].std() < 0.5 * noisy[8:].std()
+
+
+def test_an_error_leaves_the_history(package):
+    scene, sensor = mi.load_dict(BOX), sensor_at(before_the_box())
+    found = channels(scene, sensor, GUIDES_ALONE | {"light": {"type": "direct"}})
+    still = {"normals": found["normal"], "flow": np.zeros((HEIGHT, WIDTH, 2))}
+    guides = {name: found[name] for name in ("depth", "shape", "primitive")} | {"sensor": sensor, "scene": scene}
+    denoisers = [package.Denoiser((WIDTH, HEIGHT), normals=True, temporal=True) for _ in range(2)]
+    for _ in range(2):
+        expected, actual = (denoiser(found["light"], **still) for denoiser in denoisers)
+        with pytest.raises(ValueError, match="samples"):
+            denoisers[1](found["light"], **still, **guides, samples=0.0)
+    np.testing.assert_array_equal(np.array(actual), np.array(expected))
+
+
 IMAGE = np.ones((HEIGHT, WIDTH, 3), np.float32)
 BAD_CALLS = {
     "size": ({"noisy": IMAGE[1:]}, ValueError, r"noisy: expected shape \(36, 48, 1\) or .*, got \(35, 48, 3\)"),
@@ -242,6 +268,13 @@ def test_errors_name_the_argument(package, case):
     denoiser(**good)
     with pytest.raises(kind, match=message):
         denoiser(**(good | changes))
+
+
+def test_a_sensor_of_another_size_is_refused(package):
+    denoiser = package.Denoiser((WIDTH, HEIGHT), normals=True)
+    sensor = sensor_at(before_the_box(), size=(2 * HEIGHT, 2 * WIDTH))
+    with pytest.raises(ValueError, match=r"sensor: its film is \(72, 96\), the images are \(36, 48\)"):
+        denoiser(IMAGE, normals=IMAGE, depth=IMAGE[..., 0], flow=IMAGE[..., :2], sensor=sensor)
 
 
 def test_errors_of_integrator_and_sensor(package):

@@ -132,6 +132,15 @@ def test_it_neither_allocates_nor_has_global_state(file, objects):
     assert needed <= {"memcpy", "memmove", "memset", "__stack_chk_fail"} | arithmetic | engines | of_the_compiler
 
 
+def test_a_shared_library_exports_the_interface_alone(library):
+    if which("nm") is None:
+        pytest.skip("nm is not installed")
+    command = ["nm", "--dynamic", "--defined-only", "--format=posix", library._name]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    names = {line.split()[0] for line in lines} - {"_init", "_fini"}
+    assert names == {f"onespp_{name}" for name in ("abi", "size", "create", "denoise", "isa", "message")}
+
+
 def test_instruction_sets_differ_by_rounding(library, one, frames, monkeypatch):
     """The fastest one is the last."""
     outputs = []
@@ -353,6 +362,12 @@ def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path, objects):
     command = [CC, *STRICT, *OPTIMISED, "-pthread", str(FOLDER / "example.c"), *objects.values()]
     subprocess.run([*command, "-o", str(tmp_path / "example"), "-lm"], check=True)
     check_example([str(tmp_path / "example")], one, frames, tmp_path)
+    whole = (tmp_path / "frames.raw").read_bytes()
+    for damaged in (whole[:-1000], whole + b"half a header"):
+        (tmp_path / "damaged.raw").write_bytes(damaged)
+        command = [str(tmp_path / "example"), "damaged.raw", "out.raw"]
+        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert run.returncode == 1 and "the sequence is damaged" in run.stderr
 
 
 # --- Long proofs ------------------------------------------------------------------------------------------------------

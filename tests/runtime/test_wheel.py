@@ -261,7 +261,8 @@ BAD = {
     "wide": ("mesh_id", np.full(SIZE, 1 << 32), ValueError, "mesh_id: expected whole numbers"),
     "names": ("mesh_id", np.full(SIZE, "a"), TypeError, "mesh_id: expected integers"),
     "no camera": ("K", np.eye(4), ValueError, r"K: expected shape \(3, 3\), got \(4, 4\)"),
-    "no lens": ("K", np.zeros((3, 3)), ValueError, "K: a focal length is 0"),
+    "no lens": ("K", np.zeros((3, 3)), ValueError, "K: a focal length is not negative"),
+    "to the right": ("K", np.diag([50.0, 50.0, 1.0]), ValueError, "K: a focal length is not negative"),
     "infinite": ("camera_to_world", np.full((4, 4), np.inf), ValueError, "camera_to_world: not all numbers are finite"),
     "scaled": ("object_to_world", 2 * np.eye(4)[None], ValueError, "object_to_world: expected rotation"),
     "transposed": ("camera_to_world", np.eye(4) + np.eye(4, k=-3), ValueError, "camera_to_world: expected rotation"),
@@ -336,6 +337,7 @@ def test_parts_of_the_light_are_denoised_in_place(module, frames):
         ([np.zeros((*SIZE, 3))], TypeError, "float32"),
         ([np.zeros((*SIZE, 1), np.float32)], ValueError, "shape"),
         ([np.zeros((*SIZE, 3), np.float32)] * 3, ValueError, "max_parts is 2"),
+        ([np.zeros(SIZE, [("b", "u1"), ("v", "f4", (3,))])["v"]], TypeError, "whole floats apart"),
     ],
 )
 def test_bad_parts(module, frames, parts, error, message):

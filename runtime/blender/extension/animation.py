@@ -13,7 +13,7 @@ from .cycles_frame import read_cycles_frame
 from .exr import BadFrame, ExrReader, write_exr
 from .history import Begin, History
 
-REPLAYED = 32  # frames at most, to restore a history: older ones weigh nothing
+REPLAYED = 32  # frames at most, to restore a history: older ones weigh little
 NOTE = "onespp"  # the attribute that says how a denoised frame was made
 VERSION = 1  # of the note: frames with another are denoised again
 

@@ -57,8 +57,14 @@ def intrinsics(projection: Matrix) -> Matrix:
 
 
 def pose(matrix: Matrix) -> Matrix:
-    """A rigid camera_to_world (4, 4), x left and z forward, of Blender's, which may be scaled."""
+    """A rigid camera_to_world (4, 4), x left and z forward, of Blender's, which may be scaled, or sheared by parents.
+
+    Raises BadFrame where it is flat.
+    """
+    left, stretch, right = np.linalg.svd(matrix[:3, :3])
+    if not stretch[2] > 0:
+        raise BadFrame("the camera is scaled by 0")
     rigid = np.eye(4)
-    rigid[:3, :3] = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0) * [-1, 1, -1]
+    rigid[:3, :3] = left @ right * [-1, 1, -1]  # the nearest rotation
     rigid[:3, 3] = matrix[:3, 3]
     return rigid

@@ -41,14 +41,16 @@ class OnesppOptions(bpy.types.PropertyGroup):
 
 
 def animation_of(scene: bpy.types.Scene) -> Animation:
-    """Raises BadFrame where denoised frames would take the place of rendered ones."""
+    """Raises BadFrame where denoised frames would take the place of rendered ones, and without a place for them."""
     options = scene.onespp
 
     def path_of(number: int) -> Path:
         return Path(scene.render.frame_path(frame=number))
 
     rendered = path_of(scene.frame_start).parent.resolve()
-    beside = rendered.with_name(f"{rendered.name}_denoised")
+    if not rendered.name and not options.folder:
+        raise BadFrame(f"there is no place beside {rendered}: choose a folder for denoised frames")
+    beside = rendered.parent / f"{rendered.name}_denoised"
     folder = Path(bpy.path.abspath(options.folder)).resolve() if options.folder else beside
     if folder == rendered:
         raise BadFrame(f"{folder} is the folder of rendered frames: choose another for denoised ones")
@@ -106,7 +108,7 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
                 self.render(context, "EXEC_DEFAULT")
                 if Session.error:
                     raise BadFrame(Session.error)
-        except (BadFrame, OSError, MemoryError, RuntimeError) as error:
+        except (ValueError, OSError, MemoryError, RuntimeError) as error:
             return self.failed(error)
         return {"FINISHED"}
 
@@ -116,7 +118,7 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
             if context.scene.onespp.frames == "RENDER":
                 self.render(context, "INVOKE_DEFAULT")
                 return {"FINISHED"}
-        except (BadFrame, RuntimeError) as error:
+        except (ValueError, OSError, RuntimeError) as error:
             return self.failed(error)
         self.finished = denoise_finished(context)
         manager = context.window_manager
@@ -134,7 +136,7 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
             context.window_manager.progress_update(next(self.finished))
         except StopIteration:
             return self.stop(context, {"FINISHED"})
-        except (BadFrame, OSError, MemoryError) as error:
+        except (ValueError, OSError, MemoryError) as error:
             self.stop(context, {"CANCELLED"})
             return self.failed(error)
         return {"RUNNING_MODAL"}
@@ -151,7 +153,9 @@ class ONESPP_OT_denoise_animation(bpy.types.Operator):  # noqa: N801
 
     def render(self, context: bpy.types.Context, call: str) -> None:
         set_passes(context.scene)
-        session = Session(context.scene, animation_of(context.scene))
+        animation = animation_of(context.scene)
+        animation.folder.mkdir(parents=True, exist_ok=True)  # or fail before the first frame is rendered
+        session = Session(context.scene, animation)
         session.begin()
         try:
             bpy.ops.render.render(call, animation=True)

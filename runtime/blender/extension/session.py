@@ -62,6 +62,6 @@ class Session:
             if not isinstance(camera, Camera):
                 raise camera or BadFrame(f"frame {number} has no camera")
             self.animation.denoise(number, camera)
-        except (BadFrame, OSError, MemoryError) as error:
+        except (ValueError, OSError, MemoryError) as error:  # BadFrame, and what the runtime refuses
             Session.error = str(error)
             print(f"Denoise Animation: {error}")

@@ -37,12 +37,12 @@ class Denoiser:
         self.width, self.height = (int(side) for side in input_size)
         self.brings = {"albedo": albedo, "normals": normals}
         self.temporal, self.threads = temporal, threads
-        self.start(shapes=0)
+        self.runtime = self.with_room(shapes=0)
         self.reset()
 
-    def start(self, shapes: int) -> None:
-        """With room for the poses of as many shapes."""
-        self.runtime = onespp_runtime.Denoiser(self.width, self.height, max_meshes=shapes, threads=self.threads)
+    def with_room(self, shapes: int) -> onespp_runtime.Denoiser:
+        """A denoiser without history, with room for the poses of as many shapes."""
+        return onespp_runtime.Denoiser(self.width, self.height, max_meshes=shapes, threads=self.threads)
 
     def reset(self) -> None:
         """Forget all frames before, as after a cut."""
@@ -102,14 +102,16 @@ class Denoiser:
         images = to_images({"albedo": albedo, "normals": normals, "flow": flow, **guides}, size)
         now = self.snapshot(images, sensor, scene)
         motion, poses = self.motion(images, now), self.moved_poses(now)
-        if len(poses) > self.runtime.max_meshes:
-            self.start(len(poses))
+        runtime = self.runtime if len(poses) <= self.runtime.max_meshes else self.with_room(len(poses))
         rgb = np.broadcast_to(light[..., :3], (*size, 3))
-        known = np.minimum(images["emission"], rgb) if "emission" in images else None
-        colour = self.runtime.denoise(
-            rgb if known is None else rgb - known,
+        normals, depth = self.surface(images, now, to_sensor)
+        known = np.minimum(images["emission"], rgb) if "emission" in images else np.zeros_like(rgb)
+        known = np.where(depth.reshape(*size, 1) > 0, known, rgb)  # background is no noise
+        colour = runtime.denoise(
+            rgb - known,
             images.get("albedo"),
-            *self.surface(images, now, to_sensor),
+            normals,
+            depth,
             motion,
             emission=known,
             roughness=images.get("roughness"),
@@ -119,7 +121,7 @@ class Denoiser:
             reset=self.is_first or not self.temporal,
             **({"K": now.camera.K, "camera_to_world": now.camera.camera_to_world} if now else FAR_AWAY),
         )
-        self.is_first, self.before, self.poses = False, now, poses
+        self.runtime, self.is_first, self.before, self.poses = runtime, False, now, poses
         return mi.TensorXf(np.concatenate([colour[..., : light.shape[2]], light[..., 3:]], axis=2))
 
     def check(self, guides: dict[str, Any], **promised: Any) -> None:
@@ -140,7 +142,10 @@ class Denoiser:
             raise ValueError("depth: it needs `sensor`, and normals")
         if scene is not None and not {"shape", "primitive"} <= images.keys():
             raise ValueError("scene: it needs the guides `shape` and `primitive`")
-        return Snapshot(sensor, scene)
+        now = Snapshot(sensor, scene)
+        if now.camera.size != (self.height, self.width):
+            raise ValueError(f"sensor: its film is {now.camera.size}, the images are {(self.height, self.width)}")
+        return now
 
     def motion(self, images: dict[str, Image], now: Snapshot | None) -> Image | Array:
         """In pixels to where surfaces were: the runtime counts the other way than `flow`."""

@@ -203,7 +203,7 @@ def pixels_of(sampler: Any, size: tuple[int, int], seed: Any) -> Iterator[Any]:
         yield dr.arange(mi.UInt32, count * spp) // spp
         return
     for pixel in range(count):
-        sampler.seed(seed * count + pixel)
+        sampler.seed((seed * count + pixel) & 0xFFFFFFFF)
         for _ in range(spp):
             yield pixel
             sampler.advance()

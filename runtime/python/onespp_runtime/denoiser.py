@@ -86,8 +86,8 @@ class Denoiser:
         Images have row 0 at the top, and are floats; float32 is read in place, whatever its strides, and other floats
         are converted. A number that is NaN or infinite counts as 0. Lengths are in any unit, always the same.
 
-        - color (H, W, 3): noisy radiance, linear RGB, at least 0, in any unit. A frame of another size than the one
-          before resets
+        - color (H, W, 3): noisy radiance of surfaces, linear RGB, at least 0, in any unit; background shows its
+          emission alone. A frame of another size than the one before resets
         - albedo (H, W, 3): reflectance in [0, 1] that the color contains, 1 for background. None: 1, so that textures
           are filtered together with the light
         - normal (H, W, 3): shading normal in world space, of length 1, towards the viewer; 0 for background
@@ -148,13 +148,15 @@ def in_place(part: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.flo
         raise TypeError("parts: expected writable numpy arrays of float32, which are denoised in place")
     if part.shape != (*size, 3):
         raise ValueError(f"parts: expected the shape {(*size, 3)}, got {part.shape}")
+    if not part.flags.aligned or any(stride % part.itemsize for stride in part.strides):
+        raise TypeError("parts: expected floats that lie whole floats apart, not fields of packed records")
     return part
 
 
 def set_camera(frame: FrameInputs, K: Array, camera_to_world: Array) -> None:
     intrinsics = to_matrices("K", K, (3, 3))
-    if intrinsics[0, 0] == 0 or intrinsics[1, 1] == 0:
-        raise ValueError("K: a focal length is 0")
+    if intrinsics[0, 0] >= 0 or intrinsics[1, 1] >= 0:
+        raise ValueError("K: a focal length is not negative; negate axes of other cameras as camera_to_world says")
     frame.K[:] = intrinsics.flatten().tolist()
     frame.camera_to_world[:] = to_poses("camera_to_world", camera_to_world, (4, 4)).flatten().tolist()
 
