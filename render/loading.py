@@ -151,7 +151,7 @@ class StockLoader:
         return self.loaded[id(description)][1]
 
     def placed(self, geometry: Mapping[str, Any]) -> dict[str, Any]:
-        """The description of a shape or light, scaled from world units."""
+        """The description of a shape, scaled from world units."""
         if self.unit == 1:
             return dict(geometry)
         return {**geometry, "to_world": np.diag([1 / self.unit] * 3 + [1.0]) @ geometry.get("to_world", np.eye(4))}
@@ -168,9 +168,12 @@ class StockLoader:
 
     def light(self, light: StockLight) -> mi.Emitter:
         """Raises BadInput, naming the light, if it cannot be loaded."""
-        emitter, position = self.placed(light.emitter), light.emitter.get("position")
+        emitter, position = dict(light.emitter), light.emitter.get("position")
         if isinstance(position, list):
-            emitter = light.emitter | {"position": [x / self.unit for x in position]}
+            emitter["position"] = [x / self.unit for x in position]
+        if "to_world" in emitter:  # of which Mitsuba takes directions, too: no scale may be in it
+            emitter["to_world"] = emitter["to_world"] @ np.eye(4)
+            emitter["to_world"][:3, 3] /= self.unit
         where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
         return self.made(to_mitsuba(emitter, self.load) | {"id": light.name}, where)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from errors import BadInput
 from render.backend import dr, mi
 from render.loading import upload
-from scenes.animation import Shape, StockLight, StockShape
+from scenes.animation import FreeMotion, RigidMotion, Shape, StockLight, StockShape
 from scenes.camera import Array
 
 Changes = dict[str, NDArray[np.float32]]  # by the parameter's name
@@ -33,6 +33,11 @@ def mesh_changes(shape: Shape, frame: float, unit: float, moves: bool) -> Change
     return changes
 
 
+def is_placed(motion: RigidMotion | FreeMotion) -> bool:
+    """Whether it ever takes a shape from its rest pose."""
+    return motion.varies() or bool((motion.matrix(0) != np.eye(4)).any())
+
+
 class StockParameters:
     """The parameters at rest of a stock shape or light that moves or changes. Raises BadInput if it cannot."""
 
@@ -41,7 +46,7 @@ class StockParameters:
         self.unit = unit
         name = described.name
         self.rest: dict[str, Array] = {}
-        if isinstance(described, StockShape) and described.motion.varies():
+        if isinstance(described, StockShape) and is_placed(described.motion):
             self.rest = at_rest(parameters, [f"{name}.{key}" for key in PLACEMENT])
             if not self.rest:
                 raise BadInput(f"shape '{name}' cannot move: it is of the kind {described.geometry['type']}")
@@ -49,7 +54,7 @@ class StockParameters:
         kind = described.emitter["type"] if described.emitter else "none"
         # Irradiance of point lights falls with the square of the distance, which is in Mitsuba's units.
         self.factor = unit**-2 if kind in POINT_LIGHTS else 1.0
-        if described.gain.varies() or self.factor != 1:
+        if described.gain.varies() or described.gain.at(0) != 1 or self.factor != 1:
             prefix = f"{name}.emitter" if isinstance(described, StockShape) else name
             self.light = at_rest(parameters, [f"{prefix}.{key}" for key in SCALES.get(kind, BRIGHTNESS)])
             if not self.light:

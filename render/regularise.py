@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from render.backend import dr, mi
-from render.loading import to_mitsuba
+from render.loading import StockLoader
 from render.materials import registry_index, registry_table
 from render.stage import Stage
 
@@ -49,10 +49,10 @@ class BlurredTable:
     def __init__(self, stage: Stage):
         self.row = registry_table(mi.UInt32, {index: row for row, index in enumerate(stage.bsdfs)})
         described = stage.bsdf_descriptions
+        loader = StockLoader()
         # Keeps objects alive, which pointers do not.
         self.bsdfs = [
-            mi.load_dict(to_mitsuba(blurred(described[index]))) if index in described else own
-            for index, own in stage.bsdfs.items()
+            loader.load(blurred(described[index])) if index in described else own for index, own in stage.bsdfs.items()
         ]
         self.pointers = mi.BSDFPtr(self.bsdfs)
 

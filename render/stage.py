@@ -27,13 +27,13 @@ CUTOUT = 0.999  # least transmission of a cut-out
 
 
 def unit_of(extents: list[float]) -> float:
-    """Mitsuba's unit in world units: 1, or a power of two for very small and very large scenes.
+    """Mitsuba's unit in world units: 1, or a power of two for very small scenes.
 
-    `extents` are the largest coordinates of its shapes. Mitsuba's epsilon against self-intersection suits scenes of
-    human size only.
+    `extents` are the largest coordinates of its shapes. Mitsuba moves the origins of rays away from surfaces by a
+    multiple of 1 + the largest coordinate, which is far for small scenes, and as it should be for large ones.
     """
     extent = max(extents, default=1.0)
-    if extent == 0 or 1 / 16 < extent < 1024:
+    if extent == 0 or extent > 1 / 16:
         return 1.0
     return float(2.0 ** np.round(np.log2(extent)))
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from datasets.tonemap import clip_exposure, display, luminance
+from errors import BadInput
 from plotting import DPI, plt, save_figure
 from render.path import PosedFrame
 from render.scene_file.load import own_scene
@@ -27,8 +28,13 @@ def displayed_frame(
     `name` is that of a built-in scene, which may need `models` (see build_scene), or the path of a TOML. Raises
     BadInput for an unknown scene.
     """
-    own = name.endswith(".toml")
-    scene = own_scene(Path(name)).clip("test", 0, frames, seed) if own else build_scene(name, seed, frames, models)
+    if name.endswith(".toml"):
+        described = own_scene(Path(name))
+        for note in described.notes:
+            tqdm.write(note)
+        scene = described.clip("test", 0, frames, seed)
+    else:
+        scene = build_scene(name, seed, frames, models)
     posed = PosedFrame(Stage(scene, height, width), frame)
     reflected = posed.reflected(seed, spp)
     return display(reflected + posed.emission, clip_exposure(luminance(reflected)))
@@ -42,7 +48,12 @@ def contact_sheet(
     spp: int = 64,
     models: Path | None = None,
 ) -> None:
-    """Write a PNG of the scenes' middle frames in `size` (height, width). Raises BadInput for an unknown scene."""
+    """Write a PNG of the scenes' middle frames in `size` (height, width).
+
+    Raises BadInput for an unknown scene, a negative seed, and less than one sample per pixel.
+    """
+    if seed < 0 or spp < 1:
+        raise BadInput(f"seed {seed}, {spp} spp: use a seed of 0 or more, and at least one sample per pixel")
     height, width = size
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

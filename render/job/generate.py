@@ -77,9 +77,11 @@ def begun(root: Path, profile: str, seed: int, reads: Sequence[str], options: Op
     if not facts.exists():
         write_json(facts, wanted)
     dataset = Dataset(root)
-    for key in ("profile", "seed", "generator", "models", "splits", "channels", "options", "source"):
+    # Notes, too: a texture that was missing may have come.
+    for key in ("profile", "seed", "generator", "models", "splits", "channels", "options", "source", "notes"):
         if dataset.facts.get(key, {}) != wanted[key]:
-            raise BadInput(f"{root} was made with another {key}: choose another --data or delete it")
+            other = "other" if key.endswith("s") else "another"
+            raise BadInput(f"{root} was made with {other} {key}: choose another --data or delete it")
     return dataset
 
 

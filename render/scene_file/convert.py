@@ -187,6 +187,8 @@ class SceneFile:
                 elif kind == "Emitter" and value is not None and value["type"] not in SURFACE_LIGHTS:
                     self.note(f"a light of the kind {value['type']} on a shape is left out", node)
                 elif value is not None:
+                    if kind in parts:
+                        self.note(f"a further {kind.lower()} on the same shape: the last one is rendered", node)
                     parts[kind] = value
         name = self.unique_name(node)
         self.shapes.append(StockShape(name, described, parts.get("BSDF"), parts.get("Emitter")))
@@ -202,6 +204,9 @@ class SceneFile:
             return
         if described["type"] == "thinlens":
             self.note("a lens: a pinhole instead, without depth of field", node)
+        films = [self.state.nodes[child].props for _, child in self.children(node) if self.kind(child) == "Film"]
+        if any(key.startswith("crop_") for props in films for key in props):
+            self.note("its film is cropped: the whole view is rendered", node)
         if "near_clip" in described or "far_clip" in described:
             self.note("near_clip and far_clip: nothing is clipped", node)
         self.sensor = described
@@ -229,7 +234,9 @@ class SceneFile:
         if props.plugin_name() not in OWN_INTEGRATORS:
             self.note(f"the integrator '{props.plugin_name()}': path tracing instead")
         depth = props.get("max_depth", None)
+        if depth == 1:
+            self.note("max_depth 1 is light seen directly, alone: surfaces show direct light, too")
         if isinstance(depth, int) and depth > 0:
-            self.max_depth = depth
+            self.max_depth = max(depth, 2)
         elif props.plugin_name() == "direct":
             self.max_depth = 2

@@ -18,10 +18,13 @@ from scenes.camera import Array
 LARGEST = 1e18  # of all numbers: its square is a finite float32; and none is NaN
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Vector = tuple[Number, Number, Number]
-Count = Annotated[int, Meta(ge=0)]
-Positive = Annotated[int, Meta(ge=1)]
+MOST = 2**20  # of all whole numbers
+MOST_SPP = 2**28  # Mitsuba counts samples by 32 bits
+Count = Annotated[int, Meta(ge=0, le=MOST)]
+Positive = Annotated[int, Meta(ge=1, le=MOST)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]  # of a clip: 0 is its first frame, 1 its last
-Even = Annotated[int, Meta(ge=2, multiple_of=2)]
+Even = Annotated[int, Meta(ge=2, le=MOST_SPP, multiple_of=2)]
+Decibels = Annotated[float, Meta(gt=0, le=200)]
 
 
 class Table(msgspec.Struct, forbid_unknown_fields=True):
@@ -70,7 +73,7 @@ class Split(Table):
     camera: Literal["auto", "keyframes"] | None = None  # by default by keyframes, where there are any
     realisations: Positive = 1
     reference_spp: Even = 256
-    floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = None  # dB
+    floor: Decibels | None = None
     most_spp: Even = 4096
 
 
@@ -81,7 +84,7 @@ class TrainSplit(Split):
 
 
 class TestSplit(Split):
-    floor: Annotated[float, Meta(gt=0, le=LARGEST)] | None = 35.0
+    floor: Decibels | None = 35.0
     most_spp: Even = 2048
     judged: tuple[Count, ...] = ()  # the frames that get a reference; by default all
 

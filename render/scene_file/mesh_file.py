@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
+from trimesh.transformations import quaternion_matrix
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -23,7 +24,8 @@ from scenes.camera import Array
 from scenes.colours import Bsdf, diffuse_bsdf, rgb, srgb_to_linear
 from scenes.textures import sky
 
-FORMATS = (".glb", ".gltf", ".obj", ".ply")
+GLTF_FORMATS = (".glb", ".gltf")
+FORMATS = (*GLTF_FORMATS, ".obj", ".ply")
 SUN = np.array([0.4, 0.8, 0.45])  # the direction to it, y up
 
 
@@ -187,36 +189,63 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
         missing = f": {resolver.missing[0]} is missing" if resolver.missing else f" is empty or damaged ({damage})"
         raise BadInput(f"{path}{missing}")
     notes = [f"the file {name} is missing: its content is left out" for name in dict.fromkeys(resolver.missing)]
-    notes += [*dict.fromkeys(problems), *notes_of_gltf(path)]
+    notes += [*dict.fromkeys(problems), *notes_of_gltf(gltf_of(path))]
     if not can_draw():
         notes.append("textures are left out: reading them needs `pip install 'onespp[report]'`")
     return scene, notes
 
 
-def notes_of_gltf(path: Path) -> list[str]:
-    """Notes on a glTF's content beyond meshes, materials and a camera; none of other formats."""
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return []
+def gltf_of(path: Path) -> dict[str, Any]:
+    """The JSON of a glTF; empty for other formats."""
+    if path.suffix.lower() not in GLTF_FORMATS:
+        return {}
     content = path.read_bytes()
     if content[:4] == b"glTF":
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-    gltf = json.loads(content)
+    return dict(json.loads(content))
+
+
+def notes_of_gltf(gltf: dict[str, Any]) -> list[str]:
+    """Notes on its content beyond meshes, materials and a perspective camera."""
     notes = [f"its {what} are left out: meshes stay at rest" for what in ("animations", "skins") if gltf.get(what)]
     notes += [f"the extension {name} may not be honoured" for name in gltf.get("extensionsUsed", [])]
-    if len(gltf.get("cameras", [])) > 1:
-        notes.append("it has several cameras: one is used")
+    kinds = [camera["type"] for camera in gltf.get("cameras", [])]
+    if kinds.count("perspective") > 1:
+        notes.append("it has several cameras: the first one is used")
+    if "orthographic" in kinds:
+        notes.append("orthographic cameras are left out")
     return notes
 
 
-def camera_of(scene: trimesh.Scene, aspect: float) -> Camera | None:
-    """The file's camera, which looks along its -z, with its vertical field of view for images of that `aspect`."""
-    if not scene.has_camera:
-        return None
-    pose = np.asarray(scene.camera_transform, np.float64)
-    eye = pose[:3, 3]
-    x_fov = np.degrees(2 * np.arctan(aspect * np.tan(np.radians(scene.camera.fov[1]) / 2)))
-    axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
-    return Camera.at_rest(eye, eye - axes[:, 2], float(x_fov), axes[:, 1])
+def local_matrix(node: dict[str, Any]) -> Array:
+    """A glTF node's transform (4, 4) to its parent (glTF 2.0, 3.5.3)."""
+    if "matrix" in node:
+        return np.reshape(node["matrix"], (4, 4)).T.astype(np.float64)
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    matrix = quaternion_matrix([w, x, y, z]) @ np.diag([*node.get("scale", (1.0, 1.0, 1.0)), 1.0])
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return np.asarray(matrix, np.float64)
+
+
+def camera_of_gltf(gltf: dict[str, Any], aspect: float) -> Camera | None:
+    """Its first perspective camera, which looks along its -z, with its vertical field of view for that `aspect`.
+
+    Trimesh neither follows the parents of cameras nor reads those without an aspect ratio.
+    """
+    nodes = gltf.get("nodes", [])
+    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
+    for index, node in enumerate(nodes):
+        camera = gltf["cameras"][node["camera"]] if "camera" in node else {}
+        if camera.get("type") != "perspective":
+            continue
+        pose, above = local_matrix(node), parents.get(index)
+        for _ in nodes:  # and no more often: a damaged file may have a circle
+            pose = pose if above is None else local_matrix(nodes[above]) @ pose
+            above = parents.get(above) if above is not None else None
+        axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
+        x_fov = np.degrees(2 * np.arctan(aspect * np.tan(camera["perspective"]["yfov"] / 2)))
+        return Camera.at_rest(pose[:3, 3], pose[:3, 3] - axes[:, 2], float(x_fov), axes[:, 1])
+    return None
 
 
 class MeshFile:
@@ -227,7 +256,11 @@ class MeshFile:
 
     def __init__(self, path: Path, aspect: float):
         scene, self.notes = load_scene(path)
-        self.camera = camera_of(scene, aspect)
+        try:
+            self.camera = camera_of_gltf(gltf_of(path), aspect)
+        except (KeyError, IndexError, TypeError, ValueError):
+            self.camera = None
+            self.notes.append("its cameras are damaged: left out")
         self.shapes: list[Shape] = []
         self.sky: Array | None = None
         names = Names()
@@ -246,7 +279,9 @@ class MeshFile:
             if not isinstance(mesh.visual, TextureVisuals):
                 mesh.visual = TextureVisuals()
             emission = None if radiance is None else Track.constant(radiance)
-            self.shapes.append(Shape(name, mesh, bsdf, emission, smooth=True))
+            # By its specification, a glTF mesh without normals has flat faces.
+            smooth = path.suffix.lower() not in GLTF_FORMATS or "vertex_normals" in mesh._cache
+            self.shapes.append(Shape(name, mesh, bsdf, emission, smooth=smooth))
         if not self.shapes:
             raise BadInput("; ".join([f"{path} has no mesh to render", *self.notes]))
         if not any(shape.radiance for shape in self.shapes):

@@ -87,7 +87,7 @@ def ward(described: Properties) -> StandIn:
 
 
 def coated(described: Properties) -> StandIn:
-    inner = nested(described)
+    inner = [value for value in nested(described) if value["type"] not in TEXTURES]
     return (inner[0], "what is under the coat") if inner else (plain_bsdf(described), "a diffuse surface")
 
 
@@ -101,6 +101,8 @@ def mixture(described: Properties) -> StandIn:
         total += weight
         share = weight / total if total > 0 else 0.5
         mixed = {"type": "blendbsdf", "weight": share, "first": mixed, "second": bsdf}
+    if total < 1:  # the rest is absorbed
+        mixed = {"type": "blendbsdf", "weight": 1 - total, "first": mixed, "second": diffuse_bsdf(rgb([0.0] * 3))}
     return mixed, "the same mixture, by blendbsdf"
 
 

@@ -1,7 +1,7 @@
 """Parses Mitsuba's XML files of this and earlier versions; nothing outside of their folder is read."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 from xml.etree import ElementTree
@@ -81,18 +81,18 @@ def with_parameters(element: LocatedElement, tag: str = "float", **parameters: s
     return element
 
 
-def old_subsurface(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+def old_subsurface(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     comment = cast(Element, ElementTree.Comment("subsurface"))
     return comment, "subsurface scattering is left out: the surface alone is rendered"
 
 
-def old_animation(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+def old_animation(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     first = named_like(element, "transform")
     first.extend(next(iter(element.findall("transform")), []))
     return first, f"an <animation> ('{element.get('name')}'): its first transform instead"
 
 
-def old_colour(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+def old_colour(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     """The values of <rgb>, hexadecimal ones too, are linear; those of <srgb> are not."""
     colour = element.get("value", "")
     if colour.startswith("#"):
@@ -107,15 +107,18 @@ def old_colour(element: LocatedElement, folder: Path) -> tuple[Element, str]:
     return upgraded, ""
 
 
-def old_blackbody(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+def old_blackbody(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     parameters = {name: element.get(name, "1").strip(" K") for name in ("temperature", "scale")}
     return with_parameters(named_like(element, "spectrum", type="blackbody"), **parameters), ""
 
 
-def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
+def old_spectrum(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     """Three values without wavelengths are red, green and blue; more are evenly spaced from 360 to 830 nm."""
     file = element.get("filename")
-    if file is not None and not (folder / file).exists():
+    found = [folder / file for folder in searched if file is not None and (folder / file).exists()]
+    if found:
+        element.set("filename", str(found[0]))
+    elif file is not None:
         note = f"the file {file} of a spectrum is missing: 0.5 everywhere instead"
         return named_like(element, "spectrum", value="0.5"), note
     values = element.get("value", "").replace(",", " ").split()
@@ -129,7 +132,7 @@ def old_spectrum(element: LocatedElement, folder: Path) -> tuple[Element, str]:
 
 
 # The element instead, and a note.
-UPGRADES: dict[str, Callable[[LocatedElement, Path], tuple[Element, str]]] = {
+UPGRADES: dict[str, Callable[[LocatedElement, Sequence[Path]], tuple[Element, str]]] = {
     "subsurface": old_subsurface,
     "animation": old_animation,
     **dict.fromkeys(("srgb", "rgb"), old_colour),
@@ -139,8 +142,13 @@ UPGRADES: dict[str, Callable[[LocatedElement, Path], tuple[Element, str]]] = {
 RENAMED = {"lookAt": "lookat", "camera": "sensor", "luminaire": "emitter"}
 
 
-def upgrade(root: LocatedElement, folder: Path) -> list[str]:
-    """Replace what Mitsuba's parser does not support any more. Returns notes.
+def is_old(root: LocatedElement) -> bool:
+    """Whether a file is one of Mitsuba 0.x, as one without a version."""
+    return root.get("version", "0").startswith("0.") or "version" not in root.attrib
+
+
+def upgrade(root: LocatedElement, searched: Sequence[Path]) -> list[str]:
+    """Replace what Mitsuba's parser does not support any more; files are in the folders `searched`. Returns notes.
 
     Raises ValueError, with its place, for an element whose value is invalid.
     """
@@ -154,7 +162,7 @@ def upgrade(root: LocatedElement, folder: Path) -> list[str]:
             child.tag = RENAMED.get(child.tag, child.tag)
             if child.tag in UPGRADES:
                 try:
-                    parent[index], note = UPGRADES[child.tag](child, folder)
+                    parent[index], note = UPGRADES[child.tag](child, searched)
                 except ValueError as error:
                     raise ValueError(f"{child.place}, <{child.tag}>: {error}") from None
                 notes += [note] if note else []
@@ -184,7 +192,7 @@ class ParsedFile:
         mi.set_file_resolver(folders)  # type: ignore[operator]
         try:
             root = self.read(self.path)
-            self.notes = upgrade(root, self.path.parent)
+            self.notes = upgrade(root, self.searched)
             self.elements = [element for element in root.iter() if isinstance(element, LocatedElement)]
             self.text = ElementTree.tostring(root, "unicode")
             self.state = mi.parser.parse_string(config, self.text)
@@ -196,7 +204,7 @@ class ParsedFile:
             mi.set_file_resolver(usual_folders)  # type: ignore[operator]
 
     def read(self, file: Path, depth: int = 0) -> LocatedElement:
-        """The root of `file`, with the content of included files of its version in place."""
+        """The root of `file`, with the content of included files in place: of its version, or as old as it."""
         self.included += 1
         if depth > MAX_INCLUDE_DEPTH or self.included > MAX_INCLUDES:
             limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
@@ -221,7 +229,7 @@ class ParsedFile:
                     self.searched.append(named)
                 elif child.tag == "include":
                     part = self.read(named, depth + 1)
-                    if part.get("version") == root.get("version"):
+                    if part.get("version") == root.get("version") or (is_old(part) and is_old(root)):
                         place = [*parent].index(child)
                         parent[place : place + 1] = [*part]
         return root

@@ -29,6 +29,9 @@ def test_contact_sheet_shows_every_scene(tmp_path):
     assert (places[3] == 1).all()
     with pytest.raises(BadInput, match="unknown scene 'castle'"):
         contact_sheet(tmp_path / "sheet.png", ["castle"])
+    for options in ({"seed": -1}, {"spp": 0}):
+        with pytest.raises(BadInput, match="use a seed of 0 or more, and at least one sample"):
+            contact_sheet(tmp_path / "sheet.png", names, **options)
 
 
 def test_strips_are_in_their_order_and_slant_to_the_left():

@@ -100,6 +100,14 @@ def test_blurred_materials_are_rough_and_others_unchanged():
     assert blurred(brushed) == {"type": "roughconductor", "alpha_u": 0.3, "alpha_v": 0.5}
 
 
+def test_a_material_with_a_property_of_another_renderer_is_blurred():
+    """As it is loaded: without what Mitsuba does not have."""
+    bsdf = {"type": "roughplastic", "alpha": 0.1, "shininess": 3.0}
+    shape = StockShape("ball", {"type": "sphere"}, {"type": "twosided", "bsdf": bsdf})
+    stage = Stage(replace(build_scene("cornell_box", 0, 2), stock=(shape,)), 8, 8)
+    assert len(BlurredTable(stage).bsdfs) == len(stage.bsdfs) and "shininess" in stage.notes[0]
+
+
 def test_materials_are_blurred_at_any_depth():
     """Whatever they are nested in; what is not glossy there stays as it is."""
     checks = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}

@@ -167,6 +167,26 @@ def test_holes_of_masks_are_seen_through():
     np.testing.assert_allclose(buffer["albedo"][2, 1], [0.1, 0.7, 0.1], rtol=1e-5)
 
 
+@pytest.mark.parametrize("light", ["to_world", "direction"])
+def test_directions_of_lights_do_not_depend_on_the_size(light):
+    """A sun above a wall that faces up, a thousand times smaller."""
+    down = mi.ScalarTransform4f().look_at([0, 1, 0], [0, 0, 0.5], [1, 0, 0])
+    places = {"to_world": np.array(down.matrix), "direction": [0.0, -1.0, 0.5]}
+    sun = StockLight("sun", {"type": "directional", light: places[light], "irradiance": rgb(1, 1, 1)})
+    means = []
+    for size in (1.0, 1e-3):
+        up = np.array(mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(size).matrix)
+        floor = StockShape("floor", {"type": "rectangle", "to_world": up}, WHITE)
+        eye = Track.constant([0.0, 2 * size, 0.1 * size])
+        stage = Stage(
+            Scene((), Camera(eye, Track.constant([0.0, 0, 0]), Track.constant(20.0)), stock=(floor,), lights=(sun,)),
+            8,
+            8,
+        )
+        means.append(float(np.add(*PathTracer(stage).radiance(stage.rays(stage.view(0)), 1, 16)).mean()))
+    assert means[0] > 0.1 and means[1] == pytest.approx(means[0], rel=1e-3)
+
+
 @pytest.mark.parametrize("factor", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
 def test_the_size_of_a_scene_changes_nothing_but_its_depth(factor):
     """Scenes measured in millimetres or in kilometres: points, spots and skies shine alike."""

@@ -190,7 +190,7 @@ def test_a_dataset_may_be_rendered_from_copies_of_the_libraries(libraries: Path,
     shutil.copytree(libraries, copies, ignore=shutil.ignore_patterns("data", "copies"))
     for folder in (libraries, copies):
         assert begun(root, "release", 0, USUAL_CHANNELS, NO_OPTIONS, str(folder)).facts["models"]
-    with pytest.raises(BadInput, match="another models"):
+    with pytest.raises(BadInput, match="other models"):
         begun(root, "release", 0, USUAL_CHANNELS, NO_OPTIONS)
 
 

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from command_line import main
 from datasets.clip import Dataset
@@ -13,7 +14,7 @@ from eval.tradeoff.samples import scene_of
 from render.job.profiles import SamplingQuality, own_profile, profile_of
 from render.scene_file.load import own_scene
 from tests.helpers.datasets import digest
-from tests.helpers.scene_files import old_xml, write
+from tests.helpers.scene_files import old_xml, write, xml
 from tests.test_cli import fails
 
 SPLITS = """
@@ -124,3 +125,14 @@ def test_defaults_and_names(tmp_path):
 def test_preview(made, tmp_path):
     main(["preview", str(made / "my.toml"), "--out", str(tmp_path / "sheet.png"), "--spp", "2"])
     assert (tmp_path / "sheet.png").stat().st_size > 1000
+
+
+def test_a_texture_that_has_come_begins_another_dataset(tmp_path, capsys):
+    """Frames rendered without it, and references of those, are not mixed with others."""
+    picture = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.png"/></texture>'
+    ball = f'<shape type="sphere" id="ball"><bsdf type="diffuse">{picture}</bsdf></shape>'
+    words = ("--scene", str(write(tmp_path, xml(shape=ball), SPLITS)), "--data", str(tmp_path / "data"))
+    main(["dataset", *words, "--reads", "noisy"])
+    Image.new("RGB", (2, 2), "red").save(tmp_path / "wood.png")
+    own_scene.cache_clear()  # as in another process
+    assert "was made with other notes" in fails(capsys, "dataset", *words, "--reads", "noisy")

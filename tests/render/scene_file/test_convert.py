@@ -9,7 +9,7 @@ from errors import BadInput
 from render.loading import StockLoader
 from render.scene_file.convert import SceneFile
 from render.scene_file.stand_ins import RESERVED_NAMES, Names
-from tests.helpers.scene_files import own, write, xml
+from tests.helpers.scene_files import own, painted, write, xml
 
 
 def converted(folder, content: str):
@@ -58,10 +58,20 @@ def test_depth_is_that_of_the_innermost_integrator(tmp_path):
     inner = '<integrator type="path"><integer name="max_depth" value="{}"/></integrator>'
     assert converted(tmp_path, xml(inner.format(7))).max_depth == 7
     assert converted(tmp_path, xml(inner.format(-1))).max_depth is None
+    lights_alone = converted(tmp_path, xml(inner.format(1)))
+    assert lights_alone.max_depth == 2 and "max_depth 1" in lights_alone.notes[0]
     assert converted(tmp_path, xml('<integrator type="direct"/>')).max_depth == 2
     aov = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{inner.format(5)}</integrator>'
     found = converted(tmp_path, xml(aov))
     assert found.max_depth == 5 and len(found.notes) == 1
+
+
+def test_what_is_left_out_of_shapes_and_films_is_noted(tmp_path):
+    ball = painted('<bsdf type="diffuse"/><bsdf type="conductor"/>')
+    found = converted(tmp_path, xml(shape=ball))
+    assert found.shapes[0].bsdf["type"] == "conductor" and "a further bsdf on the same shape" in found.notes[0]
+    film = '<film type="hdrfilm"><integer name="crop_width" value="8"/></film></sensor>'
+    assert "its film is cropped" in converted(tmp_path, xml().replace("</sensor>", film)).notes[0]
 
 
 def test_nothing_to_render(tmp_path):

@@ -56,6 +56,9 @@ REFUSED = {
     "file = 'a'\n[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=-1}]": "gain",
     "file = 'a'\n[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=inf}]": "gain",
     "file = 'a'\n[splits.test]\nfloor = inf": "floor",
+    "file = 'a'\n[splits.test]\nfloor = 4000": "floor",
+    "file = 'a'\n[splits.test]\nreference_spp = 8589934592": "reference_spp",
+    "file = 'a'\nframes = 9999999999": "frames",
     "file = 'a'\n" + 2 * "[[light]]\nlight = 'b'\nkeyframes = [{time=0,gain=1}]\n": "'b' has keyframes twice",
     "file = 'a": "docs/scenes.md",
 }

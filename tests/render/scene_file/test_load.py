@@ -174,3 +174,20 @@ def test_lamps_that_shine_through_glass_alone_need_more_bounces(tmp_path):
     (note,) = own(tmp_path, bulb_in_a_room(3)).notes
     assert note.startswith("with 2 bounces only 0 % of the light") and "set `bounces = " in note
     assert own(tmp_path, bulb_in_a_room(3), "bounces = 4").notes == []
+
+
+def test_a_single_keyframe_counts(tmp_path):
+    """A pose and a brightness that the file's scene has throughout."""
+    lamp = '<emitter type="point" id="lamp"/>'
+    toml = """
+    [[motion]]
+    shape = "ball"
+    keyframes = [{ time = 0, position = [0, 7, 0] }]
+    [[light]]
+    light = "lamp"
+    keyframes = [{ time = 0, gain = 0.25 }]
+    """
+    scene = own(tmp_path, xml(light=lamp), toml=toml).clip("test", 0, 2, 0)
+    stage = Stage(scene, 4, 4)
+    assert np.array(stage.mitsuba_scene.bbox().center())[1] == pytest.approx(7)
+    assert np.array(stage.parameters["lamp.intensity.value"]).ravel() == pytest.approx(0.25)

@@ -55,7 +55,7 @@ def test_materials_of_gltf(tmp_path):
     textures = {"baseColorTexture": picture(), "metallicRoughnessTexture": picture(1)}
     found = loaded(tmp_path, world(**textures, metallicFactor=0.5, roughnessFactor=0.25))
     (box,) = found.shapes
-    assert box.name == "box" and box.smooth and box.radiance is None
+    assert box.name == "box" and not box.smooth and box.radiance is None  # without normals
     np.testing.assert_allclose(box.mesh.bounds, [[0.5, 1.5, 2.5], [1.5, 2.5, 3.5]])
     assert box.mesh.visual.uv.shape == (len(box.mesh.vertices), 2)
     bsdf = box.bsdf["bsdf"]
@@ -65,6 +65,12 @@ def test_materials_of_gltf(tmp_path):
     np.testing.assert_allclose(bsdf["roughness"]["data"], channels[..., 1:2] * 0.25, rtol=1e-5)
     np.testing.assert_allclose(bsdf["metallic"]["data"], channels[..., 2:3] * 0.5, rtol=1e-5)
     assert found.sky is not None and found.notes == ["there is no light: a clear sky with the sun, y up"]
+
+
+def test_authored_normals_of_gltf_are_smooth(tmp_path):
+    path = tmp_path / "scene.glb"
+    path.write_bytes(world().export(file_type="glb", include_normals=True))
+    assert MeshFile(path, 1.5).shapes[0].smooth
 
 
 def test_factors_relief_and_light_of_gltf(tmp_path):
@@ -89,14 +95,29 @@ def test_srgb_pictures_become_linear():
 @pytest.mark.parametrize("aspect", [0.5, 1.5])
 def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
     def add(content):
-        content["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.0}}]
-        content["nodes"].append({"camera": 0, "translation": [0, 0, 4], "name": "eye"})
-        content["nodes"][0].setdefault("children", []).append(len(content["nodes"]) - 1)
+        content["cameras"] = [{"type": "orthographic"}, {"type": "perspective", "perspective": {"yfov": 0.8}}]
+        turned = {"rotation": [0, 2**-0.5, 0, 2**-0.5], "translation": [5, 0, 0], "children": []}  # by 90 degrees
+        content["nodes"] += [{"camera": 0}, turned, {"camera": 1, "translation": [0, 0, 4], "name": "eye"}]
+        last = len(content["nodes"]) - 1
+        content["nodes"][0].setdefault("children", []).append(last - 1)
+        content["nodes"][last - 1]["children"].append(last)
+        content["nodes"][0]["matrix"] = np.eye(4).ravel().tolist()
 
-    camera = MeshFile(gltf(tmp_path, add), aspect).camera
-    np.testing.assert_allclose(camera.eye.at(0), [0, 0, 4])
-    np.testing.assert_allclose(camera.target.at(0), [0, 0, 3])
+    found = MeshFile(gltf(tmp_path, add), aspect)
+    camera = found.camera
+    assert "orthographic cameras are left out" in found.notes
+    np.testing.assert_allclose(camera.eye.at(0), [9, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(camera.target.at(0), [8, 0, 0], atol=1e-12)
     assert np.tan(np.radians(camera.x_fov.at(0)) / 2) / aspect == pytest.approx(np.tan(0.4))
+
+
+def test_a_damaged_camera_of_gltf_is_left_out(tmp_path):
+    def add(content):
+        content["cameras"] = [{"type": "perspective", "perspective": {}}]
+        content["nodes"].append({"camera": 0})
+
+    found = MeshFile(gltf(tmp_path, add), 1.0)
+    assert found.camera is None and "its cameras are damaged: left out" in found.notes
 
 
 def test_what_gltf_says_beyond_meshes(tmp_path):

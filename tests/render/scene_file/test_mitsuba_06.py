@@ -273,5 +273,16 @@ def test_included_files_are_upgraded_too(tmp_path):
     cube = shape("cube", '<ref id="a"/>', place)
     (tmp_path / "scene.xml").write_text(old_xml('<include filename="part.xml"/>', cube))
     assert ParsedFile(tmp_path / "scene.xml").notes == []
+    for version in (' version="0.5.0"', ""):  # other old ones
+        (tmp_path / "part.xml").write_text(f"<scene{version}>\n{material}</scene>")
+        assert ParsedFile(tmp_path / "scene.xml").notes == []
     notes = SceneFile(tmp_path / "scene.xml").notes
     assert notes == ["gone.png (part.xml line 2): the file gone.png is missing: grey instead of this texture"]
+
+
+def test_spectra_lie_where_paths_say(tmp_path):
+    (tmp_path / "spd").mkdir()
+    (tmp_path / "spd" / "x.spd").write_text("400 0.25\n700 0.25\n")
+    material = '<bsdf type="diffuse"><spectrum name="reflectance" filename="x.spd"/></bsdf>'
+    (tmp_path / "scene.xml").write_text(old_xml('<path value="spd"/>', shape("cube", material)))
+    assert not any("x.spd" in note for note in SceneFile(tmp_path / "scene.xml").notes)

@@ -5,7 +5,7 @@ import pytest
 
 from render.backend import mi
 from render.scene_file.convert import turned_to_y
-from render.scene_file.stand_ins import OLD_PLUGINS, black_body, mixture, phong
+from render.scene_file.stand_ins import OLD_PLUGINS, black_body, coated, mixture, phong
 from tests.helpers.scene_files import CAMERA, SKY, old_xml, own, painted, xml
 from tests.render.scene_file.test_mitsuba_06 import bsdf, light, rendered, shape, strings, texture
 
@@ -144,6 +144,14 @@ def test_mixtures_weigh_as_they_say():
     si.wi = mi.Vector3f(0, 0, 1)
     value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))).ravel() * np.pi
     np.testing.assert_allclose(value, [0.5, 0.3, 0.2], atol=1e-6)
+    bsdf = mi.load_dict(mixture({"type": "mixturebsdf", "weights": "0.5, 0.3, 0.1", **parts})[0])  # the rest is black
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))).ravel() * np.pi
+    np.testing.assert_allclose(value, [0.5, 0.3, 0.1], atol=1e-6)
+
+
+def test_a_coat_with_a_texture_covers_a_material():
+    inner, _ = coated({"type": "roughcoating", "alpha": {"type": "bitmap"}, "bsdf": {"type": "diffuse"}})
+    assert inner == {"type": "diffuse"}
 
 
 def test_black_bodies_shine_as_planck_says():
