@@ -115,7 +115,7 @@ def motion_convention(
             break
         frame, _ = read_foreign_frame(files, sources)
         now = guides(frame)
-        if before is not None and now.shape != before.shape:
+        if before is not None and now.shape[:2] != before.shape[:2]:
             size = f"{now.shape[1]}x{now.shape[0]}"
             raise BadInput(f"{files.passes[COLOUR]} is {size}, unlike the frame before it: name one sequence")
         if index and before is not None:

@@ -172,7 +172,7 @@ class StockLoader:
         if isinstance(position, list):
             emitter["position"] = [x / self.unit for x in position]
         if "to_world" in emitter:  # of which Mitsuba takes directions, too: no scale may be in it
-            emitter["to_world"] = emitter["to_world"] @ np.eye(4)
+            emitter["to_world"] = emitter["to_world"].copy()
             emitter["to_world"][:3, 3] /= self.unit
         where = f"light '{light.name}'{light.emitter.get(PLACE, '')}"
         return self.made(to_mitsuba(emitter, self.load) | {"id": light.name}, where)

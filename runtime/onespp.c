@@ -2040,8 +2040,12 @@ static int denoise(onespp *d, const onespp_frame *frame, const onespp_output *ra
     return ONESPP_OK;
 }
 
-/* The engines are no part of the interface of a shared library. */
+/* The engines are no part of the interface of a shared library. On Windows nothing is exported by itself. */
+#if defined(_WIN32)
+#define HIDDEN
+#else
 #define HIDDEN __attribute__((visibility("hidden")))
+#endif
 
 #if defined(ONESPP_AVX512)
 

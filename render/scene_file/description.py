@@ -18,7 +18,7 @@ from scenes.camera import Array
 LARGEST = 1e18  # of all numbers: its square is a finite float32; and none is NaN
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Vector = tuple[Number, Number, Number]
-MOST = 2**20  # of all whole numbers
+MOST = 2**20  # of whole numbers, but for samples
 MOST_SPP = 2**28  # Mitsuba counts samples by 32 bits
 Count = Annotated[int, Meta(ge=0, le=MOST)]
 Positive = Annotated[int, Meta(ge=1, le=MOST)]

@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -166,8 +167,8 @@ def bsdf_of(mesh: trimesh.Trimesh, name: str, notes: list[str]) -> tuple[Bsdf, A
     return two_sided(GREY), None
 
 
-def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
-    """A file's scene, and notes.
+def load_scene(path: Path) -> tuple[trimesh.Scene, dict[str, Any], list[str]]:
+    """A file's scene, the JSON of a glTF, and notes.
 
     Raises BadInput, naming the file, if it is missing, damaged, of another format, or refers to files elsewhere.
     """
@@ -188,11 +189,12 @@ def load_scene(path: Path) -> tuple[trimesh.Scene, list[str]]:
     if scene is None:
         missing = f": {resolver.missing[0]} is missing" if resolver.missing else f" is empty or damaged ({damage})"
         raise BadInput(f"{path}{missing}")
+    gltf = gltf_of(path)
     notes = [f"the file {name} is missing: its content is left out" for name in dict.fromkeys(resolver.missing)]
-    notes += [*dict.fromkeys(problems), *notes_of_gltf(gltf_of(path))]
+    notes += [*dict.fromkeys(problems), *notes_of_gltf(gltf)]
     if not can_draw():
         notes.append("textures are left out: reading them needs `pip install 'onespp[report]'`")
-    return scene, notes
+    return scene, gltf, notes
 
 
 def gltf_of(path: Path) -> dict[str, Any]:
@@ -209,7 +211,7 @@ def notes_of_gltf(gltf: dict[str, Any]) -> list[str]:
     """Notes on its content beyond meshes, materials and a perspective camera."""
     notes = [f"its {what} are left out: meshes stay at rest" for what in ("animations", "skins") if gltf.get(what)]
     notes += [f"the extension {name} may not be honoured" for name in gltf.get("extensionsUsed", [])]
-    kinds = [camera["type"] for camera in gltf.get("cameras", [])]
+    kinds = [camera.get("type") for camera in gltf.get("cameras", [])]
     if kinds.count("perspective") > 1:
         notes.append("it has several cameras: the first one is used")
     if "orthographic" in kinds:
@@ -238,10 +240,10 @@ def camera_of_gltf(gltf: dict[str, Any], aspect: float) -> Camera | None:
         camera = gltf["cameras"][node["camera"]] if "camera" in node else {}
         if camera.get("type") != "perspective":
             continue
-        pose, above = local_matrix(node), parents.get(index)
-        for _ in nodes:  # and no more often: a damaged file may have a circle
-            pose = pose if above is None else local_matrix(nodes[above]) @ pose
-            above = parents.get(above) if above is not None else None
+        chain = [index]
+        while chain[-1] in parents and len(chain) < len(nodes):  # a damaged file may have a circle
+            chain.append(parents[chain[-1]])
+        pose = reduce(np.matmul, [local_matrix(nodes[each]) for each in reversed(chain)])
         axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
         x_fov = np.degrees(2 * np.arctan(aspect * np.tan(camera["perspective"]["yfov"] / 2)))
         return Camera.at_rest(pose[:3, 3], pose[:3, 3] - axes[:, 2], float(x_fov), axes[:, 1])
@@ -255,9 +257,9 @@ class MeshFile:
     """
 
     def __init__(self, path: Path, aspect: float):
-        scene, self.notes = load_scene(path)
+        scene, gltf, self.notes = load_scene(path)
         try:
-            self.camera = camera_of_gltf(gltf_of(path), aspect)
+            self.camera = camera_of_gltf(gltf, aspect)
         except (KeyError, IndexError, TypeError, ValueError):
             self.camera = None
             self.notes.append("its cameras are damaged: left out")

@@ -115,9 +115,10 @@ def old_blackbody(element: LocatedElement, searched: Sequence[Path]) -> tuple[El
 def old_spectrum(element: LocatedElement, searched: Sequence[Path]) -> tuple[Element, str]:
     """Three values without wavelengths are red, green and blue; more are evenly spaced from 360 to 830 nm."""
     file = element.get("filename")
-    found = [folder / file for folder in searched if file is not None and (folder / file).exists()]
+    paths = [inside(searched[0], str(folder / file), Path(element.place)) for folder in searched] if file else []
+    found = next((path for path in paths if path.is_file()), None)
     if found:
-        element.set("filename", str(found[0]))
+        element.set("filename", str(found))
     elif file is not None:
         note = f"the file {file} of a spectrum is missing: 0.5 everywhere instead"
         return named_like(element, "spectrum", value="0.5"), note
@@ -144,11 +145,12 @@ RENAMED = {"lookAt": "lookat", "camera": "sensor", "luminaire": "emitter"}
 
 def is_old(root: LocatedElement) -> bool:
     """Whether a file is one of Mitsuba 0.x, as one without a version."""
-    return root.get("version", "0").startswith("0.") or "version" not in root.attrib
+    return root.get("version", "0.6.0").startswith("0.")
 
 
 def upgrade(root: LocatedElement, searched: Sequence[Path]) -> list[str]:
-    """Replace what Mitsuba's parser does not support any more; files are in the folders `searched`. Returns notes.
+    """Replace what Mitsuba's parser does not support any more; files are in the folders
+    `searched`, of which the first is the scene's. Returns notes.
 
     Raises ValueError, with its place, for an element whose value is invalid.
     """

@@ -121,8 +121,9 @@ def test_passes_become_what_the_runtime_takes(extension, tmp_path):
 def test_albedo_that_is_no_number_is_black(extension, tmp_path):
     planes = layers(np.random.default_rng(4))
     planes["ViewLayer.Denoising Albedo.G"][7, 3] = np.nan
+    planes["ViewLayer.Denoising Albedo.R"][7, 3] = np.inf
     frame = extension("cycles_frame").read_cycles_frame(write(tmp_path / "it.exr", [planes]))
-    assert frame.albedo[7, 3, 1] == 0 and np.isfinite(frame.albedo).all()
+    assert (frame.albedo[7, 3, :2] == 0).all() and np.isfinite(frame.albedo).all()
 
 
 def test_the_pose_of_a_sheared_camera_is_rigid(extension):

@@ -62,7 +62,7 @@ def read_cycles_frame(path: Path) -> CyclesFrame:
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return CyclesFrame(
         color=np.where(surface, light[..., :3] - seen, 0),
-        albedo=np.where(surface, np.nan_to_num(image("Denoising Albedo")), 1).clip(0, 1),
+        albedo=np.where(surface, np.nan_to_num(image("Denoising Albedo"), posinf=0), 1).clip(0, 1),
         normal=np.where(surface, normal / np.maximum(length, 1e-6), 0),  # a mean of samples is shorter than 1
         depth=np.where(surface, depth, 0),
         motion=image("Vector")[..., :2] * np.array([1, -1], np.float32),  # to the frame before, with y up

@@ -105,15 +105,14 @@ class Denoiser:
         runtime = self.runtime if len(poses) <= self.runtime.max_meshes else self.with_room(len(poses))
         rgb = np.broadcast_to(light[..., :3], (*size, 3))
         normals, depth = self.surface(images, now, to_sensor)
-        known = np.minimum(images["emission"], rgb) if "emission" in images else np.zeros_like(rgb)
-        known = np.where(depth.reshape(*size, 1) > 0, known, rgb)  # background is no noise
+        emission = np.minimum(images["emission"], rgb) if "emission" in images else np.float32(0)
         colour = runtime.denoise(
-            rgb - known,
+            rgb - emission,
             images.get("albedo"),
             normals,
             depth,
             motion,
-            emission=known,
+            emission=np.where(depth.reshape(*size, 1) > 0, emission, rgb),  # background stays as it is
             roughness=images.get("roughness"),
             mesh_id=images.get("shape"),
             object_to_world=poses if len(poses) else None,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from errors import BadInput
 from render.backend import mi
 from render.path import PosedFrame
 from render.scene_file import load
@@ -286,3 +287,7 @@ def test_spectra_lie_where_paths_say(tmp_path):
     material = '<bsdf type="diffuse"><spectrum name="reflectance" filename="x.spd"/></bsdf>'
     (tmp_path / "scene.xml").write_text(old_xml('<path value="spd"/>', shape("cube", material)))
     assert not any("x.spd" in note for note in SceneFile(tmp_path / "scene.xml").notes)
+    (tmp_path / "spd" / "x.spd").unlink()
+    (tmp_path / "spd" / "x.spd").symlink_to("/etc/hostname")
+    with pytest.raises(BadInput, match="leaves the scene's folder"):
+        SceneFile(tmp_path / "scene.xml")
