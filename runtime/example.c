@@ -10,6 +10,7 @@
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <time.h>
 
 enum { MAX_MESHES = 4096, MAX_THREADS = 64 };
@@ -100,13 +101,18 @@ int main(int count, char **arguments)
 {
     int threads = count > 3 ? atoi(arguments[3]) : 2;
     int max_isa = count > 4 ? atoi(arguments[4]) : ONESPP_ISA_ANY;
-    FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL, *out = file ? fopen(arguments[2], "wb") : NULL;
+    FILE *file = count > 2 ? fopen(arguments[1], "rb") : NULL;
     raw_header *raw = NULL;
-    if (!out || threads < 1 || threads > MAX_THREADS)
+    if (!file || threads < 1 || threads > MAX_THREADS)
         return fail("usage: example SEQUENCE OUTPUT [THREADS [MAX_ISA]]");
+    if (strcmp(arguments[1], arguments[2]) == 0)
+        return fail("the output would overwrite the sequence: name another file");
     int found = read_frame(file, &raw);
     if (found != 1)
         return fail("there is no whole frame");
+    FILE *out = fopen(arguments[2], "wb"); /* not before: an earlier output stays where there is no frame */
+    if (!out)
+        return fail("the output could not be written");
 
     static Pool pool = {PTHREAD_MUTEX_INITIALIZER, PTHREAD_COND_INITIALIZER, PTHREAD_COND_INITIALIZER, 0, 0, 0, 0, 0};
     pthread_t thread;

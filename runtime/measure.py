@@ -36,6 +36,7 @@ from models.spec import DenoiserSpec, fastest_precision
 from process import keep_freed_memory
 from provenance import device_in_words
 from runtime.raw import PLANES, raw
+from runtime.script import exits_in_words
 from runtime.wheel import build_wheel
 from timing import take_turns
 
@@ -230,7 +231,5 @@ def main(size: str = "1280x720", runs: str = "runs") -> None:
 if __name__ == "__main__":
     if len(sys.argv) > 3:
         sys.exit(__doc__)
-    try:
+    with exits_in_words():
         main(*sys.argv[1:])
-    except BadInput as error:
-        sys.exit(f"error: {error}")

@@ -143,14 +143,14 @@ static inline float exponential(float x)
 {
     const float magic = 12582912.f; /* 1.5 * 2^23: adding it rounds to an integer */
     float t = x * 1.4426950408889634f;
-    float n = (t + magic) - magic;
-    float f = t - n;
+    int32_t n = bits_of(t + magic) - bits_of(magic); /* of floats: x87 would not round their difference */
+    float f = t - (float)n;
     float p = 0.00967151f + f * 0.00132647f;
     p = 0.05550734f + f * p;
     p = 0.24022242f + f * p;
     p = 0.69314698f + f * p;
     p = 1.f + f * p;
-    return float_of(bits_of(p) + (int32_t)n * (1 << 23));
+    return float_of(bits_of(p) + n * (1 << 23));
 }
 
 /* ln x for normal x = m 2^e, as e ln 2 and the series of 2 artanh((m - 1) / (m + 1)), with m between the roots of 1/2

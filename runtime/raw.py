@@ -17,6 +17,7 @@ from eval.bench.denoisers import parse_size
 from eval.bench.synthetic_frames import synthetic_frame
 from files import replacing
 from models.registry import prototype
+from runtime.script import exits_in_words
 
 PLANES = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "motion")
 
@@ -57,7 +58,5 @@ def main(source: str, count: int, path: Path) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 4 or not sys.argv[2].isdecimal():
         sys.exit(__doc__)
-    try:
+    with exits_in_words():
         main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
-    except BadInput as error:
-        sys.exit(f"error: {error}")

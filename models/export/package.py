@@ -106,13 +106,17 @@ def write_export(export: Export, frames: Sequence[Frame], folder: Path) -> dict[
     """Write an export to `folder` as a whole, replacing an earlier export. Returns the manifest.
 
     `frames` are the golden frames. Raises BadInput where the denoiser cannot be exported, its weights or a package are
-    missing, or the folder contains anything else.
+    missing, or the folder is anything else or contains the current one.
     """
     check_installed(export.to)
+    folder = folder.resolve()
+    if Path.cwd().is_relative_to(folder):
+        raise BadInput(f"{folder} is the current folder or contains it: choose another --out")
     earlier = folder / MANIFEST
     is_export = earlier.exists() and "sha256" in read_json(earlier)
-    if folder.exists() and any(folder.iterdir()) and not is_export:
-        raise BadInput(f"{folder} contains files that are not an export: choose another --out")
+    is_empty = folder.is_dir() and not any(folder.iterdir())
+    if folder.exists() and not (is_export or is_empty):
+        raise BadInput(f"{folder} is not an earlier export: choose another --out")
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     golden = temporary / "golden"
     golden.mkdir(parents=True)

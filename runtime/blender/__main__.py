@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 from errors import BadInput
 from files import replacing
+from runtime.script import exits_in_words
 from runtime.wheel import build_wheel
 
 HERE = Path(__file__).resolve().parent
@@ -46,7 +47,5 @@ def build(out: Path) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 2 or not sys.argv[1].endswith(".zip"):
         sys.exit(__doc__)
-    try:
+    with exits_in_words():
         build(Path(sys.argv[1]))
-    except BadInput as error:
-        sys.exit(str(error))

@@ -17,6 +17,7 @@ from errors import BadInput
 from files import write_file
 from models.registry import prototype
 from runtime.raw import raw
+from runtime.script import exits_in_words
 from web_page import deflated, filled, packed
 
 HERE = Path(__file__).parent
@@ -78,10 +79,8 @@ def write_live_page(source: Path, path: Path, frames: int | None = None) -> None
 def main(arguments: list[str]) -> None:
     if len(arguments) not in (2, 3) or not all(text.isdecimal() and int(text) for text in arguments[2:]):
         sys.exit(__doc__)
-    try:
+    with exits_in_words():
         write_live_page(Path(arguments[0]), Path(arguments[1]), *map(int, arguments[2:]))
-    except BadInput as error:
-        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import copy
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -316,14 +317,18 @@ def test_extreme_logits_take_the_slower_branch_in_files(weights, tmp_path):
 def test_what_cannot_be_exported(weights, tmp_path, monkeypatch):
     def refused(match, name, weights, to="pt2", precision="float32", folder="out"):
         with pytest.raises(BadInput, match=match):
-            write_export(Export(name, weights, to, precision, "inside"), sequence((8, 8), frames=1), tmp_path / folder)
+            write_export(Export(name, weights, to, precision, "inside"), sequence((8, 8), frames=1), Path(folder))
 
+    monkeypatch.chdir(tmp_path)
     refused("'svgf' cannot be exported; wskp3, wskp6, one can", "svgf", weights["wskp3"])
     refused("holds weights of 'wskp3', not of 'wskp6'", "wskp6", weights["wskp3"])
     refused(r"One does not compute in torch\.float16", "one", weights["one"], precision="float16")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
-    refused("contains files that are not an export", "wskp3", weights["wskp3"], folder="mine")
+    for folder in ("mine", "mine/thesis.txt"):
+        refused("is not an earlier export: choose another", "wskp3", weights["wskp3"], folder=folder)
+    for folder in (".", ".."):
+        refused("is the current folder or contains it", "wskp3", weights["wskp3"], folder=folder)
     monkeypatch.setattr(programs, "find_spec", lambda package: None if package == "onnxscript" else object())
     refused(r"needs onnxscript: pip install 'onespp\[export\]'", "wskp3", weights["wskp3"], "onnx")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]

@@ -204,3 +204,22 @@ def test_surfaces_that_come_into_view_begin_with_their_own_albedo(extension):
     for rows in (slice(0, 5), slice(11, 19)):
         np.testing.assert_array_equal(mean.mean[rows], second.albedo[rows])
     assert (mean.frames[20:] == 2).all() and np.isfinite(mean.mean).all()
+
+
+def test_files_of_others_are_not_replaced(extension, unpacked, tmp_path, monkeypatch):
+    """As are its own, damaged ones too."""
+    monkeypatch.syspath_prepend(unpacked)
+    rendered = write(tmp_path / "0001.exr", [layers(np.random.default_rng(8))])
+    camera = extension("camera").Camera("", np.array([[-1, 0, 0.5], [0, -1, 0.5], [0, 0, 1]]), np.eye(4))
+    animation = extension("animation").Animation(lambda _: rendered, tmp_path / "denoised")
+    target = animation.denoised(1)
+    animation.denoise(1, camera)
+    expected = target.read_bytes()
+    target.write_bytes(expected[:-100])
+    animation.denoise(1, camera)
+    assert target.read_bytes() == expected
+    for content in (rendered.read_bytes(), b"a text"):
+        target.write_bytes(content)
+        with pytest.raises(extension("exr").BadFrame, match=r"0001\.exr was not written by .* choose another folder"):
+            animation.denoise(1, camera)
+        assert target.read_bytes() == content

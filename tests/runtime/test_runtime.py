@@ -1,7 +1,9 @@
 """The C runtime is `one`: frame by frame, at any size, on any number of threads, and whatever the frames contain."""
 
 import ctypes
+import runpy
 import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -156,8 +158,12 @@ def test_instruction_sets_differ_by_rounding(library, one, frames, monkeypatch):
 
 
 @pytest.mark.slow
-def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, tmp_path):
-    library = build(tmp_path / "libonespp.so", SOURCES[:1], ["-O3"])
+@pytest.mark.parametrize("flags", [["-O3"], ["-O1", "-std=gnu17", "-mfpmath=387"]], ids=["plain", "x87"])
+def test_one_file_alone_serves_the_flags_of_the_compiler(one, frames, flags, tmp_path):
+    """Also where floats are computed in higher precision, as on i386."""
+    if subprocess.run([CC, *flags, "-E", "-x", "c", "/dev/null"], capture_output=True).returncode:
+        pytest.skip(f"{CC} does not take {' '.join(flags)}")
+    library = build(tmp_path / "libonespp.so", SOURCES[:1], flags)
     assert CRuntime(library, 8, 8).isa == ISAS["baseline"]
     compare(library, one, frames)
 
@@ -358,16 +364,31 @@ def check_example(command: list[str], one: One, frames: list[Frame], folder: Pat
         torch.testing.assert_close(output, expected, rtol=0, atol=TOLERANCE * expected.amax().item())
 
 
+def test_a_sequence_that_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["raw.py", "8x8", "1", str(tmp_path / "missing" / "frames.raw")])
+    with pytest.raises(SystemExit, match=r"missing/.*frames\.raw.*: No such file .* choose another file"):
+        runpy.run_path(str(FOLDER / "raw.py"), run_name="__main__")
+
+
 def test_the_example_denoises_a_raw_sequence(one, frames, tmp_path, objects):
     command = [CC, *STRICT, *OPTIMISED, "-pthread", str(FOLDER / "example.c"), *objects.values()]
     subprocess.run([*command, "-o", str(tmp_path / "example"), "-lm"], check=True)
     check_example([str(tmp_path / "example")], one, frames, tmp_path)
-    whole = (tmp_path / "frames.raw").read_bytes()
-    for damaged in (whole[:-1000], whole + b"half a header"):
-        (tmp_path / "damaged.raw").write_bytes(damaged)
-        command = [str(tmp_path / "example"), "damaged.raw", "out.raw"]
+    whole, earlier = ((tmp_path / name).read_bytes() for name in ("frames.raw", "out.raw"))
+
+    def complaint(source: str, content: bytes) -> str:
+        (tmp_path / source).write_bytes(content)
+        command = [str(tmp_path / "example"), source, "out.raw"]
         run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert run.returncode == 1 and "the sequence is damaged" in run.stderr
+        assert run.returncode == 1
+        return run.stderr
+
+    assert "there is no whole frame" in complaint("damaged.raw", b"half a header")
+    assert (tmp_path / "out.raw").read_bytes() == earlier
+    for damaged in (whole[:-1000], whole + b"half a header"):
+        assert "the sequence is damaged" in complaint("damaged.raw", damaged)
+    assert "the output would overwrite the sequence" in complaint("out.raw", whole)
+    assert (tmp_path / "out.raw").read_bytes() == whole
 
 
 # --- Long proofs ------------------------------------------------------------------------------------------------------
@@ -430,14 +451,63 @@ def test_it_runs_on_aarch64(one, frames, tmp_path):
     check_example([emulator, str(tmp_path / "example")], one, frames, tmp_path)
 
 
+PROGRAM = """
+#include <onespp.h>
+int main(void) { return onespp_abi() != ONESPP_ABI; }
+"""
+PROJECT = """
+cmake_minimum_required(VERSION 3.16)
+project(program C)
+if(SOURCE)
+  add_subdirectory(${SOURCE} onespp)
+else()
+  find_package(onespp ${ABI} REQUIRED)
+endif()
+add_executable(program program.c)
+target_link_libraries(program onespp::onespp)
+"""
+
+
+def cmake(*arguments: object, succeeds: bool = True) -> None:
+    if which("cmake") is None:
+        pytest.skip("cmake is not installed")
+    assert (subprocess.run(["cmake", *map(str, arguments)]).returncode == 0) == succeeds
+
+
 @pytest.mark.slow
-def test_cmake_and_make_build_it(tmp_path):
-    if which("cmake") is None or which("make") is None:
-        pytest.skip("cmake or make is not installed")
-    subprocess.run(["cmake", "-S", str(FOLDER), "-B", str(tmp_path / "build"), "-DBUILD_SHARED_LIBS=ON"], check=True)
-    subprocess.run(["cmake", "--build", str(tmp_path / "build")], check=True)
-    subprocess.run(["cmake", "--install", str(tmp_path / "build"), "--prefix", str(tmp_path / "installed")], check=True)
-    assert (tmp_path / "installed" / "include" / "onespp.h").exists()
+def test_cmake_builds_it_for_other_projects(tmp_path):
+    """Also where these join files to compile them; of another ABI than they ask for it is not taken."""
+    build, installed, project = (tmp_path / name for name in ("build", "installed", "project"))
+    cmake("-S", FOLDER, "-B", build, "-DBUILD_SHARED_LIBS=ON", "-DCMAKE_UNITY_BUILD=ON")
+    cmake("--build", build)
+    cmake("--install", build, "--prefix", installed)
+    project.mkdir()
+    (project / "program.c").write_text(PROGRAM)
+    (project / "CMakeLists.txt").write_text(PROJECT)
+    configure = ("-S", project, f"-DCMAKE_PREFIX_PATH={installed}")
+    cmake(*configure, "-B", build / "other", f"-DABI={ABI + 1}", succeeds=False)
+    cmake(*configure, "-B", build / "found", f"-DABI={ABI}")
+    cmake("--build", build / "found")
+    subprocess.run([build / "found" / "program"], check=True)
+    cmake(*configure, "-B", build / "added", f"-DSOURCE={FOLDER}")
+
+
+@pytest.mark.slow
+def test_cmake_installs_a_dll_for_windows(tmp_path):
+    compiler = which("x86_64-w64-mingw32-gcc")
+    if compiler is None:
+        pytest.skip("x86_64-w64-mingw32-gcc is not installed")
+    windows = ("-DCMAKE_SYSTEM_NAME=Windows", f"-DCMAKE_C_COMPILER={compiler}", "-DBUILD_SHARED_LIBS=ON")
+    cmake("-S", FOLDER, "-B", tmp_path / "build", *windows)
+    cmake("--build", tmp_path / "build")
+    cmake("--install", tmp_path / "build", "--prefix", tmp_path / "installed")
+    assert [path.name for path in (tmp_path / "installed" / "bin").iterdir()] == ["libonespp.dll"]
+
+
+@pytest.mark.slow
+def test_make_builds_it(tmp_path):
+    if which("make") is None:
+        pytest.skip("make is not installed")
     copy = Path(copytree(FOLDER, tmp_path / "runtime"))
     subprocess.run(["make", "-C", str(copy)], check=True)
     assert (copy / "libonespp.a").exists() and (copy / "example").exists()

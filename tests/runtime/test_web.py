@@ -1,5 +1,6 @@
 """The page with the runtime as WebAssembly: it denoises as the C library does, and answers its controls."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -196,14 +197,18 @@ def test_a_page_of_fewer_frames(page, clip, tmp_path):
 
 
 def test_bad_input(clip, tmp_path, monkeypatch):
-    def complaint(source: Path, *frames: str) -> str:
+    def complaint(source: Path, *frames: str, page: str = "page.html") -> str:
         with pytest.raises(SystemExit) as stopped:
-            main([str(source), str(tmp_path / "page.html"), *frames])
+            main([str(source), str(tmp_path / page), *frames])
         return str(stopped.value.code)  # Python prints a text, and exits with 1
 
     assert complaint(clip.path, str(clip.frames + 1)) == f"error: {clip.path} has 8 frames, not 9"
     assert "clip.json is missing" in complaint(tmp_path)
     assert "CLIP PAGE [FRAMES]" in complaint(clip.path, "many")
+    with monkeypatch.context() as patch:
+        patch.setattr("runtime.web.__main__.module", bytes)
+        unwritable = complaint(clip.path, "1", page="missing/page.html")
+    assert re.search(r"missing/.*page\.html.*: No such file .* choose another file", unwritable)
     assert not list(tmp_path.iterdir())
     shutil.copytree(ROOT / "runtime", tmp_path / "runtime", ignore=shutil.ignore_patterns("*.wasm"))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))

@@ -63,6 +63,9 @@ class Animation:
 
     def denoise(self, number: int, camera: Camera) -> Begin:
         """Denoise and write a rendered frame. Raises BadFrame where it cannot be, and OSError of the disk."""
+        target = self.denoised(number)
+        if target.exists() and f"{NOTE}\0string\0".encode() not in target.read_bytes():  # ours may be damaged
+            raise BadFrame(f"{target} was not written by this extension: move it away or choose another folder")
         if self.history.number != number - 1:
             self.replay(number)
         frame = read_cycles_frame(self.path_of(number))
@@ -77,7 +80,7 @@ class Animation:
             "camera_to_world": camera.camera_to_world.tolist(),
         }
         planes = {name: radiance[..., index] for index, name in enumerate("RGB")} | {"A": frame.alpha}
-        write_exr(self.denoised(number), planes, {NOTE: json.dumps(note)})
+        write_exr(target, planes, {NOTE: json.dumps(note)})
         if not self.keeps_noisy:
             self.path_of(number).unlink()
         return begin
