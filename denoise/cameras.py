@@ -83,7 +83,8 @@ def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View |
     """The view of `worldToNDC`, None without.
 
     OpenEXR specifies coordinates in [-1, 1] with y up; where the viewing axis meets the image at (1/2, 1/2), they are
-    in [0, 1]. A matrix that makes pixels oblong is ignored: pbrt writes one for images that are not square.
+    in [0, 1]. They are those of the display window, of which the pixels may be a part. A matrix that makes pixels
+    oblong is ignored: pbrt writes one for images that are not square.
     """
     if "worldToNDC" not in header:
         return None
@@ -93,8 +94,14 @@ def view_of_header(header: Mapping[str, Any], height: int, width: int) -> View |
         return None
     centre = axis[:2] / axis[3]
     from_zero = np.abs(centre - 0.5).max() < np.abs(centre).max()
+    if "displayWindow" in header:
+        low, high = header["displayWindow"]
+        width, height = (int(number) for number in high - low + 1)
+        left, top = low - header["dataWindow"][0]
+    else:
+        left, top = 0, 0
     scale, shift = ([width, -height], [0, height]) if from_zero else ([width / 2, -height / 2], [width / 2, height / 2])
-    to_pixels = np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]], [0, 0, 1.0]])
+    to_pixels = np.array([[scale[0], 0, shift[0] + left], [0, scale[1], shift[1] + top], [0, 0, 1.0]])
     view = view_of(to_pixels @ ndc[[0, 1, 3]])
     aspect = float(header.get("pixelAspectRatio", 1.0))
     if view is None or abs(view.K[1, 1] / (view.K[0, 0] * aspect) - 1) > MAX_OBLONGNESS:

@@ -1,6 +1,7 @@
 """An OpenEXR file of any program in memory: its planes by name, its header, and writing it with changes."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,24 @@ from datasets.exr import silenced, write_file
 from datasets.writer import FLOAT16_MAX
 from errors import BadInput
 
+Window = tuple[int, int, int, int]  # left, top, right, bottom in pixels, the last two included
+
 
 def plane_name(part: str, channel: str, several: bool) -> str:
     """The channel's name, after that of its part unless it is the file's only part or the name begins with it."""
     begins = channel.casefold().startswith(f"{part}.".casefold())
     return f"{part}.{channel}" if several and part and not begins else channel
+
+
+def window_of(header: Mapping[str, Any]) -> Window:
+    low, high = header["dataWindow"]
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def size_of(window: Window) -> tuple[int, int]:
+    """(H, W)."""
+    left, top, right, bottom = window
+    return bottom - top + 1, right - left + 1
 
 
 class ExrImage:
@@ -35,24 +49,28 @@ class ExrImage:
         if len(self.file.parts) < len(headers.parts) or not headers.parts:  # OpenEXR leaves out what it cannot read
             raise BadInput(f"{path} is damaged: render it again")
         several = len(self.file.parts) > 1
-        self.header: dict[str, Any] = {key: value for part in self.file.parts for key, value in part.header.items()}
-        self.channels: dict[str, Any] = {
-            plane_name(part.name(), name, several): channel
-            for part in self.file.parts
-            for name, channel in (part.channels or {c.name: c for c in part.header["channels"]}).items()
-        }
-        low, high = self.header["dataWindow"]
-        self.width, self.height = (int(number) for number in high - low + 1)
+        by_size = sorted(self.file.parts, key=lambda part: math.prod(size_of(window_of(part.header))))
+        # The largest part counts: others may be cropped.
+        self.header: dict[str, Any] = {key: value for part in by_size for key, value in part.header.items()}
+        self.window = window_of(self.header)
+        self.height, self.width = size_of(self.window)
+        self.channels: dict[str, Any] = {}
+        self.windows: dict[str, Window] = {}  # by channel
+        for part in self.file.parts:
+            channels = part.channels or {channel.name: channel for channel in part.header["channels"]}
+            planes = {plane_name(part.name(), name, several): channel for name, channel in channels.items()}
+            self.channels |= planes
+            self.windows |= dict.fromkeys(planes, window_of(part.header))
 
     def stacked(self, channels: Sequence[str]) -> NDArray[np.float32]:
-        """The named channels as one array (H, W, C). Raises BadInput where one is missing or of another size."""
+        """The named channels as one array (H, W, C). Raises BadInput where one is missing or has another window."""
         planes = []
         for name in channels:
             if name not in self.channels:
                 raise BadInput(f"{self.path} has no channel '{name}', which the first frame has")
             plane = self.channels[name].pixels
-            if plane.shape != (self.height, self.width):
-                raise BadInput(f"{self.path}: the channel '{name}' is subsampled or of another size than the others")
+            if plane.shape != (self.height, self.width) or self.windows[name] != self.window:
+                raise BadInput(f"{self.path}: the channel '{name}' is subsampled or has another size or data window")
             planes.append(plane.astype(np.float32))
         return np.stack(planes, axis=-1)
 
@@ -76,6 +94,7 @@ class ExrImage:
                 self.channels[name].pixels = plane
             else:
                 self.channels[name] = home.channels[name] = OpenEXR.Channel(name, plane)
+                self.windows[name] = self.windows[beside]
 
     def write(self, path: Path, note: str) -> None:
         """Write everything atomically, with `note` as the attribute `denoised`. Raises BadInput where that fails."""

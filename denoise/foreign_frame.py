@@ -39,13 +39,16 @@ class ForeignFrame:
 
 
 def open_passes(files: FrameFiles, header_only: bool = False) -> dict[str, ExrImage]:
-    """The files of a frame by pass. Raises BadInput where one is damaged or of another size than the colour's."""
+    """The files of a frame by pass. Raises BadInput where one is damaged or has another window than the colour."""
     images = {name: ExrImage(path, header_only) for name, path in files.passes.items()}
     colour = images[COLOUR]
     for image in images.values():
         if (image.height, image.width) != (colour.height, colour.width):
             sizes = f"{image.path} is {image.width}x{image.height} and {colour.path} {colour.width}x{colour.height}"
             raise BadInput(f"{sizes}: the passes of a frame must have the same size")
+        if image.window != colour.window:
+            windows = f"{image.path} begins at {image.window[:2]} and {colour.path} at {colour.window[:2]}"
+            raise BadInput(f"{windows}: the passes of a frame must have the same data window")
     return images
 
 

@@ -21,6 +21,8 @@ from eval.metrics import METRICS
 from files import write_csv
 from models.wrappers.error_estimate import ErrorEstimate
 
+METRICS_FILE = "metrics.csv"
+ERRORS_FILE = "error.csv"
 COMPARED_METRICS = ("rmse", "psnr", "ssim")
 
 
@@ -39,7 +41,7 @@ def compare(
             raise BadInput(f"{reference} is of another size than {out / files.name}")
         comparison = Comparison(denoised, reference_pair, exposure)
         rows.append([files.number, *(METRICS[name].of(comparison) for name in COMPARED_METRICS)])
-    write_csv(out / "metrics.csv", ["frame", *COMPARED_METRICS], rows)
+    write_csv(out / METRICS_FILE, ["frame", *COMPARED_METRICS], rows)
     columns = zip(COMPARED_METRICS, list(zip(*rows, strict=True))[1:], strict=True)
     cells = ["-" if None in column else METRICS[name].form.format(np.mean(column)) for name, column in columns]
     return tabulate([cells], [f"mean {METRICS[name].title}" for name in COMPARED_METRICS], disable_numparse=True)
@@ -72,7 +74,7 @@ class ErrorTable:
     """The rows of a folder's frames, written after each. Raises BadInput where the file there is damaged."""
 
     def __init__(self, folder: Path):
-        self.path = folder / "error.csv"
+        self.path = folder / ERRORS_FILE
         self.rows: dict[int, FrameError] = {}
         if self.path.exists():
             try:

@@ -89,7 +89,7 @@ class FrameBuilder:
 
     def __init__(self, conventions: InputConventions, reads: tuple[str, ...], source: str, spp: float = 1.0):
         if not 0 < spp < math.inf:
-            raise BadInput(f"{spp:g} is no number of samples per pixel: frames have one or more")
+            raise BadInput(f"{spp:g} is not a number of samples per pixel: frames have one or more")
         self.conventions = conventions
         self.reads = reads
         self.source = source
@@ -143,10 +143,11 @@ class FrameBuilder:
 
         Reprojection then compares depths along one axis alone. So that a camera that comes closer keeps its history,
         this one moves along that axis as far as the median of depths changes from the previous frame to this one.
+        Without history, each frame has a view of its own.
         """
         height, width = foreign.size
         K = np.array([[-TELEPHOTO, 0, width / 2], [0, -TELEPHOTO, height / 2], [0, 0, 1.0]])
-        if self.view is None:
+        if self.view is None or not self.conventions.has_history:
             return View(K, facing_pose(self.given_normal(foreign), foreign.surface), STILL)
         pose = self.view.camera_to_world.copy()
         if motion is not None and self.depth is not None and self.depth.shape == depth.shape:

@@ -12,6 +12,7 @@ from denoise.exr_image import ExrImage
 from denoise.layers import ExrLayer, grouped, list_layers
 from errors import BadInput
 from models.denoiser import Denoiser, State
+from models.layers import blended
 from models.networks.one import One
 
 
@@ -35,7 +36,11 @@ class Parts:
         return Parts([part_layer(name, image) for name in names], denoiser)
 
     def added(self, frame: Frame, image: ExrImage) -> Frame:
-        """The frame with these layers of its file. Layers of one channel are no light: they keep the divisor."""
+        """The frame with these layers of its file, and one layer of glass: parts are divided by its albedo.
+
+        Layers of one channel are no light: they keep the divisor.
+        """
+        frame = blended(frame) if frame.has_layers else frame
         parts = []
         for layer in self.layers:
             values = to_tensor(image.stacked(layer.channels)).to(frame.divisor)

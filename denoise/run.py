@@ -18,7 +18,7 @@ from datasets.tonemap import clip_exposure, display, luminance
 from denoise.analysis import Analysis, analyse
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import open_passes, read_foreign_frame
-from denoise.frame_errors import ErrorTable, FrameError, compare, radiance
+from denoise.frame_errors import ERRORS_FILE, METRICS_FILE, ErrorTable, FrameError, compare, radiance
 from denoise.frames import FrameBuilder, OwnFrameBuilder
 from denoise.job import Job
 from denoise.layers import COLOUR, parse_layers
@@ -51,7 +51,7 @@ def denoise(job: Job) -> None:
             import PIL.Image  # noqa: F401 - so that a missing package is named before the work
     frames = sequence_of(job.patterns, job.frame_range)
     references = reference_files(job, frames)
-    check_names(job.out, frames)
+    check_names(job, frames)
     shots = split_at_cuts(frames, job.reset_at)
     first = open_passes(frames[0], header_only=True)
     sources = find_sources(first, parse_layers(job.layers))
@@ -63,6 +63,7 @@ def denoise(job: Job) -> None:
     parts = Parts.named(job.aov, first[COLOUR], denoiser)
     sequence = SequenceDenoiser(job, spec, denoiser, estimator, parts, shots, sources, first[COLOUR])
     print(sequence.introduction())
+    sequence.builder()  # so that what it refuses is refused before anything is written
     check_settings(job.out, sequence.settings())
     nonfinite = list(sequence.play())
     print(f"{job.out}: {len(frames)} frames, {len(nonfinite)} of them new", end="; ")
@@ -108,22 +109,25 @@ def reference_files(job: Job, frames: Sequence[FrameFiles]) -> list[Path]:
     return [files[frame.number] for frame in frames]
 
 
-def check_names(out: Path, frames: Sequence[FrameFiles]) -> None:
+def check_names(job: Job, frames: Sequence[FrameFiles]) -> None:
     """Raise BadInput where an output would overwrite an input, another output, or a file of something else."""
+    out = job.out
     if any(path.parent.resolve() == out.resolve() for frame in frames for path in frame.passes.values()):
         raise BadInput(f"--out {out} contains the frames to denoise: choose another folder")
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
         raise BadInput("frames of different folders have the same name: denoise one folder at a time")
-    if not (out / SETTINGS_FILE).exists() and (taken := [name for name in names if (out / name).exists()]):
-        raise BadInput(f"--out {out} has a {taken[0]} that was not denoised here: choose another folder")
+    outputs = [*names, *(Path(name).with_suffix(".png").name for name in names if job.png)]
+    outputs += [METRICS_FILE] * bool(job.ref) + [ERRORS_FILE] * bool(job.error or job.until)
+    if not (out / SETTINGS_FILE).exists() and (taken := [name for name in outputs if (out / name).exists()]):
+        raise BadInput(f"--out {out} has a {taken[0]} that was not made here: choose another folder")
 
 
 def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
     """Make the folder and write the settings into it. Raises BadInput where it has frames with other settings."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / SETTINGS_FILE
-    if not path.exists():
+    if not path.exists() or not any(file.suffix.lower() == ".exr" for file in out.iterdir()):
         write_json(path, dict(settings))
         return
     present = read_json(path)
@@ -182,7 +186,7 @@ class SequenceDenoiser:
             "weights": file_digest(job.weights) if job.weights else None,
             "precision": self.spec.precision,
             "quality": job.quality,
-            "passes": {name: str(path.parent.resolve()) for name, path in first.passes.items()},
+            "passes": {name: str(path.resolve()) for name, path in first.passes.items()},
             "first frame": first.number,
             "reset-at": sorted(job.reset_at),
             "layers": sorted(job.layers),

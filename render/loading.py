@@ -53,7 +53,8 @@ def with_placed_textures(shape: Shape) -> Shape:
     placements: list[Array] = []
     bsdf = without_placement(shape.bsdf, placements)
     uv = getattr(shape.mesh.visual, "uv", None)
-    if uv is None or not placements or any((other != placements[0]).any() for other in placements):
+    moved = any((placement != np.eye(3)).any() for placement in placements)
+    if uv is None or not moved or any((other != placements[0]).any() for other in placements):
         return shape
     mesh = shape.mesh.copy(include_cache=True)  # keeps the authored normals
     assert isinstance(mesh.visual, TextureVisuals)
@@ -61,10 +62,10 @@ def with_placed_textures(shape: Shape) -> Shape:
     return replace(shape, mesh=mesh, bsdf=bsdf)
 
 
-def load_mesh(shape: Shape) -> mi.Mesh:
-    """The shape in its rest pose, with its material and the emission of frame 0."""
+def load_mesh(shape: Shape, load: Callable[[Bsdf], object]) -> mi.Mesh:
+    """The shape in its rest pose, with its material, of which `load` makes an object, and the emission of frame 0."""
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(to_mitsuba(shape.bsdf))
+    properties["bsdf"] = load(shape.bsdf)
     if shape.radiance is not None:
         light = {"type": "area", "radiance": {"type": "rgb", "value": shape.radiance.at(0).tolist()}}
         properties["emitter"] = mi.load_dict(light)
@@ -143,15 +144,21 @@ class StockLoader:
     def load(self, description: Bsdf) -> Any:
         if id(description) not in self.loaded:
             what = f"{description.get('filename', description['type'])}{description.get(PLACE, '')}"
-            loaded = self.made(to_mitsuba(description, self.load), what)
+            loaded = self.made(to_mitsuba(self.scaled(description), self.load), what)
             self.loaded[id(description)] = (description, loaded)
             if isinstance(loaded, mi.Shape):
                 check_shape(loaded, what)
                 (self.groups if loaded.class_name() == "ShapeGroupPlugin" else self.grouped).append(loaded)
         return self.loaded[id(description)][1]
 
+    def scaled(self, description: Bsdf) -> Bsdf:
+        """The description of a part of a material, with heights and volumes scaled from world units."""
+        if self.unit != 1 and description["type"] == "bumpmap":
+            return description | {"scale": description.get("scale", 1.0) / self.unit}
+        return self.placed(description) if description["type"] == "gridvolume" else description
+
     def placed(self, geometry: Mapping[str, Any]) -> dict[str, Any]:
-        """The description of a shape, scaled from world units."""
+        """The description of a shape or volume, scaled from world units."""
         if self.unit == 1:
             return dict(geometry)
         return {**geometry, "to_world": np.diag([1 / self.unit] * 3 + [1.0]) @ geometry.get("to_world", np.eye(4))}

@@ -6,6 +6,7 @@ textures and numbers of a BSDF, which are read once into tables. BSDFs that are 
 normal incidence: one albedo and one roughness for the whole surface.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -227,8 +228,16 @@ def scatters(flags: mi.UInt32) -> mi.Bool:
 
 def may_be_mirror(bsdf: mi.BSDF, material: Material | Mixture) -> bool:
     """Whether a BSDF is a mirror where its roughness is the mean of its texture."""
-    smooth = isinstance(material, Material) and float(np.array(material.roughness.mean())[0]) < MAX_MIRROR_ALPHA
+    smooth = isinstance(material, Material) and mean_of(material.roughness) < MAX_MIRROR_ALPHA
     return smooth and not scatters(bsdf.flags())
+
+
+def mean_of(texture: mi.Texture) -> float:
+    """Infinite where Mitsuba does not know it, as of attributes of meshes."""
+    try:
+        return float(np.array(texture.mean())[0])
+    except RuntimeError:
+        return math.inf
 
 
 class MaterialTable:

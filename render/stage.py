@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 MAX_CUTOUTS = 32  # that a primary ray passes
 MAX_EVENTS = 8  # in a chain of specular events: through a vitrine of solid panes, and a bottle in it
+CURVES = ("BSplineCurve", "LinearCurve")
 CUTOUT = 0.999  # least transmission of a cut-out
 
 
@@ -86,12 +87,14 @@ class Stage:
         # Upper bounds of coordinates in frame 0:
         extents = [np.abs(each.mesh.bounds).max() + np.abs(each.motion.position.at(0)).max() for each in scene.shapes]
         self.unit = unit_of([*extents, *(np.abs(corners(shape.bbox())).max() for shape in loaded)])
+        if any(shape.class_name() in CURVES for shape in (*loaded, *loader.grouped)):
+            self.unit = 1.0  # no transform scales how thick they are
         if self.unit != 1:
             loader = StockLoader(self.unit)
             loaded = [loader.shape(shape) for shape in scene.stock]
         self.notes = loader.notes
         content: dict[str, object] = {"type": "scene"}
-        content |= {shape.name: load_mesh(shape) for shape in scene.shapes}
+        content |= {shape.name: load_mesh(shape, loader.load) for shape in scene.shapes}
         content |= {shape.name: instance for shape, instance in zip(scene.stock, loaded, strict=True)}
         content |= {f"_group {index}": group for index, group in enumerate(loader.groups)}
         content |= {light.name: loader.light(light) for light in scene.lights}

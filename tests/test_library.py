@@ -38,6 +38,13 @@ def test_networks_have_their_shipped_weights(shipped, tmp_path):
         assert all(map(torch.equal, found, given.values())) == same
     with pytest.raises(BadInput, match="'wskp3@quick' are weights in a folder of runs"):
         onespp.load("wskp3@quick")
+    with pytest.raises(BadInput, match="no denoiser computes in float64: use one of float32, bfloat16"):
+        onespp.load("wskp3", precision=torch.float64)
+    with pytest.raises(BadInput, match="there is no device 'gpu'"):
+        onespp.load("svgf", device="gpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(BadInput, match="no CUDA device"):
+            onespp.load("svgf", device="cuda:0")
 
 
 def arrays(index: int, size: tuple[int, int] = (24, 32)) -> dict:
@@ -108,9 +115,17 @@ def test_unusable_arrays_are_named(changes, message):
         [*onespp.frames([arrays(0), {"colour": np.zeros((24, 32, 3))}], onespp.load("noisy"))]
 
 
+def test_denoisers_of_what_arrays_lack_are_refused():
+    with pytest.raises(BadInput, match=r'SVGF denoises indirect light.*onespp.load\(..., signal="total"\)'):
+        next(onespp.frames([arrays(0)], onespp.load("svgf+taa", signal="indirect")))
+    with pytest.raises(BadInput, match="ASVGF reads gradient, which only onespp renders: use another, such as svgf"):
+        next(onespp.frames([arrays(0)], onespp.load("asvgf")))
+    assert next(onespp.frames([arrays(0)], create("ntd", "total"))).radiance("total").mean() > 0.5
+
+
 @pytest.mark.parametrize("spp", [0.0, -1.0, float("nan"), float("inf")])
 def test_sample_counts_out_of_range_are_refused(spp):
-    with pytest.raises(BadInput, match="is no number of samples"):
+    with pytest.raises(BadInput, match="is not a number of samples"):
         next(onespp.frames([arrays(0)], onespp.load("noisy"), spp))
 
 

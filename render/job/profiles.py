@@ -1,6 +1,7 @@
 """Data profiles: which clips a dataset has, and how well they are sampled."""
 
 import re
+import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from datasets.clip import SPLITS
 from errors import BadInput
 from files import crc32_of
 from render.scene_file.description import read_description
+from render.scene_file.load import own_scene
 from scenes.glass import SETTINGS
 from scenes.objects.library import open_libraries
 
@@ -148,12 +150,16 @@ def own_profile(path: Path) -> DataProfile:
 
 
 def source_of(profile: DataProfile) -> dict[str, str]:
-    """The files of a user's own scene by name, with crc32; else none. Raises BadInput where one cannot be read."""
+    """The TOML of a user's own scene and the files that it is read from, with crc32; else none.
+
+    Raises BadInput where one cannot be read.
+    """
     if profile.own is None:
         return {}
-    files = [profile.own, profile.own.parent / read_description(profile.own).file]
+    scene = own_scene(profile.own)
     try:
-        return {str(file): crc32_of(file) for file in files}
+        crcs = [crc32_of(file) for file in sorted(set(scene.files))]
+        return {str(profile.own): crc32_of(profile.own), str(scene.file): f"{zlib.crc32(''.join(crcs).encode()):08x}"}
     except OSError as error:
         raise BadInput(f"{error.filename} cannot be read: {error.strerror}") from None
 

@@ -34,7 +34,7 @@ def turned_to_y(described: Properties) -> Properties:
 
 
 class SceneFile:
-    """The content of a Mitsuba XML file; `notes` list what is not honoured, and its stand-ins.
+    """The content of a Mitsuba XML file; `notes` list what is not honoured, and its stand-ins, `files` what it names.
 
     A node with several references is one shared dictionary. Raises BadInput, naming the file, if it cannot be used, or
     if nothing is left to render.
@@ -49,6 +49,7 @@ class SceneFile:
         self.sensor: Properties | None = None
         self.max_depth: int | None = None
         self.notes = self.parsed.notes
+        self.files = self.parsed.files
         self.names = Names()
         self.described = cache(self.describe)
         adders = {
@@ -96,7 +97,7 @@ class SceneFile:
                 self.note("a property called 'type' is left out", node)
             elif value is not None:
                 described[key.lstrip("_")] = value
-        if plugin in ("sky", "sun", "sunsky") and str(self.state.versions[node.file_index]).startswith("0."):
+        if plugin in ("sky", "sun", "sunsky") and self.is_old(node):
             described = turned_to_y(described)
         if plugin not in plugins() or (kind == "Shape" and plugin == "hair"):  # today that is a material
             found, words = stand_in(kind, described)
@@ -147,6 +148,7 @@ class SceneFile:
         for folder in self.parsed.searched:
             path = inside(self.path.parent, str(folder / name), self.path)
             if path.is_file():
+                self.files.append(path)
                 return described | {"filename": str(path)}
         replacements: dict[str, StandIn] = {
             "Texture": (GREY, "grey instead of this texture"),
@@ -190,8 +192,21 @@ class SceneFile:
                     if kind in parts:
                         self.note(f"a further {kind.lower()} on the same shape: the last one is rendered", node)
                     parts[kind] = value
+        if "Emitter" not in parts and self.is_invisible(node, parts.get("BSDF")):
+            self.note("the boundary of a medium is no surface: left out", node)
+            return
         name = self.unique_name(node)
         self.shapes.append(StockShape(name, described, parts.get("BSDF"), parts.get("Emitter")))
+
+    def is_invisible(self, node: mi.parser.SceneNode, bsdf: Properties | None) -> bool:
+        """Whether light passes through a shape unchanged; before version 3, that was the default around a medium."""
+        if bsdf is not None:
+            return bool(bsdf["type"] == "null")
+        return self.is_old(node) and any(self.kind(child) == "Medium" for _, child in self.children(node))
+
+    def is_old(self, node: mi.parser.SceneNode) -> bool:
+        """Whether a node is from a file of a version before 3."""
+        return str(self.state.versions[node.file_index]).startswith("0.")
 
     def add_sensor(self, index: int) -> None:
         node = self.state.nodes[index]
@@ -227,7 +242,8 @@ class SceneFile:
 
     def add_integrator(self, index: int) -> None:
         props = self.state.nodes[index].props
-        for _, inner in self.children(self.state.nodes[index]):
+        nested = self.children(self.state.nodes[index])
+        for _, inner in nested:
             self.add_integrator(inner)
         if props.get("hide_emitters", False):
             self.note("hide_emitters: lights stay visible")
@@ -240,3 +256,5 @@ class SceneFile:
             self.max_depth = max(depth, 2)
         elif props.plugin_name() == "direct":
             self.max_depth = 2
+        elif not nested:
+            self.note("paths of any length: of 2 bounces, unless the TOML sets `bounces`")

@@ -21,7 +21,7 @@ from scenes.animation import Camera, KeyframedTrack, Scene, Shape
 from scenes.camera import Array, look_at, pixel_centres
 
 DEFAULT_DEPTH = 3  # path edges: one indirect bounce
-MAX_DEPTH = 64  # for files with endless paths; Russian roulette ends them before
+MAX_DEPTH = 64  # that files get; Russian roulette ends most paths before
 MAX_SHAPES = 65535  # mesh ids have 16 bits
 FOV_WITHOUT_CAMERA = 50.0  # degrees
 
@@ -46,7 +46,7 @@ def camera_of_sensor(sensor: dict[str, Any], height: int, width: int) -> tuple[C
     notes = []
     if np.linalg.det(axes) < 0:
         notes.append("the camera mirrors its image: not mirrored instead")
-    if "principal_point_offset_x" in sensor or "principal_point_offset_y" in sensor:
+    if any(sensor.get(f"principal_point_offset_{axis}", 0) != 0 for axis in "xy"):
         notes.append("the camera's principal point is off centre: in the centre instead")
     return Camera.at_rest(eye, eye + axes[:, 2], x_fov, axes[:, 1]), notes
 
@@ -98,7 +98,8 @@ def note_on_depth(stage: Stage, scene: Scene) -> list[str]:
 class OwnScene:
     """The scene that a TOML describes, at rest.
 
-    `notes` list what is not honoured, and its stand-ins. Raises BadInput, naming the file, if it cannot be used.
+    `notes` list what is not honoured, and its stand-ins, `files` all that it is read from. Raises BadInput, naming the
+    file, if it cannot be used.
     """
 
     def __init__(self, path: Path):
@@ -125,6 +126,7 @@ class OwnScene:
 
     def from_xml(self) -> tuple[Scene, list[str]]:
         found = SceneFile(self.file)
+        self.files = found.files
         camera, notes = DEFAULT_CAMERA, [*found.notes]
         if found.sensor:
             try:
@@ -137,6 +139,7 @@ class OwnScene:
 
     def from_meshes(self) -> tuple[Scene, list[str]]:
         found = MeshFile(self.file, self.width / self.height)
+        self.files = found.files
         return Scene(tuple(found.shapes), found.camera or DEFAULT_CAMERA, DEFAULT_DEPTH, sky=found.sky), found.notes
 
     def check_names(self) -> None:

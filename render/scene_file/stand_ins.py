@@ -17,6 +17,7 @@ StandIn = tuple[Properties | None, str]  # None is nothing; and a description of
 GREY = rgb([0.5, 0.5, 0.5])
 TEXTURES = ("rgb", "spectrum", "bitmap", "checkerboard", "mesh_attribute", "volume", "uniform", "srgb", "rawconstant")
 RESERVED_NAMES = ("type", "id", "sky")  # keys of a Mitsuba scene's dictionary
+DEFAULT_ALPHA = 0.1  # Mitsuba's roughness of surfaces
 SURFACE_LIGHTS = ("area", "directionalarea")  # emitters that belong to shapes, unlike all others
 
 
@@ -82,7 +83,7 @@ def phong(described: Properties) -> StandIn:
 
 
 def ward(described: Properties) -> StandIn:
-    alphas = [number_of(described, name, 0.1) for name in ("alpha_u", "alpha_v")]
+    alphas = [number_of(described, name, DEFAULT_ALPHA) for name in ("alpha_u", "alpha_v")]
     return rough_plastic(described, np.sqrt(alphas[0] * alphas[1]))
 
 
@@ -218,12 +219,23 @@ FILTERS = ("bilinear", "nearest")
 
 
 def valid_microfacets(described: Properties) -> StandIn | None:
-    """Before version 3 there were the distributions "phong" and "as", with the width of Beckmann's for an alpha."""
+    """Before version 3 there were the distributions "phong" and "as", with the width of Beckmann's for an alpha.
+
+    Plastic could be rougher here than there.
+    """
     distribution = described.get("distribution", "beckmann")
-    if distribution in ("beckmann", "ggx"):
-        return valid_metal(described)
-    valid = described | {"distribution": "beckmann"}
-    return (valid_metal(valid) or (valid, ""))[0], f"Beckmann's distribution instead of '{distribution}'"
+    changes: Properties = {}
+    words = []
+    if distribution not in ("beckmann", "ggx"):
+        changes["distribution"] = "beckmann"
+        words.append(f"Beckmann's distribution instead of '{distribution}'")
+    if described["type"] == "roughplastic" and isinstance(described.get("alpha"), dict):
+        changes["alpha"] = DEFAULT_ALPHA
+        words.append(f"a roughness of {DEFAULT_ALPHA} instead of its texture")
+    metal = valid_metal(described | changes)
+    if not metal and not words:
+        return None
+    return (metal or (described | changes, ""))[0], ", ".join([*words, *([metal[1]] if metal else [])])
 
 
 def valid_metal(described: Properties) -> StandIn | None:
@@ -257,6 +269,11 @@ def valid_bitmap(described: Properties) -> StandIn | None:
     return valid | ({"raw": True} if gamma == 1 else {}), ", ".join(words)
 
 
+def sampled_everywhere(described: Properties) -> StandIn | None:
+    """With compensation, directions darker than the mean are left to rays, which the last vertex of a path lacks."""
+    return (described | {"mis_compensation": False}, "") if described.get("mis_compensation") else None
+
+
 def valid_lens(described: Properties) -> StandIn | None:
     length = described.get("focal_length", "")
     return None if isinstance(length, str) else (described | {"focal_length": f"{length}mm"}, "")
@@ -273,6 +290,7 @@ REPAIRS: dict[str, Callable[[Properties], StandIn | None]] = {
     **dict.fromkeys(("roughconductor", "roughdielectric", "roughplastic"), valid_microfacets),
     **dict.fromkeys(("perspective", "thinlens"), valid_lens),
     "spot": spot_without_texture,
+    "envmap": sampled_everywhere,
     "shapegroup": dark_group,
     "instance": lambda described: None if nested(described) else (None, "an instance of nothing is left out"),
     # Mitsuba cannot trace a moving sun symbolically, as our path tracer does.

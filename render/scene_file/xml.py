@@ -184,8 +184,8 @@ class ParsedFile:
     def __init__(self, path: Path):
         self.path = path.resolve()
         self.searched = [self.path.parent]
+        self.files: list[Path] = []  # that were read, and those of spectra
         self.bytes = 0
-        self.included = -1
         config = mi.parser.ParserConfig(VARIANT)
         config.unused_parameters = mi.LogLevel.Debug
         usual_folders = mi.file_resolver()  # type: ignore[operator]
@@ -195,6 +195,7 @@ class ParsedFile:
         try:
             root = self.read(self.path)
             self.notes = upgrade(root, self.searched)
+            self.files += [Path(each.attrib["filename"]) for each in root.iter("spectrum") if "filename" in each.attrib]
             self.elements = [element for element in root.iter() if isinstance(element, LocatedElement)]
             self.text = ElementTree.tostring(root, "unicode")
             self.state = mi.parser.parse_string(config, self.text)
@@ -207,8 +208,8 @@ class ParsedFile:
 
     def read(self, file: Path, depth: int = 0) -> LocatedElement:
         """The root of `file`, with the content of included files in place: of its version, or as old as it."""
-        self.included += 1
-        if depth > MAX_INCLUDE_DEPTH or self.included > MAX_INCLUDES:
+        self.files.append(file)
+        if depth > MAX_INCLUDE_DEPTH or len(self.files) > MAX_INCLUDES + 1:
             limits = f"{MAX_INCLUDES} files, or more than {MAX_INCLUDE_DEPTH} in each other"
             raise BadInput(f"{self.path} includes more than {limits}: merge some")
         try:

@@ -62,11 +62,19 @@ def test_positions_that_do_not_determine_a_camera():
     assert view_of_positions(points_of(view), ~SURFACE) is None
 
 
+def windowed(left: int, top: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """A window as OpenEXR gives it."""
+    return np.array([left, top], np.int32), np.array([left + width - 1, top + height - 1], np.int32)
+
+
 @pytest.mark.parametrize("from_zero", [True, False])
 def test_cameras_of_headers(from_zero):
     view = some_view(4)
     ndc = world_to_ndc(view, HEIGHT, WIDTH, from_zero)
     assert_same(view_of_header({"worldToNDC": ndc}, HEIGHT, WIDTH), view, 1e-4)
+    cropped = {"displayWindow": windowed(0, 0, WIDTH, HEIGHT), "dataWindow": windowed(5, 3, 8, 6)}
+    K = view.K - [[0, 0, 5], [0, 0, 3], [0, 0, 0]]
+    assert_same(view_of_header({"worldToNDC": ndc, **cropped}, 6, 8), view._replace(K=K), 1e-4)
     assert view_of_header({}, HEIGHT, WIDTH) is None
     assert view_of_header({"worldToNDC": np.zeros((4, 4))}, HEIGHT, WIDTH) is None
     assert view_of_header({"worldToNDC": ndc * [[0.5, 1, 1, 1]]}, HEIGHT, WIDTH) is None  # oblong pixels

@@ -23,6 +23,7 @@ from datasets.frame import Frame, read_frame
 from denoise.exr_image import ExrImage
 from denoise.frame_errors import ErrorTable
 from denoise.job import Job
+from denoise.parts import Parts
 from denoise.run import denoise
 from errors import BadInput
 from eval.tradeoff.samples import with_samples
@@ -33,6 +34,7 @@ from tests.denoise.conftest import as_foreign
 from tests.helpers import foreign
 from tests.helpers.frames import run
 from tests.helpers.training import fresh_weights
+from tests.models.test_glass_layers import glass_frame
 from tests.test_cli import fails
 
 TARGETS = ("ViewLayer.Combined.", "rgba.Beauty.", "Foo.", "")  # where denoised radiance is, before R, G and B
@@ -213,11 +215,14 @@ def test_multi_part_files(spheres, tmp_path):
     parts = [
         OpenEXR.Part({**foreign.HEADER, "owner": name}, foreign.planes(each), name) for name, each in layers.items()
     ]
+    # What is not used may be cropped.
+    display = {"displayWindow": parts[0].header["displayWindow"]}
+    parts.append(OpenEXR.Part({**foreign.HEADER, **display}, {"Z": np.zeros((3, 5), np.float32)}, "crypto"))
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "1.exr"))
     denoise(Job((str(tmp_path / "1.exr"),), "svgf", tmp_path / "out"))
     with OpenEXR.File(str(tmp_path / "out" / "1.exr"), separate_channels=True) as file:
-        assert [part.name() for part in file.parts] == ["rgba", "N"] and file.parts[1].header["owner"] == "N"
+        assert [part.name() for part in file.parts] == ["rgba", "N", "crypto"] and file.parts[1].header["owner"] == "N"
         np.testing.assert_array_equal(file.parts[1].channels["Z"].pixels, normal[..., 2])
         assert np.abs(file.parts[0].channels["R"].pixels - foreign.beauty(spheres[0])[..., 0]).max() > 0.1
 
@@ -288,11 +293,49 @@ def test_a_frame_rendered_again_is_denoised_again_with_all_that_depend_on_it(sph
 
 def test_settings_are_never_mixed(spheres, tmp_path):
     foreign.write_sequence(tmp_path / "in", spheres, foreign.blender)
+    with pytest.raises(BadInput, match="not a number of samples"):
+        denoised(tmp_path / "in", tmp_path / "out", spp=math.nan)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "denoise.json").write_text("{}")  # of a run that failed before its first frame
     denoised(tmp_path / "in", tmp_path / "out")
     others = {"denoiser": "eaw", "reset_at": [2], "stored_as": "half", "motion": "XY,-x,+y,pixels", "spp": 4.0}
     for name, value in others.items():
         with pytest.raises(BadInput, match="denoised with other settings"):
             denoised(tmp_path / "in", tmp_path / "out", **{name: value})
+
+
+def test_another_pass_is_another_setting(spheres, tmp_path):
+    foreign.write_sequence(tmp_path / "in", spheres[:1], foreign.blender)
+    for name in ("a", "b"):
+        foreign.write(tmp_path / "albedo" / f"{name}_1.exr", {"RGB": foreign.image(spheres[0], "albedo")})
+    denoised(tmp_path / "in", tmp_path / "out", alb=(str(tmp_path / "albedo" / "a_1.exr"),))
+    with pytest.raises(BadInput, match=r"other settings \(passes\)"):
+        denoised(tmp_path / "in", tmp_path / "out", alb=(str(tmp_path / "albedo" / "b_1.exr"),))
+
+
+@pytest.mark.parametrize(("name", "option"), [("0001.png", {"png": True}), ("metrics.csv", {"ref": ("in/*.exr",)})])
+def test_nothing_of_others_is_overwritten(spheres, tmp_path, monkeypatch, name, option):
+    monkeypatch.chdir(tmp_path)
+    foreign.write_sequence(Path("in"), spheres[:1], foreign.blender)
+    Path("out").mkdir()
+    Path("out", name).write_text("precious")
+    with pytest.raises(BadInput, match=f"has a {name} that was not made here"):
+        denoised(Path("in"), Path("out"), **option)
+    assert contents(Path("out")) == {name: b"precious"}
+
+
+def test_frames_without_history_do_not_depend_on_others(spheres, tmp_path):
+    """The first one's normals turn no later frame: what is denoised after an interruption is the same."""
+
+    def still(frame: Frame) -> foreign.Layers:
+        angle = float(frame.direct.mean())
+        turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        return {"RGB": foreign.beauty(frame), "N.XYZ": foreign.image(frame, "normal") @ np.float32(turn)}
+
+    foreign.write_sequence(tmp_path / "in", spheres, still)
+    whole = denoised(tmp_path / "in", tmp_path / "whole", "one")
+    denoised(tmp_path / "in", tmp_path / "late", "one", frame_range="3-4")
+    assert same(images_in(tmp_path / "late"), whole[2:])
 
 
 def test_history_ends_at_resets_and_gaps(spheres, tmp_path, capsys):
@@ -329,11 +372,15 @@ def test_what_cannot_be_done_is_explained(spheres, tmp_path, capfd):
     ):
         with pytest.raises(BadInput, match=complaint):
             denoised(tmp_path / "in", tmp_path / "out", **options)
+    shifted = {"dataWindow": (np.array([1, 0], np.int32), np.array([56, 39], np.int32))}
+    foreign.write(tmp_path / "shifted" / "1.exr", {"RGB": foreign.image(spheres[0], "albedo")}, shifted)
+    with pytest.raises(BadInput, match=r"begins at \(1, 0\) .* must have the same data window"):
+        denoised(tmp_path / "in", tmp_path / "out", alb=(str(tmp_path / "shifted" / "1.exr"),), frame_range="1")
     with pytest.raises(BadInput, match="choose another folder"):
         denoised(tmp_path / "in", tmp_path / "in")
     assert not (tmp_path / "out").exists()
     others = contents(foreign.write_sequence(tmp_path / "clean", spheres, foreign.blender)[0].parent)
-    with pytest.raises(BadInput, match=r"clean has a 0001\.exr that was not denoised here"):
+    with pytest.raises(BadInput, match=r"clean has a 0001\.exr that was not made here"):
         denoised(tmp_path / "in", tmp_path / "clean", ref=(str(tmp_path / "clean" / "*.exr"),))
     assert contents(tmp_path / "clean") == others
     foreign.write(tmp_path / "sizes" / "1.exr", foreign.blender(spheres[0]))
@@ -517,6 +564,21 @@ def test_layers_that_add_up_to_the_colour_do_so_denoised(tiny, tmp_path):
         foreign.read(tmp_path / folder / sorted(os.listdir(tmp_path / "in"))[0]) for folder in ("in", "out")
     )
     assert before["depth.Z"].min() <= after["depth.Z"].min() and after["depth.Z"].max() <= before["depth.Z"].max()
+
+
+def test_layers_behind_glass_add_up_to_the_whole(tmp_path):
+    frame = glass_frame(0, noise=1.0)
+    names = ("direct", "indirect")
+    foreign.write(tmp_path / "1.exr", {f"{name}.RGB": foreign.image(frame, name) for name in names})
+    image = ExrImage(tmp_path / "1.exr")
+    parts = Parts.named(names, image, create("one"))
+    frame = parts.added(frame, image)
+    with torch.inference_mode():
+        whole, state = parts.denoiser(frame, None)
+        parts.write(image, frame, state, np.float32)
+    total = sum(image.stacked([f"{name}.{letter}" for letter in "RGB"]) for name in names)
+    shown = whole[0].permute(1, 2, 0).numpy() - foreign.image(frame, "emission")
+    np.testing.assert_allclose(total, shown, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(

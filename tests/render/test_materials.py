@@ -6,6 +6,7 @@ import trimesh
 
 from render.backend import dr, mi
 from render.loading import to_mitsuba
+from render.materials import mean_of
 from render.stage import Stage
 from scenes.animation import Camera, Scene, Shape, StockShape, Track
 from tests.helpers.rendering import first_gbuffer, rgb
@@ -182,3 +183,8 @@ def test_every_shape_has_its_own_material():
     buffer = first_gbuffer(Scene(tuple(shapes), base.camera), 4, 4)
     np.testing.assert_allclose(buffer["roughness"][0, :, 0], [1, 0, 0.25, 1])
     np.testing.assert_allclose(buffer["albedo"][0, :, 0], [0.1, 0.3, 0.5 + (0.49 / 2.49) ** 2, 0.9], rtol=2e-3)
+
+
+def test_an_attribute_of_a_mesh_is_no_mirrors_roughness():
+    """Mitsuba does not know its mean."""
+    assert mean_of(mi.load_dict({"type": "mesh_attribute", "name": "vertex_alpha"})) == np.inf

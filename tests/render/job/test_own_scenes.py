@@ -8,10 +8,13 @@ import pytest
 from PIL import Image
 
 from command_line import main
+from datasets.channels import USUAL_CHANNELS
 from datasets.clip import Dataset
 from errors import BadInput
 from eval.tradeoff.samples import scene_of
-from render.job.profiles import SamplingQuality, own_profile, profile_of
+from render.clip import NO_OPTIONS
+from render.job.generate import begun
+from render.job.profiles import SamplingQuality, own_profile, profile_of, source_of
 from render.scene_file.load import own_scene
 from tests.helpers.datasets import digest
 from tests.helpers.scene_files import old_xml, write, xml
@@ -75,6 +78,18 @@ def test_resuming_gives_the_same_bytes(made, tmp_path, capsys):
     assert digest(copy) == digest(made / "data")
 
 
+def test_files_that_the_scene_file_names_are_part_of_its_source(tmp_path):
+    mesh = '<shape type="obj"><string name="filename" value="a.obj"/></shape>'
+    (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">{mesh}</scene>')
+    path = write(tmp_path, xml('<include filename="part.xml"/>'))
+    found = []
+    for corner in ("1 1 0", "1 1 0", "1 2 0"):
+        (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv {corner}\nf 1 2 3\n")
+        own_scene.cache_clear()
+        found.append([*source_of(profile_of(str(path))).values()])
+    assert found[0] == found[1] and found[0][0] == found[2][0] and found[0][1] != found[2][1]
+
+
 @pytest.mark.parametrize("changed", ["my.toml", "scene.xml"])
 def test_a_changed_file_is_another_scene(made, tmp_path, capsys, changed):
     copy = shutil.copytree(made, tmp_path / "copy")
@@ -127,12 +142,13 @@ def test_preview(made, tmp_path):
     assert (tmp_path / "sheet.png").stat().st_size > 1000
 
 
-def test_a_texture_that_has_come_begins_another_dataset(tmp_path, capsys):
+def test_a_texture_that_has_come_begins_another_dataset(tmp_path):
     """Frames rendered without it, and references of those, are not mixed with others."""
     picture = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.png"/></texture>'
     ball = f'<shape type="sphere" id="ball"><bsdf type="diffuse">{picture}</bsdf></shape>'
-    words = ("--scene", str(write(tmp_path, xml(shape=ball), SPLITS)), "--data", str(tmp_path / "data"))
-    main(["dataset", *words, "--reads", "noisy"])
+    described = (tmp_path / "data", str(write(tmp_path, xml(shape=ball), SPLITS)), 0, USUAL_CHANNELS, NO_OPTIONS)
+    begun(*described)
     Image.new("RGB", (2, 2), "red").save(tmp_path / "wood.png")
     own_scene.cache_clear()  # as in another process
-    assert "was made with other notes" in fails(capsys, "dataset", *words, "--reads", "noisy")
+    with pytest.raises(BadInput, match="was made with another source"):
+        begun(*described)

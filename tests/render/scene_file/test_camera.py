@@ -36,6 +36,7 @@ def test_what_a_camera_cannot_do_is_said():
     _, notes = camera_of_sensor({"to_world": np.diag([-1.0, 1, 1, 1])}, 4, 4)
     assert notes == ["the camera mirrors its image: not mirrored instead"]
     assert "centre" in camera_of_sensor({"principal_point_offset_x": 0.1}, 4, 4)[1][0]
+    assert not camera_of_sensor({"principal_point_offset_x": 0.0}, 4, 4)[1]
     for lens in ({"fov": 0.0}, {"fov": 180.0}, {"fov": 40.0, "fov_axis": "z"}):
         with pytest.raises(BadInput, match="camera"):
             camera_of_sensor(lens, 4, 4)

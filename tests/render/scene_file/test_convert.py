@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errors import BadInput
+from render.backend import mi
 from render.loading import StockLoader
 from render.scene_file.convert import SceneFile
 from render.scene_file.stand_ins import RESERVED_NAMES, Names
-from tests.helpers.scene_files import own, painted, write, xml
+from tests.helpers.scene_files import old_xml, own, painted, write, xml
 
 
 def converted(folder, content: str):
@@ -57,7 +58,8 @@ def test_files_lie_in_the_folder_or_where_paths_say(tmp_path):
 def test_depth_is_that_of_the_innermost_integrator(tmp_path):
     inner = '<integrator type="path"><integer name="max_depth" value="{}"/></integrator>'
     assert converted(tmp_path, xml(inner.format(7))).max_depth == 7
-    assert converted(tmp_path, xml(inner.format(-1))).max_depth is None
+    endless = converted(tmp_path, xml(inner.format(-1)))
+    assert endless.max_depth is None and "of 2 bounces" in endless.notes[0]
     lights_alone = converted(tmp_path, xml(inner.format(1)))
     assert lights_alone.max_depth == 2 and "max_depth 1" in lights_alone.notes[0]
     assert converted(tmp_path, xml('<integrator type="direct"/>')).max_depth == 2
@@ -72,6 +74,30 @@ def test_what_is_left_out_of_shapes_and_films_is_noted(tmp_path):
     assert found.shapes[0].bsdf["type"] == "conductor" and "a further bsdf on the same shape" in found.notes[0]
     film = '<film type="hdrfilm"><integer name="crop_width" value="8"/></film></sensor>'
     assert "its film is cropped" in converted(tmp_path, xml().replace("</sensor>", film)).notes[0]
+
+
+def test_boundaries_of_media_are_no_surfaces(tmp_path):
+    fog = '<shape type="cube"><medium name="interior" type="homogeneous"/>{}</shape>'
+    null = fog.format('<bsdf type="null"/>')
+    for content in (xml(null), old_xml(null), old_xml(fog.format(""))):
+        found = converted(tmp_path, content)
+        assert [shape.name for shape in found.shapes] == ["ball"] and "boundary of a medium" in found.notes[-1]
+    for content in (xml(fog.format("")), old_xml(fog.format('<bsdf type="dielectric"/>'))):
+        assert len(converted(tmp_path, content).shapes) == 2
+
+
+def test_rough_plastic_has_no_texture_of_roughness(tmp_path):
+    texture = '<texture name="alpha" type="checkerboard"/>'
+    scene = own(tmp_path, xml(shape=painted(f'<bsdf type="roughplastic">{texture}</bsdf>')))
+    assert scene.scene.stock[0].bsdf["alpha"] == 0.1 and "0.1 instead of its texture" in scene.notes[0]
+
+
+def test_a_sky_is_sampled_where_it_is_dark_too(tmp_path):
+    """The last vertex of a path gets light from samples of the sky alone: none may be left out."""
+    mi.Bitmap(np.linspace(0.1, 2, 24, dtype=np.float32).reshape(2, 4, 3)).write(str(tmp_path / "sky.exr"))
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/>{}</emitter>'
+    compensated = sky.format('<boolean name="mis_compensation" value="true"/>')
+    assert converted(tmp_path, xml(light=compensated)).lights[0].emitter["mis_compensation"] is False
 
 
 def test_nothing_to_render(tmp_path):

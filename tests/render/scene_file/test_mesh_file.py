@@ -10,7 +10,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from errors import BadInput
-from render.scene_file.mesh_file import MeshFile, linear_image, texture
+from render.scene_file.assets import linear_image, texture
+from render.scene_file.mesh_file import MeshFile
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
 OBJ = f"mtllib m.mtl\n{TRIANGLE}usemtl red\nf 1/1 2/2 3/3\n"
@@ -75,11 +76,11 @@ def test_authored_normals_of_gltf_are_smooth(tmp_path):
 
 def test_factors_relief_and_light_of_gltf(tmp_path):
     factors = {"baseColorFactor": [1.0, 0.5, 0.25, 0.5], "emissiveFactor": [1.0, 0.5, 0.2], "metallicFactor": 0.0}
-    textures = {"normalTexture": picture(), "emissiveTexture": picture()}
+    textures = {"normalTexture": picture(), "emissiveTexture": Image.new("RGB", (4, 4), (188, 188, 188))}
     found = loaded(tmp_path, world(**factors, **textures, alphaMode="BLEND"))
     (box,) = found.shapes
     assert found.sky is None
-    np.testing.assert_allclose(box.radiance.at(3), [1, 0.5, 0.2])
+    np.testing.assert_allclose(box.radiance.at(3), np.multiply(0.5029, [1, 0.5, 0.2]), atol=1e-4)
     assert box.bsdf["bsdf"]["type"] == "normalmap"
     assert box.bsdf["bsdf"]["bsdf"]["base_color"]["value"] == pytest.approx([1, 0.5, 0.25], abs=0.01)
     assert len(found.notes) == 2 and "transparency" in found.notes[0] and "emissive texture" in found.notes[1]
@@ -111,9 +112,10 @@ def test_cameras_of_gltf_keep_their_vertical_field_of_view(tmp_path, aspect):
     assert np.tan(np.radians(camera.x_fov.at(0)) / 2) / aspect == pytest.approx(np.tan(0.4))
 
 
-def test_a_damaged_camera_of_gltf_is_left_out(tmp_path):
+@pytest.mark.parametrize("perspective", [{}, {"yfov": float("nan")}])
+def test_a_damaged_camera_of_gltf_is_left_out(tmp_path, perspective):
     def add(content):
-        content["cameras"] = [{"type": "perspective", "perspective": {}}]
+        content["cameras"] = [{"type": "perspective", "perspective": perspective}]
         content["nodes"].append({"camera": 0})
 
     found = MeshFile(gltf(tmp_path, add), 1.0)
@@ -139,9 +141,9 @@ def test_names_are_unique(tmp_path):
 def test_materials_of_obj(tmp_path):
     picture().save(tmp_path / "tex.png")
     (tmp_path / "scene.obj").write_text(OBJ)
-    (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0.5 0.5 0.5\nKe 3 2 1\nd 0.5\n")
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.0015 0.2 0.4\nKs 0.5 0.5 0.5\nKe 3 2 1\nd 0.5\n")
     found = MeshFile(tmp_path / "scene.obj", 1.0)
-    assert found.shapes[0].bsdf["bsdf"]["reflectance"]["value"] == pytest.approx([0.8, 0.2, 0.4], abs=1e-6)
+    assert found.shapes[0].bsdf["bsdf"]["reflectance"]["value"] == [0.0015, 0.2, 0.4]
     np.testing.assert_array_equal(found.shapes[0].radiance.at(0), [3, 2, 1])
     assert ["gloss" in note for note in found.notes] == [True, False] and "transparency" in found.notes[1]
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nKs 0 0 0\nd 1\nmap_Kd tex.png\n")
@@ -149,6 +151,27 @@ def test_materials_of_obj(tmp_path):
     stored = found.shapes[0].bsdf["bsdf"]["reflectance"]["data"]
     np.testing.assert_allclose(stored, linear_image(picture())[::-1], rtol=1e-6)
     assert len(found.notes) == 1  # of the sky
+
+
+@pytest.mark.parametrize("name", ["t\\tex.png", "-s 2 2 1 -clamp on t/tex.png"])
+def test_textures_of_obj_behind_options_and_backslashes(tmp_path, name):
+    (tmp_path / "t").mkdir()
+    picture().save(tmp_path / "t" / "tex.png")
+    (tmp_path / "scene.obj").write_text(OBJ)
+    (tmp_path / "m.mtl").write_text(f"newmtl red\nmap_Kd {name}\n")
+    found = MeshFile(tmp_path / "scene.obj", 1.0)
+    assert found.shapes[0].bsdf["bsdf"]["reflectance"]["type"] == "bitmap"
+    assert any("options" in note for note in found.notes) == name.startswith("-")
+
+
+def test_a_damaged_texture_of_obj_is_left_out(tmp_path):
+    picture().resize((64, 64)).save(tmp_path / "tex.png")
+    (tmp_path / "tex.png").write_bytes((tmp_path / "tex.png").read_bytes()[:500])
+    (tmp_path / "scene.obj").write_text(OBJ)
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 0.8 0.2 0.4\nmap_Kd tex.png\n")
+    found = MeshFile(tmp_path / "scene.obj", 1.0)
+    assert found.shapes[0].bsdf["bsdf"]["reflectance"]["value"] == [0.8, 0.2, 0.4]
+    assert "its texture is damaged" in found.notes[0]
 
 
 def test_colours_of_ply(tmp_path):

@@ -77,7 +77,6 @@ BSDFS = {
     "difftrans": (bsdf("difftrans", spectra(transmittance=0.5)), "a diffuse surface"),
     "hk": (bsdf("hk", strings(material="skin1"), floats(thickness=5)), "a diffuse surface"),
     "irawan": (bsdf("irawan", strings(filename="cloth.wv")), "a diffuse surface"),
-    "null": (bsdf("null"), ""),
 }  # fmt: skip
 
 
