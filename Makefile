@@ -16,9 +16,11 @@ LLVM := libllvm19
 # Seconds since this call of make began, for the documentation.
 START := $(shell date +%s)
 SECONDS = $$(( $$(date +%s) - $(START) ))
+# Whether this call does everything but set-up: what a later one takes says nothing.
+FRESH := $(shell [ $(READY) -nt pyproject.toml ] && [ ! -e $(DATA) ] && [ ! -e $(RUNS) ] && echo yes)
 
 all: dataset train eval report
-	@echo $(SECONDS) > $(RUNS)/make.seconds
+	@$(if $(FRESH),echo $(SECONDS) > $(RUNS)/make.seconds,:)
 
 setup: $(READY)
 

@@ -155,6 +155,8 @@ def evaluate(
     from eval.error_location import where as error_tables
     from eval.harness import evaluate as evaluate_on
 
+    if where and jod:
+        raise BadInput("--where prints other tables and stores no pictures for --jod: leave one of them out")
     folders = data or [data_folder(None, budget)]
     if where:
         print(error_tables(folders, runs, budget, names, device, first_hits))
@@ -265,7 +267,10 @@ def bench_denoisers(
         Flag, arg(name="all", help="also other precisions, PyTorch without kernels, one thread")
     ] = False,
 ) -> None:
-    """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers as `onespp eval` runs them."""
+    """Measure milliseconds and memory per frame beside OIDN, by default of all denoisers as `onespp eval` runs them.
+
+    Where there is a GPU, also on it, without OIDN, which computes on the CPU.
+    """
     from eval.bench.denoisers import bench_denoisers as bench
 
     print(bench(runs, names, size, threads, every_way=every_way))
@@ -367,11 +372,13 @@ def weights(
     from models.registry import create, shipped_names
     from models.weights import average_weights
 
-    if average:
-        if not (name and out):
-            raise BadInput("--average FILE... needs the NETWORK and --out FILE")
+    if average and card:
+        raise BadInput("--average writes weights and --card the card of shipped ones: leave one of them out")
+    if average and name and out:
         average_weights(create(name), name, average, out)
         print(out)
+    elif average or out:
+        raise BadInput("--average FILE... needs the NETWORK and --out FILE, and --out needs --average")
     elif card:
         for each in [name] if name else shipped_names():
             print(measure_card(each, card))
@@ -476,12 +483,21 @@ SUMMARIES = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command. Exits with 2 and one line on what the user can correct, 130 when interrupted."""
+    """Run one command.
+
+    Exits with 2 and one line on what the user can correct, 130 when interrupted, 141 where `| head` has read enough.
+    """
     words = sys.argv[1:] if arguments is None else arguments
     set_up_process()
     try:
-        run(words)
+        try:
+            run(words)
+        finally:
+            sys.stdout.flush()
         return
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
+        sys.exit(141)
     except BadInput as error:
         code, message = 2, f"onespp: {error}"
     except OSError as error:

@@ -113,9 +113,10 @@ def where(
     data: Sequence[Path], runs: Path, budget: str, names: Sequence[str], device: str = "cpu", first_hits: bool = False
 ) -> str:
     """A table for each test clip. Raises BadInput as `onespp eval` does."""
-    specs = evaluated(names, runs, budget, device)
+    clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
+    specs = evaluated(names, runs, budget, device, clips)
     tables = []
-    for clip in (clip for path in data for clip in Dataset(path).clips("test", first_hits)):
+    for clip in clips:
         shares = error_shares(clip, specs)
         keys = dict.fromkeys(key for each in shares.values() for key in each)
         columns = shares.values()

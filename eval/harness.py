@@ -5,7 +5,9 @@ import multiprocessing
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 from signal import SIG_IGN, SIGINT
@@ -25,6 +27,7 @@ from eval.results import (
     Result,
     by_clip,
     folder_of,
+    heading,
     is_finished,
     load_picture,
     load_result,
@@ -91,8 +94,7 @@ def evaluate_in_worker(specs: list[DenoiserSpec], runs: Path, threads: int, clip
 
 
 def start_worker() -> None:
-    """Ignore interrupts, which the parent handles, and keep the progress bars' lock within the process."""
-    on_signal(SIGINT, SIG_IGN)
+    """Keep freed memory, and the progress bars' lock within the process."""
     set_up_process()
     tqdm.set_lock(threading.RLock())
 
@@ -106,13 +108,32 @@ def compile_kernels(spec: DenoiserSpec) -> None:
         _, state = denoiser(synthetic_frame(index, *COMPILED_SIZE).to(spec.device), state)
 
 
+def do_all(
+    pool: ProcessPoolExecutor, work: Callable[[Any], None], arguments: Sequence[Any], label: str, unit: str
+) -> None:
+    """Call `work` for each of the arguments in the pool's processes. Raises BadInput where one of these is killed."""
+    try:
+        before = on_signal(SIGINT, SIG_IGN)  # in the processes that begin with these calls: this one handles interrupts
+        futures = [pool.submit(work, argument) for argument in arguments]
+        on_signal(SIGINT, before)
+        for future in tqdm(as_completed(futures), label, len(futures), unit=unit):
+            future.result()
+    except BrokenProcessPool:
+        raise BadInput("a process was killed, probably for lack of memory: use fewer --processes") from None
+    except BaseException:  # an interrupt, or an error in one process: wait for none of the others
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+
+
 def evaluate_in_processes(clips: Sequence[Clip], specs: list[DenoiserSpec], runs: Path, processes: int) -> None:
     """Evaluate clips in parallel, after compiling kernels in parallel, those of networks first: they take longest."""
     work = partial(evaluate_in_worker, specs, runs, max(1, torch.get_num_threads() // processes))
-    jobs = [(clip.path, clip.first_hits) for clip in clips]
-    with multiprocessing.get_context("spawn").Pool(processes, start_worker) as pool:
-        list(tqdm(pool.imap_unordered(compile_kernels, specs[::-1]), "kernels", len(specs), unit="denoiser"))
-        list(tqdm(pool.imap_unordered(work, jobs), "clips", len(jobs), unit="clip"))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, start_worker) as pool:
+        do_all(pool, compile_kernels, specs[::-1], "kernels", "denoiser")
+        do_all(pool, work, [(clip.path, clip.first_hits) for clip in clips], "clips", "clip")
 
 
 def sheet(runs: Path, results: ClipResults) -> "Figure":
@@ -162,7 +183,7 @@ def evaluate(
     clips = [clip for path in data for clip in Dataset(path).clips("test", first_hits)]
     if twice := [name for name, count in Counter((clip.scene, clip.name) for clip in clips).items() if count > 1]:
         raise BadInput(f"{' and '.join(map(str, data))} both have {'/'.join(twice[0])}: evaluate them by themselves")
-    specs = evaluated(names, runs, budget, device)
+    specs = evaluated(names, runs, budget, device, clips)
     denoisers = named_denoisers(specs)
     (runs / "eval").mkdir(parents=True, exist_ok=True)
     missing = [clip for clip in clips if unfinished(clip, runs_through(clip, denoisers, runs))]
@@ -172,8 +193,8 @@ def evaluate(
         evaluate_in_processes(missing, specs, runs, processes)
     results = [result for clip in clips for result in evaluate_clip(clip, denoisers, runs)]
     weights = {spec.name: str(spec.weights) if spec.weights else None for spec in specs}
-    content = write_results(runs, data, device_in_words(device), results, weights)
+    content = write_results(runs, data, device_in_words(device), results, weights, first_hits)
     judged = list(by_clip(results))
     save_sheets(runs, judged)
-    print(f"{results_table(judged)}\n\n{table_by_age(judged)}")
+    print(f"{heading(content)}\n\n{results_table(judged)}\n\n{table_by_age(judged)}")
     return content

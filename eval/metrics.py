@@ -213,9 +213,9 @@ def energy(c: Comparison) -> float | None:
 
 
 def energy_error(c: Comparison) -> float | None:
-    """Its standard error for a perfect image with independent pixels."""
+    """Its standard error for a perfect image with independent pixels, whose channels share the noise of their paths."""
     mean = float((c.exposure * c.reference).mean())
-    return float(c.noise.square().sum().sqrt()) / c.noise.numel() / mean if mean > 0 else None
+    return float(c.noise.sum(dim=0).square().sum().sqrt()) / c.noise.numel() / mean if mean > 0 else None
 
 
 def gradient_product(x: Tensor, y: Tensor) -> float:

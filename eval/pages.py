@@ -9,7 +9,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -20,7 +20,7 @@ from tabulate import tabulate
 from errors import BadInput
 from eval.metrics import METRICS, Values, means
 from eval.results import FLOOR, NOISE_FLOOR, ClipResults, Result, of_one_spp, read_results
-from eval.tables import PRINTED, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
+from eval.tables import PRINTED, ClipScores, TableRow, clip_rows, mean_rows, source_of_denoiser, value_cell
 from eval.tradeoff.trades import Trade, psnr_front
 from files import read_json, write_file, write_json
 from provenance import ROOT, device_in_words
@@ -80,9 +80,9 @@ def extract_stress(runs: Path) -> dict[str, Any]:
 
 
 def steady_clips(runs: Path, first: int) -> list[dict[str, Any]]:
-    """Metrics of all denoisers, and their noise floors, from frame `first` of each clip on."""
+    """Metrics of all denoisers in total light, and their noise floors, from frame `first` of each clip of 1 spp on."""
     rows = []
-    for clip in read_results(runs)[1]:
+    for clip in of_one_spp([clip for clip in read_results(runs)[1] if clip.signal == "total"]):
         values = {result.denoiser: result.frames[first:] for result in (*clip.results, clip.reference)}
         rows.append({"scene": clip.scene, "clip": clip.clip, "results": {n: kept(means(f)) for n, f in values.items()}})
     return rows
@@ -124,7 +124,7 @@ def extract_runtime(isa: str, runs: Path) -> dict[str, Any]:
 
 
 def extract_times(runs: Path) -> dict[str, Any]:
-    """Seconds that `make` and `make test` took, which they leave in RUNS, on this machine."""
+    """Seconds that the first `make` after set-up and `make test` took, which they leave in RUNS, on this machine."""
     files = {name: runs / f"{name}.seconds" for name in ("make", "test")}
     if missing := [str(file) for file in files.values() if not file.exists()]:
         raise BadInput(f"{' and '.join(missing)} missing")
@@ -270,6 +270,12 @@ def front() -> str:
     return table(lines)
 
 
+def mean_row(clips: Sequence[dict[str, Any]], denoiser: str) -> TableRow:
+    """Means of a denoiser, or of the noise floors, over clips of `steady_clips`."""
+    scores = ClipScores([clip["results"][denoiser] for clip in clips], [clip["results"][NOISE_FLOOR] for clip in clips])
+    return TableRow("mean", FLOOR if denoiser == NOISE_FLOOR else denoiser, "total", scores.means, scores.joint_floor)
+
+
 def noise_off(clips: Iterable[dict[str, Any]], denoiser: str) -> str:
     """Mean PSNR of a denoiser over clips, in dB, of its squared error less that of the references' noise."""
     pairs = [(clip["results"][denoiser]["psnr"], clip["results"][NOISE_FLOOR]["psnr"]) for clip in clips]
@@ -283,16 +289,12 @@ def glass() -> str:
     for guides, clips in measured("glass")["clips"].items():
         scenes = list(dict.fromkeys(clip["scene"].split("-")[1] for clip in clips))
         for denoiser in clips[0]["results"]:
-
-            def mean(metric: str, scene: str, clips: list[Any] = clips, name: str = denoiser) -> float:
-                return fmean(c["results"][name][metric] for c in clips if scene in c["scene"])
-
-            floor = denoiser == NOISE_FLOOR
-            row = TableRow("mean", FLOOR if floor else denoiser, "total", {}, {})
-            line = {"denoiser": cell(row), "made from": row.made_from, "guides": "" if floor else guides}
-            line |= {scene: f"{mean('psnr', scene):.2f}" for scene in scenes}
-            line |= {"mean": f"{mean('psnr', 'glass'):.2f}", "noise off": noise_off(clips, denoiser)}
-            line |= {"temporal error": f"{mean('temporal_error', 'glass'):.4f}"}
+            row = mean_row(clips, denoiser)
+            line = {"denoiser": cell(row), "made from": row.made_from, "guides": "" if row.is_floor else guides}
+            for scene in scenes:
+                line[scene] = mean_row([clip for clip in clips if scene in clip["scene"]], denoiser).text("psnr")
+            line |= {"mean": row.text("psnr"), "noise off": noise_off(clips, denoiser)}
+            line |= {"temporal error": row.text("temporal_error")}
             lines.setdefault(denoiser, {})[line["guides"]] = line
     return table([line for alike in lines.values() for line in alike.values()])
 
@@ -323,16 +325,14 @@ def steady(folder: str, *names: str) -> str:
     own_clips = measured("benchmark")["folders"].get(f"{folder}-own", {}).get("clips", [])
     lines = []
     for denoiser in (*names, NOISE_FLOOR) if names else clips[0]["results"]:
-        values = {clip["scene"]: clip["results"][denoiser] for clip in clips}
-        label = FLOOR if denoiser == NOISE_FLOOR else denoiser
-        row = TableRow("mean", label, "total", means([*values.values()]), {})
+        row = mean_row(clips, denoiser)
         line = {"denoiser": cell(row), "made from": row.made_from}
         line |= {METRICS[metric].title: row.text(metric) for metric in SHOWN_METRICS}
         line |= {"noise off": noise_off(clips, denoiser)}
-        line |= {scene: value_cell("psnr", each["psnr"]) for scene, each in values.items()}
+        line |= {clip["scene"]: mean_row([clip], denoiser).text("psnr") for clip in clips}
         if own_clips:
-            own = [clip["results"][denoiser]["psnr"] for clip in own_clips if denoiser in clip["results"]]
-            line |= {f"{len(own_clips)} of ours": value_cell("psnr", fmean(own)) if own else ""}
+            own = [clip for clip in own_clips if denoiser in clip["results"]]
+            line |= {f"{len(own_clips)} of ours": mean_row(own, denoiser).text("psnr") if own else ""}
         lines.append(line)
     return table(lines)
 

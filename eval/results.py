@@ -121,7 +121,12 @@ def is_finished(folder: Path, wanted: str) -> bool:
 
 
 def write_results(
-    runs: Path, data: Sequence[Path], device: str, results: list[Result], weights: Mapping[str, str | None]
+    runs: Path,
+    data: Sequence[Path],
+    device: str,
+    results: list[Result],
+    weights: Mapping[str, str | None],
+    first_hits: bool = False,
 ) -> dict[str, Any]:
     """Write results.json and, frame by frame, frames.csv. Returns the content of results.json."""
     rows = [
@@ -142,12 +147,18 @@ def write_results(
         "schema": 1,
         "dataset": ", ".join(map(str, data)),
         "device": device,
+        "first_hits": first_hits,
         "versions": versions(DENOISING),
         "rows": rows,
     }
     write_frames(runs / "eval" / "frames.csv", results)
     write_json(runs / "eval" / RESULTS_FILE, content)
     return content
+
+
+def heading(content: Mapping[str, Any]) -> str:
+    """What results.json is of."""
+    return f"{content['dataset']}{', with first hits as guides' if content.get('first_hits') else ''}"
 
 
 def write_frames(path: Path, results: list[Result]) -> None:

@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from datasets.channels import CHANNELS
+from datasets.clip import Clip
 from errors import BadInput
 from models.registry import DENOISERS, DenoiserName, parse_name, prototype, shipped_weights
 from models.spec import DenoiserSpec, fastest_precision
@@ -67,6 +69,15 @@ def untrained(runs: Path, budget: str, name: DenoiserName) -> str | None:
     return f"it has no weights at {path}" + (f": train them with `{command}`" if name.base in TRAINABLE else "")
 
 
+def lacks_channels(clips: Iterable[Clip], name: DenoiserName) -> str | None:
+    """That a clip lacks channels which a denoiser reads; None where it has all. Sample buffers are optional."""
+    reads = [channel for channel in prototype(name).reads if CHANNELS[channel].kind != "buffers"]
+    for clip in clips:
+        if missing := [channel for channel in reads if channel not in clip.channels]:
+            return f"{clip.path} has no {' and no '.join(missing)}: take clips that `onespp dataset` rendered"
+    return None
+
+
 def weights_of(name: DenoiserName, runs: Path) -> Path | None:
     """The file of a denoiser's weights; None for one without weights. Raises BadInput where they are missing."""
     if reason := untrained(runs, USUAL_BUDGET, name):
@@ -90,12 +101,15 @@ def evaluated_by_default(runs: Path, budget: str) -> Iterator[DenoiserName]:
             yield trained
 
 
-def evaluated(names: Sequence[str], runs: Path, budget: str, device: str = "cpu") -> list[DenoiserSpec]:
-    """The named denoisers, or all that can run and have weights, as `onespp eval` runs them.
+def evaluated(
+    names: Sequence[str], runs: Path, budget: str, device: str = "cpu", clips: Sequence[Clip] = ()
+) -> list[DenoiserSpec]:
+    """The named denoisers, or all that can run on the clips and have weights, as `onespp eval` runs them.
 
     Raises BadInput where a named one is unknown, cannot run or is not trained.
     """
-    chosen = choose(names, evaluated_by_default(runs, budget), cannot_run, partial(untrained, runs, budget))
+    obstacles = (cannot_run, partial(untrained, runs, budget), partial(lacks_channels, clips))
+    chosen = choose(names, evaluated_by_default(runs, budget), *obstacles)
     return [
         DenoiserSpec(name, None, fastest_precision(name, device), weights_file(name, runs, budget), device=device)
         for name in chosen

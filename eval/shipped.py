@@ -58,7 +58,6 @@ def measure_card(name: str, runs: Path) -> Path:
 
     Returns the card's path. Raises BadInput if there is no card yet, or if RUNS/eval has no results of these weights.
     """
-    write_json(measured_file(name), measurements(name, runs))
     path = card_file(name)
     text = path.read_text() if path.exists() else ""
     before, begin, rest = text.partition(BEGIN)
@@ -68,6 +67,7 @@ def measure_card(name: str, runs: Path) -> Path:
             f"{path}: write the network's intended use and limitations, with the lines '{BEGIN}' and '{END}' where "
             "its facts belong"
         )
+    write_json(measured_file(name), measurements(name, runs))
     write_file(path, f"{before}{begin}\n{facts(name)}\n{end}{after}".encode())
     return path
 
@@ -160,7 +160,7 @@ def version_list(versions: dict[str, str]) -> str:
 def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipResults]]:
     """The content of RUNS/eval/results.json, and the results of the network and of its baselines.
 
-    Raises BadInput unless the network was evaluated with the shipped weights as they are now.
+    Raises BadInput unless the network was evaluated with the shipped weights as they are now, without --first-hits.
     """
     weights = require_shipped(name)
     wanted = (*baselines(), name)
@@ -168,7 +168,10 @@ def evaluated_clips(name: str, runs: Path) -> tuple[dict[str, Any], list[ClipRes
     content, clips = read_results(runs)
     evaluated = [clip for clip in clips if results_of([clip], name)]
     files = {Path(row["weights"]).name for row in content["rows"] if row["denoiser"] == name}
-    if not of_one_spp(evaluated) or files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime:
+    stale = files != {weights.name} or path.stat().st_mtime < weights.stat().st_mtime
+    if not of_one_spp(evaluated) or stale or content.get("first_hits"):
         command = f"onespp eval {' '.join(wanted)} --runs {runs}"
-        raise BadInput(f"{path} has no results of {weights} as it is now, on clips at 1 spp: run `{command}`")
+        raise BadInput(
+            f"{path} has no results of {weights} as it is now, on clips at 1 spp without --first-hits: run `{command}`"
+        )
     return content, [replace(clip, results=[r for r in clip.results if r.denoiser in wanted]) for clip in evaluated]

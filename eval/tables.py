@@ -23,14 +23,15 @@ AGES = {"first frame": slice(0, 1), "fifth": slice(4, 5), "from the 16th on": sl
 
 
 def means_by_age(clips: Sequence[ClipResults], metric: str = "psnr") -> dict[str, dict[str, float | None]]:
-    """A metric of each denoiser by AGES, the mean over clips of one signal; None where no clip is that long."""
+    """A metric of each denoiser by AGES, the mean over clips of one signal, of 1 spp; None unless all clips have it."""
+    clips = of_one_spp(clips)
     rows: dict[str, dict[str, float | None]] = {}
     for denoiser in dict.fromkeys(result.denoiser for clip in clips for result in clip.results):
         results = results_of(clips, denoiser)
         for age, frames in AGES.items():
             chosen = [means(result.frames[frames]).get(metric) for result in results]
             values = [value for value in chosen if value is not None]
-            rows.setdefault(denoiser, {})[age] = fmean(values) if values else None
+            rows.setdefault(denoiser, {})[age] = fmean(values) if len(values) == len(chosen) else None
     return rows
 
 
@@ -121,8 +122,9 @@ class TableRow:
         value = self.values.get(metric)
         if not self.is_floor:
             return value_cell(metric, value, self.floors.get(metric))
-        mark = "±" if METRICS[metric].floor_is_error and value is not None else ""
-        return mark + value_cell(metric, value)
+        if value is None or not METRICS[metric].floor_is_error:
+            return value_cell(metric, value)
+        return f"±{100 * value:.2g}%" if METRICS[metric].form.endswith("%}") else f"±{value_cell(metric, value)}"
 
     def near(self, metric: str) -> bool:
         return not self.is_floor and within_floor(metric, self.values.get(metric), self.floors.get(metric))
@@ -185,7 +187,7 @@ def results_table(clips: Sequence[ClipResults]) -> str:
 
 
 def table_by_age(clips: Sequence[ClipResults]) -> str:
-    """PSNR by the age of the history, the mean over clips, of each signal."""
+    """PSNR by the age of the history, see means_by_age, of each signal."""
     tables = []
     for signal, ours in by_signal(clips).items():
         rows = means_by_age(ours)

@@ -1,11 +1,15 @@
 """The command line: help, and bad input answered by one line and exit code 2, with nothing half-written."""
 
 import contextlib
+import os
 import shutil
+import subprocess
+import sys
 
 import pytest
 
 from command_line import GROUPS, main
+from provenance import ROOT
 from render.job.profiles import DATA_PROFILES
 from train.recipes import RECIPES
 
@@ -63,6 +67,42 @@ def test_a_bench_refuses_unknown_options(capsys):
 def test_unknown_commands(capsys):
     assert "unknown command 'onespp fly'" in fails(capsys, "fly")
     assert "denoisers, light" in fails(capsys, "bench", "everything")
+
+
+@pytest.mark.parametrize("words", [["--help"], ["eval", "--help"]], ids=" ".join)
+def test_nobody_reads_on(monkeypatch, capfd, words):
+    """As behind `| true`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as gone, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdout", gone)
+        with pytest.raises(SystemExit) as exit_:
+            main(words)
+    assert exit_.value.code == 141 and capfd.readouterr().err == ""
+
+
+def test_options_that_would_do_nothing(capsys, tmp_path):
+    file = str(tmp_path / "file")
+    assert "--where prints other tables" in fails(capsys, "eval", "--where", "--jod", "--data", file)
+    assert "--out needs --average" in fails(capsys, "weights", "one", "--out", file)
+    average = ("weights", "one", "--average", file, "--out", file)
+    assert "leave one of them out" in fails(capsys, *average, "--card", file)
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="needs make")
+def test_make_keeps_its_time_where_it_does_everything_but_set_up(tmp_path):
+    def keeps() -> bool:
+        command = ["make", "--dry-run", "-C", tmp_path, "-f", ROOT / "Makefile", "all"]
+        return "make.seconds" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    (tmp_path / "pyproject.toml").touch()
+    assert not keeps()  # it sets up first
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv" / ".ready").touch()
+    os.utime(tmp_path / "pyproject.toml", (0, 0))
+    assert keeps()
+    (tmp_path / "data" / "quick").mkdir(parents=True)
+    assert not keeps()
 
 
 def test_unknown_names(capsys, tiny, tmp_path):

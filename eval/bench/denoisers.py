@@ -22,7 +22,7 @@ from eval.selection import cannot_run, choose, with_indirect_baselines
 from files import read_json, write_json
 from models.denoiser import Denoiser, State
 from models.filters.oidn import OIDN
-from models.registry import DENOISERS, DenoiserName, parse_name
+from models.registry import DENOISERS, DenoiserName, parse_name, prototype
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from models.wrappers.wrapper import unwrapped
 from process import keep_freed_memory
@@ -82,8 +82,13 @@ class DenoiserCost:
         return self.height, self.width, self.threads
 
 
+def computes_on(device: str, name: DenoiserName) -> bool:
+    """Whether a denoiser computes on a device; OIDN does on the CPU alone, to which it copies images of a GPU."""
+    return device == "cpu" or not isinstance(unwrapped(prototype(name)), OIDN)
+
+
 def timed_specs(names: Sequence[str], device: str = "cpu", every_way: bool = False) -> list[DenoiserSpec]:
-    """The named denoisers and OIDN, or all that can run here, as `onespp eval` runs them.
+    """The named denoisers and OIDN, or all that can run here, as `onespp eval` runs them; on a GPU without OIDN.
 
     With `every_way` also in their other precisions, and in PyTorch where they have compiled kernels. Raises BadInput
     where a named one is unknown or cannot run.
@@ -91,7 +96,7 @@ def timed_specs(names: Sequence[str], device: str = "cpu", every_way: bool = Fal
     named = [str(replace(parse_name(name), budget=None)) for name in names]  # weights do not change the time
     if named and not cannot_run(parse_name(BASELINE)):
         named.append(BASELINE)
-    chosen = choose(named, map(DenoiserName, DENOISERS), cannot_run)
+    chosen = [name for name in choose(named, map(DenoiserName, DENOISERS), cannot_run) if computes_on(device, name)]
     specs = [DenoiserSpec(name, precision=fastest_precision(name, device), device=device) for name in chosen]
     others = [other for spec in specs for other in other_ways(spec)] if every_way else []
     return [*with_indirect_baselines(specs), *others]
@@ -260,7 +265,7 @@ def bench_denoisers(
     pixels = [parse_size(size) for size in dict.fromkeys(sizes)]
     counts = thread_counts(threads or ((1, torch.get_num_threads()) if every_way else ()))
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
-    specs = {device: timed_specs(names, device, every_way) for device in devices}
+    specs = {device: ours for device in devices if (ours := timed_specs(names, device, every_way))}
     tables = []
     for device, ours in specs.items():
         path = results_file(runs, device)
@@ -276,7 +281,8 @@ def bench_denoisers(
         }
         write_json(path, content)
         unfinished.unlink()
-        tables.append(f"{device}\n{tabulate(table_lines(rows), 'keys', floatfmt='.3g', missingval='-')}")
+        head = device if device == "cpu" else f"{device}, without OIDN, which computes on the CPU"
+        tables.append(f"{head}\n{tabulate(table_lines(rows), 'keys', floatfmt='.3g', missingval='-')}")
     return "\n\n".join(tables)
 
 

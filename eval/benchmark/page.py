@@ -30,7 +30,8 @@ def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget:
 
     Raises BadInput as `onespp eval`, and for one denoiser named twice.
     """
-    specs = evaluated(names, runs, budget)
+    played = [clip for folder in data for clip in Dataset(folder).clips("test")]
+    specs = evaluated(names, runs, budget, clips=played)
     if len(specs) < 2:
         raise BadInput(f"{names[0]} is named twice: name two denoisers to compare")
     clips = [
@@ -40,8 +41,7 @@ def write_page(names: tuple[str, str], data: Sequence[Path], runs: Path, budget:
             "height": clip.height,
             "videos": [video(clip, spec) for spec in specs],
         }
-        for folder in data
-        for clip in Dataset(folder).clips("test")
+        for clip in played
     ]
     content = {"denoisers": [spec.name for spec in specs], "clips": clips}
     template = resources.files("eval.benchmark").joinpath("page.html").read_text()

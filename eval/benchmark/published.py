@@ -113,12 +113,13 @@ def published(names: Sequence[str], data: Path, runs: Path, budget: str) -> str:
     """A table of denoisers and published rows. Raises BadInput as `protocol_of` and `onespp eval`."""
     dataset = Dataset(data)
     protocol = protocol_of(dataset)
-    for clip in dataset.clips("test"):
+    clips = dataset.clips("test")
+    for clip in clips:
         if clip.frames <= protocol.warm_up:
             raise BadInput(f"{clip.path} has {clip.frames} frames; of {protocol.warm_up} the first do not count")
     rows: list[list[Any]] = [[name, "published", *row] for name, row in protocol.rows.items()]
-    for spec in evaluated(names, runs, budget):
-        clips = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in dataset.clips("test")]
-        rows.append([spec.name, spec.facts.made_from, *np.mean(clips, axis=0)])
+    for spec in evaluated(names, runs, budget, clips=clips):
+        means = [np.nanmean(np.array(scores(clip, spec, protocol), float), axis=0) for clip in clips]
+        rows.append([spec.name, spec.facts.made_from, *np.mean(means, axis=0)])
     lines = [[name, source, *(f"{mean:.4g}" for mean in means)] for name, source, *means in rows]
     return f"{tabulate(lines, ['', 'made from', *PUBLISHED_METRICS], disable_numparse=True)}\n{protocol.note}"

@@ -118,23 +118,13 @@ class DenoiserView:
 
 def runnable(clip: Clip, runs: Path, budget: str, names: Sequence[str]) -> dict[str, Denoiser]:
     """`noisy`, and the named denoisers or all that can run on the clip. Raises BadInput as `evaluated`."""
-    ready = {"noisy": create("noisy")}
-    for spec in evaluated(names, runs, budget):
-        denoiser = spec.build()
-        missing = [channel for channel in denoiser.reads if channel not in clip.channels]
-        if missing and not names:
-            print(f"{spec.name}: skipped, the clip has no {' and no '.join(missing)}")
-            continue
-        ready[spec.name] = denoiser
-    return ready
+    specs = evaluated(names, runs, budget, clips=[clip])
+    return {"noisy": create("noisy")} | {spec.name: spec.build() for spec in specs}
 
 
 @torch.inference_mode()
 def view_clip(clip: Clip, denoisers: Mapping[str, Denoiser], shown: Sequence[int]) -> tuple[list[DenoiserView], Column]:
-    """Run the denoisers over the clip. Returns their views of the `shown` frames, and the references if there are any.
-
-    Raises BadInput where the clip lacks a channel that a denoiser reads.
-    """
+    """Run the denoisers over the clip. Returns their views of the `shown` frames, and references if there are any."""
     views = [DenoiserView(name, denoiser) for name, denoiser in denoisers.items()]
     channels = {channel for denoiser in denoisers.values() for channel in denoiser.reads}
     has_reference = all(channel in clip.channels for channel in REFERENCE_CHANNELS)

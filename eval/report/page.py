@@ -14,7 +14,16 @@ from tqdm import tqdm
 from datasets.clip import is_clip
 from errors import BadInput, requires_extra
 from eval.metrics import METRICS, flip_map
-from eval.results import ClipResults, by_signal, folders_of, load_picture, of_one_spp, picture_path, read_results
+from eval.results import (
+    ClipResults,
+    by_signal,
+    folders_of,
+    heading,
+    load_picture,
+    of_one_spp,
+    picture_path,
+    read_results,
+)
 from eval.tables import LEGEND, MEAN, scores_of, table_rows
 from eval.tradeoff.trades import Times, dominated_by_name, times_of_first_size
 from files import replacing, write_file
@@ -126,6 +135,7 @@ def trade_plots(times: Times, clips: Sequence[ClipResults]) -> list[dict[str, An
             points.sort(key=lambda point: point["ms"])
             missing = [name for name in specs if name not in by]
             plot = {"signal": signal, "metric": metric, "points": points, "missing": missing}
+            plot["command"] = times.command(specs)
             plots += [plot | {"size": f"{width} × {height}"}] if points else []
     return plots
 
@@ -152,6 +162,7 @@ def render(results: dict[str, Any], clips: Sequence[ClipResults], runs: Path, me
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}  # metrics and denoisers keep their order
     return environment.from_string((page / "template.html").read_text()).render(
         results=results,
+        heading=heading(results),
         clips=clips,
         rows=rows,
         metrics=metrics,

@@ -24,7 +24,7 @@ from files import write_json
 from models.registry import DENOISERS, DenoiserName, shipped_names
 from models.spec import DenoiserSpec, fastest_precision, precisions_of
 from plotting import DPI, Figure, plt, save_figure, ticker
-from provenance import DENOISING, device_in_words, versions
+from provenance import DENOISING, versions
 from render.clip import Options
 
 FRONTS = "Fronts count a clip within its noise floor as at the floor's edge: a worse mean can dominate a better one."
@@ -67,7 +67,7 @@ def trade(
     content = {
         "schema": 1,
         "dataset": str(data),
-        "device": device_in_words(),
+        "device": times.device,
         "versions": versions(DENOISING),
         "budget": budget,
         "clips": [f"{clip.scene}/{clip.name}" for clip in clips],
@@ -101,12 +101,12 @@ def candidates(names: Sequence[str], runs: Path, budget: str) -> list[DenoiserSp
 
 
 def with_more_samples(chosen: Sequence[DenoiserSpec], named: bool) -> list[DenoiserSpec]:
-    """The named candidates, or baselines and networks with shipped weights, in the precision of `onespp eval`."""
+    """The named candidates, or baselines and networks with shipped weights, in the usual precision, which is timed."""
     usual = (*baselines(), *shipped_names())
     return [
         candidate
         for candidate in chosen
-        if (named or candidate.name in usual) and candidate.precision == fastest_precision(candidate.denoiser)
+        if (named or candidate.name in usual) and candidate.precision == fastest_precision(candidate.denoiser, RENDERER)
     ]
 
 
@@ -167,6 +167,8 @@ def tables(rows: Sequence[Trade], sample_rows: Sequence[Trade], title: str, time
     for signal in dict.fromkeys(row.signal for row in rows):
         parts.append(f"{signal} light\n{front_table([row for row in rows if row.signal == signal])}")
     if untimed := [row.label for row in rows if row.ms is None]:
-        parts.append(f"Without a time: {', '.join(untimed)}. Measure them with `{times.command} --all`.")
+        command = f"{times.command(row.denoiser for row in rows)} --all"
+        note = "" if RENDERER == "cpu" else "; OIDN computes on the CPU alone"
+        parts.append(f"Without a time: {', '.join(untimed)}. Measure all with `{command}`{note}.")
     parts.append(f"samples per pixel\n{samples_table(sample_rows)}")
     return "\n\n".join(parts)

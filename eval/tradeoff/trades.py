@@ -1,9 +1,10 @@
 """Quality against time: times from `onespp bench denoisers`, Pareto fronts, the rows of trade.json, their tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from tabulate import tabulate
 
@@ -29,25 +30,33 @@ class Times:
         path = results_file(runs, device)
         self.size = size
         self.name = size_name(size)
-        self.command = f"onespp bench denoisers --size {self.name} --runs {runs}"
+        self.runs = runs
         if not path.exists():
-            raise BadInput(f"there are no times at {path}: measure them with `{self.command}`")
+            command = f"onespp bench denoisers --size {self.name} --runs {runs}"
+            raise BadInput(f"there are no times at {path}: measure them with `{command}`")
         bench = read_json(path, ("device", "threads", "rows"))
         self.device: str = bench["device"]
         self.threads: int = threads or bench["threads"]
+        self.rows: list[dict[str, Any]] = bench["rows"]
         # By the bench's name of the denoiser, and precision.
         self.ms: dict[tuple[str, str], float] = {
             (row["denoiser"], row["dtype"]): row["ms_median"]
-            for row in bench["rows"]
+            for row in self.rows
             if (row["height"], row["width"], row["threads"]) == (*size, self.threads)
         }
         if not self.ms:
-            sizes = dict.fromkeys([*(size_name((row["height"], row["width"])) for row in bench["rows"]), self.name])
-            command = f"onespp bench denoisers --size {' '.join(sizes)} --runs {runs} --threads {self.threads}"
             raise BadInput(
-                f"{path} has no times of {self.name} with {self.threads} threads: measure them with `{command}`, or "
-                "name a size that it has with --size"
+                f"{path} has no times of {self.name} with {self.threads} threads: measure them with "
+                f"`{self.command()}`, or name a size that it has with --size"
             )
+
+    def command(self, names: Iterable[str] = ()) -> str:
+        """The call of the bench for the named denoisers and, as it replaces results, for all that were timed."""
+        denoisers = dict.fromkeys((*(row["denoiser"].partition(" (")[0] for row in self.rows), *names))
+        sizes = dict.fromkeys((*(size_name((row["height"], row["width"])) for row in self.rows), self.name))
+        threads = sorted({*(row["threads"] for row in self.rows), self.threads})
+        options = f"--size {' '.join(sizes)} --threads {' '.join(map(str, threads))} --runs {self.runs}"
+        return f"onespp bench denoisers {' '.join(denoisers)} {options}"
 
     def of(self, spec: DenoiserSpec) -> float | None:
         """Milliseconds a frame; None where that was not measured."""

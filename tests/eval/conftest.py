@@ -37,6 +37,16 @@ def bench_of(runs: Path, times: dict[str, float], size: tuple[int, int], threads
     (runs / "bench" / "results.json").write_text(json.dumps(results))
 
 
+def without_live_page(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("eval.report.page.save_live_page", lambda *_: [])
+
+
+@pytest.fixture
+def no_live_page(monkeypatch) -> None:
+    """Reports have none, which takes a process of its own: for tests of something else."""
+    without_live_page(monkeypatch)
+
+
 @pytest.fixture(scope="session")
 def evaluated(tiny, shared) -> Path:
     """Results on the tiny data set, what was printed of them, the bench's times, a figure, and the report of all."""
@@ -48,6 +58,8 @@ def evaluated(tiny, shared) -> Path:
         bench_of(runs, TIMES | INDIRECT, (720, 1280))
         (runs / "report" / "figures").mkdir(parents=True)
         Image.new("RGB", (20, 10), "red").save(runs / "report" / "figures" / "trade-flip.png")
-        report(runs)
+        with pytest.MonkeyPatch.context() as patch:
+            without_live_page(patch)
+            report(runs)
 
     return made_once(shared / "evaluated", make)

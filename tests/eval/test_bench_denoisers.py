@@ -182,6 +182,13 @@ def test_rows_by_default_and_on_request(monkeypatch, capsys):
         assert [spec.way for spec in timed_specs(["oidn"])] == ["oidn"]
 
 
+def test_oidn_is_not_timed_on_a_gpu(monkeypatch):
+    """It computes on the CPU: a ratio to it would compare two devices."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(eval.bench.denoisers, "cannot_run", lambda name: None)
+    assert [spec.name for spec in timed_specs(["oidn-fast+taa", "noisy"], "cuda")] == ["noisy"]
+
+
 def test_invalid_sizes_and_threads(tmp_path):
     for text in ("720p", "0x5", "5x", "-1x3"):
         with pytest.raises(BadInput, match="not a size"):

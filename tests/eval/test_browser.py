@@ -3,6 +3,7 @@
 import time
 
 import pytest
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
@@ -172,10 +173,20 @@ def test_every_control_has_a_name_and_can_be_reached(page):
 def test_the_blind_comparison_counts_votes(browser, tiny, tmp_path):
     browser.get(write_page(("noisy", "accumulated"), [tiny], tmp_path, "tiny").as_uri())
     body = browser.find_element(By.TAG_NAME, "body")
-    for count, button in enumerate(["prefer-left", "prefer-none"]):
-        WebDriverWait(browser, 10).until(lambda _, n=count: body.get_attribute("data-ready") == str(n))
-        assert "noisy" not in body.text
-        browser.find_element(By.ID, button).click()
+
+    def ready(count):
+        WebDriverWait(browser, 10).until(lambda _: body.get_attribute("data-ready") == str(count))
+        return "noisy" not in body.text
+
+    assert ready(0)
+    browser.find_element(By.ID, "prefer-left").click()
+    assert ready(1)
+    ActionChains(browser).send_keys(" ").perform()  # to what has the focus: it pauses, and the button votes no more
+    speed = browser.find_element(By.ID, "speed")
+    before = int(speed.get_attribute("value"))
+    speed.send_keys(Keys.ARROW_RIGHT)
+    assert ready(1) and int(speed.get_attribute("value")) == before + 1
+    browser.find_element(By.ID, "prefer-none").click()
     rows = {row.text for row in browser.find_elements(By.CSS_SELECTOR, "#result tr")}
     assert "no difference 1" in rows
     assert rows > {"noisy 1", "accumulated 0"} or rows > {"noisy 0", "accumulated 1"}

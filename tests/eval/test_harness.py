@@ -2,7 +2,11 @@
 
 import csv
 import json
+import multiprocessing
+import os
 import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +15,9 @@ import pytest
 from datasets.clip import Dataset
 from errors import BadInput
 from eval import clip_run, harness
-from eval.harness import evaluate, sheet
+from eval.harness import do_all, evaluate, sheet
 from eval.metrics import METRICS
-from eval.results import FLOOR, ClipResults, Result, folder_of, load_picture, read_results
+from eval.results import FLOOR, ClipResults, Result, folder_of, heading, load_picture, read_results
 from eval.tables import means_by_age
 from files import read_json, write_json
 from tests.eval.conftest import untrained
@@ -39,7 +43,8 @@ ROWS = {
 
 def test_results_file_has_the_agreed_form(evaluated):
     results = json.loads((evaluated / "eval" / "results.json").read_text())
-    assert results.keys() == {"schema", "dataset", "device", "versions", "rows"} and results["schema"] == 1
+    assert results.keys() == {"schema", "dataset", "device", "first_hits", "versions", "rows"}
+    assert results["schema"] == 1 and not results["first_hits"]
     assert len(results["rows"]) == len(ROWS) * 2
     assert {(row["denoiser"], row["signal"]) for row in results["rows"]} == ROWS
     for row in results["rows"]:
@@ -101,9 +106,20 @@ def test_several_data_sets_are_one_table(tiny, tmp_path):
     facts = read_json(other / "dataset.json", ())
     facts["splits"]["test"] = [f"other_{clip}" for clip in facts["splits"]["test"]]
     write_json(other / "dataset.json", facts)
-    rows = evaluate([tiny, other], tmp_path, "tiny", ["noisy"])["rows"]
+    content = evaluate([tiny, other], tmp_path, "tiny", ["noisy"], first_hits=True)
     scenes = {path.name for path in (tiny / "test").iterdir()}
-    assert {row["scene"] for row in rows} == scenes | {f"other_{scene}" for scene in scenes}
+    assert {row["scene"] for row in content["rows"]} == scenes | {f"other_{scene}" for scene in scenes}
+    assert content["first_hits"] and heading(content) == f"{tiny}, {other}, with first hits as guides"
+
+
+def test_clips_that_lack_a_channel_are_refused_before_any_work(tiny_copy, tmp_path):
+    path = Dataset(tiny_copy).planned(["test"])[-1] / "clip.json"
+    facts = read_json(path)
+    del facts["channels"]["gradient"]
+    write_json(path, facts)
+    with pytest.raises(BadInput, match=f"asvgf: {path.parent} has no gradient"):
+        evaluate([tiny_copy], tmp_path / "runs", "tiny", ["noisy", "asvgf"])
+    assert not (tmp_path / "runs").exists()
 
 
 # --- Frame by frame, and resumed --------------------------------------------------------------------------------------
@@ -249,16 +265,26 @@ def test_parallel_evaluation_gives_the_same_results(once, tiny, tmp_path):
             ]
 
 
+def test_killed_processes_and_errors_end_an_evaluation():
+    """Neither is waited for, nor are the other processes."""
+    spawning = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawning) as pool, pytest.raises(BadInput, match=r"was killed.*fewer --processes"):
+        do_all(pool, os._exit, [1], "calls", "call")
+    start = time.monotonic()
+    with ProcessPoolExecutor(2, spawning) as pool, pytest.raises(TypeError):
+        do_all(pool, time.sleep, [60, "long", 60], "calls", "call")
+    assert time.monotonic() - start < 30
+
+
 def test_denoisers_are_judged_by_the_age_of_their_history():
-    """The first frame, the fifth, and the mean from the 16th on, of the clips that are so long."""
+    """The first frame, the fifth, and the mean from the 16th on, if all clips of 1 spp are so long."""
 
-    def clip(length: int, offset: float) -> ClipResults:
+    def clip(length: int, offset: float, name: str = "000") -> ClipResults:
         frames = [{metric: offset + index for metric in METRICS} for index in range(length)]
-        result = Result(
-            key="", denoiser="one", signal="total", scene="box", clip=str(length), metrics={}, frames=frames
-        )
-        return ClipResults("box", str(length), "total", [result], result)
+        result = Result(key="", denoiser="one", signal="total", scene="box", clip=name, metrics={}, frames=frames)
+        return ClipResults("box", name, "total", [result], result)
 
-    ages = means_by_age([clip(20, 100.0), clip(6, 200.0)])["one"]
-    assert list(ages.values()) == [150.0, 154.0, 117.0]
+    ages = means_by_age([clip(20, 100.0), clip(20, 200.0), clip(20, 900.0, "000-4spp")])["one"]
+    assert list(ages.values()) == [150.0, 154.0, 167.0]
+    assert list(means_by_age([clip(20, 100.0), clip(6, 200.0)])["one"].values()) == [150.0, 154.0, None]
     assert list(means_by_age([clip(1, 3.0)])["one"].values()) == [3.0, None, None]

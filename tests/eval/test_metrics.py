@@ -277,8 +277,9 @@ def test_ssim_between_buffers_would_count_noise_as_structure():
 
 
 @pytest.mark.parametrize("correlated", [True, False])
-def test_error_of_the_unbiased_mse(correlated):
-    """Its spread over references of a perfect image: met where channels share their noise, else bounded."""
+@pytest.mark.parametrize("metric", ["mse_unbiased", "energy"])
+def test_standard_errors(metric, correlated):
+    """The spread over references of a perfect image; that of the unbiased MSE is a bound where noise is coloured."""
     rng = np.random.default_rng(1)
     truth = torch.full((1, 3, 24, 24), 0.5, dtype=torch.float64)
     values = []
@@ -287,10 +288,10 @@ def test_error_of_the_unbiased_mse(correlated):
         noise = torch.from_numpy(rng.normal(0, 0.1, (2, 1 if correlated else 3, 24, 24))).expand(2, 3, -1, -1)
         buffers = truth + noise
         comparison = Comparison(truth, buffers, 1.0)
-        values.append(METRICS["mse_unbiased"].of(comparison))
-        errors.append(METRICS["mse_unbiased"].floor(comparison))
+        values.append(METRICS[metric].of(comparison))
+        errors.append(METRICS[metric].floor(comparison))
     ratio = np.mean(errors) / np.std(values)
-    assert 0.9 < ratio < 1.1 if correlated else 1 < ratio < 2.5
+    assert 0.9 < ratio < 1.1 if correlated or metric == "energy" else 1 < ratio < 2.5
     assert abs(np.mean(values)) < 4 * np.std(values) / math.sqrt(len(values))
 
 

@@ -1,6 +1,7 @@
 """Which denoisers run, and the facts that a spec gives before anything is built."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from errors import BadInput
 from eval import selection
 from eval.selection import choose, evaluated, untrained, weights_file, weights_of, with_indirect_baselines
-from models.registry import DENOISERS, DenoiserName, create, parse_name
+from models.registry import DENOISERS, DenoiserName, create, parse_name, prototype
 from models.spec import DenoiserSpec
 from models.weights import save_weights
 from train.task import WEIGHTS_FILE, run_folder
@@ -55,6 +56,17 @@ def test_the_message_on_a_network_without_weights_names_the_training_command(tmp
     path.write_bytes(b"")
     assert untrained(tmp_path, "tiny", name) is None
     assert "onespp train kp --budget release" in untrained(tmp_path, "tiny", parse_name("kp@release+adaptive"))
+
+
+def test_denoisers_that_a_clip_has_too_few_channels_for(tmp_path, capsys):
+    """As of imported data sets, which have no gradient; sample buffers are optional."""
+    clip = SimpleNamespace(path=tmp_path / "room", channels=set(prototype("svgf").reads))
+    ready = {spec.name for spec in evaluated([], tmp_path, "tiny", clips=[clip])}
+    assert "svgf" in ready and "asvgf" not in ready
+    assert evaluated(["svgf+js"], tmp_path, "tiny", clips=[clip])
+    assert f"asvgf: skipped, {clip.path} has no gradient" in capsys.readouterr().out
+    with pytest.raises(BadInput, match=r"trmv: .*room has no roughness and no dual_motion and no .*onespp dataset"):
+        evaluated(["svgf", "trmv"], tmp_path, "tiny", clips=[clip])
 
 
 @pytest.mark.parametrize(

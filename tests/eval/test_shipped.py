@@ -72,6 +72,7 @@ def test_only_the_generated_part_of_a_card_changes(wskp3, tiny, tmp_path, capsys
     card = wskp3.with_suffix(".md")
     with pytest.raises(BadInput, match=r"wskp3.md: write the network's intended use.*the lines"):
         measure_card("wskp3", tmp_path)
+    assert not wskp3.with_suffix(".json").exists()
     card.write_text(HAND)
     assert measure_card("wskp3", tmp_path) == card
     text = card.read_text()
@@ -177,6 +178,9 @@ def test_results_of_other_weights_are_refused(wskp3, tiny, tmp_path):
         measure_card("wskp3", tmp_path)
     os.utime(wskp3, (0, 0))
     measure_card("wskp3", tmp_path)
+    write_json(results, content | {"first_hits": True})
+    with pytest.raises(BadInput, match="without --first-hits"):
+        measure_card("wskp3", tmp_path)
     for row in content["rows"]:
         row["weights"] = row["weights"] and "runs/train/wskp3-quick/weights.safetensors"
     write_json(results, content)

@@ -7,8 +7,8 @@ import pytest
 
 from errors import BadInput
 from eval.pages import EXTRACTS, GENERATORS, measured, noise_off
-from eval.results import NOISE_FLOOR, read_results
-from eval.tables import results_table, table_by_age
+from eval.results import FLOOR, NOISE_FLOOR, read_results
+from eval.tables import TableRow, results_table, table_by_age
 from eval.tradeoff.trades import Trade, front_table, samples_table
 from files import write_json
 from models.registry import DENOISERS, prototype
@@ -61,6 +61,12 @@ def test_noise_of_references_is_taken_off():
     ]
     assert noise_off(clips, "one") == "25.00"
     assert noise_off(clips, NOISE_FLOOR) == ""
+
+
+def test_however_small_the_error_of_energy_has_two_digits():
+    errors = {"energy": 0.00021, "mse_unbiased": 1.25e-6, "psnr": 40.0}
+    row = TableRow("box/000", FLOOR, "total", errors, errors)
+    assert [row.text(metric) for metric in (*errors, "rmse")] == ["±0.021%", "±1.25e-06", "40.00", "-"]
 
 
 def test_the_console_s_tables(evaluated):

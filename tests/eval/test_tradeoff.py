@@ -6,7 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 
+import eval.tradeoff.run
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
 from errors import BadInput
@@ -15,7 +17,7 @@ from eval.metrics import METRICS
 from eval.report.page import trade_plots
 from eval.results import NOISE_FLOOR, ClipResults, Result
 from eval.tables import ClipScores
-from eval.tradeoff.run import candidates, check_levels, draw_samples, trade
+from eval.tradeoff.run import candidates, check_levels, draw_samples, tables, trade, with_more_samples
 from eval.tradeoff.samples import fit_cost, rendered, sample_cost, scene_of, with_samples
 from eval.tradeoff.trades import Times, Trade, dominated_by_name, trades
 from files import read_json, write_json
@@ -191,8 +193,27 @@ def test_times_come_from_the_bench(tmp_path):
     assert Times(tmp_path, SIZE).of(DenoiserSpec.named("noisy", signal="indirect")) is None  # of total light alone
     with pytest.raises(BadInput, match=r"results-cuda.json"):
         Times(tmp_path, SIZE, device="cuda")
-    with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*--threads 3"):
+    with pytest.raises(BadInput, match=r"no times of 48x32 with 3 threads.*noisy rae --size 48x32 --threads 1 2 3"):
         Times(tmp_path, SIZE, threads=3)
+
+
+def test_the_remedy_for_missing_times_measures_all_in_one_run(tmp_path):
+    """Since a run of the bench replaces the results of the last one, and only times of one run compare."""
+    bench_of(tmp_path, {"noisy": 1.0, "noisy (indirect)": 1.0, "rae": 2.0}, SIZE)
+    times = Times(tmp_path, SIZE)
+    specs = [DenoiserSpec.named(name) for name in ("noisy", "svgf+js")]
+    rows = trades(specs, {1: [clip_results(**{"noisy": 20.0, "svgf+js": 25.0})]}, {1: 0.0}, times)
+    command = f"onespp bench denoisers noisy rae svgf+js --size 48x32 --threads 1 2 --runs {tmp_path} --all"
+    assert f"Without a time: svgf+js. Measure all with `{command}`." in tables(rows, rows, "title", times)
+
+
+def test_networks_are_fed_in_the_precision_that_is_timed(monkeypatch):
+    monkeypatch.setattr(eval.tradeoff.run, "RENDERER", "cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for precision in ("float32", "bfloat16"):
+        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda p=precision, **_: p == "bfloat16")
+        specs = [DenoiserSpec.named("wskp6", precision=each) for each in ("float32", "bfloat16", "float16")]
+        assert [spec.precision for spec in with_more_samples(specs, True)] == [precision]
 
 
 # --- From end to end --------------------------------------------------------------------------------------------------
@@ -212,6 +233,7 @@ def traded(tiny, tmp_path_factory):
 def test_trade_has_every_precision(traded):
     content, text, figures = traded
     assert (content["size"], content["threads"], len(content["clips"])) == ("48x32", 2, 2)
+    assert content["device"] == "cpu"  # that of the times
     rows = {row["label"]: row for row in content["rows"]}
     assert {"noisy", "wskp6@tiny", "wskp6@tiny-bfloat16", "wskp6@tiny-float16"} <= rows.keys()
     assert rows["wskp6@tiny"]["ms"] == rows["wskp6@tiny-float16"]["ms"] == 2.0

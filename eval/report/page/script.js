@@ -138,7 +138,7 @@ function plotTrade(plot) {
   byId("trade-plot").replaceChildren(svg);
   const lines = points.map(({ name, ms, quality, by }) => make("li", {}, make("b", {}, name),
     ` ${short(ms)} ms, ${metric.title} ${short(quality)}: ${by === null ? "on the Pareto front" : `dominated by ${by}`}`));
-  const missing = plot.missing.length ? [make("p", { class: "note" }, `Not timed: ${plot.missing.join(", ")}. Time them with onespp bench denoisers.`)] : [];
+  const missing = plot.missing.length ? [make("p", { class: "note" }, `Not timed: ${plot.missing.join(", ")}. Time all with: ${plot.command}`)] : [];
   byId("trade-words").replaceChildren(make("ul", {}, ...lines), ...missing);
 }
 
