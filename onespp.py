@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from datasets.clip import Clip, Dataset
-    from datasets.frame import Frame
+    from datasets.frame import Frame, Signal
     from models.denoiser import Denoiser
     from scenes.camera import View
 
@@ -27,12 +27,14 @@ def load(
     weights: str | Path | None = None,
     precision: torch.dtype | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
+    signal: Signal | None = None,
 ) -> Denoiser:
     """A denoiser ready to use, by its name: svgf, wskp6+adaptive, oidn+taa, ...
 
     `weights` is the file of a network's weights, by default the shipped one (`onespp weights` lists them). `precision`
-    is by default the fastest on the device. Raises errors.BadInput where the name is unknown, the file missing, damaged
-    or of another network, for a network without weights, and where there is no such device.
+    is by default the fastest on the device. `signal` is the light that it returns, "total" or "indirect": by default
+    total, but for NTD. Raises errors.BadInput where the name is unknown, the file missing, damaged or of another
+    network, for a network without weights, a precision that it does not compute in, and where there is no such device.
     """
     from errors import BadInput
     from models.registry import parse_name, shipped_weights
@@ -42,7 +44,7 @@ def load(
     if parsed.budget and not weights:
         raise BadInput(f"'{name}' are weights in a folder of runs, such as runs/train: give their file as `weights`")
     file = Path(weights) if weights else shipped_weights(parsed.base)
-    return load_denoiser(name, file, precision, device=device)
+    return load_denoiser(name, file, precision, signal, device)
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -55,10 +57,11 @@ def open_dataset(path: str | Path) -> Dataset:
 def read_frames(clip: Clip, denoiser: Denoiser, realisation: int = 0) -> Iterator[Frame]:
     """The frames of a clip, tensors (1, C, H, W) read from memory maps, with the channels that the denoiser reads.
 
-    Raises errors.BadInput where the clip lacks a channel that the denoiser needs.
+    Raises errors.BadInput where the clip lacks a channel or the light that the denoiser needs.
     """
     from datasets.frame import read_frame
 
+    clip.check_signal(denoiser.signal)
     for index in range(clip.frames):
         yield read_frame(clip, index, denoiser.reads, realisation)
 
@@ -90,11 +93,12 @@ def frames(
     - "camera": returned by `camera`
 
     Without motion it is derived from depth and cameras, as if nothing else moved; without those there is no history.
-    Raises errors.BadInput, naming the frame, for arrays that cannot be used.
+    Raises errors.BadInput, naming the frame, for arrays that cannot be used; and for a denoiser of indirect light, or
+    of channels that only onespp renders.
     """
     from denoise.arrays import frames_of_arrays
 
-    return frames_of_arrays(sequence, denoiser.reads, spp)
+    return frames_of_arrays(sequence, denoiser, spp)
 
 
 def denoise(denoiser: Denoiser, sequence: Iterable[Frame]) -> Iterator[NDArray[np.float32]]:

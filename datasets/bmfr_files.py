@@ -14,18 +14,20 @@ import OpenEXR
 from tqdm import tqdm
 
 from datasets.exr import silenced
-from datasets.imported import Image, ImportedFrame, by_name, view_of_clip_space, write_dataset
+from datasets.imported import Image, ImportedFrame, by_name, check_size, view_of_clip_space, write_dataset
 from errors import BadInput
 from scenes.camera import Array
 
 MATRICES = "camera_matrices.h"
+PASSES = ("color", "reference", "albedo", "shading_normal", "world_position")
 NUMBER = r"-?\d+\.?\d*(?:[eE][-+]?\d+)?f?"
 
 
 def import_bmfr(source: Path, out: Path) -> int:
     """Make a dataset of the scenes below `source`. Returns how many clips were written.
 
-    Raises BadInput, naming the file, where there is none, one is missing or damaged, or two have the same name.
+    Raises BadInput, naming the file, where there is none, one is missing, damaged or of another size, or two have the
+    same name.
     """
     folders = sorted(path.parent for path in source.glob(f"**/{MATRICES}"))
     if not folders:
@@ -41,13 +43,14 @@ def frames_of(folder: Path) -> Iterator[ImportedFrame]:
     count = sum((folder / f"color{index}.exr").exists() for index in range(len(matrices)))
     if not count:
         raise BadInput(f"{folder / 'color0.exr'} is missing")
+    size = height, width = read_rgb(folder / "color0.exr").shape[:2]
     for index in tqdm(range(count), folder.parent.name, unit="frame", leave=False):
-        color, reference, albedo, normal, position = (
-            read_rgb(folder / f"{name}{index}.exr")
-            for name in ("color", "reference", "albedo", "shading_normal", "world_position")
-        )
+        files = [folder / f"{name}{index}.exr" for name in PASSES]
+        images = [read_rgb(file) for file in files]
+        for file, image in zip(files, images, strict=True):
+            check_size(image.shape[:2], size, file)
+        color, reference, albedo, normal, position = images
         surface = np.abs(normal).sum(axis=-1) > 0
-        height, width = surface.shape
         to_pixels = np.array([[width / 2, 0, width / 2], [0, height / 2, height / 2], [0, 0, 1]])
         view = view_of_clip_space(matrices[index], to_pixels, folder / MATRICES)
         yield ImportedFrame(color * albedo, reference, albedo, normal, position, surface, view)
@@ -55,10 +58,11 @@ def frames_of(folder: Path) -> Iterator[ImportedFrame]:
 
 def read_matrices(path: Path) -> Array:
     """The matrices (N, 4, 4) of all frames. Raises BadInput where the file has none."""
-    match = re.search(r"camera_matrices[^=]*=\s*\{(.*?)\}\s*;", path.read_text(), re.DOTALL)
+    text = path.read_bytes().decode("ascii", errors="replace")
+    match = re.search(r"camera_matrices[^=]*=\s*\{(.*?)\}\s*;", text, re.DOTALL)
     without_comments = re.sub(r"//.*", "", match[1] if match else "")
     numbers = [float(number.rstrip("f")) for number in re.findall(NUMBER, without_comments)]
-    if not numbers or len(numbers) % 16:
+    if not numbers or len(numbers) % 16 or "\N{REPLACEMENT CHARACTER}" in without_comments:
         raise BadInput(f"{path} has no 4 x 4 matrices named camera_matrices: get the file again")
     return np.array(numbers).reshape(-1, 4, 4)
 

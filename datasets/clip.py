@@ -1,5 +1,6 @@
 """Clips and data sets on disk, read through memory maps."""
 
+import hashlib
 import re
 import resource
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -19,6 +20,7 @@ from scenes.camera import View, motion_vectors, pixel_centres
 SCHEMA = 1
 NEEDED_FOR_LAYERS = ("indirect", "emission", "albedo", "mesh_id")  # to denoise glass in two layers
 SPLITS = ("train", "val", "test")
+FACTS_OF_A_DATASET = ("schema", "profile", "seed", "generator", "scenes", "splits")
 FACTS_OF_A_CLIP = ("frames", "height", "width", "exposure", "channels", "floor_mse", "nonfinite", "clamped", "complete")
 
 ImageWindow = tuple[slice, slice]  # rows, columns
@@ -88,6 +90,8 @@ class Clip:
         # The frames that have a reference, by default all.
         self.judged: list[int] = self.facts.get("judged") or list(range(self.frames))
         self.exposure: float = self.facts["exposure"]  # multiplies radiance in pictures and metrics: clip_exposure
+        # Whether others rendered it: all light counts as direct, and both buffers of the reference are one image.
+        self.is_imported = "source" in self.facts
         self.scene = path.parent.name  # such as "room-3"
         self.name = path.name  # within its scene, such as "000" or "still"; see ClipKind
         self.channels: dict[str, dict[str, Any]] = self.facts["channels"]
@@ -98,6 +102,11 @@ class Clip:
         """The checksum (crc32, 8 hex digits) of clip.json, which contains those of all channels."""
         checksum = crc32_of(self.path / "clip.json")
         return f"{checksum}-first-hits" if self.first_hits else checksum
+
+    def check_signal(self, signal: Literal["total", "indirect"]) -> None:
+        """Raise BadInput for indirect light where that is a part of the direct."""
+        if signal == "indirect" and self.is_imported:
+            raise BadInput(f"{self.path} was imported and has no indirect light: denoise the total")
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -141,8 +150,8 @@ class Clip:
         """One frame of a channel, cut to `window`: (h, w, C), or (2, h, w, C) of two sample buffers.
 
         The array is the same whether the channel is stored in full, stored as one value or derived from others.
-        Raises BadInput where the channel was not rendered or its file is missing or damaged, and for the reference of
-        a frame that is not judged.
+        Raises BadInput where the channel was not rendered or its file is missing or damaged, for the reference of a
+        frame that is not judged, and for a realisation that there is not.
         """
         rows, columns = window
         entry = self.entry(channel)
@@ -159,8 +168,11 @@ class Clip:
         if "derived" in entry:
             return self.motion_to(frame, max(frame - 1, 0), window, self.read)
         array = self.map(channel)
-        images = array[frame, realisation] if "S" in spec.axes else array[frame]
-        return images[..., rows, columns, :]
+        if "S" not in spec.axes:
+            return array[frame][..., rows, columns, :]
+        if not 0 <= realisation < array.shape[1]:
+            raise BadInput(f"{self.path} has {array.shape[1]} realisations, numbered from 0: there is no {realisation}")
+        return array[frame, realisation][..., rows, columns, :]
 
     def read_visible(
         self, channel: str, frame: int, window: ImageWindow = WHOLE_IMAGE, realisation: int = 0
@@ -202,7 +214,11 @@ class Clip:
         return emission + direct + indirect
 
     def reference(self, frame: int, signal: Literal["total", "indirect"] = "total") -> NDArray[np.float32]:
-        """Both buffers (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone."""
+        """Both buffers (2, H, W, 3) of the reference radiance: emission + direct + indirect, or indirect alone.
+
+        Raises BadInput as `read`, and for indirect light of an imported clip.
+        """
+        self.check_signal(signal)
         indirect = self.read("indirect_reference", frame).astype(np.float32)
         if signal == "indirect":
             return indirect
@@ -217,7 +233,7 @@ class Dataset:
         self.path = path
         if not path.is_dir():
             raise BadInput(f"there is no data set at {path}: make one with `onespp dataset --data {path}`")
-        self.facts = read_json(path / "dataset.json", ("schema",))
+        self.facts = read_json(path / "dataset.json", FACTS_OF_A_DATASET)
         if self.facts["schema"] != SCHEMA:
             raise BadInput(
                 f"{path} has schema version {self.facts['schema']}, not {SCHEMA}: render it again with "
@@ -230,6 +246,8 @@ class Dataset:
 
     def clips(self, split: str, first_hits: bool = False) -> list[Clip]:
         """All clips of a split. Raises BadInput where one has not been rendered yet, or none is planned."""
+        if split not in self.facts["splits"]:
+            raise BadInput(f"{self.path} has no split '{split}': use one of {', '.join(self.facts['splits'])}")
         paths = self.planned([split])
         if missing := [path for path in paths if not is_clip(path)]:
             raise BadInput(
@@ -237,9 +255,14 @@ class Dataset:
                 "finish them with `onespp dataset`"
             )
         if not paths:
-            raise BadInput(f"{self.path} has no clips to {split} with")
+            raise BadInput(f"{self.path} has no clips in its split '{split}': use another data set")
         allow_open_files(len(paths) * len(CHANNELS))
         return [Clip(path, first_hits) for path in paths]
+
+
+def digest_of(clips: Iterable[Clip]) -> str:
+    """SHA-256 of the fingerprints of clips, as hexadecimal digits."""
+    return hashlib.sha256(" ".join(clip.fingerprint for clip in clips).encode()).hexdigest()
 
 
 def constant_channels(clips: Sequence[Clip]) -> dict[str, list[float]]:

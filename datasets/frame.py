@@ -211,7 +211,7 @@ class Frame:
         return self.reference_buffers(signal).mean(dim=1) / self.divisor
 
     def remodulate(self, irradiance: Tensor, signal: Signal) -> Tensor:
-        """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, see `complete`."""
+        """Radiance (B, 3, H, W) of denoised irradiance: times `divisor`, see `complete`. Reads albedo, too."""
         return self.complete(irradiance * self.divisor, signal)
 
     def demodulate(self, radiance: Tensor, signal: Signal) -> Tensor:
@@ -220,7 +220,10 @@ class Frame:
         return (reflected / self.divisor).clamp(min=0)
 
     def complete(self, reflected: Tensor, signal: Signal) -> Tensor:
-        """Radiance (B, 3, H, W) of what was denoised: background reflects nothing; "total" has noise-free emission."""
+        """Radiance (B, 3, H, W) of what was denoised: background reflects nothing; "total" has noise-free emission.
+
+        Reads depth, and emission for "total".
+        """
         surface = self.surface
         if surface is not None:
             reflected = torch.where(surface > 0, reflected, 0)

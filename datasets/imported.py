@@ -41,13 +41,23 @@ def view_of_clip_space(matrix: Array, to_pixels: Array, file: Path) -> View:
     return view
 
 
-def channels_of(frame: ImportedFrame, previous: View) -> dict[str, NDArray[Any]]:
-    """The channels of a frame, as ClipWriter takes them. All light counts as direct, all surfaces as one mesh."""
+def check_size(shape: Sequence[int], size: Sequence[int], file: Path) -> None:
+    """Raise BadInput, naming the `file`, where the shape of an image is not the `size` (H, W) of the first frame."""
+    if tuple(shape) != tuple(size):
+        raise BadInput(f"{file} has an image that is not {size[1]}x{size[0]}, as the first frame is: get it again")
+
+
+def channels_of(frame: ImportedFrame, before: View | None) -> dict[str, NDArray[Any]]:
+    """The channels of a frame, as ClipWriter takes them. All light counts as direct, all surfaces as one mesh.
+
+    `before` is the view of the frame before. Without one motion is 0, whatever the frame says.
+    """
     world_to_camera = np.linalg.inv(frame.view.camera_to_world)
     shown = frame.surface[..., None]
     depth = np.where(shown, frame.position @ world_to_camera[2, :3, None] + world_to_camera[2, 3], 0)
     now = frame.position.astype(np.float64)
-    motion = project(now + frame.moved, frame.surface, previous) - project(now, frame.surface, frame.view)
+    then = project(now + frame.moved if before else now, frame.surface, before or frame.view)
+    motion = then - project(now, frame.surface, frame.view)
     dark = np.zeros_like(frame.radiance)
     return {
         "direct": np.where(shown, frame.radiance, 0)[None],
@@ -77,7 +87,7 @@ def by_name(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
 def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[ImportedFrame]], spp: int) -> int:
     """Write test clips by their scenes' names to a dataset, or resume. Returns how many were written.
 
-    Both buffers of references are the one image that there is: noise floors are unknown, and shown as perfect. Raises
+    Both buffers of references are the one image that there is: noise floors are unknown, see Clip.is_imported. Raises
     BadInput where `root` has something else, and as the clips' files are read.
     """
     facts = {
@@ -98,9 +108,9 @@ def write_dataset(root: Path, source: str, clips: Mapping[str, Iterator[Imported
     missing = {folder: frames for folder, frames in missing.items() if not is_clip(folder)}
     for folder, frames in missing.items():
         with ClipWriter(folder) as writer:
-            previous = None
+            before = None
             for frame in frames:
-                writer.add(channels_of(frame, previous or frame.view), {})
-                previous = frame.view
+                writer.add(channels_of(frame, before), {})
+                before = frame.view
             writer.finish({"noisy_spp": spp, "reference_spp": 0, "meshes": ["scene"], "source": source}, {})
     return len(missing)

@@ -35,7 +35,7 @@ def summarise(root: Path) -> str:
             "size": f"{clip.width}x{clip.height}",
             "noisy": clip.realisations,
             "reference spp": clip.facts["reference_spp"],
-            "floor dB": f"{psnr(clip.facts['floor_mse']):.1f}",
+            "floor dB": "unknown" if clip.is_imported else f"{psnr(clip.facts['floor_mse']):.1f}",
             "exposure": f"{clip.exposure:.3g}",
             "bad values": sum(clip.facts["nonfinite"].values()) + sum(clip.facts["clamped"].values()),
             "MB": megabytes(size_of(path)),

@@ -5,7 +5,9 @@ group. Samples are the last axis; radiance is coded as RGBE; matrices are for ro
 scripts leave out 28 rows at the top and at the bottom.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +15,46 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from datasets.imported import Image, ImportedFrame, by_name, view_of_clip_space, write_dataset
+from datasets.imported import Image, ImportedFrame, by_name, check_size, view_of_clip_space, write_dataset
 from errors import BadInput, requires_extra
 
 CROPPED_ROWS = 28  # rows
+ARRAYS = ("color", "reference", "position", "motion", "normal", "diffuse")
+FRAME = re.compile(r"frame(\d{4})\.zip")
 
 
 def import_noisebase(source: Path, out: Path, samples: int) -> int:
     """Make a dataset of the sequences below `source`, with the first `samples` of each pixel. Returns how many.
 
-    Raises BadInput, naming the file, where there is none, or one is damaged, too small, or has fewer samples.
+    Raises BadInput, naming the file, where there is none, or one is missing, damaged, too small or of another size, or
+    has fewer samples.
     """
-    folders = sorted({path.parent for path in source.glob("**/frame[0-9][0-9][0-9][0-9].zip")})
+    folders = sorted({path.parent for path in source.glob("**/frame*.zip") if FRAME.fullmatch(path.name)})
     if not folders:
         raise BadInput(f"{source} has no sequence: each is a folder with frame0000.zip and so on")
     named = by_name(folders, [folder.name for folder in folders])
-    clips = {name: frames_of(folder, samples) for name, folder in named.items()}
+    clips = {name: frames_of(files_of(folder), samples) for name, folder in named.items()}
     return write_dataset(out, f"noisebase at {samples} spp", clips, samples)
 
 
-def frames_of(folder: Path, samples: int) -> Iterator[ImportedFrame]:
+def files_of(folder: Path) -> list[Path]:
+    """The frames of a sequence in order. Raises BadInput where one is missing: motion leads to the frame before."""
+    numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := FRAME.fullmatch(path.name)))
+    for before, number in pairwise(numbers):
+        if number != before + 1:
+            raise BadInput(f"{folder / f'frame{before + 1:04d}.zip'} is missing: get it, too")
+    return [folder / f"frame{number:04d}.zip" for number in numbers]
+
+
+def frames_of(files: Sequence[Path], samples: int) -> Iterator[ImportedFrame]:
     """The frames of a sequence. Surfaces are those of the first sample: the mean of several depths lies on none."""
-    for path in tqdm(sorted(folder.glob("frame*.zip")), folder.name, unit="frame", leave=False):
+    size: tuple[int, int] | None = None
+    for path in tqdm(files, files[0].parent.name, unit="frame", leave=False):
         arrays = read_group(path)
         _, height, width, count = arrays["color"].shape
+        size = size or (height, width)
+        for name in ARRAYS:
+            check_size(arrays[name].shape[1:3], size, path)
         if count < samples:
             raise BadInput(f"{path} has {count} samples per pixel, not {samples}")
         if height <= 2 * CROPPED_ROWS:
@@ -64,11 +82,10 @@ def read_group(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a frame. Raises BadInput where the file is damaged or lacks one."""
     with requires_extra("noisebase"):
         import zarr
-    names = ("color", "exposure", "reference", "position", "motion", "normal", "diffuse", "view_proj_mat")
     try:
         with zarr.storage.ZipStore(path, mode="r") as store:
             group = zarr.open_group(store, mode="r")
-            return {name: np.asarray(group[name]) for name in names}
+            return {name: np.asarray(group[name]) for name in (*ARRAYS, "exposure", "view_proj_mat")}
     except Exception as error:  # a damaged archive may fail in any way
         raise BadInput(f"{path} is damaged or incomplete ({error}): get it again") from None
 

@@ -6,12 +6,15 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.channels import CHANNELS
 from datasets.frame import Frame
 from denoise.foreign_frame import ForeignFrame, make_finite, surface_of
 from denoise.frames import FrameBuilder, InputConventions
 from denoise.layers import COLOUR, QUANTITIES
 from denoise.motion_convention import MotionConvention
 from errors import BadInput
+from models.denoiser import Denoiser
+from models.wrappers.wrapper import unwrapped
 from scenes.camera import View
 
 CAMERA = "camera"
@@ -20,18 +23,29 @@ COMPONENTS = {"depth": 1, "distance": 1, "roughness": 1, "id": 1, "motion": 2}  
 Quantities = Mapping[str, NDArray[np.floating] | View]  # of one frame
 
 
-def frames_of_arrays(sequence: Iterable[Quantities], reads: tuple[str, ...], spp: float) -> Iterator[Frame]:
-    """A Frame with the channels in `reads` for each mapping of arrays (H, W, C); see onespp.frames for their content.
+def check_usable(denoiser: Denoiser) -> None:
+    """Raise BadInput where a denoiser needs what arrays do not have."""
+    name = type(unwrapped(denoiser)).__name__
+    if denoiser.signal == "indirect":
+        remedy = 'load it by onespp.load(..., signal="total")'
+        raise BadInput(f"{name} denoises indirect light, and arrays have only the total: {remedy}")
+    if ours := [channel for channel in denoiser.reads if CHANNELS[channel].renderer_only]:
+        raise BadInput(f"{name} reads {', '.join(ours)}, which only onespp renders: use another, such as svgf")
 
-    Raises BadInput, naming the frame and the quantity, for what cannot be used.
+
+def frames_of_arrays(sequence: Iterable[Quantities], denoiser: Denoiser, spp: float) -> Iterator[Frame]:
+    """A Frame for the denoiser of each mapping of arrays (H, W, C); see onespp.frames for their content.
+
+    Raises BadInput as `check_usable`, and, naming the frame and the quantity, for what cannot be used.
     """
+    check_usable(denoiser)
     remaining = iter(sequence)
     first = next(remaining, None)
     if first is None:
         return
     motion = MotionConvention() if "motion" in first else None
     conventions = InputConventions(motion, cameras="arrays" if CAMERA in first else None)
-    builder = FrameBuilder(conventions, reads, "arrays", spp)
+    builder = FrameBuilder(conventions, denoiser.reads, "arrays", spp)
     for index, quantities in enumerate(chain([first], remaining)):
         if quantities.keys() != first.keys():
             other = min(quantities.keys() ^ first.keys())

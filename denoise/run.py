@@ -236,8 +236,6 @@ class SequenceDenoiser:
                     size = f"{image.width}x{image.height}"
                     raise BadInput(f"{image.path} is {size}, unlike the first frame: name one sequence")
                 frame = frame.to(self.denoiser.device)
-                if self.estimator:
-                    frame = frame.without("second")  # as denoise_with_error does, so that history is the same
                 if self.parts:
                     frame = self.parts.added(frame, image)
                 if albedo:

@@ -191,7 +191,8 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
                 run.frames.append({})
                 run.before = None
                 continue
-            comparison = Comparison(output, reference, clip.exposure, hidden, run.before, still, frame.motion)
+            context = (hidden, run.before, still, frame.motion, clip.is_imported)
+            comparison = Comparison(output, reference, clip.exposure, *context)
             run.frames.append(run.values(comparison))
             run.before = comparison.as_previous()
             save_picture(picture_path(folder, index), as_displayed(output, clip.exposure))

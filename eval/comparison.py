@@ -44,6 +44,7 @@ class Comparison:
     before: Previous | None = None  # None on the first frame
     still: bool = False  # whether nothing moves in the clip
     motion: Tensor | None = None  # from a pixel to where its surface was in the previous frame, (1, 2, H, W) in px
+    one_reference: bool = False  # whether both buffers are the one image that there is: its noise is unknown
 
     @cached_property
     def output(self) -> Tensor:

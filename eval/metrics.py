@@ -117,8 +117,10 @@ def flip_floor(c: Comparison) -> float:
     return flip((a + b) / 2, a)
 
 
-def mse_unbiased(c: Comparison) -> float:
+def mse_unbiased(c: Comparison) -> float | None:
     """E[(x - A)(x - B)] = E[(x - truth)²] of exposed linear radiance, for independent buffers A and B; signed."""
+    if c.one_reference:
+        return None
     x = c.exposure * c.output
     a, b = c.exposure * c.buffers
     return float(((x - a) * (x - b)).mean())
@@ -161,7 +163,7 @@ def temporal_error(c: Comparison) -> float | None:
 
 def temporal_error_floor(c: Comparison) -> float | None:
     """Half the temporal error between the buffers."""
-    if c.change is None:
+    if c.change is None or c.one_reference:
         return None
     a, b = c.change.buffers.split(1)
     return float((a - b).abs().mean()) / 2
@@ -228,6 +230,8 @@ def detail(c: Comparison) -> float | None:
 
     Gradients of noise, in image and reference, are uncorrelated with those of the truth.
     """
+    if c.one_reference:
+        return None
     output, reference, buffers = c.luminances
     truth = gradient_product(*buffers.split(1))
     return gradient_product(output, reference) / truth if truth > 0 else None
@@ -299,7 +303,8 @@ def measure(comparison: Comparison) -> Values:
 
 def noise_floors(comparison: Comparison) -> Values:
     """The noise floors of all metrics that have one; they do not depend on the comparison's output."""
-    return {name: metric.floor(comparison) for name, metric in METRICS.items() if metric.floor}
+    floors = {name: metric.floor for name, metric in METRICS.items() if metric.floor}
+    return {name: None if comparison.one_reference else floor(comparison) for name, floor in floors.items()}
 
 
 def within_floor(metric: str, value: float | None, floor: float | None) -> bool:

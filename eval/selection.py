@@ -73,6 +73,8 @@ def lacks_channels(clips: Iterable[Clip], name: DenoiserName) -> str | None:
     """That a clip lacks channels which a denoiser reads; None where it has all. Sample buffers are optional."""
     reads = [channel for channel in prototype(name).reads if CHANNELS[channel].kind != "buffers"]
     for clip in clips:
+        if clip.is_imported and prototype(name).signal == "indirect":
+            return f"{clip.path} was imported and has no indirect light"
         if missing := [channel for channel in reads if channel not in clip.channels]:
             return f"{clip.path} has no {' and no '.join(missing)}: take clips that `onespp dataset` rendered"
     return None

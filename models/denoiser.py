@@ -39,6 +39,8 @@ class LayeredState(State):
 # Why filters without a network compute in float32 only.
 CLASSICAL = {dtype: "it has no network, and its sums need float32" for dtype in (torch.bfloat16, torch.float16)}
 
+NO_FLOAT16 = {torch.float16: "it is slower than float32 on processors, which bfloat16 is not"}  # of networks
+
 CONSTANT_TOLERANCE = 1e-3  # of a channel that counts as constant: more than float16 rounds
 
 S = TypeVar("S", bound=State)

@@ -19,7 +19,7 @@ from models import compiled
 from models.compiled import layers as kernels
 from models.compiled.layers import FILL_WINDOWS
 from models.networks.pixel_kernels import window_taps
-from models.operators import MIN_DIVISOR
+from models.operators import MIN_DIVISOR, block_sums
 
 LAYER_SCALE = 2  # px, for a pixel of the second layer
 
@@ -75,12 +75,9 @@ def second_samples(
 
     Also the largest share in the block, and the index of its pixel in the image, by rows.
     """
-
-    def sums(image: Tensor) -> Tensor:
-        return F.avg_pool2d(image, LAYER_SCALE, ceil_mode=True, divisor_override=1)
-
+    irradiance = second / albedo.clamp(min=ALBEDO_FLOOR)
     best, chosen = F.max_pool2d(share, LAYER_SCALE, ceil_mode=True, return_indices=True)
-    return sums(second / albedo.clamp(min=ALBEDO_FLOOR)), sums(samples), best, chosen
+    return block_sums(irradiance, LAYER_SCALE), block_sums(samples, LAYER_SCALE), best, chosen
 
 
 @compiled.by(kernels.pixels_at)

@@ -26,6 +26,11 @@ def image_luminance(rgb: Tensor) -> Tensor:
     return (rgb * torch.tensor(LUMINANCE_WEIGHTS, dtype=torch.float64).to(rgb)[:, None, None]).sum(dim=1, keepdim=True)
 
 
+def block_sums(image: Tensor, size: int) -> Tensor:
+    """Sums (B, C, h, w) of an image (B, C, H, W) over blocks of `size` x `size` pixels, fewer at the far borders."""
+    return F.avg_pool2d(image, size, ceil_mode=True, divisor_override=1)
+
+
 def halve(image: Tensor, surface: Tensor | None = None) -> Tensor:
     """Means of 2 x 2 pixels, fewer at odd borders: (B, C, H, W) becomes half as large, rounded up.
 

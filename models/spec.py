@@ -80,8 +80,12 @@ def fastest_precision(name: str | DenoiserName, device: str = "cpu") -> str:
 
 
 def check_device(device: str) -> None:
-    """Raise BadInput for "cuda" where PyTorch finds no CUDA device."""
-    if device == "cuda" and not torch.cuda.is_available():
+    """Raise BadInput for the name of no device, and for "cuda" or "cuda:0" where PyTorch finds no CUDA device."""
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        raise BadInput(f"there is no device '{device}': use cpu or cuda") from None
+    if kind == "cuda" and not torch.cuda.is_available():
         raise BadInput("PyTorch finds no CUDA device here: use the device cpu")
 
 
@@ -165,4 +169,6 @@ def load(
     elif weights is None:
         raise BadInput(f"'{name}' needs trained weights")
     chosen = str(precision).removeprefix("torch.") if precision else fastest_precision(parsed, device)
+    if chosen not in PRECISIONS:
+        raise BadInput(f"no denoiser computes in {chosen}: use one of {', '.join(PRECISIONS)}")
     return DenoiserSpec(parsed, signal, chosen, weights, device=device).build()

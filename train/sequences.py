@@ -12,7 +12,7 @@ from datasets.channels import HIT_CHANNELS, NOISY_CHANNELS, REFERENCE_CHANNELS
 from datasets.clip import Clip, ImageWindow
 from datasets.frame import Frame, Signal, read_frame
 from errors import BadInput
-from models.history.running_scale import log_luminance_and_depth
+from models.history.running_scale import block_luminances, log_depth, log_luminance
 from train.augmentation import Augmentation, averaged
 
 
@@ -41,24 +41,33 @@ def random_window(clip: Clip, crop: int | None, rng: np.random.Generator) -> Ima
 
 
 class WholeFrames:
-    """What running_scale measures in the noisy light of `signal`, once for each frame and realisation.
+    """What running_scale measures in the noisy light of `signal`. Each frame and realisation is read once.
 
     A crop of 64 x 64 pixels may be three times brighter or darker than its frame; in use, networks get whole frames.
     """
 
     def __init__(self, signal: Signal):
         self.signal = signal
-        self.measured: dict[tuple[str, int, int], Tensor] = {}
+        self.measured: dict[tuple[str, int, int], tuple[Tensor, Tensor]] = {}
 
     @torch.no_grad()
-    def __call__(self, clip: Clip, index: int, realisation: int) -> Tensor:
-        """Logarithms of luminance and depth of frame `index`, (1, 2)."""
+    def __call__(self, clip: Clip, index: int, realisations: Sequence[int]) -> Tensor:
+        """Logarithms of luminance and depth of the mean over `realisations` of frame `index`, (1, 2)."""
+        luminances, scales = zip(*(self.measure(clip, index, each) for each in realisations), strict=True)
+        if len(realisations) == 1:
+            return scales[0]
+        return torch.stack([log_luminance(torch.stack(luminances).mean(dim=0)), scales[0][:, 1]], dim=1)
+
+    def measure(self, clip: Clip, index: int, realisation: int) -> tuple[Tensor, Tensor]:
+        """Luminances of blocks, (1, blocks), and the logarithms of luminance and depth, (1, 2), of one realisation."""
         key = (str(clip.path), index, realisation)
         if key not in self.measured:
             light = ("indirect",) if self.signal == "indirect" else NOISY_CHANNELS
             frame = read_frame(clip, index, (*light, "albedo", "depth"), realisation, in_layers=False)
             radiance = frame.irradiance(self.signal).clamp(min=0) * frame.divisor
-            self.measured[key] = log_luminance_and_depth(radiance, frame.depth)
+            luminances = block_luminances(radiance, frame.depth)
+            scale = torch.stack([log_luminance(luminances), log_depth(frame.depth)], dim=1)
+            self.measured[key] = luminances, scale
         return self.measured[key]
 
 
@@ -135,7 +144,7 @@ class TrainingSequences:
             if others:
                 frame = averaged([frame, *(read(position, self.sampled, other) for other in others)])
             if self.whole_frames is not None:
-                frame = replace(frame, whole=self.whole_frames(clip, position, first))
+                frame = replace(frame, whole=self.whole_frames(clip, position, [first, *others]))
             frames.append(draw.apply(frame, time))
         return frames
 

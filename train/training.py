@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from datasets.clip import digest_of
 from errors import BadInput
 from files import write_file
 from models.weights import save_weights
@@ -91,7 +92,8 @@ class Training:
         torch.backends.mkldnn.deterministic = True  # type: ignore[assignment]
         torch.manual_seed(task.seed)
         self.clips = {split: task.data.clips(split) for split in ("train", "val")}
-        denoiser = task.network([*self.clips["train"], *self.clips["val"]])
+        clips = [*self.clips["train"], *self.clips["val"]]
+        denoiser = task.network(clips)
         loss = NetworkLoss(denoiser, self.recipe.loss)
         fabric = fabric_here()
         with fabric.rank_zero_first():  # the others find the accumulated frames that the first has cached
@@ -111,10 +113,11 @@ class Training:
         self.judged: NetworkLoss = self.loss.module
         if self.recipe.average:
             self.judged = NetworkLoss(deepcopy(denoiser), self.recipe.loss).to(self.fabric.device)
+        data = {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")}
         self.facts: dict[str, Any] = {
             "budget": task.budget,
             "seed": task.seed,
-            "data": {key: task.data.facts[key] for key in ("profile", "seed", "generator", "scenes")},
+            "data": data | {"clips": digest_of(clips)},
             **asdict(self.recipe),
             "loss": {"name": type(self.recipe.loss).__name__, **asdict(self.recipe.loss)},
             "parameters": denoiser.parameter_count(),
@@ -150,8 +153,10 @@ class Training:
         return kept
 
     def resume(self, saved: Checkpoint) -> None:
-        # What recipes have got since the checkpoint was written was as it is by default; losses had no names.
+        # What recipes have got since the checkpoint was written was as it is by default; losses had no names, and clips
+        # no digest.
         facts = RECIPE_DEFAULTS | saved.get("facts", {})
+        facts["data"] = {"clips": self.facts["data"]["clips"]} | facts.get("data", {})
         facts["loss"] = {"name": self.facts["loss"]["name"]} | facts.get("loss", {})
         if facts != self.facts:
             raise BadInput(

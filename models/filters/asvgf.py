@@ -17,12 +17,12 @@ from datasets.frame import Frame
 from models.filters.atrous import ATROUS_STEPS, CENTRE, RADIUS, Tap, b3_spline, strip_taps, window_mean
 from models.filters.svgf import SVGF, geometry_weight, pack_geometry
 from models.layers import pixels_at
-from models.operators import MIN_DIVISOR, pad_to_multiple
+from models.operators import MIN_DIVISOR, block_sums, pad_to_multiple
 
 
 def strata_sums(image: Tensor) -> Tensor:
-    """Sums (B, C, h, w) of an image (B, C, H, W) over strata of 3 x 3 pixels, fewer at the far borders."""
-    return F.avg_pool2d(image, STRATUM, ceil_mode=True, divisor_override=1)
+    """Sums (B, C, h, w) of an image (B, C, H, W) over strata."""
+    return block_sums(image, STRATUM)
 
 
 def strata_centres(image: Tensor) -> Tensor:

@@ -46,10 +46,10 @@ class RunningScale:
         return torch.where(depth > 0, depth / (depth + scale), 1)
 
 
-def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
-    """Logarithms of one frame's mean luminance and of its median depth, both of surfaces alone: (B, 2).
+def block_luminances(radiance: Tensor, depth: Tensor) -> Tensor:
+    """Mean luminances (B, blocks) of the surfaces in each block, float64; NaN where it shows none.
 
-    `radiance` (B, 3, H, W) is noisy direct + indirect light. NaN where a frame is black, or has no surface.
+    `radiance` (B, 3, H, W) is noisy direct + indirect light.
     """
 
     def block_means(image: Tensor) -> Tensor:
@@ -57,31 +57,41 @@ def log_luminance_and_depth(radiance: Tensor, depth: Tensor) -> Tensor:
 
     surface = (depth > 0).to(radiance)
     share = block_means(surface)
-    has_surface = share > 0
-    y = block_means(image_luminance(radiance).clamp(min=0) * surface) / torch.where(has_surface, share, 1)
+    return block_means(image_luminance(radiance).clamp(min=0) * surface) / torch.where(share > 0, share, torch.nan)
+
+
+def log_luminance(luminances: Tensor) -> Tensor:
+    """The mean logarithm (B,) of the luminances of a frame's blocks; NaN where it is black, or has no surface."""
+    has_surface = ~luminances.isnan()
+    y = torch.where(has_surface, luminances, 0)
     blocks = has_surface.sum(dim=1).clamp(min=1)
     mean = y.sum(dim=1) / blocks
     log_y = torch.log(torch.maximum(y, 1e-4 * mean[:, None]).clamp(min=1e-300)) * has_surface
-    log_y = (log_y.sum(dim=1) / blocks).to(radiance.dtype)
+    return torch.where(mean > 0, log_y.sum(dim=1) / blocks, torch.nan).float()
+
+
+def log_depth(depth: Tensor) -> Tensor:
+    """The logarithm (B,) of the median depth of a frame's surfaces; NaN where it has none."""
     stride_y, stride_x = (max(1, size // MEDIAN_GRID) for size in depth.shape[-2:])
     depths = depth[..., ::stride_y, ::stride_x].flatten(1)
-    median = torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values
-    return torch.stack([torch.where(mean > 0, log_y, torch.nan), torch.log(median)], dim=1)
+    return torch.log(torch.where(depths > 0, depths, torch.nan).nanmedian(dim=1).values)
 
 
 def running_scale(
     radiance: Tensor, depth: Tensor, previous: RunningScale | None, whole: Tensor | None = None
 ) -> RunningScale:
-    """Update the estimates with one frame, see `log_luminance_and_depth`; where that is NaN, they stay.
+    """Update the estimates with `log_luminance` and `log_depth` of one frame; where these are NaN, they stay.
 
-    Of a training crop, `whole` (B, 2) are the logarithms of the frame that it was cut from.
+    `radiance` (B, 3, H, W) is noisy direct + indirect light. Of a training crop, `whole` (B, 2) are both logarithms of
+    the frame that it was cut from.
     """
     if previous is None:  # exposure 1 and depth scale 1, until the first valid frame
         zero = radiance.new_zeros(len(radiance))
         previous = RunningScale(RunningMean(zero + math.log(MIDDLE_GREY), zero), RunningMean(zero, zero))
-    new = log_luminance_and_depth(radiance, depth) if whole is None else whole
-    log_luminance, log_depth = new.to(radiance).unbind(dim=1)
+    if whole is None:
+        whole = torch.stack([log_luminance(block_luminances(radiance, depth)), log_depth(depth)], dim=1)
+    luminance, distance = whole.to(radiance).unbind(dim=1)
     return RunningScale(
-        previous.log_luminance.update(log_luminance, ~log_luminance.isnan()),
-        previous.log_depth.update(log_depth, ~log_depth.isnan()),
+        previous.log_luminance.update(luminance, ~luminance.isnan()),
+        previous.log_depth.update(distance, ~distance.isnan()),
     )

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datasets.frame import Frame, Signal, disoccluded
-from models.denoiser import Denoiser, State, matching_state
+from models.denoiser import NO_FLOAT16, Denoiser, State, matching_state
 from models.history.running_scale import RunningScale, running_scale
 from models.networks.convolution import ConvReLU, encoded
 from models.networks.pixel_kernels import apply_kernels
@@ -171,7 +171,7 @@ class NTD(Denoiser):
     reads: tuple[str, ...] = ("indirect", "albedo", "normal", "depth", "motion", "dual_motion")
     pool: Pool = staticmethod(maximum_pool)  # D of Eq. 4
     signal: Signal = "indirect"
-    refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
+    refuses = NO_FLOAT16
     is_network = True
     dispensable: ClassVar = {"albedo": nn.Identity(), "normal": nn.Identity()}
     inputs = NTD_INPUTS

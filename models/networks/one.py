@@ -28,7 +28,7 @@ from models.compiled.one import (
     SPREADING_LEVELS,
     TAP_SPACINGS,
 )
-from models.denoiser import Denoiser, State, matching_state
+from models.denoiser import NO_FLOAT16, Denoiser, State, matching_state
 from models.filters.neighbours import mesh_means, taps_3x3
 from models.history.geometry import GBuffer
 from models.history.reprojection import reproject
@@ -332,7 +332,7 @@ class One(Denoiser):
 
     made_from = "ours"
     reads = ("direct", "indirect", "emission", "albedo", "normal", "depth", "roughness", "mesh_id", "motion")
-    refuses = dict.fromkeys((torch.float16,), "it is slower than float32 on processors, which bfloat16 is not")
+    refuses = NO_FLOAT16
     is_network = True
     convex = True
     inputs = INPUT_CHANNELS

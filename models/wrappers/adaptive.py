@@ -184,6 +184,7 @@ class AccumulatedAfter(Wrapper, Accumulating):
     def __init__(self, inner: Denoiser):
         super().__init__(inner)
         self.convex = inner.convex
+        self.separates_lights = inner.separates_lights
 
     def forward(self, frame: Frame, state: State | None) -> tuple[Tensor, State]:
         previous = matching_state(state, AccumulatedAfterState, frame)

@@ -13,11 +13,15 @@ A blend of both, M + ρ (N - M), has the squared error
 Only the noise of this frame has to be independent, not the history. So F(A) and F(B) begin with the state of F(N), and
 their own states are dropped: three passes of the filter in all.
 
+The light of the second layer of glass has no buffers. So frames with glass pass as one layer, with the history of the
+main one: F(A) - F(B) shows what noise does, more of it than in two layers, and M is F(N) itself. The error in glass is
+overestimated.
+
 The estimate of a single pixel is pure noise, so a map averages it over windows. A mean over many pixels needs none.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import torch
@@ -25,11 +29,13 @@ from torch import Tensor
 
 from datasets.frame import Frame
 from errors import BadInput
-from models.denoiser import State
+from models.denoiser import LayeredState, State
 from models.filters.neighbours import mesh_sums, mesh_sums_9x9
 from models.operators import MIN_DIVISOR, image_luminance
 from models.wrappers import shrinkage
+from models.wrappers.adaptive import AccumulatedAfterState
 from models.wrappers.shrinkage import JamesStein
+from models.wrappers.taa import TAAState
 
 MAX_SAMPLES = 2.0**20  # per pixel; no larger number is recommended
 
@@ -133,18 +139,30 @@ class ErrorEstimate:
 
 
 def denoise_with_error(denoiser: JamesStein, frame: Frame, state: State | None) -> tuple[Tensor, State, ErrorEstimate]:
-    """The output of NAME+js for a frame, its state, and its error. Raises BadInput without sample buffers."""
+    """The output and state of NAME+js for a frame, and the error. Raises BadInput without sample buffers."""
     if not frame.has_buffers:
         raise BadInput(f"{frame.source} has no two sample buffers: its error cannot be estimated")
-    frame = frame.finite().without("second")  # whose light has no sample buffers
+    frame = frame.finite()
     inner, signal = denoiser.inner, denoiser.signal
     output, after = inner(frame, state)
-    filtered = frame.demodulate(output, signal)
-    rho = shrinkage.shrinkage_weight(frame, filtered, signal)
+    filtered, rho = denoiser.weighed(frame, output)
     buffers = [frame.buffer(which) for which in (0, 1)]
-    passes = [buffer.demodulate(inner(buffer, state)[0], signal) for buffer in buffers]
+    before = of_one_layer(state) if state else None
+    passes = [buffer.demodulate(inner(buffer, before)[0], signal) for buffer in buffers]
+    if frame.has_layers:
+        offset = filtered - (passes[0] + passes[1]) / 2
+        passes = [each + offset for each in passes]
     estimate = estimate_error(frame, filtered, passes, [buffer.irradiance(signal) for buffer in buffers], rho)
-    return frame.remodulate(shrinkage.blend(frame, filtered, rho, signal), signal), after, estimate
+    return denoiser.shrunk(frame, filtered, rho), after, estimate
+
+
+def of_one_layer(state: State) -> State:
+    """A state, of wrappers too, with the history of the main layer of glass in place of that of both."""
+    if isinstance(state, LayeredState):
+        return state.main
+    if isinstance(state, TAAState | AccumulatedAfterState):
+        return replace(state, inner=of_one_layer(state.inner))
+    return state
 
 
 def estimate_error(

@@ -112,6 +112,13 @@ class JamesStein(Wrapper):
         output, after = self.inner.run(frame, state)
         if not frame.has_buffers:
             return output, after
+        return self.shrunk(frame, *self.weighed(frame, output)), after
+
+    def weighed(self, frame: Frame, output: Tensor) -> tuple[Tensor, Tensor]:
+        """The irradiance of the inner denoiser's `output`, and ρ, of a frame with sample buffers."""
         denoised = frame.demodulate(output, self.signal)
-        rho = shrinkage_weight(frame, denoised, self.signal)
-        return frame.remodulate(blend(frame, denoised, rho, self.signal), self.signal), after
+        return denoised, shrinkage_weight(frame, denoised, self.signal)
+
+    def shrunk(self, frame: Frame, denoised: Tensor, rho: Tensor) -> Tensor:
+        """Radiance (B, 3, H, W) of O + ρ (N - O)."""
+        return frame.remodulate(blend(frame, denoised, rho, self.signal), self.signal)

@@ -69,6 +69,19 @@ def test_missing_clip_and_other_schema(tiny_copy):
     (tiny_copy / "dataset.json").write_text(json.dumps(facts | {"schema": 99}))
     with pytest.raises(BadInput, match="schema version 99"):
         Dataset(tiny_copy)
+    (tiny_copy / "dataset.json").write_text('{"schema": 1}')
+    with pytest.raises(BadInput, match=r"dataset.json is damaged: it lacks .*splits"):
+        Dataset(tiny_copy)
+
+
+def test_splits_and_realisations_that_there_are_not(tiny):
+    with pytest.raises(BadInput, match="has no split 'validation': use one of train, val, test"):
+        Dataset(tiny).clips("validation")
+    clip = Dataset(tiny).clips("test")[0]
+    assert not clip.is_imported
+    for number in (-1, clip.realisations):
+        with pytest.raises(BadInput, match=f"realisations, numbered from 0: there is no {number}"):
+            clip.read("direct", 0, realisation=number)
 
 
 def test_more_memory_maps_than_files_may_be_open(tiny):

@@ -6,6 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+import onespp
 from datasets.bmfr_files import import_bmfr
 from datasets.clip import Clip, Dataset
 from datasets.frame import read_frame
@@ -129,6 +130,17 @@ def test_what_needs_a_scene_says_so_and_the_rest_works(bmfr, tmp_path):
         scene_of(dataset.clips("test")[0], dataset)
 
 
+def test_what_one_reference_of_total_light_cannot_tell_is_refused(bmfr, tmp_path):
+    import_bmfr(bmfr, tmp_path / "data")
+    (clip,) = Dataset(tmp_path / "data").clips("test")
+    assert clip.is_imported
+    assert "unknown" in summarise(tmp_path / "data")  # the noise floor
+    for read in (lambda: clip.reference(0, "indirect"), lambda: next(onespp.read_frames(clip, create("ntd")))):
+        with pytest.raises(BadInput, match="sponza/000 was imported and has no indirect light"):
+            read()
+    assert next(onespp.read_frames(clip, create("ntd", "total"))).radiance("total").max() > 0
+
+
 def test_scenes_of_one_name_are_refused(bmfr, tmp_path):
     shutil.copytree(bmfr / "sponza", bmfr / "again" / "sponza")
     with pytest.raises(BadInput, match=r"again.* and .*sponza.* have the same name"):
@@ -143,6 +155,24 @@ def test_a_scene_without_frames_or_with_a_singular_camera_is_refused(bmfr, tmp_p
         import_bmfr(bmfr, tmp_path / "data")
     (folder / "color0.exr").unlink()
     with pytest.raises(BadInput, match=r"color0\.exr is missing"):
+        import_bmfr(bmfr, tmp_path / "data")
+
+
+def test_bmfr_files_of_another_size_and_damaged_matrices_are_named(bmfr, tmp_path):
+    folder = bmfr / "sponza" / "inputs"
+    shutil.move(folder / "albedo1.exr", tmp_path)
+    write_exr(folder / "albedo1.exr", np.ones((8, 8, 3)))
+    with pytest.raises(BadInput, match=r"albedo1\.exr has an image that is not 96x72"):
+        import_bmfr(bmfr, tmp_path / "data")
+    shutil.move(tmp_path / "albedo1.exr", folder / "albedo1.exr")
+    for path in folder.glob("*2.exr"):
+        write_exr(path, np.ones((8, 8, 3)))
+    with pytest.raises(BadInput, match=r"color2\.exr has an image that is not 96x72"):
+        import_bmfr(bmfr, tmp_path / "data")
+    matrices = folder / "camera_matrices.h"
+    head, brace, numbers = matrices.read_bytes().rpartition(b"f}")
+    matrices.write_bytes(head[:-1] + b"\xff" + brace + numbers)
+    with pytest.raises(BadInput, match=r"camera_matrices\.h has no 4 x 4 matrices"):
         import_bmfr(bmfr, tmp_path / "data")
 
 
@@ -242,10 +272,26 @@ def test_noisebase_files_keep_the_motion_of_things(tmp_path):
         u, v, w = view.K @ (np.linalg.inv(view.camera_to_world)[:3] @ [*point, 1])
         return np.array([u / w, v / w])
 
+    assert np.abs(moving.read("motion", 0)).max() < 1e-3  # without a frame before
     for clip, motion in ((still, zeros), (moving, moved)):
         found = clip.read("motion", 1)[30, 40]
         assert np.allclose(found, pixel(point + motion, before) - pixel(point, now), atol=0.01)
     assert abs(moving.read("motion", 1)[30, 40, 0] - still.read("motion", 1)[30, 40, 0]) > 1
+
+
+def test_noisebase_frames_are_those_with_numbers_and_none_is_missing(noisebase, tmp_path):
+    folder = noisebase / "bistro1"
+    shutil.copy(folder / "frame0001.zip", folder / "frame0001 (1).zip")
+    import_noisebase(noisebase, tmp_path / "data", samples=1)
+    assert Dataset(tmp_path / "data").clips("test")[0].frames == FRAMES
+    shutil.copy(folder / "frame0001.zip", folder / "frame0005.zip")
+    with pytest.raises(BadInput, match=r"frame0003\.zip is missing"):
+        import_noisebase(noisebase, tmp_path / "other", samples=1)
+    write_noisebase(tmp_path / "small", (80, 64))
+    shutil.move(tmp_path / "small" / "frame0002.zip", folder / "frame0002.zip")
+    (folder / "frame0005.zip").unlink()
+    with pytest.raises(BadInput, match=r"frame0002\.zip has an image that is not 96x128"):
+        import_noisebase(noisebase, tmp_path / "other", samples=1)
 
 
 def test_noisebase_files_with_too_few_samples_are_refused(noisebase, tmp_path):

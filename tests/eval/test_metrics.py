@@ -265,6 +265,14 @@ def test_floors_are_the_scores_of_the_truth(deviation):
     assert found[0]["disocclusion_l1"] == pytest.approx(found[0]["l1"], rel=0.2)
 
 
+def test_the_noise_of_a_single_reference_is_unknown():
+    truth, buffers = edged_pair(0.03, 0)
+    comparison = Comparison(truth, buffers[:1].expand(2, -1, -1, -1), 1.0, one_reference=True)
+    values = measure(comparison)
+    assert values["mse_unbiased"] is None and values["detail"] is None and values["psnr"] < 35
+    assert set(noise_floors(comparison).values()) == {None}
+
+
 def test_ssim_between_buffers_would_count_noise_as_structure():
     """Why SSIM has an estimate of its own: on a flat wall its floor is far below the SSIM of a half and the mean."""
     rng = np.random.default_rng(0)

@@ -8,7 +8,15 @@ import torch
 
 from errors import BadInput
 from eval import selection
-from eval.selection import choose, evaluated, untrained, weights_file, weights_of, with_indirect_baselines
+from eval.selection import (
+    choose,
+    evaluated,
+    lacks_channels,
+    untrained,
+    weights_file,
+    weights_of,
+    with_indirect_baselines,
+)
 from models.registry import DENOISERS, DenoiserName, create, parse_name, prototype
 from models.spec import DenoiserSpec
 from models.weights import save_weights
@@ -60,13 +68,14 @@ def test_the_message_on_a_network_without_weights_names_the_training_command(tmp
 
 def test_denoisers_that_a_clip_has_too_few_channels_for(tmp_path, capsys):
     """As of imported data sets, which have no gradient; sample buffers are optional."""
-    clip = SimpleNamespace(path=tmp_path / "room", channels=set(prototype("svgf").reads))
+    clip = SimpleNamespace(path=tmp_path / "room", channels=set(prototype("svgf").reads), is_imported=True)
     ready = {spec.name for spec in evaluated([], tmp_path, "tiny", clips=[clip])}
     assert "svgf" in ready and "asvgf" not in ready
     assert evaluated(["svgf+js"], tmp_path, "tiny", clips=[clip])
     assert f"asvgf: skipped, {clip.path} has no gradient" in capsys.readouterr().out
     with pytest.raises(BadInput, match=r"trmv: .*room has no roughness and no dual_motion and no .*onespp dataset"):
         evaluated(["svgf", "trmv"], tmp_path, "tiny", clips=[clip])
+    assert lacks_channels([clip], parse_name("ntd")) == f"{clip.path} was imported and has no indirect light"
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,12 @@ def implementation(request):
         yield request.param
 
 
+# In place of the fixture's parameters, for what takes long without kernels.
+MOSTLY_KERNELS = pytest.mark.parametrize(
+    "implementation", ["kernels", pytest.param("PyTorch", marks=pytest.mark.slow)], indirect=True, scope="class"
+)
+
+
 @pytest.fixture(scope="session")
 def moving_clip(tiny) -> Clip:
     """Eight rendered frames in which a mesh and the camera move."""

@@ -182,6 +182,9 @@ def test_every_accumulating_denoiser_has_the_wrapper():
         assert adaptive.reads == registry.prototype(name).reads
         assert registry.prototype(name).accumulation is accumulate
     assert isinstance(registry.prototype("oidn+accumulated+adaptive").inner, AccumulatedAfter)
+    for name in ("aaf", "eaw"):  # whose means after it have the same range
+        inner, after = registry.prototype(name), registry.prototype(f"{name}+accumulated")
+        assert (after.convex, after.separates_lights) == (inner.convex, inner.separates_lights)
     for name in ("noisy+adaptive", "svgf+adaptive", "eaw+taa+adaptive"):
         with pytest.raises(BadInput, match="does not accumulate"):
             registry.prototype(name)

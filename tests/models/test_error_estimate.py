@@ -12,10 +12,12 @@ from torch.nn import functional as F
 from datasets.frame import Frame
 from errors import BadInput
 from models.denoiser import Denoiser, State
+from models.registry import create
 from models.wrappers.error_estimate import ErrorEstimate, denoise_with_error, estimate_error
 from models.wrappers.shrinkage import JamesStein
 from tests.helpers.buffers import any_images, noisy_buffers, with_buffers
 from tests.helpers.frames import flat_frame
+from tests.models.test_glass_layers import glass_frame
 
 SIZE = (256, 256)
 SHAPES = (1, 3, *SIZE)
@@ -105,6 +107,22 @@ def test_a_frame_without_buffers_is_refused():
 def test_the_output_is_that_of_the_denoiser():
     frame = with_buffers(*noisy_buffers(waves(20), 0.3))
     torch.testing.assert_close(denoised(frame)[0], JamesStein(Blur())(frame, None)[0])
+
+
+@pytest.mark.parametrize("name", ["accumulated+js", "accumulated+taa+js"])
+def test_glass_is_denoised_in_layers_and_its_error_has_the_history(name):
+    denoiser = create(name)
+    state, expected_state = None, None
+    for seed in range(2):
+        frame = glass_frame(seed, noise=1.0)
+        for light in ("direct", "indirect"):
+            halves = torch.stack([share * frame.channel(light) for share in (0.5, 1.5)], dim=1)
+            frame = frame.with_channels({f"{light}_buffers": halves})
+        output, state, estimate = denoise_with_error(denoiser, frame, state)
+        expected, expected_state = denoiser(frame, expected_state)
+        assert torch.equal(output, expected)
+    _, _, without_history = denoise_with_error(denoiser, frame, None)
+    assert estimate.filter_variance.mean() < 0.5 * without_history.filter_variance.mean()
 
 
 @settings(max_examples=40, deadline=None)

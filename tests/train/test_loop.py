@@ -60,7 +60,7 @@ def test_interrupted_training_resumes_to_equal_weights(tiny, tmp_path, monkeypat
 
 def test_a_training_from_before_recipes_got_a_number_has_its_default(tiny, tmp_path, trained_copy):
     saved = torch.load(trained_copy / CHECKPOINT_FILE)
-    del saved["facts"]["warm_up"], saved["facts"]["loss"]["name"]
+    del saved["facts"]["warm_up"], saved["facts"]["loss"]["name"], saved["facts"]["data"]["clips"]
     torch.save(saved, trained_copy / CHECKPOINT_FILE)
     assert train_network(short_task("rae", tiny, tmp_path, precision=None)) == trained_copy / WEIGHTS_FILE
     with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
@@ -71,7 +71,7 @@ def test_a_training_from_before_recipes_got_a_number_has_its_default(tiny, tmp_p
         train_network(short_task("rae", tiny, tmp_path, precision=None))
 
 
-def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, trained_copy):
+def test_a_finished_training_is_left_alone_and_another_refused(tiny, tiny_copy, tmp_path, trained_copy):
     weights = trained_copy / WEIGHTS_FILE
     before = {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()}
     task = short_task("rae", tiny, tmp_path, precision=None)
@@ -79,6 +79,10 @@ def test_a_finished_training_is_left_alone_and_another_refused(tiny, tmp_path, t
     assert {path: path.stat().st_mtime_ns for path in trained_copy.iterdir()} == before
     with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
         train_network(short_task("rae", tiny, tmp_path, seed=1, precision=None))
+    clip = next(tiny_copy.glob("val/*/*/clip.json"))
+    clip.write_text(clip.read_text() + "\n")  # of other content, as a scene of one's own that was changed
+    with pytest.raises(BadInput, match="another recipe, seed, data set or start"):
+        train_network(short_task("rae", tiny_copy, tmp_path, precision=None))
     with pytest.raises(BadInput, match="a training in float32"):
         train_network(short_task("rae", tiny, tmp_path, precision=BFLOAT16))
     weights.unlink()

@@ -15,6 +15,7 @@ from datasets.channels import CHANNELS, HIT_CHANNELS, USUAL_CHANNELS
 from datasets.clip import Clip, Dataset
 from datasets.frame import Frame, read_frame
 from errors import BadInput
+from models.history.running_scale import running_scale
 from models.registry import create
 from train import sequences as module
 from train.augmentation import Augmentation, LightEdge, averaged, rotated
@@ -323,9 +324,9 @@ class Recorded(WholeFrames):
         super().__init__(signal)
         self.requests: list[Played] = []
 
-    def __call__(self, clip, index, realisation):
-        self.requests.append((clip, index, realisation))
-        return super().__call__(clip, index, realisation)
+    def __call__(self, clip, index, realisations):
+        self.requests.append((clip, index, *realisations))
+        return super().__call__(clip, index, realisations)
 
 
 @pytest.mark.parametrize("name, reverse", [("rae", True), ("ntd", False)])
@@ -360,11 +361,24 @@ def test_crops_get_the_scale_of_their_whole_frames(clips, name, reverse):
 
 def test_each_frame_is_measured_once(clips, monkeypatch):
     measure = WholeFrames("total")
-    first = measure(clips[0], 3, 1)
-    other = [measure(*requests) for requests in ((clips[0], 3, 0), (clips[0], 4, 1), (clips[1], 3, 1))]
+    first = measure(clips[0], 3, [1])
+    other = [measure(*requests) for requests in ((clips[0], 3, [0]), (clips[0], 4, [1]), (clips[1], 3, [1]))]
     assert not any(torch.equal(first, each) for each in other)
     monkeypatch.setattr(module, "read_frame", lambda *_: pytest.fail("measured again"))
-    assert torch.equal(measure(clips[0], 3, 1), first)
+    assert torch.equal(measure(clips[0], 3, [1]), first)
+    assert first[0, 0] != measure(clips[0], 3, [0, 1])[0, 0] > min(first[0, 0], other[0][0, 0])
+
+
+def test_the_scale_of_a_mean_is_that_of_the_frame_that_it_makes(clips):
+    frames = [read_frame(clips[0], 3, ("direct", "indirect", "albedo", "depth"), each) for each in (0, 1)]
+    mean = averaged(frames)
+    scale = running_scale(mean.irradiance("total") * mean.divisor, mean.depth, None)
+    found = WholeFrames("total")(clips[0], 3, [0, 1])
+    torch.testing.assert_close(found[0], torch.cat([scale.log_luminance.value, scale.log_depth.value]))
+    data = TrainingSequences(clips, IMAGE_CHANNELS, 2, 64, Augmentation(samples=True), 0, "total")
+    for frame in (frame for index in range(12) for frame in data[index]):  # a crop is all of the frame
+        scale = running_scale(frame.irradiance("total") * frame.divisor, frame.depth, None)
+        torch.testing.assert_close(frame.whole[0, :1], scale.log_luminance.value)
 
 
 def test_the_scale_of_whole_frames_survives_batches(clips):
