@@ -105,11 +105,13 @@ def denoise(denoiser: Denoiser, sequence: Iterable[Frame]) -> Iterator[NDArray[n
     """Denoised radiance (H, W, 3), linear RGB, of each frame of a sequence, with history except across cuts."""
     import torch
 
+    from datasets.frame import to_image
+
     state = None
     for frame in sequence:
         with torch.inference_mode():
             radiance, state = denoiser(frame.to(denoiser.device), state)
-        yield radiance[0].permute(1, 2, 0).cpu().numpy()
+        yield to_image(radiance)
 
 
 if __name__ == "__main__":

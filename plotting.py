@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.tonemap import to_8_bits
 from errors import requires_extra
 from files import replacing
 
@@ -46,7 +47,7 @@ def data_uri(content: bytes, kind: str) -> str:
 def webp_uri(image: NDArray[np.floating], **options: Any) -> str:
     """A WebP, with Pillow's `options`, of an image (H, W, 3) or (H, W) in [0, 1]."""
     buffer = io.BytesIO()
-    Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(buffer, "WEBP", **options)
+    Image.fromarray(to_8_bits(image)).save(buffer, "WEBP", **options)
     return data_uri(buffer.getvalue(), "webp")
 
 

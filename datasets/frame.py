@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -329,3 +329,8 @@ def to_tensor(array: NDArray[np.generic], has_buffers: bool = False) -> Tensor:
     tensor = torch.from_numpy(np.ascontiguousarray(np.moveaxis(array.astype(np.float32), -1, -3)))
     assert tensor.ndim == (4 if has_buffers else 3)
     return tensor[None]
+
+
+def to_image(tensor: Tensor) -> NDArray[Any]:
+    """(1, C, H, W), on any device, as (H, W, C)."""
+    return tensor[0].permute(1, 2, 0).cpu().numpy()

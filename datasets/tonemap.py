@@ -39,6 +39,11 @@ def display(radiance: ArrayOrTensor, exposure: float) -> ArrayOrTensor:
     return exposed.clip(0, 1) ** (1 / DISPLAY_GAMMA)
 
 
+def to_8_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Values in [0, 1], rounded to bytes."""
+    return (255 * image + 0.5).astype(np.uint8)
+
+
 def noise_of_mean(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     """Expected squared error of the mean of two independent images, as displayed: mean((a - b)^2) / 4."""
     return float(((a - b) ** 2).mean() / 4)

@@ -9,6 +9,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from datasets.channels import CHANNELS
+from datasets.frame import to_image
 from datasets.tonemap import luminance
 from denoise.foreign_frame import ForeignFrame, Image, read_foreign_frame
 from denoise.frames import InputConventions, are_encoded, camera_conventions
@@ -143,4 +144,4 @@ def blurred(image: Image) -> Image:
     smooth = torch.from_numpy(image).permute(2, 0, 1)[None]
     for _ in range(2):
         smooth = avg_pool2d(smooth, 5, stride=1, padding=2, count_include_pad=False)
-    return smooth[0].permute(1, 2, 0).numpy()
+    return to_image(smooth)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datasets.frame import Frame, to_tensor
+from datasets.frame import Frame, to_image, to_tensor
 from denoise.exr_image import ExrImage
 from denoise.layers import ExrLayer, grouped, list_layers
 from errors import BadInput
@@ -59,7 +59,7 @@ def planes_of(layer: ExrLayer, part: Tensor, divisor: Tensor) -> np.ndarray:
     """(H, W, 3), or (H, W, 1) of a layer of one channel."""
     if len(layer.channels) == 1:
         part = (part / divisor).mean(dim=1, keepdim=True)
-    return part[0].permute(1, 2, 0).cpu().numpy()
+    return to_image(part)
 
 
 def part_layer(name: str, image: ExrImage) -> ExrLayer:

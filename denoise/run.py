@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from datasets.frame import Frame
-from datasets.tonemap import clip_exposure, display, luminance
+from datasets.frame import Frame, to_image
+from datasets.tonemap import clip_exposure, display, luminance, to_8_bits
 from denoise.analysis import Analysis, analyse
 from denoise.exr_image import ExrImage
 from denoise.foreign_frame import open_passes, read_foreign_frame
@@ -135,11 +135,6 @@ def check_settings(out: Path, settings: Mapping[str, Any]) -> None:
         raise BadInput(f"{out} has frames denoised with other settings ({', '.join(changed)}): choose another --out")
 
 
-def image_of(tensor: Tensor) -> NDArray[np.float32]:
-    """(H, W, C) of (1, C, H, W)."""
-    return tensor[0].permute(1, 2, 0).cpu().numpy()
-
-
 @dataclass
 class SequenceDenoiser:
     job: Job
@@ -242,7 +237,7 @@ class SequenceDenoiser:
                     frame = albedo.add(frame)
                 output, state = self.step(files, image, frame, state, index >= start)
                 if index >= start:
-                    self.write(files, image, image_of(output))
+                    self.write(files, image, to_image(output))
                     yield nonfinite
             progress.update()
 
@@ -258,7 +253,7 @@ class SequenceDenoiser:
         output, state, estimate = denoise_with_error(self.estimator, frame, state)
         self.errors.add(FrameError.of(files.number, estimate, self.job.until))
         if self.job.error:
-            image.add("error", image_of(estimate.radiance_error()), self.sources.target[0])
+            image.add("error", to_image(estimate.radiance_error()), self.sources.target[0])
         return output, state
 
     @cached_property
@@ -285,5 +280,5 @@ class SequenceDenoiser:
 
             shown = display(np.nan_to_num(radiance).clip(0, None), self.exposure)
             with replacing(self.preview(files)) as temporary:
-                Image.fromarray((255 * shown + 0.5).astype(np.uint8)).save(temporary, "PNG")
+                Image.fromarray(to_8_bits(shown)).save(temporary, "PNG")
         image.write(self.job.out / files.name, f"onespp {self.job.denoiser}")

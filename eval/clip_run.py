@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
 from datasets.clip import Clip
-from datasets.frame import Frame, Signal, disoccluded, read_frame, to_tensor
+from datasets.frame import Frame, Signal, disoccluded, read_frame, to_image, to_tensor
 from datasets.tonemap import display
 from eval.comparison import Comparison, Previous
 from eval.metrics import Values, mean_floor, means, measure, noise_floors, temporal_error_floor
@@ -203,7 +203,7 @@ def run_clip(clip: Clip, runs: Mapping[Path, Run], quiet: bool = False) -> None:
 
 def as_displayed(radiance: Tensor, exposure: float) -> NDArray[np.floating]:
     """(H, W, 3) in [0, 1] of radiance (1, 3, H, W)."""
-    return display(finite(radiance), exposure)[0].permute(1, 2, 0).numpy()
+    return to_image(display(finite(radiance), exposure))
 
 
 def play(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from datasets.frame import to_image
 from datasets.tonemap import psnr
 from eval.comparison import Comparison, Luminances
 from models.operators import sampling_grid
@@ -108,7 +109,7 @@ def flip_map(x: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArra
 
 def flip(x: Tensor, reference: Tensor) -> float:
     """Mean LDR-FLIP of displayed images (1, 3, H, W)."""
-    return float(flip_map(*(image[0].permute(1, 2, 0).numpy() for image in (x, reference))).mean(dtype=np.float64))
+    return float(flip_map(*map(to_image, (x, reference))).mean(dtype=np.float64))
 
 
 def flip_floor(c: Comparison) -> float:

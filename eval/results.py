@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from datasets.clip import Clip, ClipKind
 from datasets.frame import Signal
+from datasets.tonemap import to_8_bits
 from errors import BadInput, can_draw
 from eval.metrics import METRICS, Values
 from files import read_json, write_file, write_json
@@ -59,7 +60,7 @@ def save_picture(path: Path, image: NDArray[np.floating]) -> None:
     if can_draw():
         from plotting import Image
 
-        Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(path, lossless=True, method=2)
+        Image.fromarray(to_8_bits(image)).save(path, lossless=True, method=2)
 
 
 def load_picture(folder: Path, index: int) -> NDArray[np.uint8]:

@@ -24,7 +24,7 @@ from eval.tables import PRINTED, means_by_age
 from files import crc32_of, write_file, write_json
 from models.registry import channels_read, parse_name
 from render.job.generate import generate
-from render.job.profiles import BENCHMARK_SCENES, JUDGED
+from render.job.profiles import BENCHMARK_SCENES, DATA_PROFILES, JUDGED
 
 NAMES = (
     *("noisy", "svgf", "oidn", "oidn-balanced", "oidn-fast"),
@@ -99,7 +99,16 @@ class Format(NamedTuple):
     floor: float  # noise floor of the references, PSNR in dB
 
 
-OWN_FORMAT = Format((640, 360), 49, 35.0)  # of the profile BUILT_IN, and by default of all
+def own_format() -> Format:
+    """That of our own scenes, and by default of all."""
+    profile = DATA_PROFILES[BUILT_IN]
+    frames, height, width = profile.size
+    floor = profile.quality["test"].floor
+    assert floor is not None
+    return Format((width, height), frames, float(floor))
+
+
+OWN_FORMAT = own_format()
 
 
 def description(name: str, file: str, clips: Format) -> str:
@@ -170,7 +179,9 @@ def run(scenes: Path | None, data: Path, runs: Path, names: Sequence[str], clips
     `onespp eval` for denoisers, and for `clips` that our own scenes do not have.
     """
     if own and clips != OWN_FORMAT:
-        raise BadInput("our own scenes are 640x360, 49 frames, to 35 dB: leave out --size, --frames and --floor")
+        size, frames, floor = OWN_FORMAT
+        ours = f"our own scenes are {size[0]}x{size[1]}, {frames} frames, to {floor:g} dB"
+        raise BadInput(f"{ours}: leave out --size, --frames and --floor")
     obstacles = (cannot_run, partial(untrained, runs, BUDGET))
     chosen = [str(name) for name in choose(names, map(parse_name, NAMES), *obstacles)]  # before what takes hours
     done = render_scenes(scenes, data, clips) if scenes else {}

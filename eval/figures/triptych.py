@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from datasets.channels import CHANNELS
 from datasets.clip import Clip
-from datasets.tonemap import clip_exposure, display, luminance
+from datasets.frame import to_image
+from datasets.tonemap import clip_exposure, display, luminance, to_8_bits
 from eval.clip_run import play
 from eval.selection import USUAL_BUDGET, evaluated
 from files import replacing
@@ -35,7 +36,7 @@ Picture = NDArray[np.float64]
 def last_frame(clip: Clip, network: Denoiser) -> tuple[Picture, Picture]:
     """Radiance (H, W, 3) of the last frame, noisy and denoised with the history of all frames."""
     _, frame, (output,) = deque(play(clip, [network], ("direct", "indirect", "emission")), maxlen=1).pop()
-    noisy, denoised = (image[0].permute(1, 2, 0).double().numpy() for image in (frame.radiance("total"), output))
+    noisy, denoised = (to_image(image.double()) for image in (frame.radiance("total"), output))
     return noisy, denoised
 
 
@@ -76,7 +77,7 @@ def triptych(
     exposure = clip_exposure(luminance(reflected))
     picture = in_strips([display(image, exposure) for image in (noisy, denoised, reflected + posed.emission)])
     with replacing(out) as temporary:
-        Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(temporary, format="png", optimize=True)
+        Image.fromarray(to_8_bits(picture)).save(temporary, format="png", optimize=True)
 
 
 if __name__ == "__main__":

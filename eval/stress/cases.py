@@ -12,7 +12,7 @@ from torch import Tensor
 
 from datasets.cameras import Cameras
 from datasets.channels import CHANNELS, LENGTH, MOTION_CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS, channels_of
-from datasets.frame import Frame, to_tensor
+from datasets.frame import Frame, to_image, to_tensor
 from eval.bench.denoisers import Size
 from eval.bench.synthetic_frames import HIT_DIRECT, HIT_INDIRECT, noisy, split_into_buffers, synthetic_frame
 
@@ -102,7 +102,7 @@ def lit_frame(surfaces: FrameChange, size: Size, index: int, seed: int | None) -
     With the noise of one sample per pixel, or without noise if no seed.
     """
     frame = surfaces(synthetic_frame(index, *size))
-    reflected = (frame.divisor * (frame.depth > 0))[0].permute(1, 2, 0).double().numpy()
+    reflected = to_image((frame.divisor * (frame.depth > 0)).double())
     light = {name: share * reflected for name, share in LIGHT_SHARES.items()}
     if seed is not None:
         rng = np.random.default_rng(seed)

@@ -1,6 +1,5 @@
 """More samples per pixel: a dataset's clips with other noisy input, rendered and stored; and what samples cost."""
 
-import zlib
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import count
@@ -15,7 +14,7 @@ from tqdm import tqdm
 from datasets.channels import CHANNELS, NOISY_CHANNELS, SAMPLE_BUFFERS
 from datasets.clip import Clip, Dataset
 from errors import BadInput
-from files import locked, read_json, write_json
+from files import crc32_of, locked, read_json, write_json
 from render.backend import VARIANT, dr
 from render.clip import Options, Sampling, render_clip
 from render.job.generate import check_versions
@@ -97,7 +96,7 @@ def write_resampled(path: Path, clip: Clip, frames: list[NoisyFrame], facts: dic
         file = path / f"{name}.npy"
         np.save(file, array)
         entry = {"file": file.name, "dtype": "<f4", "shape": list(array.shape), "unit": CHANNELS[name].unit}
-        entries[name] = entry | {"crc32": f"{zlib.crc32(file.read_bytes()):08x}"}
+        entries[name] = entry | {"crc32": crc32_of(file)}
     write_json(path / "clip.json", clip.facts | facts | {"channels": entries})
 
 

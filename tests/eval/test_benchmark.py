@@ -13,12 +13,12 @@ from datasets.imported import ImportedFrame, write_dataset
 from errors import BadInput
 from eval.benchmark.page import write_page
 from eval.benchmark.published import aces_tone, published
-from eval.benchmark.run import BUILT_IN, OWN_FORMAT, Format, entries, list_scenes, located, run, toml_of
+from eval.benchmark.run import OWN_FORMAT, Format, entries, list_scenes, located, run, toml_of
 from files import read_json
 from models.filters.oidn import OIDN
 from models.registry import prototype
 from provenance import ROOT
-from render.job.profiles import BENCHMARK_SCENES, DATA_PROFILES, JUDGED
+from render.job.profiles import BENCHMARK_SCENES, JUDGED
 from render.scene_file.description import read_description
 from scenes.camera import STILL, View, intrinsics, look_at
 from tests.helpers.scene_files import xml
@@ -86,10 +86,7 @@ def test_the_toml_of_a_scene_can_be_printed(tmp_path):
 
 
 def test_clips_of_our_own_have_one_format(tmp_path):
-    profile = DATA_PROFILES[BUILT_IN]
-    frames, height, width = profile.size
-    assert Format((width, height), frames, profile.quality["test"].floor) == OWN_FORMAT
-    with pytest.raises(BadInput, match="leave out --size"):
+    with pytest.raises(BadInput, match="640x360, 49 frames, to 35 dB: leave out --size"):
         run(None, tmp_path / "data", tmp_path / "runs", NAMES, OWN_FORMAT._replace(floor=30.0), own=True)
     assert not any(tmp_path.iterdir())
 
